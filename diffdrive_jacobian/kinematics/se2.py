@@ -1,0 +1,144 @@
+"""Rigid motions of the plane, SE(2).
+
+Model: a pose `[x, y, theta]` (m, m, rad) is the placement of a frame B in a frame W, x forward,
+y left, theta counter-clockwise and wrapped to (-pi, pi]. A twist `[vx, vy, omega]` (m/s, m/s,
+rad/s) is a velocity in B.
+
+Everything broadcasts over leading axes: a pose has shape (..., 3). Wrong shapes raise ValueError.
+
+Source: MATH.md, "Motion of a virtual robot"; document B for the homogeneous transform.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from diffdrive_jacobian.kinematics._checks import components
+
+TURN = 2.0 * np.pi
+
+
+def wrap_angle(angle: ArrayLike) -> Any:
+    """Wrap angles to (-pi, pi].
+
+    The result is exact with respect to the double nearest to 2 pi, and an angle that is already
+    inside comes back to the last bit.
+
+    Args:
+        angle: Angles, any shape (rad).
+
+    Returns:
+        The wrapped angles, same shape (rad).
+    """
+    wrapped = np.fmod(angle, TURN)
+    return wrapped - TURN * (wrapped > np.pi) + TURN * (wrapped <= -np.pi)
+
+
+def sinc(angle: Any) -> Any:
+    """Compute sin(angle) / angle without a hole at zero (not NumPy's sin(pi x) / (pi x))."""
+    # A tiny angle in the place of zero gives exactly 1.
+    angle = angle + (angle == 0.0) * 1e-20
+    return np.sin(angle) / angle
+
+
+def exp(twist: ArrayLike) -> NDArray[np.float64]:
+    """Move from the identity with a constant twist for unit time.
+
+    Args:
+        twist: `[vx, vy, omega]`, shape (..., 3): velocity in B times time (m, m, rad).
+
+    Returns:
+        The pose reached, shape (..., 3), theta wrapped.
+    """
+    vx, vy, turn = components('twist', twist, 3)
+    chord = sinc(turn / 2.0)
+    along, across = chord * np.cos(turn / 2.0), chord * np.sin(turn / 2.0)
+    return _pose(along * vx - across * vy, across * vx + along * vy, wrap_angle(turn))
+
+
+def log(pose: ArrayLike) -> NDArray[np.float64]:
+    """Find the constant twist that reaches a pose from the identity in unit time: inverse of `exp`.
+
+    Args:
+        pose: `[x, y, theta]`, shape (..., 3).
+
+    Returns:
+        The twist `[vx, vy, omega]`, shape (..., 3), with the turn of least magnitude.
+    """
+    x, y, theta = components('pose', pose, 3)
+    turn = wrap_angle(theta)
+    along = np.cos(turn / 2.0) / sinc(turn / 2.0)
+    return _pose(along * x + turn / 2.0 * y, along * y - turn / 2.0 * x, turn)
+
+
+def compose(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
+    """Place `second`, given in the frame of `first`, in the frame in which `first` is given.
+
+    Args:
+        first: Pose of B in W, shape (..., 3).
+        second: Pose of C in B, shape (..., 3).
+
+    Returns:
+        Pose of C in W, shape (..., 3), theta wrapped.
+    """
+    x, y, theta = components('first', first, 3)
+    dx, dy, turn = components('second', second, 3)
+    cos, sin = np.cos(theta), np.sin(theta)
+    return _pose(x + cos * dx - sin * dy, y + sin * dx + cos * dy, wrap_angle(theta + turn))
+
+
+def inverse(pose: ArrayLike) -> NDArray[np.float64]:
+    """Give the pose of W in B from the pose of B in W, shape (..., 3), theta wrapped."""
+    x, y, theta = components('pose', pose, 3)
+    cos, sin = np.cos(theta), np.sin(theta)
+    return _pose(-cos * x - sin * y, sin * x - cos * y, wrap_angle(-theta))
+
+
+def homogeneous(pose: ArrayLike) -> NDArray[np.float64]:
+    """Write a pose as the homogeneous transform `H_B^W` (document B).
+
+    Args:
+        pose: `[x, y, theta]`, shape (..., 3).
+
+    Returns:
+        Transforms, shape (..., 3, 3): they map `[x, y, 1]` in B to W.
+    """
+    x, y, theta = components('pose', pose, 3)
+    cos, sin = np.cos(theta), np.sin(theta)
+    transform = np.zeros((*np.shape(x), 3, 3))
+    transform[..., 0, 0], transform[..., 0, 1], transform[..., 0, 2] = cos, -sin, x
+    transform[..., 1, 0], transform[..., 1, 1], transform[..., 1, 2] = sin, cos, y
+    transform[..., 2, 2] = 1.0
+    return transform
+
+
+def integrate(pose: ArrayLike, twist: ArrayLike, dt: ArrayLike) -> NDArray[np.float64]:
+    """Hold a unicycle's twist for a time: `q * Exp(u dt)`, the exact arc (MATH.md, "Motion").
+
+    The chord `v dt sin(a/2)/(a/2)` along the heading `theta + a/2`, `a = omega dt`, loses no digits
+    for small turns.
+
+    Args:
+        pose: `[x, y, theta]` at the start, shape (..., 3).
+        twist: `[v, omega]` (m/s, rad/s), shape (..., 2).
+        dt: Time for which the twist is held (s), shape (...); negative goes back.
+
+    Returns:
+        The pose at the end, shape (..., 3), theta wrapped.
+    """
+    x, y, theta = components('pose', pose, 3)
+    v, omega = components('twist', twist, 2)
+    turn = omega * dt
+    chord = v * dt * sinc(turn / 2.0)
+    heading = theta + turn / 2.0
+    return _pose(x + chord * np.cos(heading), y + chord * np.sin(heading), wrap_angle(theta + turn))
+
+
+def _pose(x: Any, y: Any, theta: Any) -> NDArray[np.float64]:
+    """Stack three components that broadcast along a new last axis (np.stack is three times slower)."""
+    pose = np.empty((*np.broadcast(x, y, theta).shape, 3))
+    pose[..., 0], pose[..., 1], pose[..., 2] = x, y, theta
+    return pose

@@ -1,0 +1,1 @@
+"""The three nodes: convert a message, call the library, publish."""

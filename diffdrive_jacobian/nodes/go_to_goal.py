@@ -1,0 +1,255 @@
+"""Drive a robot to goals by document A's law: odometry and goals in, body twists out."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from action_msgs.msg import GoalInfo, GoalStatus
+from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from nav_msgs.msg import Goals, Odometry
+from std_srvs.srv import Trigger
+from unique_identifier_msgs.msg import UUID
+
+from diffdrive_jacobian.control import Arrival, Waypoints, go_to_goal, saturate
+from diffdrive_jacobian.control.waypoints import Law
+from diffdrive_jacobian.nodes.parameters import GoToGoalParameters, nanoseconds
+from diffdrive_jacobian.ros import messages
+from diffdrive_jacobian.ros.messages import MessageError
+from diffdrive_jacobian.ros.node import ParameterizedNode
+
+LAWS: dict[str, Callable[[GoToGoalParameters], Law]] = {
+    'go_to_goal': lambda parameters: partial(go_to_goal, Kp=parameters.kp, Kv=parameters.kv),
+}
+"""Parameter `controller` to the law with its gains."""
+
+
+@dataclass(slots=True)
+class Goal:
+    """A goal that was accepted: what came in one message."""
+
+    info: GoalInfo
+    frame: str
+    """Frame of its poses; empty: the odometry's."""
+    waypoints: Waypoints
+    executing: bool = False
+    """Whether odometry has come for it."""
+    stale: bool = False
+    """Whether the robot was stopped for want of odometry."""
+
+
+class GoToGoal(ParameterizedNode[GoToGoalParameters]):
+    """Node go_to_goal: `odom`, `goal_pose` and `goals` in; `cmd_vel` and `goal_status` out;
+    `cancel_goal` stops.
+
+    While a goal is active, every odometry message is answered by one command; without one the node is
+    silent, so that others may drive.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        """Create the controller without a goal; `kwargs` as for `ParameterizedNode`."""
+        super().__init__('go_to_goal', GoToGoalParameters, **kwargs)
+        self._goal: Goal | None = None
+        self._odom_frame = ''
+        stamped = self.parameters.enable_stamped_cmd_vel
+        self._cmd_vel = self.advertise(TwistStamped if stamped else Twist, 'cmd_vel')
+        self._status = self.advertise(GoalStatus, 'goal_status', latched=True)
+        self.subscribe(Odometry, 'odom', self._on_odometry)
+        self.subscribe(PoseStamped, 'goal_pose', self._on_goal_pose)
+        self.subscribe(Goals, 'goals', self._on_goals)
+        self.create_service(Trigger, 'cancel_goal', self._on_cancel)
+        self._watchdog = self.create_timer(1.0, self._on_stale_odometry)
+        self._arm_watchdog()
+        self.report_unknown_parameters()
+        self._judge_gains()
+
+    @property
+    def waypoint(self) -> int | None:
+        """Which pose of the active goal is driven to; None without a goal."""
+        return None if self._goal is None else self._goal.waypoints.index
+
+    # --- Goals
+
+    def _on_goal_pose(self, message: PoseStamped) -> None:
+        self._accept(message.header, [message])
+
+    def _on_goals(self, message: Goals) -> None:
+        self._accept(message.header, message.goals)
+
+    def _accept(self, header: Any, poses: Sequence[PoseStamped]) -> None:
+        """Take the poses of one message as the goal, in the place of the active one; or refuse it."""
+        info = GoalInfo(goal_id=UUID(uuid=list(uuid.uuid4().bytes)), stamp=header.stamp)
+        try:
+            goal = Goal(info, *_read_goal(header.frame_id, poses))
+            self._match_frames(goal)
+        except MessageError as error:
+            self.get_logger().warning(f'goal refused: {error}')
+            self._publish_status(info, GoalStatus.STATUS_ABORTED)
+            if self._goal is not None:
+                # What is latched last must be what goes on.
+                self._publish_status(self._goal.info, self._goal_status(self._goal))
+            return
+        if self._goal is not None:
+            self._end(GoalStatus.STATUS_CANCELED, 'replaced by another')
+        self._goal = goal
+        self._publish_status(info, GoalStatus.STATUS_ACCEPTED)
+        self._arm_watchdog()
+        x, y, _ = goal.waypoints.poses[-1]
+        more = f' by way of {count} more' if (count := len(goal.waypoints.poses) - 1) else ''
+        self.get_logger().info(f'goal accepted: x {x:.3f}, y {y:.3f}{more}')
+
+    def _match_frames(self, goal: Goal) -> None:
+        if goal.frame and self._odom_frame and goal.frame != self._odom_frame:
+            raise MessageError(
+                f"it must be given in the frame of the odometry, '{self._odom_frame}' or '' for it, "
+                f"got '{goal.frame}'"
+            )
+
+    def _on_cancel(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._goal is None:
+            response.message = 'no goal is active'
+            return response
+        self._publish_command(0.0, 0.0)
+        self._end(GoalStatus.STATUS_CANCELED, 'canceled')
+        response.success, response.message = True, 'goal canceled, zero sent'
+        return response
+
+    def _end(self, status: int, what: str) -> None:
+        """Let go of the active goal."""
+        if self._goal is not None:
+            self._publish_status(self._goal.info, status)
+            self._goal = None
+            self._watchdog.cancel()
+            self.get_logger().info(f'goal {what}')
+
+    def _publish_status(self, info: GoalInfo, status: int) -> None:
+        self._status.publish(GoalStatus(goal_info=info, status=status))
+
+    @staticmethod
+    def _goal_status(goal: Goal) -> int:
+        return int(GoalStatus.STATUS_EXECUTING if goal.executing else GoalStatus.STATUS_ACCEPTED)
+
+    # --- Control
+
+    def _on_odometry(self, message: Odometry) -> None:
+        goal = self._goal
+        try:
+            pose = messages.from_pose(message.pose.pose)
+            if goal is not None and goal.executing and message.header.frame_id != self._odom_frame:
+                raise MessageError(
+                    f"it must stay in frame '{self._odom_frame}', got '{message.header.frame_id}'"
+                )
+        except MessageError as error:
+            self.warn(f'odometry dropped: {error}')
+            return
+        self._odom_frame = message.header.frame_id
+        if goal is None:
+            return
+        if self.parameters.odom_timeout > 0.0:
+            self._watchdog.reset()
+        if not goal.executing and not self._begin(goal):
+            return
+        if goal.stale:
+            goal.stale = False
+            self.get_logger().info('odometry is back: driving on')
+        parameters = self.parameters
+        goal.waypoints, command = goal.waypoints.follow(
+            pose,
+            LAWS[parameters.controller](parameters),
+            Arrival(
+                xy_tolerance=parameters.xy_goal_tolerance,
+                yaw_tolerance=parameters.yaw_goal_tolerance,
+                use_heading=parameters.use_goal_heading,
+            ),
+            parameters.kp,
+        )
+        if command is None:
+            self._publish_command(0.0, 0.0)
+            self._end(GoalStatus.STATUS_SUCCEEDED, 'reached')
+            return
+        # Without wheels in the limits the geometry of the wheels does not matter.
+        self._publish_command(*saturate(*command, parameters.limits(), 1.0, 1.0))
+
+    def _begin(self, goal: Goal) -> bool:
+        """Begin to drive, now that the odometry's frame is known."""
+        try:
+            self._match_frames(goal)
+        except MessageError as error:
+            self.get_logger().warning(f'goal refused: {error}')
+            self._end(GoalStatus.STATUS_ABORTED, 'refused')
+            return False
+        goal.executing = True
+        self._publish_status(goal.info, GoalStatus.STATUS_EXECUTING)
+        return True
+
+    def _on_stale_odometry(self) -> None:
+        """Stop the robot that is no longer seen; the goal stays, and odometry may come back."""
+        goal = self._goal
+        if goal is None:
+            return
+        topic, timeout = self.resolve_topic_name('odom'), self.parameters.odom_timeout
+        if not goal.executing:
+            self.warn(f'the goal waits for odometry on {topic}: is the robot running?')
+        elif not goal.stale:
+            goal.stale = True
+            self._publish_command(0.0, 0.0)
+            self.warn(f'no valid odometry on {topic} for {timeout:g} s: zero sent, waiting')
+
+    def _publish_command(self, v: float, omega: float) -> None:
+        if self.parameters.enable_stamped_cmd_vel:
+            # No frame: the twist is the robot's own, and its name is not ours to know.
+            self._cmd_vel.publish(messages.to_twist_stamped(v, omega, self.now(), ''))
+        else:
+            self._cmd_vel.publish(messages.to_twist(v, omega))
+
+    def stop(self) -> None:
+        """Send zero and give the goal up, if there is one."""
+        if self._goal is not None:
+            self._publish_command(0.0, 0.0)
+            self._end(GoalStatus.STATUS_CANCELED, 'given up: shutting down')
+
+    # --- Parameters
+
+    def parameters_changed(self, previous: GoToGoalParameters) -> None:
+        """Control on with the new parameters."""
+        parameters = self.parameters
+        if parameters.odom_timeout != previous.odom_timeout:
+            self._arm_watchdog()
+        if (parameters.kp, parameters.kv) != (previous.kp, previous.kv):
+            self._judge_gains()
+
+    def _arm_watchdog(self) -> None:
+        """Let the watchdog bark once the odometry is too old; each odometry message puts it off."""
+        timeout = self.parameters.odom_timeout
+        if self._goal is None or timeout == 0.0:
+            self._watchdog.cancel()
+            return
+        self._watchdog.timer_period_ns = nanoseconds(timeout)
+        self._watchdog.reset()
+
+    def _judge_gains(self) -> None:
+        kp, kv = self.parameters.kp, self.parameters.kv
+        if kp <= kv:
+            self.get_logger().warning(
+                f'kp {kp:g} is not larger than kv {kv:g}: the robot approaches faster than it turns '
+                'and spirals in; choose kp > kv'
+            )
+
+
+def _read_goal(frame: str, poses: Sequence[PoseStamped]) -> tuple[str, Waypoints]:
+    """Read the frame and the poses of a goal.
+
+    Raises:
+        MessageError: There is no pose, one is not valid, or they are given in several frames.
+    """
+    if not poses:
+        raise MessageError('goals must hold at least one pose, got none (to stop, call cancel_goal)')
+    frames = {pose.header.frame_id or frame for pose in poses}
+    if len(frames) > 1:
+        raise MessageError(f'all poses must be given in one frame, got {sorted(frames)}')
+    read = np.array([messages.from_pose(pose.pose) for pose in poses])
+    return frames.pop(), Waypoints(read)

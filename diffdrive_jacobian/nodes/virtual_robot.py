@@ -1,0 +1,234 @@
+"""A differential-drive robot that needs no simulator: commands in, odometry out.
+
+It integrates the unicycle model exactly: its motion is a function of the commands and their instants
+alone, whatever `publish_rate` is and however late a timer comes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import (
+    PoseWithCovarianceStamped,
+    TransformStamped,
+    Twist,
+    TwistStamped,
+)
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
+from diffdrive_jacobian.kinematics.se2 import wrap_angle
+from diffdrive_jacobian.nodes.parameters import VirtualRobotParameters, nanoseconds
+from diffdrive_jacobian.ros import messages
+from diffdrive_jacobian.ros.messages import MessageError
+from diffdrive_jacobian.ros.node import ParameterizedNode
+from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot, RobotModel
+
+
+class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
+    """Node virtual_robot: `cmd_vel` or `joint_command` in; `odom`, `joint_states`, `cmd_vel_out`,
+    `start_pose` and TF out; `initialpose` and `reset_odometry` place it.
+
+    A command takes effect on receipt, or at its stamp if it has one. `cmd_vel_out` tells each command
+    as it was applied, `start_pose` where and when the odometry last began: together the whole motion.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        """Create the robot at its initial pose; `kwargs` as for `ParameterizedNode`."""
+        super().__init__('virtual_robot', VirtualRobotParameters, **kwargs)
+        self._robot: Robot | None = None
+        self._latest = 0
+        self._odom = self.advertise(Odometry, 'odom')
+        self._joint_states = self.advertise(JointState, 'joint_states')
+        self._applied = self.advertise(TwistStamped, 'cmd_vel_out')
+        self._start_pose = self.advertise(PoseWithCovarianceStamped, 'start_pose', latched=True)
+        self._transforms = self._transform_broadcaster() if self.parameters.enable_odom_tf else None
+        if self.parameters.command_interface == 'wheels':
+            self.subscribe(JointState, 'joint_command', self._on_joint_command)
+        elif self.parameters.enable_stamped_cmd_vel:
+            self.subscribe(TwistStamped, 'cmd_vel', self._on_twist_stamped)
+        else:
+            self.subscribe(Twist, 'cmd_vel', self._on_twist)
+        self.subscribe(PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose)
+        self.create_service(Trigger, 'reset_odometry', self._on_reset)
+        self._timer = self.create_timer(1.0 / self.parameters.publish_rate, self._on_tick)
+        self.report_unknown_parameters()
+        self._advance()
+
+    # --- Time
+
+    def _advance(self) -> tuple[int, Robot] | None:
+        """Bring the robot past what happened by now; None while simulated time has not begun."""
+        now = self.now()
+        if now == 0:
+            return None
+        robot = self._robot
+        if robot is None:
+            robot = Robot(model=self._model(), stamp=now, pose=self._initial_pose())
+            self._begin(robot)
+        elif now < self._latest:
+            self.get_logger().warning(
+                f'time went back by {(self._latest - now) / NANOSECONDS:.3f} s: '
+                'the robot stands still where it is'
+            )
+            robot = robot.at(self._latest).restarted(now)
+            self._begin(robot)
+            self._publish_applied(robot)
+        elif (expiry := robot.expiry) is not None and expiry <= now:
+            robot = robot.at(expiry)
+            self._publish_applied(robot)
+        self._robot, self._latest = robot, now
+        return now, robot
+
+    def _begin(self, robot: Robot) -> None:
+        """Say where and when the odometry begins."""
+        message = PoseWithCovarianceStamped()
+        message.header.stamp = messages.to_time(robot.stamp)
+        message.header.frame_id = self.parameters.odom_frame_id
+        messages.fill_pose_with_covariance(message.pose, robot.pose, robot.covariance)
+        self._start_pose.publish(message)
+
+    def _on_tick(self) -> None:
+        advanced = self._advance()
+        if advanced is None:
+            return
+        now, robot = advanced
+        state = robot.at(now)
+        parameters = self.parameters
+        odometry = messages.to_odometry(
+            state,
+            1.0 / parameters.publish_rate,
+            parameters.odom_frame_id,
+            parameters.base_frame_id,
+        )
+        self._odom.publish(odometry)
+        self._joint_states.publish(
+            messages.to_joint_state(self._joint_names(), now, state.wheel_speeds, state.wheel_angles)
+        )
+        if self._transforms is not None:
+            self._transforms.sendTransform(_transform(odometry))
+
+    # --- Commands
+
+    def _on_twist(self, message: Twist) -> None:
+        self._take(lambda: messages.from_twist(message), 0)
+
+    def _on_twist_stamped(self, message: TwistStamped) -> None:
+        self._take(lambda: messages.from_twist(message.twist), messages.from_time(message.header.stamp))
+
+    def _on_joint_command(self, message: JointState) -> None:
+        def twist() -> tuple[float, float]:
+            speeds = messages.from_joint_state(message, self._joint_names())
+            parameters = self.parameters
+            v, omega = wheel_to_body(*speeds, parameters.wheel_radius, parameters.wheel_separation)
+            return messages.plausible_twist(v, omega)
+
+        self._take(twist, messages.from_time(message.header.stamp))
+
+    def _take(self, read: Any, stamp: int) -> None:
+        """Apply the command that `read` gives, or say why not."""
+        advanced = self._advance()
+        try:
+            if advanced is None:
+                raise MessageError('simulated time has not begun, nothing came on /clock')
+            now, robot = advanced
+            twist = read()
+            timeout = robot.model.command_timeout
+            instant = messages.command_instant(stamp, now, robot.stamp, timeout)
+        except MessageError as error:
+            self.warn(f'command dropped: {error}')
+            return
+        self._robot = robot.commanded(twist, instant)
+        self._publish_applied(self._robot)
+
+    def _publish_applied(self, robot: Robot) -> None:
+        """Tell the command that drives the robot from its instant on."""
+        self._applied.publish(
+            messages.to_twist_stamped(*robot.twist, robot.stamp, self.parameters.base_frame_id)
+        )
+
+    # --- Placement
+
+    def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
+        advanced = self._advance()
+        frame, ours = message.header.frame_id, self.parameters.odom_frame_id
+        try:
+            if advanced is None:
+                raise MessageError('simulated time has not begun, nothing came on /clock')
+            if frame not in ('', ours):
+                raise MessageError(f"it must be given in frame '{ours}', got '{frame}'")
+            pose, covariance = messages.from_pose_with_covariance(message.pose)
+        except MessageError as error:
+            self.warn(f'initialpose dropped: {error}')
+            return
+        now, robot = advanced
+        self._place(robot.placed(pose, covariance, now))
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        advanced = self._advance()
+        if advanced is None:
+            response.message = 'simulated time has not begun, nothing came on /clock'
+            return response
+        now, robot = advanced
+        self._place(robot.placed(self._initial_pose(), np.zeros((3, 3)), now))
+        response.success, response.message = True, f'odometry begins anew at {self._initial_pose()}'
+        return response
+
+    def _place(self, robot: Robot) -> None:
+        self._robot = robot
+        self._begin(robot)
+        x, y, theta = robot.pose
+        self.get_logger().info(f'odometry begins at x {x:.3f}, y {y:.3f}, theta {theta:.3f}')
+
+    # --- Parameters
+
+    def parameters_changed(self, previous: VirtualRobotParameters) -> None:
+        """Drive on under the new parameters."""
+        parameters = self.parameters
+        if parameters.publish_rate != previous.publish_rate:
+            self._timer.timer_period_ns = nanoseconds(1.0 / parameters.publish_rate)
+            self._timer.reset()
+        model = self._model()
+        advanced = self._advance()
+        if advanced is not None and model != advanced[1].model:
+            now, robot = advanced
+            self._robot = robot.remodelled(model, now)
+            if self._robot.twist != robot.twist:
+                self._publish_applied(self._robot)
+
+    def _model(self) -> RobotModel:
+        parameters = self.parameters
+        return RobotModel(
+            wheel_radius=parameters.wheel_radius,
+            wheel_separation=parameters.wheel_separation,
+            limits=parameters.limits(parameters.max_wheel_velocity),
+            command_timeout=nanoseconds(parameters.cmd_vel_timeout),
+            wheel_travel_variance=parameters.wheel_travel_variance,
+        )
+
+    def _initial_pose(self) -> Any:
+        parameters = self.parameters
+        return np.array([parameters.x, parameters.y, wrap_angle(parameters.theta)])
+
+    def _joint_names(self) -> tuple[str, str]:
+        return self.parameters.left_wheel_name, self.parameters.right_wheel_name
+
+    def _transform_broadcaster(self) -> Any | None:
+        try:
+            from tf2_ros import TransformBroadcaster
+        except ImportError:
+            self.get_logger().info('tf2_ros is not installed: no transform odom -> base is sent')
+            return None
+        return TransformBroadcaster(self)
+
+
+def _transform(odometry: Odometry) -> TransformStamped:
+    """Write a pose as the transform from the odometry's frame to the robot's."""
+    message = TransformStamped(header=odometry.header, child_frame_id=odometry.child_frame_id)
+    position, translation = odometry.pose.pose.position, message.transform.translation
+    translation.x, translation.y = position.x, position.y
+    message.transform.rotation = odometry.pose.pose.orientation
+    return message

@@ -1,0 +1,110 @@
+"""Body twists to wheel speeds through the inverse wheel Jacobian, for motors that know nothing else."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from geometry_msgs.msg import Twist, TwistStamped
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
+from diffdrive_jacobian.nodes.parameters import WheelBridgeParameters, nanoseconds
+from diffdrive_jacobian.ros import messages
+from diffdrive_jacobian.ros.messages import MessageError
+from diffdrive_jacobian.ros.node import ParameterizedNode
+
+
+class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
+    """Node wheel_bridge: `cmd_vel` in, `joint_command` out.
+
+    Each command gives one message with the same stamp (an unstamped one: that of its receipt). When
+    commands cease, one zero follows after the timeout.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        """Create the bridge; `kwargs` as for `ParameterizedNode`."""
+        super().__init__('wheel_bridge', WheelBridgeParameters, **kwargs)
+        parameters = self.parameters
+        self._as_joint_state = parameters.joint_command_type == 'JointState'
+        self._joint_command = self.advertise(
+            JointState if self._as_joint_state else Float64MultiArray, 'joint_command'
+        )
+        if parameters.enable_stamped_cmd_vel:
+            self.subscribe(TwistStamped, 'cmd_vel', self._on_twist_stamped)
+        else:
+            self.subscribe(Twist, 'cmd_vel', self._on_twist)
+        self._last = 0
+        self._moving = False
+        self._watchdog = self.create_timer(1.0, self._on_silence)
+        self._arm_watchdog()
+        self.report_unknown_parameters()
+
+    def _on_twist(self, message: Twist) -> None:
+        self._take(message, 0)
+
+    def _on_twist_stamped(self, message: TwistStamped) -> None:
+        self._take(message.twist, messages.from_time(message.header.stamp))
+
+    def _take(self, twist: Twist, stamp: int) -> None:
+        now = self.now()
+        # After time went back the last command's instant means nothing any more.
+        last = self._last if self._last <= now else 0
+        try:
+            v, omega = messages.from_twist(twist)
+            timeout = nanoseconds(self.parameters.cmd_vel_timeout)
+            self._last = messages.command_instant(stamp, now, last, timeout)
+        except MessageError as error:
+            self.warn(f'command dropped: {error}')
+            return
+        if timeout:
+            self._watchdog.reset()
+        self._publish(self._wheel_speeds(v, omega), self._last)
+
+    def _wheel_speeds(self, v: float, omega: float) -> tuple[Any, Any]:
+        """Give `(omega_R, omega_L)` of calibrated wheels, within their limit."""
+        parameters = self.parameters
+        r, L = parameters.wheel_radius, parameters.wheel_separation
+        L *= parameters.wheel_separation_multiplier
+        right, left = body_to_wheel(v, omega, r, L)
+        right /= parameters.right_wheel_radius_multiplier
+        left /= parameters.left_wheel_radius_multiplier
+        excess = max(1.0, max(abs(right), abs(left)) / parameters.fastest_wheel)
+        return right / excess, left / excess
+
+    def _publish(self, speeds: tuple[Any, Any], stamp: int) -> None:
+        self._moving = speeds != (0.0, 0.0)
+        if self._as_joint_state:
+            names = self.parameters.left_wheel_name, self.parameters.right_wheel_name
+            self._joint_command.publish(messages.to_joint_state(names, stamp, speeds))
+        else:
+            self._joint_command.publish(messages.to_float64_multi_array(speeds))
+
+    def _on_silence(self) -> None:
+        self._watchdog.cancel()
+        if self._moving:
+            self._publish((0.0, 0.0), self.now())
+            self.warn(
+                f'no command on {self.resolve_topic_name("cmd_vel")} '
+                f'for {self.parameters.cmd_vel_timeout:g} s: the wheels are stopped'
+            )
+
+    def stop(self) -> None:
+        """Stop the wheels, if they turn."""
+        if self._moving:
+            self._publish((0.0, 0.0), self.now())
+
+    def parameters_changed(self, previous: WheelBridgeParameters) -> None:
+        """Follow a new timeout; the rest counts from the next command on."""
+        if self.parameters.cmd_vel_timeout != previous.cmd_vel_timeout:
+            self._arm_watchdog()
+
+    def _arm_watchdog(self) -> None:
+        """Let the watchdog bark when commands cease; each command puts it off."""
+        timeout = self.parameters.cmd_vel_timeout
+        if timeout == 0.0 or not self._moving:
+            self._watchdog.cancel()
+        if timeout > 0.0:
+            self._watchdog.timer_period_ns = nanoseconds(timeout)
+            if self._moving:
+                self._watchdog.reset()

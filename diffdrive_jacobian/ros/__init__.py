@@ -1,0 +1,1 @@
+"""What the nodes share: parameters, message conversion, the node's base, the runner."""

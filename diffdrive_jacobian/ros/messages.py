@@ -1,0 +1,234 @@
+"""Between ROS messages and what the mathematics speaks: the one place where either knows the other.
+
+Poses are `[x, y, theta]` (m, m, rad), twists `(v, omega)` (m/s, rad/s), instants integer nanoseconds.
+Wheel joints stand left, right in messages (ROS habit) and right, left in the mathematics.
+
+Reading a message never trusts it: what cannot be meant raises MessageError, which says what was got
+and what is allowed.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Pose, PoseWithCovariance, Quaternion, Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot
+
+MAX_SPEED = 1e3
+"""Twists beyond this are not plausible (m/s, rad/s)."""
+MAX_POSITION = 1e6
+"""Positions beyond this are not plausible (m)."""
+
+# x, y and yaw, and forward and yaw, in the row-major 6x6 covariances of ROS.
+_PLANAR = np.array([6 * row + column for row in (0, 1, 5) for column in (0, 1, 5)])
+_FORWARD_AND_YAW = np.array([0, 5, 30, 35])
+
+
+class MessageError(ValueError):
+    """A message that cannot be meant."""
+
+
+def to_time(nanoseconds: int) -> Time:
+    """Write an instant as a stamp."""
+    sec, nanosec = divmod(nanoseconds, NANOSECONDS)
+    return Time(sec=sec, nanosec=nanosec)
+
+
+def from_time(stamp: Time) -> int:
+    """Read a stamp (ns)."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def from_twist(message: Twist) -> tuple[float, float]:
+    """Read `(v, omega)`; what a differential drive cannot do is passed over.
+
+    Raises:
+        MessageError: A component is NaN or infinite, or v or omega is not plausible.
+    """
+    linear, angular = message.linear, message.angular
+    values = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
+    if not all(map(math.isfinite, values)):
+        raise MessageError(f'twist must be finite, got linear {values[:3]}, angular {values[3:]}')
+    return plausible_twist(linear.x, angular.z)
+
+
+def plausible_twist(v: float, omega: float) -> tuple[float, float]:
+    """Give back a twist that a robot can mean.
+
+    Raises:
+        MessageError: It is not finite or not plausible.
+    """
+    if not (abs(v) <= MAX_SPEED and abs(omega) <= MAX_SPEED):
+        raise MessageError(
+            f'twist must be within {MAX_SPEED:g} m/s and {MAX_SPEED:g} rad/s, '
+            f'got v {v:g}, omega {omega:g}'
+        )
+    return v, omega
+
+
+def to_twist(v: float, omega: float) -> Twist:
+    """Write `(v, omega)`."""
+    message = Twist()
+    message.linear.x, message.angular.z = float(v), float(omega)
+    return message
+
+
+def to_twist_stamped(v: float, omega: float, stamp: int, frame_id: str) -> TwistStamped:
+    """Write `(v, omega)` with an instant and the frame it is given in."""
+    message = TwistStamped()
+    message.header.stamp, message.header.frame_id = to_time(stamp), frame_id
+    message.twist.linear.x, message.twist.angular.z = float(v), float(omega)
+    return message
+
+
+def command_instant(stamp: int, now: int, last: int, timeout: int) -> int:
+    """Say when a stamped command takes effect (ns): at its stamp, or now if it has none (zero).
+
+    Args:
+        stamp: The command's stamp (ns).
+        now: The present (ns).
+        last: When the last command took effect (ns).
+        timeout: How old a command may be (ns); 0: any age.
+
+    Raises:
+        MessageError: The stamp lies in the future, before the last command, or too far back.
+    """
+    if stamp == 0:
+        return now
+    if stamp > now:
+        raise MessageError(f'its stamp lies {(stamp - now) / NANOSECONDS:.6f} s in the future')
+    if timeout and now - stamp > timeout:
+        raise MessageError(
+            f'its stamp lies {(now - stamp) / NANOSECONDS:.6f} s back, '
+            f'allowed is the timeout of {timeout / NANOSECONDS:g} s'
+        )
+    if stamp < last:
+        raise MessageError(
+            f'its stamp lies {(last - stamp) / NANOSECONDS:.6f} s before what was commanded last'
+        )
+    return stamp
+
+
+def from_pose(message: Pose) -> NDArray[np.float64]:
+    """Read `[x, y, theta]`; the height and any tilt are passed over.
+
+    Raises:
+        MessageError: The position is not finite or not plausible, or the orientation is no rotation.
+    """
+    x, y = message.position.x, message.position.y
+    if not (abs(x) <= MAX_POSITION and abs(y) <= MAX_POSITION):
+        raise MessageError(
+            f'position must be finite and within {MAX_POSITION:g} m, got x {x:g}, y {y:g}'
+        )
+    q = message.orientation
+    norm = math.hypot(q.x, q.y, q.z, q.w)
+    if not 0.9 <= norm <= 1.1:
+        raise MessageError(
+            'orientation must be a quaternion of length 1 (0.9 to 1.1), '
+            f'got x {q.x:g}, y {q.y:g}, z {q.z:g}, w {q.w:g}'
+        )
+    sine, cosine = 2.0 * (q.w * q.z + q.x * q.y), q.w**2 + q.x**2 - q.y**2 - q.z**2
+    return np.array([x, y, math.atan2(sine, cosine)])
+
+
+def to_quaternion(theta: float) -> Quaternion:
+    """Write a heading."""
+    return Quaternion(z=math.sin(theta / 2.0), w=math.cos(theta / 2.0))
+
+
+def fill_pose(message: Pose, pose: NDArray[np.float64]) -> None:
+    """Write `[x, y, theta]` into a pose."""
+    x, y, theta = pose.tolist()
+    message.position.x, message.position.y = x, y
+    message.orientation.z, message.orientation.w = math.sin(theta / 2.0), math.cos(theta / 2.0)
+
+
+def from_pose_with_covariance(
+    message: PoseWithCovariance,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Read `[x, y, theta]` and its covariance, shapes (3,) and (3, 3).
+
+    Raises:
+        MessageError: As `from_pose`; or the covariance is not finite, symmetric and positive
+            semidefinite.
+    """
+    pose = from_pose(message.pose)
+    covariance = np.asarray(message.covariance)[_PLANAR].reshape(3, 3)
+    scale = np.abs(covariance).max()
+    if not (
+        np.isfinite(scale)
+        and np.allclose(covariance, covariance.T, rtol=0.0, atol=1e-9 * scale)
+        and np.linalg.eigvalsh(covariance).min() >= -1e-9 * scale
+    ):
+        raise MessageError(
+            'covariance of x, y, yaw must be finite, symmetric and positive semidefinite, '
+            f'got {covariance.tolist()}'
+        )
+    return pose, (covariance + covariance.T) / 2.0
+
+
+def fill_pose_with_covariance(
+    message: PoseWithCovariance, pose: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> None:
+    """Write a pose (3,) and its covariance (3, 3); what the plane fixes has no variance."""
+    fill_pose(message.pose, pose)
+    message.covariance[_PLANAR] = covariance.ravel()
+
+
+def to_odometry(robot: Robot, interval: float, frame_id: str, child_frame_id: str) -> Odometry:
+    """Write what a robot knows of its motion; the twist is measured over an interval (s)."""
+    message = Odometry()
+    message.header.stamp, message.header.frame_id = to_time(robot.stamp), frame_id
+    message.child_frame_id = child_frame_id
+    fill_pose_with_covariance(message.pose, robot.pose, robot.covariance)
+    message.twist.twist.linear.x, message.twist.twist.angular.z = robot.twist
+    message.twist.covariance[_FORWARD_AND_YAW] = robot.twist_covariance(interval).ravel()
+    return message
+
+
+def to_joint_state(
+    names: tuple[str, str], stamp: int, speeds: Any, angles: Any | None = None
+) -> JointState:
+    """Write wheel speeds, and angles where known, given right, left; `names` are left, right."""
+    right, left = speeds
+    message = JointState(name=list(names), velocity=[float(left), float(right)])
+    message.header.stamp = to_time(stamp)
+    if angles is not None:
+        right, left = angles
+        message.position = [float(left), float(right)]
+    return message
+
+
+def from_joint_state(message: JointState, names: tuple[str, str]) -> tuple[float, float]:
+    """Read `(omega_R, omega_L)` of the joints `names`, which are left, right.
+
+    Raises:
+        MessageError: A joint is missing, has no velocity, or one that is not finite.
+    """
+    if len(message.velocity) != len(message.name):
+        raise MessageError(
+            f'joint command must have a velocity for each name, got {len(message.name)} names '
+            f'and {len(message.velocity)} velocities'
+        )
+    speeds = dict(zip(message.name, message.velocity, strict=True))
+    missing = [name for name in names if name not in speeds]
+    if missing:
+        raise MessageError(f'joint command lacks {missing}, it names {list(message.name)}')
+    left, right = (speeds[name] for name in names)
+    if not (math.isfinite(left) and math.isfinite(right)):
+        raise MessageError(f'wheel speeds must be finite, got left {left}, right {right}')
+    return right, left
+
+
+def to_float64_multi_array(speeds: Any) -> Float64MultiArray:
+    """Write wheel speeds given right, left as the list left, right."""
+    right, left = speeds
+    return Float64MultiArray(data=[float(left), float(right)])

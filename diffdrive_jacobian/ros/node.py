@@ -1,0 +1,163 @@
+"""The base of the nodes: parameters as one value, and eyes for what goes wrong in silence.
+
+Two things are silent in ROS and cost newcomers hours: a topic that carries another type than its
+reader wants, and simulated time without anybody who publishes /clock. Both are looked for once a
+second, on the wall clock, and said once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+
+from diffdrive_jacobian.ros import parameters as ros_parameters
+from diffdrive_jacobian.ros.parameters import NodeParameters
+
+P = TypeVar('P', bound=NodeParameters)
+
+WATCH_PERIOD = 1.0
+"""How often the graph and the clock are looked at (s)."""
+CLOCK_PATIENCE = 5
+"""How many looks find no /clock before that is said."""
+
+
+class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
+    """A node with a dataclass of parameters and reliable, overridable topics."""
+
+    parameters: P
+
+    def __init__(self, name: str, parameters: type[P], **kwargs: Any) -> None:
+        """Declare the parameters with the values their user gave.
+
+        Args:
+            name: Name of the node.
+            parameters: The dataclass of its parameters.
+            kwargs: Passed on to `rclpy.node.Node` (context, namespace, parameter_overrides, ...).
+
+        Raises:
+            ParameterError: The values given are not a valid set; the node is destroyed.
+        """
+        super().__init__(name, **kwargs)
+        try:
+            self.parameters = ros_parameters.declare(self, parameters)
+        except ros_parameters.ParameterError:
+            self.destroy_node()
+            raise
+        self.add_pre_set_parameters_callback(self._before_parameters)
+        self.add_on_set_parameters_callback(self._judge_parameters)
+        self.add_post_set_parameters_callback(self._after_parameters)
+        self._watched: list[tuple[str, str, bool]] = []
+        self._mismatches: set[tuple[str, str, str]] = set()
+        self._looks_without_clock = 0
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(WATCH_PERIOD, self._watch, clock=steady)
+
+    def now(self) -> int:
+        """Give the time of the node's clock (ns); 0 while simulated time has not begun."""
+        return int(self.get_clock().now().nanoseconds)
+
+    def advertise(self, message: type, topic: str, *, latched: bool = False) -> Publisher:
+        """Create a publisher: reliable, keep last 10; latched: for those who come later, too."""
+        self._watched.append((topic, _type_name(message), False))
+        profile = QoSProfile(depth=10)
+        if latched:
+            profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        return self.create_publisher(
+            message,
+            topic,
+            profile,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+
+    def subscribe(self, message: type, topic: str, callback: Callable[[Any], None]) -> Subscription:
+        """Create a subscription: reliable, keep last 10."""
+        self._watched.append((topic, _type_name(message), True))
+        return self.create_subscription(
+            message,
+            topic,
+            callback,
+            QoSProfile(depth=10),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+
+    def warn(self, text: str) -> None:
+        """Warn about something that may come with every message, at most every two seconds."""
+        self.get_logger().warning(text, throttle_duration_sec=2.0)
+
+    def report_unknown_parameters(self) -> None:
+        """Warn of parameters that the user gave and no part of the node has declared."""
+        for text in ros_parameters.unknown_overrides(self):
+            self.get_logger().warning(text)
+
+    def parameters_changed(self, previous: P) -> None:
+        """Act on new parameters; called after `parameters` was replaced."""
+
+    def stop(self) -> None:
+        """Leave what this node commands standing still; called before it is destroyed."""
+
+    def _before_parameters(self, changes: list[Parameter]) -> list[Parameter]:
+        return ros_parameters.accept_integers(type(self.parameters), changes)
+
+    def _judge_parameters(self, changes: list[Parameter]) -> SetParametersResult:
+        return ros_parameters.judge(self.parameters, changes)
+
+    def _after_parameters(self, changes: list[Parameter]) -> None:
+        previous = self.parameters
+        self.parameters = ros_parameters.changed(previous, changes)
+        if self.parameters != previous:
+            self.parameters_changed(previous)
+
+    def _watch(self) -> None:
+        self._watch_clock()
+        mismatches = set()
+        for topic, wanted, reading in self._watched:
+            name = self.resolve_topic_name(topic)
+            if reading:
+                others = self.get_publishers_info_by_topic(name)
+            else:
+                others = self.get_subscriptions_info_by_topic(name)
+            for other in others:
+                if other.topic_type != wanted:
+                    mismatches.add((name, wanted, other.topic_type))
+                    self._report_mismatch(name, wanted, other, reading)
+        self._mismatches = mismatches
+
+    def _report_mismatch(self, name: str, wanted: str, other: Any, reading: bool) -> None:
+        if (name, wanted, other.topic_type) in self._mismatches:
+            return
+        who = f'{other.node_namespace.rstrip("/")}/{other.node_name}'
+        theirs, ours = ('publishes', 'reads') if reading else ('reads', 'publishes')
+        hint = ''
+        if self.has_parameter('enable_stamped_cmd_vel') and 'Twist' in wanted:
+            hint = '; enable_stamped_cmd_vel chooses between Twist and TwistStamped'
+        self.get_logger().error(
+            f'{who} {theirs} {other.topic_type} on {name}, but this node {ours} {wanted}: '
+            f'nothing will arrive{hint}'
+        )
+
+    def _watch_clock(self) -> None:
+        if self.now() != 0:
+            self._looks_without_clock = 0
+            return
+        self._looks_without_clock += 1
+        if self._looks_without_clock == CLOCK_PATIENCE:
+            self.get_logger().warning(
+                f'use_sim_time is true, but nothing came on /clock for {CLOCK_PATIENCE} s: '
+                'time stands still, and so does this node; publish /clock or set use_sim_time to false'
+            )
+
+
+def _type_name(message: type) -> str:
+    """Name a message type as the graph does: package/msg/Name."""
+    package = message.__module__.split('.')[0]
+    return f'{package}/msg/{message.__name__}'

@@ -1,0 +1,139 @@
+"""The one way in which every entry point runs its nodes: context, executor, loop, orderly end.
+
+Signals are counted by our own handlers (`signals`), not by rclpy's, which end the context before a
+node could send its last zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TypeVar
+
+import rclpy
+from rclpy.context import Context
+from rclpy.exceptions import NameValidationException, ParameterException
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos_overriding_options import InvalidQosOverridesError
+from rclpy.signals import SignalHandlerOptions
+
+from diffdrive_jacobian.ros.node import ParameterizedNode
+from diffdrive_jacobian.ros.parameters import ParameterError
+
+N = TypeVar('N', bound=Node)
+
+LOOK_PERIOD = 0.1
+"""How long the loop may wait before it looks at its condition again (s)."""
+
+
+class UserError(Exception):
+    """A mistake of the one who started the process; the message says which."""
+
+
+@contextmanager
+def ros_context(arguments: Sequence[str]) -> Iterator[Context]:
+    """Hold a ROS context without signal handlers of rclpy.
+
+    Args:
+        arguments: The command line with the program's name; what follows `--ros-args` counts.
+
+    Raises:
+        UserError: rcl does not understand the arguments or the environment.
+    """
+    context = Context()
+    try:
+        rclpy.init(
+            args=list(arguments),
+            context=context,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+    except RuntimeError as error:
+        # rcl appends where in its sources it gave up.
+        raise UserError(str(error).split(', at /')[0].strip()) from error
+    try:
+        yield context
+    finally:
+        context.try_shutdown()
+
+
+def make_executor(context: Context, *, closed_world: bool) -> Executor:
+    """Choose the executor.
+
+    Args:
+        context: The context of its nodes.
+        closed_world: No stranger can reach the nodes. Then the EventsExecutor, which takes a third of
+            the time per message, is safe; its queue knows no bound and no fairness, so a node that
+            strangers can flood needs the SingleThreadedExecutor. Older Jazzy has only that one.
+    """
+    if closed_world:
+        try:
+            from rclpy.experimental.events_executor import EventsExecutor
+        except ImportError:
+            pass
+        else:
+            return EventsExecutor(context=context)
+    return SingleThreadedExecutor(context=context)
+
+
+@contextmanager
+def running(context: Context, *, closed_world: bool) -> Iterator[Runner]:
+    """Hold an executor and the nodes that are added to it; at the end each is stopped and destroyed."""
+    runner = Runner(context, make_executor(context, closed_world=closed_world))
+    try:
+        yield runner
+    finally:
+        runner.close()
+
+
+class Runner:
+    """An executor with its nodes."""
+
+    def __init__(self, context: Context, executor: Executor) -> None:
+        """Begin without nodes."""
+        self.context = context
+        self._executor = executor
+        self._nodes: list[Node] = []
+
+    def add(self, make: Callable[[], N]) -> N:
+        """Make a node and add it.
+
+        Raises:
+            UserError: The name, the parameters or the QoS that its user gave cannot be.
+        """
+        try:
+            node = make()
+        except (
+            ParameterError,
+            ParameterException,
+            NameValidationException,
+            InvalidQosOverridesError,
+        ) as error:
+            raise UserError(str(error)) from error
+        self._nodes.append(node)
+        self._executor.add_node(node)
+        return node
+
+    def spin(self, until: Callable[[], bool]) -> bool:
+        """Serve the nodes until a condition holds; False if the context was shut down before.
+
+        The condition is looked at after every callback and at least every LOOK_PERIOD.
+        """
+        try:
+            while not until():
+                if not self.context.ok():
+                    return False
+                self._executor.spin_once(timeout_sec=LOOK_PERIOD)
+        except ExternalShutdownException:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Stop the nodes while they can still speak, then take everything down."""
+        if self.context.ok():
+            for node in self._nodes:
+                if isinstance(node, ParameterizedNode):
+                    node.stop()
+        self._executor.shutdown()
+        for node in self._nodes:
+            node.destroy_node()

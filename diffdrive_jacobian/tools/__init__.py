@@ -1,0 +1,1 @@
+"""The command-line tools: thin shells that read arguments, show progress and give exit codes."""

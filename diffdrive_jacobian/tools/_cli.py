@@ -1,0 +1,139 @@
+"""What the command-line tools share: arguments, exit codes, progress."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+import time
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+
+from diffdrive_jacobian.ros.messages import MAX_POSITION
+
+DONE, FAILED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
+"""Exit codes: done as asked, not done, a user's mistake, interrupted by a signal."""
+
+
+def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Tell a tool's own arguments from what stands between `--ros-args` and `--`.
+
+    Negative numbers get a leading space, for argparse takes `-1e3` for an option otherwise.
+    """
+    own: list[str] = []
+    ros: list[str] = []
+    in_ros = False
+    for argument in arguments:
+        if argument == '--ros-args':
+            in_ros = True
+        if in_ros:
+            ros.append(argument)
+            in_ros = argument != '--'
+        else:
+            own.append(f' {argument}' if argument.startswith('-') and _is_number(argument) else argument)
+    return own, ros
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def number(text: str) -> float:
+    """Read a finite number."""
+    text = text.strip()
+    if not _is_number(text) or not math.isfinite(float(text)):
+        raise argparse.ArgumentTypeError(f'must be a finite number, got {text!r}')
+    return float(text)
+
+
+def coordinate(text: str) -> float:
+    """Read a coordinate that a robot can be sent to (m)."""
+    value = number(text)
+    if abs(value) > MAX_POSITION:
+        raise argparse.ArgumentTypeError(
+            f'must be within {MAX_POSITION:g} m of the origin, got {text.strip()!r}'
+        )
+    return value
+
+
+def positive(text: str) -> float:
+    """Read a positive finite number."""
+    value = number(text)
+    if value <= 0.0:
+        raise argparse.ArgumentTypeError(f'must be positive, got {text.strip()!r}')
+    return value
+
+
+def readable_file(text: str) -> str:
+    """Read the name of a file that can be read."""
+    if not os.path.isfile(text):
+        raise argparse.ArgumentTypeError(f'no such file: {text!r}')
+    if not os.access(text, os.R_OK):
+        raise argparse.ArgumentTypeError(f'file cannot be read: {text!r}')
+    return text
+
+
+def complain(program: str, message: object) -> int:
+    """Report a user's mistake as argparse does; gives the exit code."""
+    print(f'{program}: error: {message}', file=sys.stderr)
+    return USER_ERROR
+
+
+class Drive:
+    """The progress of a drive: a bar on a terminal, a line per second elsewhere."""
+
+    def __init__(self) -> None:
+        """Begin without a goal."""
+        self._console = Console()
+        self._progress = Progress(
+            TextColumn('{task.description}'),
+            BarColumn(),
+            TextColumn('{task.fields[state]}'),
+            console=self._console,
+            auto_refresh=False,
+            transient=True,
+        )
+        self._task: TaskID | None = None
+        self._farthest = 0.0
+        self._shown = -math.inf
+
+    def __enter__(self) -> Drive:
+        """Show the bar, where there is a terminal."""
+        if self._console.is_terminal:
+            self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Take the bar away."""
+        if self._console.is_terminal:
+            self._progress.stop()
+
+    def show(self, what: str, distance: float, wheels: tuple[float, float] | None = None) -> None:
+        """Show how far it still is (m) and how fast the wheels turn, `(left, right)` (rad/s)."""
+        period = 0.1 if self._console.is_terminal else 1.0
+        if time.monotonic() - self._shown < period:
+            return
+        self._shown = time.monotonic()
+        self._farthest = max(self._farthest, distance)
+        state = f'{distance:7.3f} m to go'
+        if wheels is not None:
+            state += f', wheels left {wheels[0]:7.2f}, right {wheels[1]:7.2f} rad/s'
+        if not self._console.is_terminal:
+            print(f'{what} {state}', flush=True)
+            return
+        if self._task is None:
+            self._task = self._progress.add_task(what, total=1.0, state=state)
+        done = 1.0 - distance / self._farthest if self._farthest else 1.0
+        self._progress.update(self._task, description=what, completed=done, state=state)
+        self._progress.refresh()
+
+    def next(self) -> None:
+        """Begin the bar anew, for another waypoint."""
+        self._farthest = 0.0

@@ -1,0 +1,244 @@
+"""Drive the virtual robot to goals: robot, controller and wheel bridge in one process.
+
+The robot is driven by its wheels, so that the whole Jacobian chain is in use:
+goal -> control law -> body twist -> J_w^-1 -> wheel speeds -> J_w -> body twist -> S(theta) -> pose.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Goals, Odometry
+from numpy.typing import NDArray
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import JointState
+
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.ros import messages
+from diffdrive_jacobian.ros.runner import Runner, UserError, ros_context, running
+from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.tools import _cli
+
+PROGRAM = 'drive_to'
+STOP_PATIENCE = 2.0
+"""How long the robot may take to come to rest at the end (s)."""
+
+
+class Observer(Node):  # type: ignore[misc]
+    """Sends the goals and watches what becomes of them."""
+
+    def __init__(self, goals: NDArray[np.float64], context: Context) -> None:
+        """Prepare to send goals `[x, y]`, shape (n, 2)."""
+        super().__init__('drive_to', context=context)
+        self.goals = goals
+        self.index = 0
+        """The goal that is driven to."""
+        self.pose: NDArray[np.float64] | None = None
+        self.moving = False
+        self.wheels = (0.0, 0.0)
+        """Speeds of the left and right wheel (rad/s)."""
+        self.status = GoalStatus.STATUS_UNKNOWN
+        self._sent: Goals | None = None
+        self._publisher = self.create_publisher(Goals, 'goals', 10)
+        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.create_subscription(GoalStatus, 'goal_status', self._on_status, latched)
+        self.create_subscription(Odometry, 'odom', self._on_odometry, 10)
+        self.create_subscription(JointState, 'joint_states', self._on_joint_states, 10)
+
+    @property
+    def distance(self) -> float:
+        """The distance to the goal that is driven to (m); infinite before the first odometry."""
+        if self.pose is None:
+            return math.inf
+        x, y = self.goals[self.index]
+        return math.hypot(x - self.pose[0], y - self.pose[1])
+
+    @property
+    def ended(self) -> bool:
+        """Whether the controller is done with the goals."""
+        return self.status in (
+            GoalStatus.STATUS_SUCCEEDED,
+            GoalStatus.STATUS_CANCELED,
+            GoalStatus.STATUS_ABORTED,
+        )
+
+    def _on_odometry(self, message: Odometry) -> None:
+        self.pose = messages.from_pose(message.pose.pose)
+        self.moving = messages.from_twist(message.twist.twist) != (0.0, 0.0)
+        if self._sent is None:
+            self._send()
+
+    def _send(self) -> None:
+        self._sent = Goals()
+        self._sent.header.stamp = self.get_clock().now().to_msg()
+        for x, y in self.goals.tolist():
+            pose = PoseStamped()
+            pose.pose.position.x, pose.pose.position.y = x, y
+            self._sent.goals.append(pose)
+        self._publisher.publish(self._sent)
+
+    def _on_joint_states(self, message: JointState) -> None:
+        left, right = message.velocity
+        self.wheels = left, right
+
+    def _on_status(self, message: GoalStatus) -> None:
+        if self._sent is not None and message.goal_info.stamp == self._sent.header.stamp:
+            self.status = message.status
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Outcome:
+    """How a drive ended."""
+
+    arrived: bool
+    interrupted: bool
+    pose: NDArray[np.float64] | None
+    """Where the robot stopped; None: it never reported."""
+    distance: float
+    """Distance to the last goal (m)."""
+    seconds: float
+    """How long it took (s)."""
+
+
+def drive(
+    goals: NDArray[np.float64],
+    runner: Runner,
+    signals: Signals,
+    *,
+    timeout: float,
+    tolerance: float | None,
+) -> Outcome:
+    """Drive to goals `[x, y]`, shape (n, 2), in order, with all three nodes in this process.
+
+    Raises:
+        UserError: A node cannot run with the parameters given.
+    """
+    context = runner.context
+    wheels = Parameter('command_interface', value='wheels')
+    runner.add(lambda: VirtualRobot(context=context, parameter_overrides=[wheels]))
+    runner.add(lambda: WheelBridge(context=context))
+    tolerances = [] if tolerance is None else [Parameter('xy_goal_tolerance', value=tolerance)]
+    controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=tolerances))
+    observer = runner.add(lambda: Observer(goals, context))
+    begun = time.monotonic()
+    with _cli.Drive() as progress:
+
+        def over() -> bool:
+            if observer.pose is not None and not observer.ended:
+                index = controller.waypoint
+                if index is not None and index != observer.index:
+                    observer.index = index
+                    progress.next()
+                x, y = goals[observer.index]
+                what = f'goal {observer.index + 1}/{len(goals)} ({x:g}, {y:g})'
+                progress.show(what, observer.distance, observer.wheels)
+            return bool(observer.ended or signals.count or time.monotonic() - begun > timeout)
+
+        runner.spin(over)
+        seconds = time.monotonic() - begun
+        if not observer.ended:
+            controller.stop()
+        resting = time.monotonic() + STOP_PATIENCE
+        runner.spin(lambda: not observer.moving or time.monotonic() > resting or signals.count > 1)
+    observer.index = len(goals) - 1
+    return Outcome(
+        arrived=observer.status == GoalStatus.STATUS_SUCCEEDED,
+        interrupted=signals.count > 0,
+        pose=observer.pose,
+        distance=observer.distance,
+        seconds=seconds,
+    )
+
+
+def main(arguments: Sequence[str], signals: Signals) -> int:
+    """Run the tool; gives the exit code."""
+    own, ros = _cli.split_arguments(arguments)
+    parser = _parser()
+    options = parser.parse_args(own)
+    if len(options.coordinates) % 2:
+        parser.error(f'coordinates come in pairs X Y, got {len(options.coordinates)} numbers')
+    goals = np.reshape(options.coordinates, (-1, 2))
+    if not options.open:
+        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
+    ros = ['--ros-args', '--log-level', 'warn', '--', *ros]
+    if options.params_file:
+        ros += ['--ros-args', '--params-file', options.params_file, '--']
+    try:
+        with (
+            ros_context([PROGRAM, *ros]) as context,
+            running(context, closed_world=not options.open) as runner,
+        ):
+            outcome = drive(
+                goals,
+                runner,
+                signals,
+                timeout=options.timeout,
+                tolerance=options.tolerance,
+            )
+    except UserError as error:
+        return _cli.complain(PROGRAM, error)
+    return _report(outcome, options.timeout)
+
+
+def _report(outcome: Outcome, timeout: float) -> int:
+    """Say how it ended in one line; gives the exit code."""
+    if outcome.pose is None:
+        where = 'the robot never reported where it is'
+    else:
+        x, y, theta = outcome.pose
+        where = (
+            f'the robot stopped at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, '
+            f'{outcome.distance:.3f} m from the goal, after {outcome.seconds:.1f} s'
+        )
+    if outcome.arrived:
+        print(f'arrived: {where}')
+        return _cli.DONE
+    if outcome.interrupted:
+        print(f'interrupted: {where}')
+        return _cli.INTERRUPTED
+    reason = f'--timeout {timeout:g} s was too short' if outcome.seconds > timeout else 'goal refused'
+    print(f'not arrived ({reason}): {where}')
+    return _cli.FAILED
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM,
+        usage=f'{PROGRAM} X Y [X Y ...] [options] [--ros-args ...]',
+        description='Drive the virtual robot to goals, in order: robot, controller and wheel bridge '
+        'in one process, the whole Jacobian chain in use. Exit code 0: arrived; 1: not; '
+        '2: wrong arguments; 130: interrupted.',
+    )
+    parser.add_argument('coordinates', metavar='X Y', nargs='+', type=_cli.coordinate, help='goals (m)')
+    parser.add_argument(
+        '--timeout',
+        type=_cli.positive,
+        default=300.0,
+        help='give up after this long (s); %(default)s',
+    )
+    parser.add_argument(
+        '--tolerance', type=_cli.positive, help='distance that counts as arrived (m); 0.02'
+    )
+    parser.add_argument(
+        '--params-file', metavar='FILE', type=_cli.readable_file, help='ROS parameters (YAML)'
+    )
+    parser.add_argument(
+        '--open',
+        action='store_true',
+        help='let other processes see the nodes and reach them (RViz, ros2 topic); '
+        'otherwise nobody can, and a real robot on the network cannot be moved by mistake',
+    )
+    return parser

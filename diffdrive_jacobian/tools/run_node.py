@@ -1,0 +1,70 @@
+"""Run one node as its own process: what `virtual_robot`, `go_to_goal` and `wheel_bridge` start."""
+
+from __future__ import annotations
+
+import argparse
+import textwrap
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any
+
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.parameters import (
+    GoToGoalParameters,
+    VirtualRobotParameters,
+    WheelBridgeParameters,
+)
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.ros.parameters import NodeParameters, specifications
+from diffdrive_jacobian.ros.runner import UserError, ros_context, running
+from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.tools import _cli
+
+NODES: dict[str, tuple[Any, type[NodeParameters]]] = {
+    'virtual_robot': (VirtualRobot, VirtualRobotParameters),
+    'go_to_goal': (GoToGoal, GoToGoalParameters),
+    'wheel_bridge': (WheelBridge, WheelBridgeParameters),
+}
+
+
+def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
+    """Run a node until a signal comes; gives the exit code.
+
+    Args:
+        name: One of NODES; also the program's name in messages.
+        arguments: The command line without the program's name.
+        signals: What was caught so far.
+    """
+    make, parameters = NODES[name]
+    own, _ = _cli.split_arguments(arguments)
+    _parser(name, make, parameters).parse_args(own)
+    try:
+        with (
+            ros_context([name, *arguments]) as context,
+            running(context, closed_world=False) as runner,
+        ):
+            runner.add(lambda: make(context=context))
+            runner.spin(lambda: signals.count > 0)
+    except UserError as error:
+        return _cli.complain(name, error)
+    return _cli.DONE
+
+
+def _parser(name: str, node: Any, parameters: type[NodeParameters]) -> argparse.ArgumentParser:
+    defaults = {field.name: field.default for field in fields(parameters)}
+    lines = []
+    for ros_name, (field, specification) in specifications(parameters).items():
+        text = f'{specification.description} Default {defaults[field]}'
+        text += f'; {specification.allowed}.' if specification.allowed else '.'
+        lines += [
+            f'  {ros_name}',
+            *textwrap.wrap(text, 90, initial_indent='      ', subsequent_indent='      '),
+        ]
+    return argparse.ArgumentParser(
+        prog=name,
+        usage=f'{name} [-h] [--ros-args -p PARAMETER:=VALUE -r NAME:=NAME --params-file FILE ...]',
+        description=textwrap.dedent('    ' + (node.__doc__ or '')),
+        epilog='\n'.join(['parameters:', *lines]),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )

@@ -1,0 +1,222 @@
+"""Send a goal to a controller that runs in another process, and wait for the end."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Sequence
+
+import numpy as np
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_srvs.srv import Trigger
+
+from diffdrive_jacobian.ros import messages
+from diffdrive_jacobian.ros.messages import MessageError
+from diffdrive_jacobian.ros.runner import Runner, UserError, ros_context, running
+from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.tools import _cli
+
+PROGRAM = 'send_goal'
+ANSWER_PATIENCE = 5.0
+"""How long the controller may take to say whether it accepts, or that it canceled (s)."""
+
+ENDS = {
+    GoalStatus.STATUS_SUCCEEDED: 'arrived',
+    GoalStatus.STATUS_CANCELED: 'canceled',
+    GoalStatus.STATUS_ABORTED: 'aborted',
+}
+
+
+class Sender(Node):  # type: ignore[misc]
+    """Sends one goal and follows what becomes of it."""
+
+    def __init__(self, goal: NDArray[np.float64], frame: str, context: Context) -> None:
+        """Prepare to send a goal `[x, y, theta]`, shape (3,)."""
+        super().__init__('send_goal', context=context, start_parameter_services=False)
+        self.goal = goal
+        self.status = GoalStatus.STATUS_UNKNOWN
+        self.pose: NDArray[np.float64] | None = None
+        self._frame = frame
+        self._message: PoseStamped | None = None
+        self.publisher = self.create_publisher(PoseStamped, 'goal_pose', 10)
+        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.create_subscription(GoalStatus, 'goal_status', self._on_status, latched)
+        self.create_subscription(Odometry, 'odom', self._on_odometry, 10)
+        self._cancel = self.create_client(Trigger, 'cancel_goal')
+
+    @property
+    def distance(self) -> float:
+        """The distance to the goal (m); infinite before the first odometry."""
+        if self.pose is None:
+            return math.inf
+        return math.hypot(self.goal[0] - self.pose[0], self.goal[1] - self.pose[1])
+
+    def send(self) -> None:
+        """Publish the goal; its stamp tells it from older ones."""
+        message = PoseStamped()
+        message.header.stamp, message.header.frame_id = (
+            self.get_clock().now().to_msg(),
+            self._frame,
+        )
+        messages.fill_pose(message.pose, self.goal)
+        self._message = message
+        self.publisher.publish(message)
+
+    def cancel(self) -> None:
+        """Ask the controller to let go of the goal."""
+        self._cancel.call_async(Trigger.Request())
+
+    def _on_status(self, message: GoalStatus) -> None:
+        # The status of an older goal is latched and comes first.
+        if self._message is not None and message.goal_info.stamp == self._message.header.stamp:
+            self.status = message.status
+
+    def _on_odometry(self, message: Odometry) -> None:
+        try:
+            self.pose = messages.from_pose(message.pose.pose)
+        except MessageError as error:
+            self.get_logger().warning(f'odometry dropped: {error}', throttle_duration_sec=2.0)
+
+
+def follow(sender: Sender, runner: Runner, signals: Signals, options: argparse.Namespace) -> int:
+    """Send the goal once its reader is there, and wait for the end; gives the exit code."""
+    topic = sender.resolve_topic_name('goal_pose')
+    if not _spin(runner, signals, options.wait, lambda: sender.publisher.get_subscription_count() > 0):
+        if signals.count:
+            print('interrupted: nothing was sent')
+            return _cli.INTERRUPTED
+        print(
+            f'not sent: nobody read {topic} within {options.wait:g} s; is go_to_goal running, '
+            'in the same namespace and the same ROS_DOMAIN_ID?'
+        )
+        return _cli.FAILED
+    sender.send()
+    x, y, _ = sender.goal
+    if options.no_wait:
+        if not sender.publisher.wait_for_all_acked(Duration(seconds=ANSWER_PATIENCE)):
+            print(f'sent, but its reader on {topic} has not confirmed it')
+            return _cli.FAILED
+        print(f'sent: goal ({x:g}, {y:g}) on {topic}')
+        return _cli.DONE
+    if not _spin(runner, signals, ANSWER_PATIENCE, lambda: sender.status != GoalStatus.STATUS_UNKNOWN):
+        if signals.count:
+            return _cancel(sender, runner, signals, _cli.INTERRUPTED)
+        print(
+            f'no answer: who reads {topic} says nothing on '
+            f'{sender.resolve_topic_name("goal_status")} within {ANSWER_PATIENCE:g} s'
+        )
+        return _cli.FAILED
+    with _cli.Drive() as progress:
+
+        def over() -> bool:
+            if sender.pose is not None:
+                progress.show(f'goal ({x:g}, {y:g})', sender.distance)
+            return sender.status in ENDS or sender.publisher.get_subscription_count() == 0
+
+        ended = _spin(runner, signals, options.timeout, over)
+    where = '' if sender.pose is None else f', {sender.distance:.3f} m from the goal'
+    if sender.status in ENDS:
+        print(f'{ENDS[sender.status]}{where}{_hint(sender.status)}')
+        return _cli.DONE if sender.status == GoalStatus.STATUS_SUCCEEDED else _cli.FAILED
+    if ended:
+        print(f'lost: the controller is gone{where}')
+        return _cli.FAILED
+    if not signals.count:
+        print(f'not arrived within --timeout {options.timeout:g} s{where}')
+        return _cancel(sender, runner, signals, _cli.FAILED)
+    return _cancel(sender, runner, signals, _cli.INTERRUPTED)
+
+
+def _hint(status: int) -> str:
+    if status == GoalStatus.STATUS_ABORTED:
+        return " (the controller's log says why)"
+    if status == GoalStatus.STATUS_CANCELED:
+        return ' (by somebody else, or replaced by another goal)'
+    return ''
+
+
+def _cancel(sender: Sender, runner: Runner, signals: Signals, code: int) -> int:
+    """Take the goal back; another signal ends the wait."""
+    sender.cancel()
+    before = signals.count
+    deadline = time.monotonic() + ANSWER_PATIENCE
+    runner.spin(lambda: sender.status in ENDS or signals.count > before or time.monotonic() > deadline)
+    if sender.status in ENDS:
+        print(f'{ENDS[sender.status]}: the robot was stopped')
+    else:
+        print('the controller has not confirmed that it canceled: the robot may still drive')
+    return code
+
+
+def _spin(runner: Runner, signals: Signals, seconds: float, until: object) -> bool:
+    """Spin until a condition holds; False after so many seconds or on a signal."""
+    deadline = time.monotonic() + seconds
+    held = False
+
+    def over() -> bool:
+        nonlocal held
+        held = until()  # type: ignore[operator]
+        return held or signals.count > 0 or time.monotonic() > deadline
+
+    runner.spin(over)
+    return held
+
+
+def main(arguments: Sequence[str], signals: Signals) -> int:
+    """Run the tool; gives the exit code."""
+    own, ros = _cli.split_arguments(arguments)
+    options = _parser().parse_args(own)
+    goal = np.array([options.x, options.y, options.heading])
+    try:
+        with (
+            ros_context([PROGRAM, *ros]) as context,
+            running(context, closed_world=False) as runner,
+        ):
+            sender = runner.add(lambda: Sender(goal, options.frame, context))
+            return follow(sender, runner, signals, options)
+    except UserError as error:
+        return _cli.complain(PROGRAM, error)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM,
+        usage=f'{PROGRAM} X Y [options] [--ros-args ...]',
+        description='Send a goal to a running go_to_goal and wait for the end. Ctrl-C cancels the '
+        'goal. Exit code 0: arrived; 1: not; 2: wrong arguments; 130: interrupted.',
+    )
+    parser.add_argument('x', metavar='X', type=_cli.coordinate, help='goal (m)')
+    parser.add_argument('y', metavar='Y', type=_cli.coordinate, help='goal (m)')
+    parser.add_argument(
+        '--heading',
+        type=_cli.number,
+        default=0.0,
+        help='heading at the goal (rad); counts if the controller has use_goal_heading',
+    )
+    parser.add_argument(
+        '--frame', default='', help="frame of the goal; without it the odometry's is meant"
+    )
+    parser.add_argument(
+        '--wait',
+        type=_cli.positive,
+        default=10.0,
+        help='wait so long for a controller (s); %(default)s',
+    )
+    parser.add_argument(
+        '--timeout',
+        type=_cli.positive,
+        default=math.inf,
+        help='cancel the goal and give up after this long (s); default: never',
+    )
+    parser.add_argument(
+        '--no-wait', action='store_true', help='only send the goal, do not wait for the end'
+    )
+    return parser

@@ -1,0 +1,48 @@
+"""Package diffdrive_jacobian, for colcon and for pip."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+PACKAGE = 'diffdrive_jacobian'
+COMMANDS = ['virtual_robot', 'go_to_goal', 'wheel_bridge', 'drive_to', 'send_goal']
+MESSAGES = '5.3.6'
+CORE_MESSAGES = '2.0.3'
+
+setup(
+    name=PACKAGE,
+    version='0.1.0',
+    description='A virtual differential-drive robot, driven to goals through the mobile-robot Jacobian.',
+    author='The diffdrive_jacobian developers',
+    author_email='maintainers@example.com',
+    license='Apache-2.0',
+    packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
+    package_data={PACKAGE: ['py.typed']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
+        (f'share/{PACKAGE}', ['package.xml']),
+        (f'share/{PACKAGE}/config', sorted(glob('config/*.yaml'))),
+    ],
+    python_requires='>=3.10',
+    install_requires=['numpy>=1.21', 'rich>=12'],
+    # rclpy is not required here: a ROS installation brings its own, under another name than PyPI's.
+    extras_require={
+        'jazzy': [
+            'ros-rclpy[fastrtps]==7.1.6',
+            'ros-rmw-fastrtps-cpp==8.4.3',
+            f'ros-action-msgs=={CORE_MESSAGES}',
+            f'ros-builtin-interfaces=={CORE_MESSAGES}',
+            f'ros-geometry-msgs=={MESSAGES}',
+            f'ros-nav-msgs=={MESSAGES}',
+            f'ros-rcl-interfaces=={CORE_MESSAGES}',
+            f'ros-rosgraph-msgs=={CORE_MESSAGES}',
+            f'ros-sensor-msgs=={MESSAGES}',
+            f'ros-std-msgs=={MESSAGES}',
+            f'ros-std-srvs=={MESSAGES}',
+        ],
+        'plot': ['matplotlib>=3.5'],
+        'test': ['hypothesis>=6', 'pytest>=7'],
+    },
+    zip_safe=False,
+    entry_points={'console_scripts': [f'{name} = {PACKAGE}.entry_points:{name}' for name in COMMANDS]},
+)
