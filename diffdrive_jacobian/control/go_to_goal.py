@@ -10,10 +10,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
-from diffdrive_jacobian.kinematics._checks import components
+from diffdrive_jacobian.kinematics._elementary import arctan2, components, cos, hypot, operand
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 
 
@@ -39,10 +38,11 @@ def go_to_goal(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any) -> tuple[Any
     """
     x, y, theta = components('state', state, 3)
     x_goal, y_goal = components('goal', goal, 2)
+    Kp, Kv = operand(Kp), operand(Kv)
     dx, dy = x_goal - x, y_goal - y
-    distance = np.hypot(dx, dy)
-    heading_error = wrap_angle(np.arctan2(dy, dx) - theta)
-    return Kv * distance * np.cos(heading_error), Kp * heading_error * (distance > 0.0)
+    distance = hypot(dx, dy)
+    heading_error = wrap_angle(arctan2(dy, dx) - theta)
+    return Kv * distance * cos(heading_error), Kp * heading_error * (distance > 0.0)
 
 
 def turn_in_place(theta: ArrayLike, heading: ArrayLike, Kp: Any) -> tuple[Any, Any]:
@@ -56,5 +56,5 @@ def turn_in_place(theta: ArrayLike, heading: ArrayLike, Kp: Any) -> tuple[Any, A
     Returns:
         `(v, omega)`, each of shape (...) (m/s, rad/s).
     """
-    omega = Kp * wrap_angle(np.subtract(heading, theta))
+    omega = Kp * wrap_angle(operand(heading) - operand(theta))
     return 0.0 * omega, omega

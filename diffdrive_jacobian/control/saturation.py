@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from diffdrive_jacobian.kinematics._elementary import maximum, minimum, operand
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 
 
@@ -72,31 +73,32 @@ def saturate(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tupl
     """
     if limits.unlimited:
         return v, omega
+    v, omega = operand(v), operand(omega)
     v, v_excess = _allowed(v, limits.min_v, limits.max_v)
     omega, omega_excess = _allowed(omega, limits.min_omega, limits.max_omega)
-    excess = np.maximum(1.0, np.maximum(v_excess, omega_excess))
+    excess = maximum(1.0, maximum(v_excess, omega_excess))
     if limits.max_wheel_speed < np.inf:
         omega_R, omega_L = body_to_wheel(v, omega, r, L)
-        fastest = np.maximum(np.abs(omega_R), np.abs(omega_L))
-        excess = np.maximum(excess, fastest / limits.max_wheel_speed)
+        fastest = maximum(abs(omega_R), abs(omega_L))
+        excess = maximum(excess, fastest / limits.max_wheel_speed)
     # The quotient may round to one unit in the last place beyond the limit.
     return (
-        np.minimum(np.maximum(v / excess, limits.min_v), limits.max_v),
-        np.minimum(np.maximum(omega / excess, limits.min_omega), limits.max_omega),
+        minimum(maximum(v / excess, limits.min_v), limits.max_v),
+        minimum(maximum(omega / excess, limits.min_omega), limits.max_omega),
     )
 
 
 def _allowed(speed: Any, low: float, high: float) -> tuple[Any, Any]:
     """Drop forbidden directions, and tell how many times too fast the rest is."""
     if low == 0.0:
-        speed = np.maximum(speed, 0.0)
+        speed = maximum(speed, 0.0)
     if high == 0.0:
-        speed = np.minimum(speed, 0.0)
+        speed = minimum(speed, 0.0)
     excess: Any = 0.0
     if low < 0.0:
-        excess = np.maximum(excess, speed / low)
+        excess = maximum(excess, speed / low)
     if high > 0.0:
-        excess = np.maximum(excess, speed / high)
+        excess = maximum(excess, speed / high)
     return speed, excess
 
 

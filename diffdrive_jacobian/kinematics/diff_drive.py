@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._checks import positive
+from diffdrive_jacobian.kinematics._elementary import operand
 
 
 def unicycle_jacobian(theta: ArrayLike) -> NDArray[np.float64]:
@@ -194,11 +195,7 @@ def _geometry(r: ArrayLike, L: ArrayLike) -> tuple[NDArray[np.float64], NDArray[
 
 
 def _operands(first: Any, second: Any, r: Any, L: Any) -> tuple[Any, Any, Any, Any]:
-    """Let lists in, and leave floats floats: these functions run for every message."""
-    first, second, r, L = (
-        value if isinstance(value, float) else np.asarray(value, dtype=np.float64)
-        for value in (first, second, r, L)
-    )
+    first, second, r, L = operand(first), operand(second), operand(r), operand(L)
     positive('r', r)
     positive('L', L)
     return first, second, r, L

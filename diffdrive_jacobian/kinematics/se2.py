@@ -16,7 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import components
+from diffdrive_jacobian.kinematics._elementary import (
+    components,
+    cos,
+    operand,
+    remainder,
+    sin,
+    stack,
+)
 
 TURN = 2.0 * np.pi
 
@@ -33,7 +40,7 @@ def wrap_angle(angle: ArrayLike) -> Any:
     Returns:
         The wrapped angles, same shape (rad).
     """
-    wrapped = np.fmod(angle, TURN)
+    wrapped = remainder(operand(angle), TURN)
     return wrapped - TURN * (wrapped > np.pi) + TURN * (wrapped <= -np.pi)
 
 
@@ -41,7 +48,7 @@ def sinc(angle: Any) -> Any:
     """Compute sin(angle) / angle without a hole at zero (not NumPy's sin(pi x) / (pi x))."""
     # A tiny angle in the place of zero gives exactly 1.
     angle = angle + (angle == 0.0) * 1e-20
-    return np.sin(angle) / angle
+    return sin(angle) / angle
 
 
 def exp(twist: ArrayLike) -> NDArray[np.float64]:
@@ -55,8 +62,8 @@ def exp(twist: ArrayLike) -> NDArray[np.float64]:
     """
     vx, vy, turn = components('twist', twist, 3)
     chord = sinc(turn / 2.0)
-    along, across = chord * np.cos(turn / 2.0), chord * np.sin(turn / 2.0)
-    return _pose(along * vx - across * vy, across * vx + along * vy, wrap_angle(turn))
+    along, across = chord * cos(turn / 2.0), chord * sin(turn / 2.0)
+    return stack(along * vx - across * vy, across * vx + along * vy, wrap_angle(turn))
 
 
 def log(pose: ArrayLike) -> NDArray[np.float64]:
@@ -70,8 +77,8 @@ def log(pose: ArrayLike) -> NDArray[np.float64]:
     """
     x, y, theta = components('pose', pose, 3)
     turn = wrap_angle(theta)
-    along = np.cos(turn / 2.0) / sinc(turn / 2.0)
-    return _pose(along * x + turn / 2.0 * y, along * y - turn / 2.0 * x, turn)
+    along = cos(turn / 2.0) / sinc(turn / 2.0)
+    return stack(along * x + turn / 2.0 * y, along * y - turn / 2.0 * x, turn)
 
 
 def compose(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
@@ -86,15 +93,15 @@ def compose(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
     """
     x, y, theta = components('first', first, 3)
     dx, dy, turn = components('second', second, 3)
-    cos, sin = np.cos(theta), np.sin(theta)
-    return _pose(x + cos * dx - sin * dy, y + sin * dx + cos * dy, wrap_angle(theta + turn))
+    c, s = cos(theta), sin(theta)
+    return stack(x + c * dx - s * dy, y + s * dx + c * dy, wrap_angle(theta + turn))
 
 
 def inverse(pose: ArrayLike) -> NDArray[np.float64]:
     """Give the pose of W in B from the pose of B in W, shape (..., 3), theta wrapped."""
     x, y, theta = components('pose', pose, 3)
-    cos, sin = np.cos(theta), np.sin(theta)
-    return _pose(-cos * x - sin * y, sin * x - cos * y, wrap_angle(-theta))
+    c, s = cos(theta), sin(theta)
+    return stack(-c * x - s * y, s * x - c * y, wrap_angle(-theta))
 
 
 def homogeneous(pose: ArrayLike) -> NDArray[np.float64]:
@@ -107,10 +114,10 @@ def homogeneous(pose: ArrayLike) -> NDArray[np.float64]:
         Transforms, shape (..., 3, 3): they map `[x, y, 1]` in B to W.
     """
     x, y, theta = components('pose', pose, 3)
-    cos, sin = np.cos(theta), np.sin(theta)
+    c, s = cos(theta), sin(theta)
     transform = np.zeros((*np.shape(x), 3, 3))
-    transform[..., 0, 0], transform[..., 0, 1], transform[..., 0, 2] = cos, -sin, x
-    transform[..., 1, 0], transform[..., 1, 1], transform[..., 1, 2] = sin, cos, y
+    transform[..., 0, 0], transform[..., 0, 1], transform[..., 0, 2] = c, -s, x
+    transform[..., 1, 0], transform[..., 1, 1], transform[..., 1, 2] = s, c, y
     transform[..., 2, 2] = 1.0
     return transform
 
@@ -131,14 +138,8 @@ def integrate(pose: ArrayLike, twist: ArrayLike, dt: ArrayLike) -> NDArray[np.fl
     """
     x, y, theta = components('pose', pose, 3)
     v, omega = components('twist', twist, 2)
+    dt = operand(dt)
     turn = omega * dt
     chord = v * dt * sinc(turn / 2.0)
     heading = theta + turn / 2.0
-    return _pose(x + chord * np.cos(heading), y + chord * np.sin(heading), wrap_angle(theta + turn))
-
-
-def _pose(x: Any, y: Any, theta: Any) -> NDArray[np.float64]:
-    """Stack three components that broadcast along a new last axis (np.stack is three times slower)."""
-    pose = np.empty((*np.broadcast(x, y, theta).shape, 3))
-    pose[..., 0], pose[..., 1], pose[..., 2] = x, y, theta
-    return pose
+    return stack(x + chord * cos(heading), y + chord * sin(heading), wrap_angle(theta + turn))

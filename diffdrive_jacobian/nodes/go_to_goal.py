@@ -21,6 +21,7 @@ from diffdrive_jacobian.nodes.parameters import GoToGoalParameters, nanoseconds
 from diffdrive_jacobian.ros import messages
 from diffdrive_jacobian.ros.messages import MessageError
 from diffdrive_jacobian.ros.node import ParameterizedNode
+from diffdrive_jacobian.ros.watchdog import Watchdog
 
 LAWS: dict[str, Callable[[GoToGoalParameters], Law]] = {
     'go_to_goal': lambda parameters: partial(go_to_goal, Kp=parameters.kp, Kv=parameters.kv),
@@ -62,10 +63,10 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self.subscribe(PoseStamped, 'goal_pose', self._on_goal_pose)
         self.subscribe(Goals, 'goals', self._on_goals)
         self.create_service(Trigger, 'cancel_goal', self._on_cancel)
-        self._watchdog = self.create_timer(1.0, self._on_stale_odometry)
-        self._arm_watchdog()
+        self._message: Twist | TwistStamped = TwistStamped() if stamped else Twist()
+        self._watchdog = Watchdog(self, self._on_stale_odometry)
+        self._configure()
         self.report_unknown_parameters()
-        self._judge_gains()
 
     @property
     def waypoint(self) -> int | None:
@@ -97,7 +98,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._end(GoalStatus.STATUS_CANCELED, 'replaced by another')
         self._goal = goal
         self._publish_status(info, GoalStatus.STATUS_ACCEPTED)
-        self._arm_watchdog()
+        self._watchdog.start(nanoseconds(self.parameters.odom_timeout))
         x, y, _ = goal.waypoints.poses[-1]
         more = f' by way of {count} more' if (count := len(goal.waypoints.poses) - 1) else ''
         self.get_logger().info(f'goal accepted: x {x:.3f}, y {y:.3f}{more}')
@@ -123,7 +124,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         if self._goal is not None:
             self._publish_status(self._goal.info, status)
             self._goal = None
-            self._watchdog.cancel()
+            self._watchdog.stop()
             self.get_logger().info(f'goal {what}')
 
     def _publish_status(self, info: GoalInfo, status: int) -> None:
@@ -149,30 +150,21 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._odom_frame = message.header.frame_id
         if goal is None:
             return
-        if self.parameters.odom_timeout > 0.0:
-            self._watchdog.reset()
+        self._watchdog.feed(self.now())
         if not goal.executing and not self._begin(goal):
             return
         if goal.stale:
             goal.stale = False
             self.get_logger().info('odometry is back: driving on')
-        parameters = self.parameters
         goal.waypoints, command = goal.waypoints.follow(
-            pose,
-            LAWS[parameters.controller](parameters),
-            Arrival(
-                xy_tolerance=parameters.xy_goal_tolerance,
-                yaw_tolerance=parameters.yaw_goal_tolerance,
-                use_heading=parameters.use_goal_heading,
-            ),
-            parameters.kp,
+            pose, self._law, self._arrival, self.parameters.kp
         )
         if command is None:
             self._publish_command(0.0, 0.0)
             self._end(GoalStatus.STATUS_SUCCEEDED, 'reached')
             return
         # Without wheels in the limits the geometry of the wheels does not matter.
-        self._publish_command(*saturate(*command, parameters.limits(), 1.0, 1.0))
+        self._publish_command(*saturate(*command, self._limits, 1.0, 1.0))
 
     def _begin(self, goal: Goal) -> bool:
         """Begin to drive, now that the odometry's frame is known."""
@@ -200,11 +192,12 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self.warn(f'no valid odometry on {topic} for {timeout:g} s: zero sent, waiting')
 
     def _publish_command(self, v: float, omega: float) -> None:
-        if self.parameters.enable_stamped_cmd_vel:
+        if isinstance(self._message, TwistStamped):
             # No frame: the twist is the robot's own, and its name is not ours to know.
-            self._cmd_vel.publish(messages.to_twist_stamped(v, omega, self.now(), ''))
+            messages.set_twist_stamped(self._message, (v, omega), self.now())
         else:
-            self._cmd_vel.publish(messages.to_twist(v, omega))
+            messages.set_twist(self._message, (v, omega))
+        self._cmd_vel.publish(self._message)
 
     def stop(self) -> None:
         """Send zero and give the goal up, if there is one."""
@@ -216,20 +209,21 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
 
     def parameters_changed(self, previous: GoToGoalParameters) -> None:
         """Control on with the new parameters."""
-        parameters = self.parameters
-        if parameters.odom_timeout != previous.odom_timeout:
-            self._arm_watchdog()
-        if (parameters.kp, parameters.kv) != (previous.kp, previous.kv):
-            self._judge_gains()
+        self._configure()
+        if self._goal is not None and self.parameters.odom_timeout != previous.odom_timeout:
+            self._watchdog.start(nanoseconds(self.parameters.odom_timeout))
 
-    def _arm_watchdog(self) -> None:
-        """Let the watchdog bark once the odometry is too old; each odometry message puts it off."""
-        timeout = self.parameters.odom_timeout
-        if self._goal is None or timeout == 0.0:
-            self._watchdog.cancel()
-            return
-        self._watchdog.timer_period_ns = nanoseconds(timeout)
-        self._watchdog.reset()
+    def _configure(self) -> None:
+        """Make from the parameters what every step needs."""
+        parameters = self.parameters
+        self._law = LAWS[parameters.controller](parameters)
+        self._limits = parameters.limits()
+        self._arrival = Arrival(
+            xy_tolerance=parameters.xy_goal_tolerance,
+            yaw_tolerance=parameters.yaw_goal_tolerance,
+            use_heading=parameters.use_goal_heading,
+        )
+        self._judge_gains()
 
     def _judge_gains(self) -> None:
         kp, kv = self.parameters.kp, self.parameters.kv

@@ -41,6 +41,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         super().__init__('virtual_robot', VirtualRobotParameters, **kwargs)
         self._robot: Robot | None = None
         self._latest = 0
+        self._odometry, self._states, self._command = Odometry(), JointState(), TwistStamped()
+        self._name_messages()
         self._odom = self.advertise(Odometry, 'odom')
         self._joint_states = self.advertise(JointState, 'joint_states')
         self._applied = self.advertise(TwistStamped, 'cmd_vel_out')
@@ -86,9 +88,9 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
     def _begin(self, robot: Robot) -> None:
         """Say where and when the odometry begins."""
         message = PoseWithCovarianceStamped()
-        message.header.stamp = messages.to_time(robot.stamp)
+        messages.set_time(message.header.stamp, robot.stamp)
         message.header.frame_id = self.parameters.odom_frame_id
-        messages.fill_pose_with_covariance(message.pose, robot.pose, robot.covariance)
+        messages.set_pose_with_covariance(message.pose, robot.pose, robot.covariance)
         self._start_pose.publish(message)
 
     def _on_tick(self) -> None:
@@ -97,19 +99,12 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             return
         now, robot = advanced
         state = robot.at(now)
-        parameters = self.parameters
-        odometry = messages.to_odometry(
-            state,
-            1.0 / parameters.publish_rate,
-            parameters.odom_frame_id,
-            parameters.base_frame_id,
-        )
-        self._odom.publish(odometry)
-        self._joint_states.publish(
-            messages.to_joint_state(self._joint_names(), now, state.wheel_speeds, state.wheel_angles)
-        )
+        messages.set_odometry(self._odometry, state, 1.0 / self.parameters.publish_rate)
+        self._odom.publish(self._odometry)
+        messages.set_joint_state(self._states, now, state.wheel_speeds, state.wheel_angles)
+        self._joint_states.publish(self._states)
         if self._transforms is not None:
-            self._transforms.sendTransform(_transform(odometry))
+            self._transforms.sendTransform(_transform(self._odometry))
 
     # --- Commands
 
@@ -146,9 +141,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     def _publish_applied(self, robot: Robot) -> None:
         """Tell the command that drives the robot from its instant on."""
-        self._applied.publish(
-            messages.to_twist_stamped(*robot.twist, robot.stamp, self.parameters.base_frame_id)
-        )
+        messages.set_twist_stamped(self._command, robot.twist, robot.stamp)
+        self._applied.publish(self._command)
 
     # --- Placement
 
@@ -188,6 +182,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
     def parameters_changed(self, previous: VirtualRobotParameters) -> None:
         """Drive on under the new parameters."""
         parameters = self.parameters
+        self._name_messages()
         if parameters.publish_rate != previous.publish_rate:
             self._timer.timer_period_ns = nanoseconds(1.0 / parameters.publish_rate)
             self._timer.reset()
@@ -212,6 +207,14 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
     def _initial_pose(self) -> Any:
         parameters = self.parameters
         return np.array([parameters.x, parameters.y, wrap_angle(parameters.theta)])
+
+    def _name_messages(self) -> None:
+        """Write the frames and joints, which only parameters change, into the messages kept."""
+        parameters = self.parameters
+        self._odometry.header.frame_id = parameters.odom_frame_id
+        self._odometry.child_frame_id = parameters.base_frame_id
+        self._command.header.frame_id = parameters.base_frame_id
+        self._states.name = list(self._joint_names())
 
     def _joint_names(self) -> tuple[str, str]:
         return self.parameters.left_wheel_name, self.parameters.right_wheel_name

@@ -13,6 +13,7 @@ from diffdrive_jacobian.nodes.parameters import WheelBridgeParameters, nanosecon
 from diffdrive_jacobian.ros import messages
 from diffdrive_jacobian.ros.messages import MessageError
 from diffdrive_jacobian.ros.node import ParameterizedNode
+from diffdrive_jacobian.ros.watchdog import Watchdog
 
 
 class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
@@ -26,18 +27,18 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         """Create the bridge; `kwargs` as for `ParameterizedNode`."""
         super().__init__('wheel_bridge', WheelBridgeParameters, **kwargs)
         parameters = self.parameters
-        self._as_joint_state = parameters.joint_command_type == 'JointState'
-        self._joint_command = self.advertise(
-            JointState if self._as_joint_state else Float64MultiArray, 'joint_command'
+        self._message: JointState | Float64MultiArray = (
+            JointState() if parameters.joint_command_type == 'JointState' else Float64MultiArray()
         )
+        self._joint_command = self.advertise(type(self._message), 'joint_command')
         if parameters.enable_stamped_cmd_vel:
             self.subscribe(TwistStamped, 'cmd_vel', self._on_twist_stamped)
         else:
             self.subscribe(Twist, 'cmd_vel', self._on_twist)
         self._last = 0
         self._moving = False
-        self._watchdog = self.create_timer(1.0, self._on_silence)
-        self._arm_watchdog()
+        self._watchdog = Watchdog(self, self._on_silence)
+        self._watchdog.start(nanoseconds(parameters.cmd_vel_timeout))
         self.report_unknown_parameters()
 
     def _on_twist(self, message: Twist) -> None:
@@ -57,8 +58,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         except MessageError as error:
             self.warn(f'command dropped: {error}')
             return
-        if timeout:
-            self._watchdog.reset()
+        self._watchdog.feed(now)
         self._publish(self._wheel_speeds(v, omega), self._last)
 
     def _wheel_speeds(self, v: float, omega: float) -> tuple[Any, Any]:
@@ -74,14 +74,14 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
 
     def _publish(self, speeds: tuple[Any, Any], stamp: int) -> None:
         self._moving = speeds != (0.0, 0.0)
-        if self._as_joint_state:
-            names = self.parameters.left_wheel_name, self.parameters.right_wheel_name
-            self._joint_command.publish(messages.to_joint_state(names, stamp, speeds))
+        if isinstance(self._message, JointState):
+            self._message.name = [self.parameters.left_wheel_name, self.parameters.right_wheel_name]
+            messages.set_joint_state(self._message, stamp, speeds)
         else:
-            self._joint_command.publish(messages.to_float64_multi_array(speeds))
+            self._message.data = [speeds[1], speeds[0]]
+        self._joint_command.publish(self._message)
 
     def _on_silence(self) -> None:
-        self._watchdog.cancel()
         if self._moving:
             self._publish((0.0, 0.0), self.now())
             self.warn(
@@ -97,14 +97,4 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
     def parameters_changed(self, previous: WheelBridgeParameters) -> None:
         """Follow a new timeout; the rest counts from the next command on."""
         if self.parameters.cmd_vel_timeout != previous.cmd_vel_timeout:
-            self._arm_watchdog()
-
-    def _arm_watchdog(self) -> None:
-        """Let the watchdog bark when commands cease; each command puts it off."""
-        timeout = self.parameters.cmd_vel_timeout
-        if timeout == 0.0 or not self._moving:
-            self._watchdog.cancel()
-        if timeout > 0.0:
-            self._watchdog.timer_period_ns = nanoseconds(timeout)
-            if self._moving:
-                self._watchdog.reset()
+            self._watchdog.start(nanoseconds(self.parameters.cmd_vel_timeout))

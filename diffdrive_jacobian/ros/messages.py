@@ -3,7 +3,8 @@
 Poses are `[x, y, theta]` (m, m, rad), twists `(v, omega)` (m/s, rad/s), instants integer nanoseconds.
 Wheel joints stand left, right in messages (ROS habit) and right, left in the mathematics.
 
-Reading a message never trusts it: what cannot be meant raises MessageError, which says what was got
+Writing fills a message that is there: a node keeps one for each topic, for making the nested messages
+of ROS in Python costs more than sending them. Reading a message never trusts it: what cannot be meant raises MessageError, which says what was got
 and what is allowed.
 """
 
@@ -14,11 +15,10 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseWithCovariance, Quaternion, Twist, TwistStamped
+from geometry_msgs.msg import Pose, PoseWithCovariance, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
 
 from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot
 
@@ -36,10 +36,9 @@ class MessageError(ValueError):
     """A message that cannot be meant."""
 
 
-def to_time(nanoseconds: int) -> Time:
-    """Write an instant as a stamp."""
-    sec, nanosec = divmod(nanoseconds, NANOSECONDS)
-    return Time(sec=sec, nanosec=nanosec)
+def set_time(stamp: Time, nanoseconds: int) -> None:
+    """Write an instant into a stamp."""
+    stamp.sec, stamp.nanosec = divmod(nanoseconds, NANOSECONDS)
 
 
 def from_time(stamp: Time) -> int:
@@ -74,19 +73,15 @@ def plausible_twist(v: float, omega: float) -> tuple[float, float]:
     return v, omega
 
 
-def to_twist(v: float, omega: float) -> Twist:
-    """Write `(v, omega)`."""
-    message = Twist()
-    message.linear.x, message.angular.z = float(v), float(omega)
-    return message
+def set_twist(message: Twist, twist: tuple[float, float]) -> None:
+    """Write `(v, omega)` into a message."""
+    message.linear.x, message.angular.z = twist
 
 
-def to_twist_stamped(v: float, omega: float, stamp: int, frame_id: str) -> TwistStamped:
-    """Write `(v, omega)` with an instant and the frame it is given in."""
-    message = TwistStamped()
-    message.header.stamp, message.header.frame_id = to_time(stamp), frame_id
-    message.twist.linear.x, message.twist.angular.z = float(v), float(omega)
-    return message
+def set_twist_stamped(message: TwistStamped, twist: tuple[float, float], stamp: int) -> None:
+    """Write `(v, omega)` and its instant into a message."""
+    set_time(message.header.stamp, stamp)
+    set_twist(message.twist, twist)
 
 
 def command_instant(stamp: int, now: int, last: int, timeout: int) -> int:
@@ -112,7 +107,8 @@ def command_instant(stamp: int, now: int, last: int, timeout: int) -> int:
         )
     if stamp < last:
         raise MessageError(
-            f'its stamp lies {(last - stamp) / NANOSECONDS:.6f} s before what was commanded last'
+            f'its stamp lies {(last - stamp) / NANOSECONDS:.6f} s before the last command, '
+            'stop or placement'
         )
     return stamp
 
@@ -139,12 +135,7 @@ def from_pose(message: Pose) -> NDArray[np.float64]:
     return np.array([x, y, math.atan2(sine, cosine)])
 
 
-def to_quaternion(theta: float) -> Quaternion:
-    """Write a heading."""
-    return Quaternion(z=math.sin(theta / 2.0), w=math.cos(theta / 2.0))
-
-
-def fill_pose(message: Pose, pose: NDArray[np.float64]) -> None:
+def set_pose(message: Pose, pose: NDArray[np.float64]) -> None:
     """Write `[x, y, theta]` into a pose."""
     x, y, theta = pose.tolist()
     message.position.x, message.position.y = x, y
@@ -175,36 +166,30 @@ def from_pose_with_covariance(
     return pose, (covariance + covariance.T) / 2.0
 
 
-def fill_pose_with_covariance(
+def set_pose_with_covariance(
     message: PoseWithCovariance, pose: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> None:
     """Write a pose (3,) and its covariance (3, 3); what the plane fixes has no variance."""
-    fill_pose(message.pose, pose)
+    set_pose(message.pose, pose)
     message.covariance[_PLANAR] = covariance.ravel()
 
 
-def to_odometry(robot: Robot, interval: float, frame_id: str, child_frame_id: str) -> Odometry:
-    """Write what a robot knows of its motion; the twist is measured over an interval (s)."""
-    message = Odometry()
-    message.header.stamp, message.header.frame_id = to_time(robot.stamp), frame_id
-    message.child_frame_id = child_frame_id
-    fill_pose_with_covariance(message.pose, robot.pose, robot.covariance)
-    message.twist.twist.linear.x, message.twist.twist.angular.z = robot.twist
+def set_odometry(message: Odometry, robot: Robot, interval: float) -> None:
+    """Write what a robot knows of its motion; its twist counts as measured over an interval (s)."""
+    set_time(message.header.stamp, robot.stamp)
+    set_pose_with_covariance(message.pose, robot.pose, robot.covariance)
+    set_twist(message.twist.twist, robot.twist)
     message.twist.covariance[_FORWARD_AND_YAW] = robot.twist_covariance(interval).ravel()
-    return message
 
 
-def to_joint_state(
-    names: tuple[str, str], stamp: int, speeds: Any, angles: Any | None = None
-) -> JointState:
-    """Write wheel speeds, and angles where known, given right, left; `names` are left, right."""
-    right, left = speeds
-    message = JointState(name=list(names), velocity=[float(left), float(right)])
-    message.header.stamp = to_time(stamp)
+def set_joint_state(
+    message: JointState, stamp: int, speeds: tuple[float, float], angles: Any = None
+) -> None:
+    """Write wheel speeds, and angles where known, given right, left; the names are left, right."""
+    set_time(message.header.stamp, stamp)
+    message.velocity = [speeds[1], speeds[0]]
     if angles is not None:
-        right, left = angles
-        message.position = [float(left), float(right)]
-    return message
+        message.position = [angles[1], angles[0]]
 
 
 def from_joint_state(message: JointState, names: tuple[str, str]) -> tuple[float, float]:
@@ -226,9 +211,3 @@ def from_joint_state(message: JointState, names: tuple[str, str]) -> tuple[float
     if not (math.isfinite(left) and math.isfinite(right)):
         raise MessageError(f'wheel speeds must be finite, got left {left}, right {right}')
     return right, left
-
-
-def to_float64_multi_array(speeds: Any) -> Float64MultiArray:
-    """Write wheel speeds given right, left as the list left, right."""
-    right, left = speeds
-    return Float64MultiArray(data=[float(left), float(right)])

@@ -64,7 +64,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
 
     def now(self) -> int:
         """Give the time of the node's clock (ns); 0 while simulated time has not begun."""
-        return int(self.get_clock().now().nanoseconds)
+        return int(self.get_clock().handle.get_now().nanoseconds)
 
     def advertise(self, message: type, topic: str, *, latched: bool = False) -> Publisher:
         """Create a publisher: reliable, keep last 10; latched: for those who come later, too."""

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import components
+from diffdrive_jacobian.kinematics._elementary import components, cos, operand, sin, stack, where
 from diffdrive_jacobian.kinematics.se2 import sinc
 
 # Taylor coefficients of _sinc_defect in the square of its argument, (-1)^n / (2n + 3)!
@@ -41,11 +41,8 @@ def twist_covariance(
     """
     v, omega = components('twist', twist, 2)
     right, left = _wheel_variances(v, omega, L, wheel_travel_variance)
-    covariance = np.empty((*np.shape(right), 2, 2))
-    covariance[..., 0, 0] = (right + left) / (4.0 * interval)
-    covariance[..., 0, 1] = covariance[..., 1, 0] = (right - left) / (2.0 * L * interval)
-    covariance[..., 1, 1] = (right + left) / (L**2 * interval)
-    return covariance
+    cross = (right - left) / (2.0 * L * interval)
+    return _matrix((right + left) / (4.0 * interval), cross, cross, (right + left) / (L**2 * interval))
 
 
 def propagate_covariance(
@@ -71,29 +68,34 @@ def propagate_covariance(
     """
     _, _, theta = components('pose', pose, 3)
     v, omega = components('twist', twist, 2)
+    dt = operand(dt)
     turn, way = omega * dt, v * dt
-    cos, sin = np.cos(theta + turn), np.sin(theta + turn)
+    c, s = cos(theta + turn), sin(theta + turn)
     # The displacement, seen from the end of the arc, then in the world.
-    along, across = way * sinc(turn), -way * sinc(turn / 2.0) * np.sin(turn / 2.0)
-    dx, dy = cos * along - sin * across, sin * along + cos * across
-    transition = _matrix(1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 1.0)
+    along, across = way * sinc(turn), -way * sinc(turn / 2.0) * sin(turn / 2.0)
+    dx, dy = c * along - s * across, s * along + c * across
+    # Phi P Phi^T, written out for Phi = [[1, 0, -dy], [0, 1, dx], [0, 0, 1]].
+    shape = np.shape(covariance)[:-2]
+    pxx, pxy, pxt, _, pyy, pyt, _, _, ptt = components(
+        'covariance', np.reshape(covariance, (*shape, 9)), 9
+    )
+    # The noise, turned from the end's frame into the world.
     xx, xy, xt, yy, yt, tt = _noise_at_end(v, omega, dt, L, wheel_travel_variance)
-    noise_xy = cos * sin * (xx - yy) + (cos**2 - sin**2) * xy
-    noise_xt, noise_yt = cos * xt - sin * yt, sin * xt + cos * yt
-    noise = _matrix(
-        cos**2 * xx - 2.0 * cos * sin * xy + sin**2 * yy, noise_xy, noise_xt,
-        noise_xy, sin**2 * xx + 2.0 * cos * sin * xy + cos**2 * yy, noise_yt,
-        noise_xt, noise_yt, tt,
+    end_xx = pxx - 2.0 * dy * pxt + dy * dy * ptt + c * c * xx - 2.0 * c * s * xy + s * s * yy
+    end_xy = pxy - dy * pyt + dx * pxt - dx * dy * ptt + c * s * (xx - yy) + (c * c - s * s) * xy
+    end_xt = pxt - dy * ptt + c * xt - s * yt
+    end_yy = pyy + 2.0 * dx * pyt + dx * dx * ptt + s * s * xx + 2.0 * c * s * xy + c * c * yy
+    end_yt = pyt + dx * ptt + s * xt + c * yt
+    end_tt = ptt + tt
+    return _matrix(
+        end_xx, end_xy, end_xt, end_xy, end_yy, end_yt, end_xt, end_yt, end_tt
     )  # fmt: skip
-    carried = transition @ covariance @ np.swapaxes(transition, -1, -2)
-    result: NDArray[np.float64] = (carried + np.swapaxes(carried, -1, -2)) / 2.0 + noise
-    return result
 
 
 def _wheel_variances(v: Any, omega: Any, L: float, wheel_travel_variance: float) -> tuple[Any, Any]:
     """Give how fast the variance of the right and of the left wheel's travel grows (m^2/s)."""
     half = omega * L / 2.0
-    return wheel_travel_variance * np.abs(v + half), wheel_travel_variance * np.abs(v - half)
+    return wheel_travel_variance * abs(v + half), wheel_travel_variance * abs(v - half)
 
 
 def _noise_at_end(v: Any, omega: Any, dt: Any, L: float, wheel_travel_variance: float) -> Any:
@@ -113,13 +115,13 @@ def _noise_at_end(v: Any, omega: Any, dt: Any, L: float, wheel_travel_variance: 
     turn, way = omega * dt, v * dt
     whole, half = sinc(turn), sinc(turn / 2.0)
     once, twice = _sinc_defect(turn), _sinc_defect(2.0 * turn)
-    cos = np.cos(turn)
+    cosine = cos(turn)
     return (
-        vv * (1.0 + whole * cos) / 2.0
+        vv * (1.0 + whole * cosine) / 2.0
         + vw * way * turn * 2.0 * (2.0 * twice - once)
         + ww * way**2 * 2.0 * (once - twice),
         -vv * turn * whole**2 / 2.0
-        + vw * way * half**2 * cos / 2.0
+        + vw * way * half**2 * cosine / 2.0
         + ww * way**2 * turn * half**4 / 8.0,
         vw * whole + ww * way * turn * once,
         2.0 * twice * (vv * turn**2 - 2.0 * vw * way * turn + ww * way**2),
@@ -130,17 +132,16 @@ def _noise_at_end(v: Any, omega: Any, dt: Any, L: float, wheel_travel_variance: 
 
 def _sinc_defect(angle: Any) -> Any:
     """Compute (1 - sin(x)/x) / x^2, which is 1/6 at zero, to full precision."""
-    square: Any = np.square(angle)
+    square: Any = angle * angle
     series: Any = 0.0
     for coefficient in reversed(_DEFECT):
         series = series * square + coefficient
-    far = np.where(square < 1.0, 1.0, angle)
-    return np.where(square < 1.0, series, (1.0 - np.sin(far) / far) / far**2)[()]
+    far = where(square < 1.0, 1.0, angle)
+    return where(square < 1.0, series, (1.0 - sin(far) / far) / far**2)
 
 
 def _matrix(*entries: Any) -> NDArray[np.float64]:
-    """Build 3x3 matrices from nine entries that broadcast, row by row."""
-    matrix = np.empty((*np.broadcast(*entries).shape, 9))
-    for index, entry in enumerate(entries):
-        matrix[..., index] = entry
-    return matrix.reshape(*matrix.shape[:-1], 3, 3)
+    """Build square matrices from entries that broadcast, row by row."""
+    size = math.isqrt(len(entries))
+    matrix = stack(*entries)
+    return matrix.reshape(*matrix.shape[:-1], size, size)

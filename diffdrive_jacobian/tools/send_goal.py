@@ -66,7 +66,7 @@ class Sender(Node):  # type: ignore[misc]
             self.get_clock().now().to_msg(),
             self._frame,
         )
-        messages.fill_pose(message.pose, self.goal)
+        messages.set_pose(message.pose, self.goal)
         self._message = message
         self.publisher.publish(message)
 

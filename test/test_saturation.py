@@ -1,0 +1,165 @@
+"""Saturation keeps the curvature: the largest common factor on v and omega that meets every limit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from diffdrive_jacobian.control import VelocityLimits, saturate
+from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
+
+R, L = 0.033, 0.16
+BODY_LIMITS = ['min_v', 'max_v', 'min_omega', 'max_omega']
+EVERY_LIMIT = [*BODY_LIMITS, 'max_wheel_speed']
+ACTIVE = [*([name] for name in EVERY_LIMIT), BODY_LIMITS, EVERY_LIMIT]
+
+
+def random_limits(rng, names) -> VelocityLimits:
+    """Draw limits around the size of the commands, so that each of them is often the tightest."""
+    drawn = dict(zip(names, 10.0 ** rng.uniform(-3.0, 0.5, len(names)), strict=True))
+    for name in drawn:
+        if name.startswith('min'):
+            drawn[name] *= -1.0
+        if name == 'max_wheel_speed':
+            drawn[name] /= R
+    return VelocityLimits(**drawn)
+
+
+def random_commands(rng, count=100):
+    """Draw commands over six decades and all four quadrants."""
+    return rng.choice([-1.0, 1.0], (2, count)) * 10.0 ** rng.uniform(-4.0, 2.0, (2, count))
+
+
+def cases(names, seed):
+    """Yield 100 sets of limits, each with 100 commands and what becomes of them."""
+    rng = np.random.default_rng(seed)
+    for _ in range(100):
+        limits, (v, omega) = random_limits(rng, names), random_commands(rng)
+        yield limits, (v, omega), saturate(v, omega, limits, R, L)
+
+
+def fastest_wheel(v, omega):
+    return np.max(np.abs(body_to_wheel(v, omega, R, L)), axis=0)
+
+
+def violates(limits, v, omega):
+    """Tell which twists break a limit, without any tolerance."""
+    body = (
+        (v < limits.min_v) | (v > limits.max_v) | (omega < limits.min_omega) | (omega > limits.max_omega)
+    )
+    return body | (fastest_wheel(v, omega) > limits.max_wheel_speed)
+
+
+@pytest.mark.parametrize('names', ACTIVE, ids='+'.join)
+def test_the_ratio_is_the_commanded_one(names):
+    slowed = 0
+    for _, (v, omega), (v_limited, omega_limited) in cases(names, 1):
+        np.testing.assert_allclose(v_limited / omega_limited, v / omega, rtol=1e-12)
+        assert np.all(np.sign(v_limited) == np.sign(v))
+        slowed += np.count_nonzero(v_limited != v)
+    assert slowed > 2_000
+
+
+@pytest.mark.parametrize('names', ACTIVE, ids='+'.join)
+def test_every_limit_is_met_and_no_larger_factor_would_do(names):
+    for limits, (v, omega), limited in cases(names, 2):
+        v_limited, omega_limited = limited
+        assert np.all((limits.min_v <= v_limited) & (v_limited <= limits.max_v))
+        assert np.all((limits.min_omega <= omega_limited) & (omega_limited <= limits.max_omega))
+        assert np.all(fastest_wheel(*limited) <= limits.max_wheel_speed * (1.0 + 1e-12))
+        unchanged = (v_limited == v) & (omega_limited == omega)
+        more = np.multiply(limited, 1.0 + 1e-9)
+        assert np.all(unchanged | violates(limits, *more))
+        # Only what breaks a limit is slowed down.
+        assert np.array_equal(unchanged, ~violates(limits, v, omega))
+
+
+@pytest.mark.parametrize('names', ACTIVE, ids='+'.join)
+def test_what_is_within_the_limits_passes_to_the_last_bit(names):
+    for limits, _, limited in cases(names, 3):
+        inside = np.multiply(limited, 1.0 - 1e-9)
+        for before, after in zip(inside, saturate(*inside, limits, R, L), strict=True):
+            assert before.tobytes() == after.tobytes()
+
+
+def test_without_limits_everything_passes():
+    limits = VelocityLimits()
+    assert limits.unlimited
+    assert not VelocityLimits(max_wheel_speed=1e9).unlimited
+    v, omega = random_commands(np.random.default_rng(4))
+    for before, after in zip((v, omega), saturate(v, omega, limits, R, L), strict=True):
+        assert before.tobytes() == after.tobytes()
+
+
+@pytest.mark.parametrize('name', BODY_LIMITS)
+def test_a_limit_of_zero_forbids_a_direction_and_leaves_the_rest(name):
+    rng = np.random.default_rng(5)
+    limits = VelocityLimits(**{name: 0.0, 'max_wheel_speed': 20.0})
+    twist = random_commands(rng)
+    component = 0 if name.endswith('_v') else 1
+    forbidden = (twist[component] < 0.0) if name.startswith('min') else (twist[component] > 0.0)
+    assert 20 < np.count_nonzero(forbidden) < 80
+    limited = np.array(saturate(*twist, limits, R, L))
+    # As if the forbidden component had not been asked for: nothing of it, and nothing less of the other.
+    dropped = twist.copy()
+    dropped[component, forbidden] = 0.0
+    wheels_alone = VelocityLimits(max_wheel_speed=20.0)
+    assert np.array_equal(limited, saturate(*dropped, wheels_alone, R, L))
+    assert not limited[component, forbidden].any()
+    assert limited[1 - component].all()
+
+
+def test_limits_of_zero_both_ways_leave_nothing_of_a_component():
+    v, omega = random_commands(np.random.default_rng(6))
+    v_limited, omega_limited = saturate(v, omega, VelocityLimits(min_v=0.0, max_v=0.0), R, L)
+    assert not v_limited.any()
+    assert np.array_equal(omega_limited, omega)
+    v_limited, omega_limited = saturate(v, omega, VelocityLimits(min_omega=0.0, max_omega=0.0), R, L)
+    assert np.array_equal(v_limited, v)
+    assert not omega_limited.any()
+
+
+def test_standing_still_is_within_any_limits():
+    rng = np.random.default_rng(7)
+    for names in ACTIVE:
+        assert saturate(0.0, 0.0, random_limits(rng, names), R, L) == (0.0, 0.0)
+
+
+def test_leading_axes_of_commands_and_robots_broadcast():
+    rng = np.random.default_rng(8)
+    limits = random_limits(rng, EVERY_LIMIT)
+    v, omega = random_commands(rng, 4)
+    r, separation = rng.uniform(0.01, 0.1, (3, 1)), rng.uniform(0.1, 0.5, (3, 1))
+    v_limited, omega_limited = saturate(v, omega, limits, r, separation)
+    for i, j in np.ndindex(3, 4):
+        one = saturate(v[j], omega[j], limits, r[i, 0], separation[i, 0])
+        assert (v_limited[i, j], omega_limited[i, j]) == one
+
+
+@pytest.mark.parametrize(
+    ('name', 'bad', 'allowed'),
+    [
+        *(
+            (name, bad, 'zero or negative')
+            for name in ('min_v', 'min_omega')
+            for bad in (1e-300, np.inf, np.nan)
+        ),
+        *(
+            (name, bad, 'zero or positive')
+            for name in ('max_v', 'max_omega')
+            for bad in (-1e-300, -np.inf, np.nan)
+        ),
+        *(('max_wheel_speed', bad, 'positive') for bad in (0.0, -1.0, -np.inf, np.nan)),
+    ],
+)
+def test_a_limit_on_the_wrong_side_of_zero_is_named(name, bad, allowed):
+    with pytest.raises(ValueError, match=rf'^{name} must be {allowed}, got {bad}$'):
+        VelocityLimits(**{name: bad})
+
+
+@pytest.mark.parametrize(
+    ('r', 'separation', 'name'), [(0.0, L, 'r'), (np.nan, L, 'r'), (R, -L, 'L'), (R, np.inf, 'L')]
+)
+def test_a_robot_without_dimensions_is_refused_where_wheels_count(r, separation, name):
+    with pytest.raises(ValueError, match=rf'^{name} must be positive and finite'):
+        saturate(1.0, 1.0, VelocityLimits(max_wheel_speed=1.0), r, separation)

@@ -1,0 +1,249 @@
+"""SE(2): wrapping, the group, its exponential, and the exact arc of a held twist."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from diffdrive_jacobian.kinematics import se2
+
+TURN = 2.0 * np.pi
+EPS = np.finfo(float).eps
+deterministic = settings(deadline=None, derandomize=True)
+
+lengths = st.floats(-1e3, 1e3)
+# On purpose often next to zero and next to half a turn, where formulas lose digits.
+signs = st.sampled_from([-1.0, 1.0])
+small_turns = st.builds(lambda sign, n: sign * 10.0**n, signs, st.floats(-300.0, 0.0))
+turns = st.one_of(
+    st.floats(-math.pi, math.pi, exclude_min=True),
+    small_turns,
+    st.builds(lambda sign, n: sign * (math.pi - 10.0**n), signs, st.floats(-15.0, 0.0)),
+)
+poses = twists = st.tuples(lengths, lengths, turns).map(np.array)
+durations = st.floats(-10.0, 10.0)
+EDGES = [
+    *(sign * multiple * np.pi for sign in (-1, 1) for multiple in (0, 1, 2, 3, 4, 5, 101)),
+    *(np.nextafter(edge, to) for edge in (-np.pi, np.pi, 3.0 * np.pi) for to in (-np.inf, np.inf)),
+    *(1e15, -1e15, 1e22, -1e100, 1.7e308, 5e-324, -5e-324),
+]
+
+
+def wrapped_exactly(angle: float) -> float:
+    """The IEEE remainder by the double 2 pi is exact; only the lower end of its range is moved."""
+    rest = math.remainder(angle, TURN)
+    return math.pi if rest == -math.pi else rest
+
+
+def assert_same_pose(actual, expected, tolerance):
+    np.testing.assert_allclose(actual[..., :2], expected[..., :2], rtol=0.0, atol=tolerance)
+    turn = se2.wrap_angle(np.subtract(actual[..., 2], expected[..., 2]))
+    np.testing.assert_allclose(turn, 0.0, atol=1e-14)
+
+
+def size(*vectors) -> float:
+    """The scale of rounding errors in positions; the tiny summand is for numbers below all scales."""
+    return 1e-14 * sum(np.abs(vector[:2]).sum() for vector in vectors) + 1e-290
+
+
+def arc_by_series(way: float, turn: float) -> tuple[Fraction, Fraction]:
+    """Give `way [sin(a)/a, (1 - cos a)/a]` in rational numbers, to 40 digits for |a| <= 1."""
+    a = Fraction(turn)
+    along = sum((-1) ** n * a ** (2 * n) / math.factorial(2 * n + 1) for n in range(17))
+    across = sum((-1) ** n * a ** (2 * n + 1) / math.factorial(2 * n + 2) for n in range(17))
+    return Fraction(way) * along, Fraction(way) * across
+
+
+# --- Angles
+
+
+def test_wrap_is_the_exact_remainder_at_the_edges_in_any_shape():
+    exact = [wrapped_exactly(angle) for angle in EDGES]
+    assert [se2.wrap_angle(angle) for angle in EDGES] == exact
+    assert np.array_equal(se2.wrap_angle(np.reshape(EDGES, (3, 9))), np.reshape(exact, (3, 9)))
+
+
+@deterministic
+@given(st.one_of(st.floats(allow_nan=False, allow_infinity=False), turns))
+def test_wrap_is_the_exact_remainder_and_leaves_what_is_inside_to_the_last_bit(angle):
+    wrapped = se2.wrap_angle(angle)
+    assert -math.pi < wrapped <= math.pi
+    assert wrapped == wrapped_exactly(angle)
+    assert se2.wrap_angle(wrapped) == wrapped
+    if -math.pi < angle <= math.pi:
+        assert wrapped == angle
+
+
+# --- The group and its exponential
+
+
+@deterministic
+@given(twists)
+def test_log_undoes_exp(twist):
+    back = se2.log(se2.exp(twist))
+    np.testing.assert_allclose(back[:2], twist[:2], rtol=0.0, atol=size(twist))
+    assert back[2] == twist[2]
+
+
+@deterministic
+@given(poses)
+def test_exp_undoes_log(pose):
+    assert_same_pose(se2.exp(se2.log(pose)), pose, size(pose))
+
+
+@deterministic
+@given(twists, st.floats(-3.0, 3.0), st.floats(-3.0, 3.0))
+def test_exp_makes_one_parameter_groups(twist, s, t):
+    both = se2.compose(se2.exp(s * twist), se2.exp(t * twist))
+    assert_same_pose(se2.exp((s + t) * twist), both, 10.0 * size(twist))
+    assert_same_pose(se2.exp(-twist), se2.inverse(se2.exp(twist)), size(twist))
+
+
+@deterministic
+@given(poses, poses, poses)
+def test_group_axioms(a, b, c):
+    identity = np.zeros(3)
+    left, right = se2.compose(se2.compose(a, b), c), se2.compose(a, se2.compose(b, c))
+    assert_same_pose(left, right, size(a, b, c))
+    assert_same_pose(se2.compose(a, se2.inverse(a)), identity, size(a))
+    assert_same_pose(se2.compose(se2.inverse(a), a), identity, size(a))
+    assert_same_pose(se2.compose(a, identity), a, 0.0)
+    assert_same_pose(se2.compose(identity, a), a, 0.0)
+
+
+@deterministic
+@given(poses, poses)
+def test_homogeneous_is_a_homomorphism_into_rigid_transforms(a, b):
+    tolerance = size(a, b) + 1e-14
+    H_a, H_b = se2.homogeneous(a), se2.homogeneous(b)
+    np.testing.assert_allclose(se2.homogeneous(se2.compose(a, b)), H_a @ H_b, rtol=0.0, atol=tolerance)
+    np.testing.assert_allclose(se2.homogeneous(se2.inverse(a)) @ H_a, np.eye(3), atol=tolerance)
+    np.testing.assert_allclose(H_a[:2, :2].T @ H_a[:2, :2], np.eye(2), atol=1e-15)
+    assert np.array_equal(H_a[2], [0.0, 0.0, 1.0])
+    assert np.array_equal(H_a[:2, 2], a[:2])
+    assert math.atan2(H_a[1, 0], H_a[0, 0]) == pytest.approx(a[2], rel=1e-15, abs=1e-15)
+    assert np.linalg.det(H_a) == pytest.approx(1.0)
+
+
+# --- The exact arc
+
+
+@deterministic
+@given(poses, lengths, st.floats(-5.0, 5.0), durations)
+def test_integrate_is_composition_with_the_exponential(pose, v, omega, dt):
+    arc = se2.exp([v * dt, 0.0, omega * dt])
+    # A heading of up to 50 rad is known to 50 eps only.
+    tolerance = 50.0 * size(pose, [v * dt])
+    reached = se2.integrate(pose, [v, omega], dt)
+    assert_same_pose(reached, se2.compose(pose, arc), tolerance)
+    assert_same_pose(se2.integrate(reached, [v, omega], -dt), pose, tolerance)
+
+
+@settings(deterministic, max_examples=10)
+@given(poses, st.floats(-1.0, 1.0), st.floats(-2.0, 2.0), st.floats(0.0, 10.0))
+def test_one_arc_is_many_small_steps(pose, v, omega, duration):
+    here, steps = pose, 500
+    for _ in range(steps):
+        here = se2.integrate(here, (v, omega), duration / steps)
+    there = se2.integrate(pose, (v, omega), duration)
+    np.testing.assert_allclose(here[:2], there[:2], rtol=0.0, atol=1e-12 * (1.0 + np.abs(pose).max()))
+    assert abs(se2.wrap_angle(here[2] - there[2])) < 1e-12
+
+
+def test_a_minute_of_arc_is_the_closed_form_and_not_eulers():
+    v, omega, duration, rate = 0.22, 0.5, 60.0, 50
+    a, radius = omega * duration, v / omega
+    exact = np.array([radius * math.sin(a), radius * (1.0 - math.cos(a)), math.remainder(a, TURN)])
+    steps, euler = np.zeros(3), np.zeros(3)
+    for _ in range(int(duration * rate)):
+        steps = se2.integrate(steps, (v, omega), 1.0 / rate)
+        euler += np.array([v * math.cos(euler[2]), v * math.sin(euler[2]), omega]) / rate
+    for reached in (se2.integrate(np.zeros(3), (v, omega), duration), steps):
+        assert np.hypot(*(reached - exact)[:2]) < 1e-9
+        assert abs(reached[2] - exact[2]) < 1e-9
+    assert 2.8e-3 < np.hypot(*(euler - exact)[:2]) < 3.0e-3
+
+
+@deterministic
+@example(0.22, 1e-12, 60.0)
+@given(lengths, small_turns, st.floats(1e-3, 1.0))
+def test_small_turns_lose_no_digits(v, omega, dt):
+    x, y, theta = se2.integrate(np.zeros(3), (v, omega), dt)
+    x_exact, y_exact = arc_by_series(v * dt, omega * dt)
+    # The last summand is for numbers below the smallest normal one.
+    assert abs(Fraction(x) - x_exact) <= 4.0 * EPS * abs(x_exact) + Fraction(1, 10**300)
+    assert abs(Fraction(y) - y_exact) <= 4.0 * EPS * abs(y_exact) + Fraction(1, 10**300)
+    assert theta == omega * dt
+
+
+@deterministic
+@given(lengths, durations)
+def test_a_straight_run_is_the_product(v, dt):
+    assert se2.integrate(np.zeros(3), (v, 0.0), dt).tolist() == [v * dt, 0.0, 0.0]
+
+
+@deterministic
+@given(poses, st.floats(-2.0, 2.0), st.floats(0.1, 10.0), st.sampled_from([-3, -1, 1, 2]))
+def test_full_turns_return_to_the_start(pose, v, omega, circles):
+    duration = circles * TURN / omega
+    end = se2.integrate(pose, (v, omega), duration)
+    ulps = np.spacing(np.abs(pose[:2]) + abs(v * duration))
+    assert np.all(np.abs(end - pose)[:2] <= 4.0 * ulps)
+    assert abs(se2.wrap_angle(end[2] - pose[2])) <= 4.0 * np.spacing(abs(circles) * TURN)
+
+
+def test_a_million_steps_keep_the_heading_wrapped_and_the_pose_finite():
+    steps, dt = 1_000_000, 0.1
+    twists = np.random.default_rng(1).normal(0.0, [1.0, 5.0], (steps, 2))
+    pose, path = np.zeros(3), np.empty((steps, 3))
+    for index, twist in enumerate(twists):
+        path[index] = pose = se2.integrate(pose, twist, dt)
+    assert np.isfinite(path).all()
+    assert path[:, 2].min() > -np.pi
+    assert path[:, 2].max() <= np.pi
+    # Rounding moves the heading by half an ulp of pi per step at most; no step is longer than its way.
+    assert abs(math.remainder(pose[2] - math.fsum(twists[:, 1] * dt), TURN)) < steps * EPS
+    moved = np.hypot(*np.diff(path[:, :2], axis=0).T)
+    assert np.all(moved <= np.abs(twists[1:, 0] * dt) + 1e-12)
+
+
+# --- Shapes
+
+
+def test_every_function_broadcasts_over_leading_axes():
+    rng = np.random.default_rng(2)
+    a, b, twist, dt = (rng.normal(size=shape) for shape in [(4, 1, 3), (5, 3), (4, 1, 2), (5,)])
+    unary = (se2.exp, se2.log, se2.inverse, se2.homogeneous)
+    held = zip(b, dt, strict=True)
+    for at_once, looped in [
+        *((function(b), [function(row) for row in b]) for function in unary),
+        (se2.compose(a, b), [[se2.compose(p[0], q) for q in b] for p in a]),
+        (
+            se2.integrate(b, twist, dt),
+            np.transpose([se2.integrate(q, twist[:, 0], t) for q, t in held], (1, 0, 2)),
+        ),
+    ]:
+        np.testing.assert_allclose(at_once, looped, rtol=1e-14, atol=1e-14)
+        assert at_once.shape == np.shape(looped)
+
+
+@pytest.mark.parametrize('bad', [0.0, [], [1.0], [1.0] * 4, np.zeros((3, 1)), np.zeros((0, 4))])
+def test_a_wrong_shape_is_named(bad):
+    pose = np.zeros(3)
+    for name, call in [
+        ('twist', lambda: se2.exp(bad)),
+        ('pose', lambda: se2.log(bad)),
+        ('first', lambda: se2.compose(bad, pose)),
+        ('second', lambda: se2.compose(pose, bad)),
+        ('pose', lambda: se2.inverse(bad)),
+        ('pose', lambda: se2.homogeneous(bad)),
+        ('pose', lambda: se2.integrate(bad, (1.0, 1.0), 1.0)),
+        ('twist', lambda: se2.integrate(pose, bad, 1.0)),
+    ]:
+        with pytest.raises(ValueError, match=rf'^{name} must have shape'):
+            call()

@@ -1,0 +1,145 @@
+"""Waypoints as a value: driven in order, the heading at the end only when asked for."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from diffdrive_jacobian.control import Arrival, Waypoints, go_to_goal, turn_in_place
+from diffdrive_jacobian.kinematics.se2 import integrate, wrap_angle
+
+GAIN = 3.0
+POSES = np.array([[1.0, 0.0, 2.0], [1.0, 1.0, -2.0], [0.0, 1.0, 1.5]])
+POSITIONS_ONLY = Arrival(xy_tolerance=0.02, yaw_tolerance=0.01, use_heading=False)
+WITH_HEADING = Arrival(xy_tolerance=0.02, yaw_tolerance=0.01, use_heading=True)
+
+
+def law(pose, goal):
+    return go_to_goal(pose, goal, 3.0, 0.5)
+
+
+def refuses(pose, goal):
+    raise AssertionError(f'no law was to be asked for, got {pose} and {goal}')
+
+
+def echo(pose, goal):
+    """A law that tells what it was asked."""
+    return (*pose, *goal)
+
+
+def drive(waypoints, arrival, pose, rate=50.0):
+    """Close the loop; give the poses, the waypoints driven to at each of them, and the last pose."""
+    history, command = [], (0.0, 0.0)
+    for _ in range(10_000):
+        waypoints, command = waypoints.follow(pose, law, arrival, GAIN)
+        if command is None:
+            return history, pose
+        history.append((pose, waypoints))
+        pose = integrate(pose, command, 1.0 / rate)
+    raise AssertionError(f'never arrived: {waypoints.index} at {pose}')
+
+
+@pytest.mark.parametrize('arrival', [POSITIONS_ONLY, WITH_HEADING])
+def test_waypoints_are_reached_in_order_each_within_the_tolerance(arrival):
+    history, end = drive(Waypoints(POSES), arrival, np.zeros(3))
+    indices = [waypoints.index for _, waypoints in history]
+    assert np.all(np.diff(indices) >= 0)
+    assert set(indices) == {0, 1, 2}
+    for index in (0, 1):
+        # The step that turns to the next waypoint is taken where the last one is reached, not before.
+        switch = indices.index(index + 1)
+        left, before = history[switch][0], history[switch - 1][0]
+        assert math.dist(left[:2], POSES[index, :2]) <= arrival.xy_tolerance
+        assert math.dist(before[:2], POSES[index, :2]) > arrival.xy_tolerance
+    assert math.dist(end[:2], POSES[-1, :2]) <= arrival.xy_tolerance
+
+
+def test_the_heading_is_taken_at_the_end_and_only_when_asked_for():
+    driven, end = drive(Waypoints(POSES), POSITIONS_ONLY, np.zeros(3))
+    assert abs(wrap_angle(end[2] - POSES[-1, 2])) > 1.0
+    assert not any(waypoints.turning for _, waypoints in driven)
+    turned, end = drive(Waypoints(POSES), WITH_HEADING, np.zeros(3))
+    assert abs(wrap_angle(end[2] - POSES[-1, 2])) <= WITH_HEADING.yaw_tolerance
+    # Up to the last position both go the same way; from there on nothing but the heading changes.
+    for (pose, waypoints), (same_pose, others) in zip(turned, driven, strict=False):
+        assert (pose.tobytes(), waypoints.index) == (same_pose.tobytes(), others.index)
+    turning = turned[len(driven) :]
+    assert turning
+    assert all(waypoints.turning and waypoints.index == 2 for _, waypoints in turning)
+    assert {tuple(pose[:2]) for pose, _ in turning} == {tuple(end[:2])}
+
+
+def test_the_law_is_asked_with_the_pose_and_the_position_driven_to():
+    pose = np.array([0.25, 0.5, 3.0])
+    for index in range(3):
+        here, command = Waypoints(POSES, index).follow(pose, echo, WITH_HEADING, GAIN)
+        assert here == Waypoints(POSES, index)
+        assert command == (*pose, *POSES[index, :2])
+
+
+@pytest.mark.parametrize('arrival', [POSITIONS_ONLY, WITH_HEADING])
+def test_waypoints_already_reached_are_skipped_in_one_step(arrival):
+    near = np.array(
+        [[0.01, 0.0, 1.0], [0.0, -0.01, 2.0], [0.0, 0.0, 3.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    )
+    here, command = Waypoints(near).follow(np.zeros(3), echo, arrival, GAIN)
+    assert here.index == 3
+    assert command == (0.0, 0.0, 0.0, 1.0, 0.0)
+
+
+def test_when_every_waypoint_is_reached_there_is_no_command():
+    near = np.array([[0.01, 0.0, 1.0], [0.0, -0.01, 2.0]])
+    here, command = Waypoints(near).follow(np.zeros(3), refuses, POSITIONS_ONLY, GAIN)
+    assert (here.index, here.turning, command) == (1, False, None)
+
+
+def test_on_the_last_spot_the_heading_alone_is_left():
+    near = np.array([[0.01, 0.0, 1.0], [0.0, -0.01, 2.0]])
+    here, command = Waypoints(near).follow(np.zeros(3), refuses, WITH_HEADING, GAIN)
+    assert (here.index, here.turning) == (1, True)
+    assert command == turn_in_place(0.0, 2.0, GAIN) == (0.0, GAIN * 2.0)
+    looking = np.array([0.0, 0.0, 2.0 - 0.01])
+    assert here.follow(looking, refuses, WITH_HEADING, GAIN) == (here, None)
+
+
+def test_the_heading_error_is_wrapped_across_the_cut():
+    here = Waypoints(np.array([[0.0, 0.0, math.pi]]), turning=True)
+    just_past = np.array([0.0, 0.0, 0.005 - math.pi])
+    assert here.follow(just_past, refuses, WITH_HEADING, GAIN)[1] is None
+    v, omega = here.follow(np.array([0.0, 0.0, 0.5 - math.pi]), refuses, WITH_HEADING, GAIN)[1]
+    assert v == 0.0
+    assert omega == pytest.approx(-GAIN * 0.5)
+
+
+def test_while_it_turns_a_drift_does_not_send_it_back():
+    """A robot that is pushed off the spot while it turns finishes its turn: it would circle for ever else."""
+    here = Waypoints(POSES, 2, turning=True)
+    for pose in ([5.0, 5.0, 0.0], [0.0, 1.0, 0.0]):
+        again, command = here.follow(np.array(pose), refuses, WITH_HEADING, GAIN)
+        assert again == here
+        assert command == (0.0, GAIN * 1.5)
+
+
+def test_a_tolerance_of_zero_is_met_on_the_spot_and_a_tolerance_counts_to_its_edge():
+    exact = Arrival(xy_tolerance=0.0, yaw_tolerance=0.0, use_heading=True)
+    goal = Waypoints(np.array([[1.0, 2.0, 0.5]]))
+    assert goal.follow(np.array([1.0, 2.0, 0.5]), refuses, exact, GAIN)[1] is None
+    assert goal.follow(np.array([np.nextafter(1.0, 2.0), 2.0, 0.5]), echo, exact, GAIN)[1] is not None
+    edge = Arrival(xy_tolerance=0.25, yaw_tolerance=0.0, use_heading=False)
+    assert goal.follow(np.array([0.75, 2.0, 0.0]), refuses, edge, GAIN)[1] is None
+    assert goal.follow(np.array([np.nextafter(0.75, 0.0), 2.0, 0.0]), echo, edge, GAIN)[1] is not None
+
+
+def test_distance_is_to_the_waypoint_that_is_driven_to():
+    pose = np.array([-2.0, -3.0, 1.0])
+    for index, (x, y, _) in enumerate(POSES):
+        assert Waypoints(POSES, index).distance(pose) == pytest.approx(math.hypot(x + 2.0, y + 3.0))
+
+
+def test_following_changes_no_value_in_place():
+    waypoints, poses = Waypoints(POSES.copy()), POSES.copy()
+    waypoints.follow(np.array([1.0, 0.0, 0.0]), law, WITH_HEADING, GAIN)
+    assert (waypoints.index, waypoints.turning) == (0, False)
+    assert np.array_equal(waypoints.poses, poses)
