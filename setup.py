@@ -41,7 +41,7 @@ setup(
             f'ros-std-srvs=={MESSAGES}',
         ],
         'plot': ['matplotlib>=3.5'],
-        'test': ['hypothesis>=6', 'pytest>=7'],
+        'test': ['hypothesis>=6', 'pytest>=7', 'pyyaml>=5'],
     },
     zip_safe=False,
     entry_points={'console_scripts': [f'{name} = {PACKAGE}.entry_points:{name}' for name in COMMANDS]},

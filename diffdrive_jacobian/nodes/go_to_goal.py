@@ -20,7 +20,7 @@ from diffdrive_jacobian.control.waypoints import Law
 from diffdrive_jacobian.nodes.parameters import GoToGoalParameters, nanoseconds
 from diffdrive_jacobian.ros import messages
 from diffdrive_jacobian.ros.messages import MessageError
-from diffdrive_jacobian.ros.node import ParameterizedNode
+from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 
 LAWS: dict[str, Callable[[GoToGoalParameters], Law]] = {
@@ -145,7 +145,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
                     f"it must stay in frame '{self._odom_frame}', got '{message.header.frame_id}'"
                 )
         except MessageError as error:
-            self.warn(f'odometry dropped: {error}')
+            self.get_logger().warning(f'odometry dropped: {error}', throttle_duration_sec=THROTTLE)
             return
         self._odom_frame = message.header.frame_id
         if goal is None:
@@ -185,11 +185,13 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             return
         topic, timeout = self.resolve_topic_name('odom'), self.parameters.odom_timeout
         if not goal.executing:
-            self.warn(f'the goal waits for odometry on {topic}: is the robot running?')
+            self.get_logger().warning(f'the goal waits for odometry on {topic}: is the robot running?')
         elif not goal.stale:
             goal.stale = True
             self._publish_command(0.0, 0.0)
-            self.warn(f'no valid odometry on {topic} for {timeout:g} s: zero sent, waiting')
+            self.get_logger().warning(
+                f'no valid odometry on {topic} for {timeout:g} s: zero sent, waiting'
+            )
 
     def _publish_command(self, v: float, omega: float) -> None:
         if isinstance(self._message, TwistStamped):

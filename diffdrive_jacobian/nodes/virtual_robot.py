@@ -16,6 +16,8 @@ from geometry_msgs.msg import (
     TwistStamped,
 )
 from nav_msgs.msg import Odometry
+from rclpy.clock import JumpHandle, JumpThreshold, TimeJump
+from rclpy.duration import Duration
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
@@ -24,7 +26,7 @@ from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.nodes.parameters import VirtualRobotParameters, nanoseconds
 from diffdrive_jacobian.ros import messages
 from diffdrive_jacobian.ros.messages import MessageError
-from diffdrive_jacobian.ros.node import ParameterizedNode
+from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot, RobotModel
 
 
@@ -58,9 +60,25 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self.create_service(Trigger, 'reset_odometry', self._on_reset)
         self._timer = self.create_timer(1.0 / self.parameters.publish_rate, self._on_tick)
         self.report_unknown_parameters()
+        self._jumps = self._watch_jumps()
         self._advance()
 
     # --- Time
+
+    def _watch_jumps(self) -> list[JumpHandle]:
+        """Look at once when simulated time begins or time goes back, not with the next message."""
+        clock = self.get_clock()
+        back = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1))
+        handles = [clock.create_jump_callback(back, post_callback=lambda _: self._advance())]
+        if self.now() == 0:
+            first = JumpThreshold(min_forward=Duration(nanoseconds=1), min_backward=None)
+            handles.append(clock.create_jump_callback(first, post_callback=self._on_first_clock))
+        return handles
+
+    def _on_first_clock(self, _: TimeJump) -> None:
+        # It stays registered: rcl skips a neighbour if one leaves while they are called.
+        if self._robot is None:
+            self._advance()
 
     def _advance(self) -> tuple[int, Robot] | None:
         """Bring the robot past what happened by now; None while simulated time has not begun."""
@@ -134,7 +152,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             timeout = robot.model.command_timeout
             instant = messages.command_instant(stamp, now, robot.stamp, timeout)
         except MessageError as error:
-            self.warn(f'command dropped: {error}')
+            self.get_logger().warning(f'command dropped: {error}', throttle_duration_sec=THROTTLE)
             return
         self._robot = robot.commanded(twist, instant)
         self._publish_applied(self._robot)
@@ -156,7 +174,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
                 raise MessageError(f"it must be given in frame '{ours}', got '{frame}'")
             pose, covariance = messages.from_pose_with_covariance(message.pose)
         except MessageError as error:
-            self.warn(f'initialpose dropped: {error}')
+            self.get_logger().warning(f'initialpose dropped: {error}', throttle_duration_sec=THROTTLE)
             return
         now, robot = advanced
         self._place(robot.placed(pose, covariance, now))

@@ -12,7 +12,7 @@ from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.nodes.parameters import WheelBridgeParameters, nanoseconds
 from diffdrive_jacobian.ros import messages
 from diffdrive_jacobian.ros.messages import MessageError
-from diffdrive_jacobian.ros.node import ParameterizedNode
+from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 
 
@@ -56,7 +56,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
             timeout = nanoseconds(self.parameters.cmd_vel_timeout)
             self._last = messages.command_instant(stamp, now, last, timeout)
         except MessageError as error:
-            self.warn(f'command dropped: {error}')
+            self.get_logger().warning(f'command dropped: {error}', throttle_duration_sec=THROTTLE)
             return
         self._watchdog.feed(now)
         self._publish(self._wheel_speeds(v, omega), self._last)
@@ -84,7 +84,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
     def _on_silence(self) -> None:
         if self._moving:
             self._publish((0.0, 0.0), self.now())
-            self.warn(
+            self.get_logger().warning(
                 f'no command on {self.resolve_topic_name("cmd_vel")} '
                 f'for {self.parameters.cmd_vel_timeout:g} s: the wheels are stopped'
             )

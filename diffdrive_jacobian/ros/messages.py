@@ -4,8 +4,8 @@ Poses are `[x, y, theta]` (m, m, rad), twists `(v, omega)` (m/s, rad/s), instant
 Wheel joints stand left, right in messages (ROS habit) and right, left in the mathematics.
 
 Writing fills a message that is there: a node keeps one for each topic, for making the nested messages
-of ROS in Python costs more than sending them. Reading a message never trusts it: what cannot be meant raises MessageError, which says what was got
-and what is allowed.
+of ROS in Python costs more than sending them. Reading a message never trusts it: what cannot be meant
+raises MessageError, which says what was got and what is allowed.
 """
 
 from __future__ import annotations

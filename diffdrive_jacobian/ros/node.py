@@ -7,7 +7,8 @@ second, on the wall clock, and said once.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
@@ -21,14 +22,18 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 from diffdrive_jacobian.ros import parameters as ros_parameters
-from diffdrive_jacobian.ros.parameters import NodeParameters
+from diffdrive_jacobian.ros.parameters import NodeParameters, ParameterError
 
 P = TypeVar('P', bound=NodeParameters)
 
+THROTTLE = 2.0
+"""What may go wrong with every message is said so often at most (s). rclpy counts per line of code."""
 WATCH_PERIOD = 1.0
 """How often the graph and the clock are looked at (s)."""
 CLOCK_PATIENCE = 5
 """How many looks find no /clock before that is said."""
+NAME_PATIENCE = 3
+"""How many looks may find a node without a name before it is reported without one."""
 
 
 class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
@@ -57,7 +62,8 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         self.add_on_set_parameters_callback(self._judge_parameters)
         self.add_post_set_parameters_callback(self._after_parameters)
         self._watched: list[tuple[str, str, bool]] = []
-        self._mismatches: set[tuple[str, str, str]] = set()
+        self._looks: dict[tuple[str, str, str], int] = {}
+        self._said: set[tuple[str, str, str]] = set()
         self._looks_without_clock = 0
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(WATCH_PERIOD, self._watch, clock=steady)
@@ -72,27 +78,41 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         profile = QoSProfile(depth=10)
         if latched:
             profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
-        return self.create_publisher(
-            message,
-            topic,
-            profile,
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
+        with self._naming_other_types(message, topic):
+            return self.create_publisher(
+                message,
+                topic,
+                profile,
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
 
     def subscribe(self, message: type, topic: str, callback: Callable[[Any], None]) -> Subscription:
         """Create a subscription: reliable, keep last 10."""
         self._watched.append((topic, _type_name(message), True))
-        return self.create_subscription(
-            message,
-            topic,
-            callback,
-            QoSProfile(depth=10),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
+        with self._naming_other_types(message, topic):
+            return self.create_subscription(
+                message,
+                topic,
+                callback,
+                QoSProfile(depth=10),
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
 
-    def warn(self, text: str) -> None:
-        """Warn about something that may come with every message, at most every two seconds."""
-        self.get_logger().warning(text, throttle_duration_sec=2.0)
+    @contextmanager
+    def _naming_other_types(self, message: type, topic: str) -> Iterator[None]:
+        """Within one process Fast DDS refuses a topic of two types, without saying so."""
+        try:
+            yield
+        except RuntimeError as error:
+            name, wanted = self.resolve_topic_name(topic), _type_name(message)
+            types = dict(self.get_topic_names_and_types()).get(name, [])
+            others = ', '.join(other for other in types if other != wanted)
+            if not others:
+                raise
+            raise ParameterError(
+                f'{name} cannot be {wanted} in this node, it is {others} in another node of this '
+                'process; enable_stamped_cmd_vel must be the same for all of them'
+            ) from error
 
     def report_unknown_parameters(self) -> None:
         """Warn of parameters that the user gave and no part of the node has declared."""
@@ -119,29 +139,32 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
 
     def _watch(self) -> None:
         self._watch_clock()
-        mismatches = set()
+        looks: dict[tuple[str, str, str], int] = {}
         for topic, wanted, reading in self._watched:
             name = self.resolve_topic_name(topic)
-            if reading:
-                others = self.get_publishers_info_by_topic(name)
-            else:
-                others = self.get_subscriptions_info_by_topic(name)
-            for other in others:
-                if other.topic_type != wanted:
-                    mismatches.add((name, wanted, other.topic_type))
-                    self._report_mismatch(name, wanted, other, reading)
-        self._mismatches = mismatches
+            look = self.get_publishers_info_by_topic if reading else self.get_subscriptions_info_by_topic
+            for other in look(name):
+                mismatch = (name, wanted, other.topic_type)
+                if other.topic_type == wanted or mismatch in looks:
+                    continue
+                looks[mismatch] = self._looks.get(mismatch, 0) + 1
+                # The name of a node is found out later than its topics.
+                named = not other.node_name.startswith('_') or looks[mismatch] == NAME_PATIENCE
+                if named and mismatch not in self._said:
+                    self._said.add(mismatch)
+                    self._report_mismatch(mismatch, other, reading)
+        self._looks = looks
+        self._said &= looks.keys()
 
-    def _report_mismatch(self, name: str, wanted: str, other: Any, reading: bool) -> None:
-        if (name, wanted, other.topic_type) in self._mismatches:
-            return
+    def _report_mismatch(self, mismatch: tuple[str, str, str], other: Any, reading: bool) -> None:
+        name, wanted, theirs = mismatch
         who = f'{other.node_namespace.rstrip("/")}/{other.node_name}'
-        theirs, ours = ('publishes', 'reads') if reading else ('reads', 'publishes')
+        they_do, we_do = ('publishes', 'reads') if reading else ('reads', 'publishes')
         hint = ''
         if self.has_parameter('enable_stamped_cmd_vel') and 'Twist' in wanted:
             hint = '; enable_stamped_cmd_vel chooses between Twist and TwistStamped'
         self.get_logger().error(
-            f'{who} {theirs} {other.topic_type} on {name}, but this node {ours} {wanted}: '
+            f'{who} {they_do} {theirs} on {name}, but this node {we_do} {wanted}: '
             f'nothing will arrive{hint}'
         )
 

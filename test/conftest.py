@@ -1,0 +1,138 @@
+"""What the tests of the nodes share: one context per test that no other test can hear, and waiting for
+conditions instead of sleeping."""
+
+from __future__ import annotations
+
+import os
+import time
+
+# Before rclpy is loaded: nobody outside a test's context hears it, messages check their fields'
+# types, and nothing is written into the home directory.
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
+os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
+os.environ.setdefault('ROS_LOG_DIR', os.path.join(os.environ.get('TMPDIR', '/tmp'), 'ros_test_log'))
+
+import pytest
+
+PATIENCE = 20.0
+"""How long a condition may take to come true before the test fails (s)."""
+
+
+class Harness:
+    """A context with its nodes, an executor that serves them, and a plain node to talk to them."""
+
+    def __init__(self, context, executor):
+        from rclpy.node import Node
+
+        self.context = context
+        self.executor = executor
+        self.nodes = []
+        self.peer = self.add(Node, node_name='peer')
+
+    def add(self, node_class, *, parameters=None, **kwargs):
+        """Make a node with parameter overrides and serve it."""
+        from rclpy.parameter import Parameter
+
+        overrides = [Parameter(name, value=value) for name, value in (parameters or {}).items()]
+        node = node_class(context=self.context, parameter_overrides=overrides, **kwargs)
+        self.nodes.append(node)
+        self.executor.add_node(node)
+        return node
+
+    def listen(self, message_type, topic, *, latched=False):
+        """Collect the messages of a topic; returns the list that grows."""
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+
+        received = []
+        profile = QoSProfile(depth=1000)
+        if latched:
+            profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        self.peer.create_subscription(message_type, topic, received.append, profile)
+        return received
+
+    def talk(self, message_type, topic):
+        """Make a publisher that already has a reader."""
+        publisher = self.peer.create_publisher(message_type, topic, 100)
+        self.until(lambda: publisher.get_subscription_count() > 0, f'somebody reads {topic}')
+        return publisher
+
+    def until(self, condition, what='a condition', patience=PATIENCE):
+        """Serve the nodes until a condition holds, and fail if it never does."""
+        deadline = time.monotonic() + patience
+        while not condition():
+            assert time.monotonic() < deadline, f'not within {patience} s: {what}'
+            self.executor.spin_once(timeout_sec=0.01)
+
+    def call(self, service_type, name):
+        """Call a service without arguments; returns the response."""
+        client = self.peer.create_client(service_type, name)
+        self.until(client.service_is_ready, f'service {name}')
+        future = client.call_async(service_type.Request())
+        self.until(future.done, f'answer of {name}')
+        return future.result()
+
+    def close(self):
+        self.executor.shutdown()
+        for node in self.nodes:
+            node.destroy_node()
+
+
+class SimTime:
+    """A publisher of /clock: simulated time stands unless a test moves it."""
+
+    def __init__(self, harness):
+        from rosgraph_msgs.msg import Clock
+
+        self._harness = harness
+        self._message = Clock()
+        self._publisher = harness.peer.create_publisher(Clock, '/clock', 10)
+        self.now = 0
+
+    def set(self, nanoseconds):
+        """Let every node with simulated time see this instant."""
+        self.now = nanoseconds
+        stamp = self._message.clock
+        stamp.sec, stamp.nanosec = divmod(nanoseconds, 1_000_000_000)
+        self._publisher.publish(self._message)
+        watching = [
+            node
+            for node in self._harness.nodes
+            if node.has_parameter('use_sim_time') and node.get_parameter('use_sim_time').value
+        ]
+        self._harness.until(
+            lambda: all(node.get_clock().now().nanoseconds == nanoseconds for node in watching),
+            'the clock is seen by all nodes',
+        )
+
+    def advance(self, seconds, step=0.02):
+        """Let time pass in steps."""
+        for _ in range(round(seconds / step)):
+            self.set(self.now + round(step * 1e9))
+
+
+@pytest.fixture(params=['events', 'single'])
+def executor_kind(request):
+    """Both executors; tests that do not ask for this run on the faster one."""
+    return request.param
+
+
+@pytest.fixture
+def ros(request):
+    """A harness in a context of its own."""
+    from diffdrive_jacobian.ros.runner import make_executor, ros_context
+
+    # The EventsExecutor's timers may miss a step of simulated time when another follows at once.
+    single = 'sim_time' in request.fixturenames or (
+        'executor_kind' in request.fixturenames
+        and request.getfixturevalue('executor_kind') == 'single'
+    )
+    with ros_context(['test']) as context:
+        harness = Harness(context, make_executor(context, closed_world=not single))
+        yield harness
+        harness.close()
+
+
+@pytest.fixture
+def sim_time(ros):
+    """The /clock of the harness."""
+    return SimTime(ros)

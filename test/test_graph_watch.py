@@ -1,0 +1,59 @@
+"""What is silent in ROS is said: a topic of another type."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+from geometry_msgs.msg import TwistStamped
+from rclpy.node import Node
+
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.ros import node as ros_node
+from diffdrive_jacobian.ros.parameters import ParameterError
+from diffdrive_jacobian.ros.runner import make_executor, ros_context
+
+
+@pytest.mark.parametrize('stranger', ['publishes', 'reads'])
+def test_other_type_in_another_process_is_said_once(monkeypatch, capfd, stranger):
+    from conftest import Harness
+
+    # Two contexts are two participants, as two processes are; they meet on this machine only.
+    monkeypatch.setattr(ros_node, 'WATCH_PERIOD', 0.2)
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(os.getpid() % 100 + 1))
+    with ros_context(['test']) as context, ros_context(['other']) as other:
+        harness = Harness(context, make_executor(context, closed_world=False))
+        harness.add(VirtualRobot if stranger == 'publishes' else GoToGoal)
+        peer = Node('stranger', context=other)
+        if stranger == 'publishes':
+            peer.create_publisher(TwistStamped, 'cmd_vel', 10)
+        else:
+            peer.create_subscription(TwistStamped, 'cmd_vel', print, 10)
+        said = ''
+
+        def told():
+            nonlocal said
+            said += capfd.readouterr().err
+            return 'enable_stamped_cmd_vel' in said
+
+        harness.until(told, 'the error')
+        looks = []
+        harness.peer.create_timer(0.05, lambda: looks.append(capfd.readouterr().err))
+        harness.until(lambda: len(looks) == 5, 'more looks')
+        harness.close()
+        peer.destroy_node()
+    theirs, ours = ('publishes', 'reads') if stranger == 'publishes' else ('reads', 'publishes')
+    assert (
+        f'/stranger {theirs} geometry_msgs/msg/TwistStamped on /cmd_vel, but this node {ours} '
+        'geometry_msgs/msg/Twist: nothing will arrive' in said
+    )
+    assert 'nothing will arrive' not in ''.join(looks)
+
+
+def test_two_types_in_one_process_are_a_clear_error(ros):
+    ros.add(VirtualRobot)
+    with pytest.raises(ParameterError, match='enable_stamped_cmd_vel must be the same'):
+        ros.add(WheelBridge, parameters={'enable_stamped_cmd_vel': True})
