@@ -123,8 +123,7 @@ def ros(request):
 
     # The EventsExecutor's timers may miss a step of simulated time when another follows at once.
     single = 'sim_time' in request.fixturenames or (
-        'executor_kind' in request.fixturenames
-        and request.getfixturevalue('executor_kind') == 'single'
+        'executor_kind' in request.fixturenames and request.getfixturevalue('executor_kind') == 'single'
     )
     with ros_context(['test']) as context:
         harness = Harness(context, make_executor(context, closed_world=not single))

@@ -249,6 +249,14 @@ def test_limits_keep_the_curvature(ros):
     assert omega / v == pytest.approx(wanted_omega / wanted_v, rel=1e-12)
 
 
+def test_far_goals_ask_for_nothing_that_a_robot_would_drop(controller):
+    controller.send(goal(9e5, 9e5))
+    v, omega = controller.at(0, 0)
+    wanted_v, wanted_omega = go_to_goal([0, 0, 0], [9e5, 9e5], 3.0, 0.5)
+    assert v == 1000.0
+    assert omega / v == pytest.approx(wanted_omega / wanted_v, rel=1e-12)
+
+
 def test_stamped_commands_carry_the_time(ros):
     controller = Controller(ros, TwistStamped, enable_stamped_cmd_vel=True)
     controller.send(goal(1, 0))

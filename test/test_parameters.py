@@ -151,9 +151,7 @@ def test_unknown_parameters_are_named_with_what_was_meant(ros, capfd):
 
 
 def test_quality_of_service_can_be_overridden(ros):
-    node = ros.add(
-        VirtualRobot, parameters={'qos_overrides./odom.publisher.reliability': 'best_effort'}
-    )
+    node = ros.add(VirtualRobot, parameters={'qos_overrides./odom.publisher.reliability': 'best_effort'})
     (info,) = node.get_publishers_info_by_topic('/odom')
     assert info.qos_profile.reliability.name == 'BEST_EFFORT'
     (info,) = node.get_publishers_info_by_topic('/joint_states')

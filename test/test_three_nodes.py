@@ -64,7 +64,7 @@ def test_robot_arrives_and_stands(ros, executor_kind):
 def test_two_robots_in_two_namespaces_do_not_disturb_each_other(ros):
     targets = {'one': (1.0, 0.5), 'two': (-0.5, -1.0)}
     odoms, statuses = {}, {}
-    for name, target in targets.items():
+    for name in targets:
         team(ros, name, **QUICK)
         odoms[name] = ros.listen(Odometry, f'/{name}/odom')
         statuses[name] = ros.listen(GoalStatus, f'/{name}/goal_status', latched=True)

@@ -146,14 +146,11 @@ def test_cmd_vel_out_and_start_pose_tell_every_odometry_pose(ros, executor_kind)
             placement.pose.pose.position.x = random.uniform(-5, 5)
             placement.pose.covariance[0] = 0.1
             placements.publish(placement)
-    ros.until(
-        lambda: at_rest(odom[-1]) and applied[-1].twist == Twist() and len(starts) == 5, 'the end'
-    )
+    ros.until(lambda: at_rest(odom[-1]) and applied[-1].twist == Twist() and len(starts) == 5, 'the end')
     stops = [command for command in applied if command.twist == Twist()]
     assert len(stops) >= 3
     errors = [
-        np.abs(pose_of(one) - reproduce(applied, starts, from_time(one.header.stamp)))
-        for one in odom
+        np.abs(pose_of(one) - reproduce(applied, starts, from_time(one.header.stamp))) for one in odom
     ]
     assert np.max(errors) < 1e-9
     assert max(abs(one.twist.twist.linear.x) for one in odom) <= 0.4

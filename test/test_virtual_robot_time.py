@@ -1,4 +1,4 @@
-"""The node virtual_robot when time does what it likes, and when its parameters change while it drives."""
+"""The node virtual_robot when time does what it likes, and when its parameters change."""
 
 from __future__ import annotations
 

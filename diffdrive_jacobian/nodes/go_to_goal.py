@@ -219,7 +219,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         """Make from the parameters what every step needs."""
         parameters = self.parameters
         self._law = LAWS[parameters.controller](parameters)
-        self._limits = parameters.limits()
+        # Far from the goal the law may ask for more than any robot believes.
+        self._limits = parameters.limits(without=messages.MAX_SPEED)
         self._arrival = Arrival(
             xy_tolerance=parameters.xy_goal_tolerance,
             yaw_tolerance=parameters.yaw_goal_tolerance,

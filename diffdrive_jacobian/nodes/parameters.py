@@ -48,10 +48,15 @@ class LimitParameters(NodeParameters):
         nan_is_none=True,
     )
 
-    def limits(self, max_wheel_speed: float = math.nan) -> VelocityLimits:
-        """Gather the limits, NaN as in diff_drive_controller; `max_wheel_speed` in rad/s."""
-        max_v = _or(self.linear_x_max_velocity, math.inf)
-        max_omega = _or(self.angular_z_max_velocity, math.inf)
+    def limits(self, *, without: float = math.inf, max_wheel_speed: float = math.nan) -> VelocityLimits:
+        """Gather the limits, as diff_drive_controller reads them.
+
+        Args:
+            without: In the place of a limit that is not set (m/s, rad/s).
+            max_wheel_speed: Limit of the wheels; NaN: none (rad/s).
+        """
+        max_v = _or(self.linear_x_max_velocity, without)
+        max_omega = _or(self.angular_z_max_velocity, without)
         return VelocityLimits(
             min_v=_or(self.linear_x_min_velocity, -max_v),
             max_v=max_v,
@@ -61,8 +66,8 @@ class LimitParameters(NodeParameters):
         )
 
 
-def _or(value: float, without: float) -> float:
-    return without if math.isnan(value) else value
+def _or(value: float, otherwise: float) -> float:
+    return otherwise if math.isnan(value) else value
 
 
 def _wheel_radius() -> float:

@@ -217,7 +217,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         return RobotModel(
             wheel_radius=parameters.wheel_radius,
             wheel_separation=parameters.wheel_separation,
-            limits=parameters.limits(parameters.max_wheel_velocity),
+            limits=parameters.limits(max_wheel_speed=parameters.max_wheel_velocity),
             command_timeout=nanoseconds(parameters.cmd_vel_timeout),
             wheel_travel_variance=parameters.wheel_travel_variance,
         )

@@ -11,6 +11,7 @@ timer, a twist for each odometry, a joint command for each twist, a stamped twis
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import statistics
 import subprocess
@@ -118,10 +119,8 @@ def measure(side, executor_name, rate, seconds):
             ended = nodes[0].create_timer(
                 WARM_UP + seconds, lambda: (end(), ended.cancel(), context.try_shutdown())
             )
-            try:
+            with contextlib.suppress(rclpy.executors.ExternalShutdownException):
                 rclpy.spin(nodes[0], executor)
-            except rclpy.executors.ExternalShutdownException:
-                pass
         else:
             stop = time.monotonic() + WARM_UP
             while time.monotonic() < stop:

@@ -1,0 +1,157 @@
+"""Entry points as child processes: started in a ROS domain of their own, watched, and always ended."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+import subprocess
+import sys
+import threading
+import time
+from contextlib import ExitStack, contextmanager
+from functools import cached_property
+from unittest import mock
+
+from conftest import PATIENCE, Harness
+
+LIMIT = 30.0
+"""How long a child may live (s): then it is killed, whatever became of its test."""
+PROGRAM = 'import sys; from diffdrive_jacobian.entry_points import {0}; sys.exit({0}())'
+
+_numbers = itertools.count()
+
+
+class Child:
+    """A running entry point; what it prints goes into files, so that no pipe can fill up."""
+
+    def __init__(self, name, arguments, directory):
+        self.command = ' '.join([name, *arguments])
+        number = next(_numbers)
+        self._out, self._err = (directory / f'{number}_{name}.{end}' for end in ('out', 'err'))
+        with self._out.open('wb') as out, self._err.open('wb') as err:
+            self._process = subprocess.Popen(
+                [sys.executable, '-c', PROGRAM.format(name), *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=err,
+            )
+        self._limit = threading.Timer(LIMIT, self._process.kill)
+        self._limit.daemon = True
+        self._limit.start()
+
+    @property
+    def stdout(self):
+        return self._out.read_text()
+
+    @property
+    def stderr(self):
+        return self._err.read_text()
+
+    @property
+    def last_line(self):
+        return self.stdout.splitlines()[-1]
+
+    @property
+    def running(self):
+        return self._process.poll() is None
+
+    def signal(self, number):
+        """Send a signal; nothing happens if it has exited."""
+        self._process.send_signal(number)
+
+    def until_says(self, pattern):
+        """Wait until it has printed something, on stdout or stderr."""
+        self._until(lambda: re.search(pattern, self.stdout + self.stderr), f'says {pattern!r}')
+
+    def until_catches(self, number):
+        """Wait until it has a handler for a signal that would end it otherwise."""
+
+        def caught():
+            with open(f'/proc/{self._process.pid}/status') as status:
+                mask = next(line for line in status if line.startswith('SigCgt:')).split()[1]
+            return int(mask, 16) >> (number - 1) & 1
+
+        self._until(caught, f'catches {number!r}')
+
+    def exit(self, patience=PATIENCE):
+        """Wait for its end; gives the exit code, negative if a signal killed it."""
+        try:
+            return self._process.wait(patience)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f'not within {patience} s: {self.command} exits') from None
+
+    def close(self):
+        """Kill it, stopped or hung as it may be."""
+        self._limit.cancel()
+        self._process.kill()
+        self._process.wait()
+
+    def _until(self, condition, what):
+        deadline = time.monotonic() + PATIENCE
+        while not condition():
+            assert self.running, f'{self.command} exited with {self.exit()} before it {what}'
+            assert time.monotonic() < deadline, f'not within {PATIENCE} s: {self.command} {what}'
+            time.sleep(0.005)
+
+
+class World:
+    """A ROS domain on this machine with the processes started in it, and a harness that hears them."""
+
+    def __init__(self, directory):
+        self._directory = directory
+        self._children = []
+        self._stack = ExitStack()
+
+    def start(self, name, *arguments):
+        """Start an entry point."""
+        child = Child(name, arguments, self._directory)
+        self._children.append(child)
+        return child
+
+    def run(self, name, *arguments):
+        """Start an entry point and wait for its end."""
+        child = self.start(name, *arguments)
+        child.exit()
+        return child
+
+    @cached_property
+    def harness(self):
+        """A node in this process that the children can hear, and its executor."""
+        from diffdrive_jacobian.ros.runner import make_executor, ros_context
+
+        context = self._stack.enter_context(ros_context(['test']))
+        harness = Harness(context, make_executor(context, closed_world=False))
+        self._stack.callback(harness.close)
+        return harness
+
+    def until_published(self, *topics):
+        """Wait until each topic has a publisher."""
+        for topic in topics:
+            self.harness.until(lambda t=topic: self.harness.peer.count_publishers(t), f'has {topic}')
+
+    def close(self):
+        """End everything, and show what was printed: pytest hides it unless the test failed."""
+        for child in self._children:
+            child.close()
+        for child in self._children:
+            print(f'--- {child.command}: {child.exit()}\n{child.stdout}{child.stderr}')
+        self._stack.close()
+
+
+@contextmanager
+def open_world(directory):
+    """Hold a world of its own; files go into a directory."""
+    # Domains beyond 101 collide with the ports that Linux gives to clients.
+    domain = (os.getpid() * 37 + next(_numbers)) % 100 + 1
+    environment = {
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        'ROS_DOMAIN_ID': str(domain),
+        'ROS_LOG_DIR': str(directory),
+    }
+    with mock.patch.dict(os.environ, environment):
+        world = World(directory)
+        try:
+            yield world
+        finally:
+            world.close()

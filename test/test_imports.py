@@ -1,0 +1,106 @@
+"""The house: imports go down only, the pure half needs NumPy alone, and only the tools print."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import diffdrive_jacobian
+
+PACKAGE = diffdrive_jacobian.__name__
+HOUSE = Path(diffdrive_jacobian.__file__).parent
+# From the ground up: each layer may import itself and what stands before it.
+LAYERS = ('kinematics', 'control', 'simulation', 'ros', 'nodes', 'tools')
+PURE = LAYERS[:3]
+# Modules beside the layers, and the layers they may import.
+DOORS = {'__init__': (), 'entry_points': LAYERS}
+
+LOAD = """
+import importlib, sys
+import numpy
+before = set(sys.modules)
+importlib.import_module(sys.argv[1])
+print(*sorted(set(sys.modules) - before))
+"""
+
+
+def sources(*layers):
+    return [path for layer in layers for path in sorted((HOUSE / layer).rglob('*.py'))]
+
+
+def place(path) -> str:
+    """Give the layer of a file, or its name if it stands beside them."""
+    first, *rest = path.relative_to(HOUSE).parts
+    return first if rest else path.stem
+
+
+def imported(path) -> set[str]:
+    """Collect what a file imports, anywhere in it: `a`, `a.b` or, of `from a import b`, also `a.b`."""
+    package = '.'.join((PACKAGE, *path.parent.relative_to(HOUSE).parts))
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            module = importlib.util.resolve_name('.' * node.level + (node.module or ''), package)
+            names.update({module, *(f'{module}.{alias.name}' for alias in node.names)})
+    return names
+
+
+def test_every_directory_of_the_house_has_its_place():
+    found = {path.relative_to(HOUSE).parts[0] for path in HOUSE.rglob('*.py') if path.parent != HOUSE}
+    assert found == set(LAYERS)
+    assert {path.stem for path in HOUSE.glob('*.py')} == set(DOORS)
+
+
+@pytest.mark.parametrize(
+    'path', sorted(HOUSE.rglob('*.py')), ids=lambda path: str(path.relative_to(HOUSE))
+)
+def test_imports_go_down_only(path):
+    here = place(path)
+    allowed = DOORS[here] if here in DOORS else LAYERS[: LAYERS.index(here) + 1]
+    ours = {name.split('.')[1] for name in imported(path) if name.startswith(f'{PACKAGE}.')}
+    assert ours & {*LAYERS, *DOORS} <= set(allowed)
+
+
+@pytest.mark.parametrize('path', sources(*PURE), ids=lambda path: str(path.relative_to(HOUSE)))
+def test_the_pure_half_names_nothing_but_numpy(path):
+    outside = {name.split('.')[0] for name in imported(path)} - sys.stdlib_module_names
+    assert outside <= {'numpy', PACKAGE}
+
+
+@pytest.mark.parametrize('layer', PURE)
+def test_the_pure_half_loads_nothing_but_numpy(layer):
+    """In an interpreter of its own: no rclpy, no message package, no rosbags, nothing from above."""
+    run = subprocess.run(
+        [sys.executable, '-c', LOAD, f'{PACKAGE}.{layer}'],
+        cwd=HOUSE.parent,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    loaded = set(run.stdout.split())
+    assert f'{PACKAGE}.{layer}' in loaded
+    assert {name.split('.')[0] for name in loaded} - sys.stdlib_module_names <= {'numpy', PACKAGE}
+    floors = {name.split('.')[1] for name in loaded if name.startswith(f'{PACKAGE}.')}
+    assert floors <= set(LAYERS[: LAYERS.index(layer) + 1])
+
+
+def test_only_the_tools_print():
+    """Neither `print` nor a standard stream is named below the tools."""
+    loud = set()
+    for path in HOUSE.rglob('*.py'):
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+            named = getattr(node, 'id', None) == 'print' or getattr(node, 'attr', None) in (
+                'stdout',
+                'stderr',
+            )
+            if isinstance(node, (ast.Name, ast.Attribute)) and named:
+                loud.add(place(path))
+    assert loud == {'tools'}

@@ -1,0 +1,245 @@
+"""The nodes and send_goal as processes: signals, exit codes, goals from one process to another."""
+
+from __future__ import annotations
+
+import signal
+import time
+
+import pytest
+from processes import open_world
+
+from diffdrive_jacobian.ros.parameters import specifications
+
+NODES = {'virtual_robot': 'odom', 'go_to_goal': 'goal_status', 'wheel_bridge': 'joint_command'}
+"""Each node with a topic that it publishes."""
+FAST = ('--ros-args', '-p', 'kp:=6.0', '-p', 'kv:=2.0')
+FAR = ('50', '0')
+
+
+@pytest.fixture
+def world(tmp_path):
+    with open_world(tmp_path) as made:
+        yield made
+
+
+class Drive:
+    """A robot, a controller and what is heard of them."""
+
+    def __init__(self, world, *gains):
+        from action_msgs.msg import GoalStatus
+        from geometry_msgs.msg import Twist
+        from nav_msgs.msg import Odometry
+
+        self.world, self.harness = world, world.harness
+        self.robot = world.start('virtual_robot')
+        self.controller = world.start('go_to_goal', *gains)
+        self.odometry = self.harness.listen(Odometry, 'odom')
+        self.commands = self.harness.listen(Twist, 'cmd_vel')
+        self.status = self.harness.listen(GoalStatus, 'goal_status', latched=True)
+
+    def send(self, *arguments):
+        """Start send_goal; returns it once the robot drives and the progress is shown."""
+        sender = self.world.start('send_goal', *arguments)
+        self.harness.until(self.drives, 'the robot drives')
+        sender.until_says('m to go')
+        return sender
+
+    def drives(self):
+        return bool(self.odometry) and self.odometry[-1].twist.twist.linear.x > 0.1
+
+    def stands(self):
+        twist = self.odometry[-1].twist.twist
+        return twist.linear.x == twist.angular.z == 0.0
+
+    def until_canceled(self):
+        """Wait for the end of the last goal and of the robot's motion."""
+        self.harness.until(lambda: self.status[-1].status == self.status[-1].STATUS_CANCELED, 'CANCELED')
+        self.harness.until(self.stands, 'the robot stands')
+
+
+# --- Signals
+
+
+@pytest.mark.parametrize(
+    'signals',
+    [(signal.SIGINT,), (signal.SIGTERM,), (signal.SIGHUP,), (signal.SIGINT, signal.SIGINT)],
+    ids=lambda signals: '+'.join(number.name for number in signals),
+)
+def test_nodes_exit_0_on_a_signal(world, signals):
+    children = [world.start(name) for name in NODES]
+    world.until_published(*NODES.values())
+    for number in signals:
+        for child in children:
+            child.signal(number)
+    assert [child.exit(5.0) for child in children] == [0, 0, 0]
+    for child in children:
+        assert 'Traceback' not in child.stderr
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+def test_nodes_exit_0_on_signals_that_do_not_cease(world, number):
+    # From the start of the imports to the last moment of the interpreter.
+    children = [world.start(name) for name in NODES]
+    for child in children:
+        child.until_catches(signal.SIGHUP)
+    deadline = time.monotonic() + 10.0
+    while any(child.running for child in children):
+        assert time.monotonic() < deadline
+        for child in children:
+            child.signal(number)
+        time.sleep(0.003)
+    assert [child.exit() for child in children] == [0, 0, 0]
+    for child in children:
+        assert 'Traceback' not in child.stderr
+
+
+def test_sigterm_to_the_controller_stops_the_robot(world):
+    drive = Drive(world)
+    sender = drive.send(*FAR)
+    drive.controller.signal(signal.SIGTERM)
+    assert drive.controller.exit(5.0) == 0
+    assert 'Traceback' not in drive.controller.stderr
+    assert sender.exit() == 1
+    assert sender.last_line.startswith(('canceled', 'lost'))
+    drive.until_canceled()
+    twist = drive.commands[-1]
+    assert twist.linear.x == twist.angular.z == 0.0
+
+
+# --- Goals
+
+
+def test_send_goal_drives_three_processes_to_the_goal(world):
+    world.start('virtual_robot', '--ros-args', '-p', 'command_interface:=wheels')
+    world.start('go_to_goal', *FAST)
+    world.start('wheel_bridge')
+    sender = world.run('send_goal', '1', '1')
+    assert sender.exit() == 0
+    assert sender.last_line.startswith('arrived')
+    assert sender.stderr == ''
+
+
+def test_an_older_status_does_not_confuse_send_goal(world):
+    drive = Drive(world, *FAST)
+    for x in ('0.1', '0.4'):
+        sender = world.run('send_goal', x, '0')
+        assert (sender.exit(), sender.last_line[:7]) == (0, 'arrived')
+        drive.harness.until(
+            lambda x=x: abs(drive.odometry[-1].pose.pose.position.x - float(x)) < 0.021, f'is at {x}'
+        )
+
+
+def test_ctrl_c_cancels_the_goal(world):
+    drive = Drive(world)
+    sender = drive.send(*FAR)
+    sender.signal(signal.SIGINT)
+    assert sender.exit(5.0) == 130
+    assert sender.last_line == 'canceled: the robot was stopped'
+    assert 'Traceback' not in sender.stderr
+    drive.until_canceled()
+    assert drive.controller.running
+
+
+def test_a_second_ctrl_c_ends_the_wait_for_a_controller_that_hangs(world):
+    drive = Drive(world)
+    sender = drive.send(*FAR)
+    drive.controller.signal(signal.SIGSTOP)
+    begun = time.monotonic()
+    while sender.running and time.monotonic() < begun + 4.0:
+        sender.signal(signal.SIGINT)
+        time.sleep(0.3)
+    assert sender.exit(0.1) == 130
+    assert sender.last_line.endswith('the robot may still drive')
+    assert 'Traceback' not in sender.stderr
+
+
+def test_timeout_cancels_the_goal(world):
+    drive = Drive(world)
+    sender = world.run('send_goal', *FAR, '--timeout', '0.5')
+    assert sender.exit() == 1
+    lines = sender.stdout.splitlines()
+    assert lines[-2].startswith('not arrived within --timeout 0.5 s')
+    assert lines[-1] == 'canceled: the robot was stopped'
+    drive.until_canceled()
+
+
+def test_no_wait_leaves_the_goal_to_the_controller(world):
+    drive = Drive(world)
+    sender = world.run('send_goal', *FAR, '--no-wait')
+    assert sender.exit() == 0
+    assert sender.stdout == 'sent: goal (50, 0) on /goal_pose\n'
+    drive.harness.until(drive.drives, 'the robot drives')
+
+
+def test_a_goal_in_a_foreign_frame_is_refused(world):
+    drive = Drive(world)
+    sender = world.run('send_goal', '1', '1', '--frame', 'map')
+    assert sender.exit() == 1
+    assert sender.last_line.startswith('aborted')
+    drive.controller.until_says("refused: .*'odom'.*'map'")
+    assert not drive.commands
+
+
+def test_send_goal_without_a_controller_says_so(world):
+    sender = world.run('send_goal', '-1', '-1e-1', '--wait', '1', '--ros-args', '-r', '__ns:=/here')
+    assert sender.exit() == 1
+    assert sender.last_line.startswith('not sent: nobody read /here/goal_pose within 1 s')
+    assert sender.stderr == ''
+
+
+# --- Parameters and arguments
+
+REFUSED = [
+    ('virtual_robot', ('-p', 'wheel_radius:=0.0'), ("'wheel_radius'", '0.0', '[0.001, 10]')),
+    ('virtual_robot', ('-p', 'enable_odom_tf:=3'), ("'enable_odom_tf'", 'got 3', 'true or false')),
+    ('go_to_goal', ('-p', 'kp:=fast'), ("'kp'", "'fast'", 'double')),
+    ('go_to_goal', ('-p', 'use_sim_time:=often'), ("'use_sim_time'", "'often'", 'BOOL')),
+    ('wheel_bridge', ('-p', 'left_wheel_name:=right_wheel_joint'), ("'left_wheel_name'", 'differ')),
+    # RuntimeError and RCLError of rclpy, not InvalidQosOverridesError.
+    ('go_to_goal', ('-p', 'qos_overrides./odom.subscription.reliability:=often'), ('often',)),
+    ('go_to_goal', ('-p', 'qos_overrides./odom.subscription.depth:=-3'), ('go_to_goal: error:',)),
+    ('go_to_goal', ('--params-file', 'nowhere.yaml'), ('nowhere.yaml',)),
+    ('go_to_goal', ('--params-file', 'malformed.yaml'), ('malformed.yaml',)),
+    ('go_to_goal', ('--', '--bogus'), ('--bogus',)),
+]
+
+
+@pytest.mark.parametrize('cases', [REFUSED[:5], REFUSED[5:7], REFUSED[7:]], ids=['value', 'qos', 'file'])
+def test_what_a_node_cannot_run_with_is_said(world, tmp_path, monkeypatch, cases):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'malformed.yaml').write_text('go_to_goal: [1, 2\n  b: }')
+    children = [world.start(name, '--ros-args', *arguments) for name, arguments, _ in cases]
+    for child, (name, _, words) in zip(children, cases, strict=True):
+        child.exit()
+    for child, (name, _, words) in zip(children, cases, strict=True):
+        assert (child.exit(), child.stdout) == (2, ''), child.command
+        assert 'Traceback' not in child.stderr
+        line = child.stderr.splitlines()[-1]
+        assert line.startswith(f'{name}: error: ')
+        assert not [word for word in words if word not in line]
+        if cases is REFUSED[:5]:
+            assert child.stderr == f'{line}\n'
+
+
+def test_an_integer_is_taken_for_a_double_and_an_unknown_parameter_is_named(world, tmp_path):
+    from rcl_interfaces.srv import GetParameters
+
+    file = tmp_path / 'parameters.yaml'
+    file.write_text('go_to_goal:\n  ros__parameters:\n    xy_goal_tolerence: 0.1\n    kp: 4\n')
+    node = world.start('go_to_goal', '--ros-args', '--params-file', str(file), '-p', 'kv:=1')
+    node.until_says("unknown parameter 'xy_goal_tolerence' .* did you mean 'xy_goal_tolerance'")
+    client = world.harness.peer.create_client(GetParameters, 'go_to_goal/get_parameters')
+    world.harness.until(client.service_is_ready, 'parameter service')
+    future = client.call_async(GetParameters.Request(names=['kp', 'kv']))
+    world.harness.until(future.done, 'parameters')
+    assert [value.double_value for value in future.result().values] == [4.0, 1.0]
+
+
+def test_help_lists_every_parameter(world):
+    from diffdrive_jacobian.tools.run_node import NODES as CLASSES
+
+    children = {name: world.start(name, '--help') for name in NODES}
+    for name, child in children.items():
+        assert (child.exit(), child.stderr) == (0, '')
+        lines = [line.strip() for line in child.stdout.splitlines()]
+        assert set(specifications(CLASSES[name][1])) <= set(lines)

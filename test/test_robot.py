@@ -1,0 +1,245 @@
+"""The virtual robot as a value: its motion is a function of its commands and their instants alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from diffdrive_jacobian.control import VelocityLimits
+from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
+from diffdrive_jacobian.kinematics.se2 import integrate, wrap_angle
+from diffdrive_jacobian.simulation import Robot, RobotModel
+from diffdrive_jacobian.simulation.odometry_noise import propagate_covariance, twist_covariance
+
+SECOND = 1_000_000_000
+LIMITS = VelocityLimits(min_v=-0.1, max_v=0.22, min_omega=-2.0, max_omega=2.0, max_wheel_speed=10.0)
+MODEL = RobotModel(limits=LIMITS, command_timeout=SECOND // 4)
+HELD = replace(MODEL, command_timeout=0)
+EPOCH = 1_999_999_999_123_456_789
+START = np.array([0.3, -0.2, 2.9])
+STANDING = ((0.0, 0.0), (0.0, 0.0), None)
+COVARIANCE = np.array([[4e-4, 1e-4, 0.0], [1e-4, 2e-4, -1e-4], [0.0, -1e-4, 9e-4]])
+
+
+def start(model=MODEL, stamp=0) -> Robot:
+    return Robot(model=model, stamp=stamp, pose=START, covariance=COVARIANCE)
+
+
+def random_commands(rng, count=12):
+    """Draw commands at instants up to 0.4 s apart: some outlive their timeout of 0.25 s, some do not."""
+    instants = np.cumsum(rng.integers(1, 2 * SECOND // 5, count)).tolist()
+    twists = rng.normal(0.0, [0.3, 3.0], (count, 2))
+    twists[rng.random(count) < 0.2] = 0.0
+    return [
+        (instant, (float(v), float(omega))) for instant, (v, omega) in zip(instants, twists, strict=True)
+    ]
+
+
+def driven(robot, commands, rate=None, offset=0):
+    """Apply commands; with a rate, somebody looks, and notices a timeout, at every tick in between."""
+    period = SECOND // rate if rate else None
+    tick = offset
+    for instant, twist in commands:
+        while rate and tick + period < offset + instant:
+            tick += period
+            expiry = robot.expiry
+            robot.at(tick)
+            if expiry is not None and expiry <= tick:
+                robot = robot.at(expiry)
+        robot = robot.commanded(twist, offset + instant)
+    return robot.at(offset + commands[-1][0] + SECOND)
+
+
+def state(robot):
+    """All that is known of a robot, to the last bit, but for its time."""
+    arrays = (robot.pose, robot.covariance, robot.wheel_angles)
+    return (
+        *(np.asarray(array).tobytes() for array in arrays),
+        robot.command,
+        robot.twist,
+        robot.commanded_at,
+    )
+
+
+def drive(robot):
+    return robot.command, robot.twist, robot.expiry
+
+
+def close(robot, other, tolerance=1e-12):
+    difference = robot.pose - other.pose
+    assert np.abs(difference[:2]).max() < tolerance
+    assert abs(wrap_angle(difference[2])) < tolerance
+    np.testing.assert_allclose(robot.covariance, other.covariance, rtol=tolerance, atol=1e-3 * tolerance)
+    np.testing.assert_allclose(robot.wheel_angles, other.wheel_angles, rtol=tolerance, atol=tolerance)
+
+
+# --- A function of the commands alone
+
+
+@pytest.mark.parametrize('seed', range(5))
+@pytest.mark.parametrize('model', [MODEL, HELD])
+def test_looking_changes_nothing_to_the_last_bit(seed, model):
+    commands = random_commands(np.random.default_rng(seed))
+    unseen = driven(start(model), commands)
+    assert np.hypot(*(unseen.pose - START)[:2]) > 1e-3
+    for rate in (10, 50, 1000):
+        assert state(driven(start(model), commands, rate)) == state(unseen)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_near_the_epoch_nothing_is_lost(seed):
+    commands = random_commands(np.random.default_rng(10 + seed))
+    early, late = driven(start(), commands), driven(start(stamp=EPOCH), commands, offset=EPOCH)
+    assert state(early) == state(late)
+    assert late.stamp - early.stamp == EPOCH
+    # A nanosecond is a nanosecond: 0.2 m/s for 1 ns is 0.2 nm.
+    one = Robot(model=HELD, stamp=EPOCH, pose=np.zeros(3)).commanded((0.2, 0.0), EPOCH).at(EPOCH + 1)
+    assert one.pose[0] == 0.2 * 1e-9
+
+
+def test_a_held_command_is_the_same_command_issued_often():
+    twist, rng = (0.2, -1.3), np.random.default_rng(20)
+    once = often = start(HELD).commanded(twist, 0)
+    for instant in np.unique(rng.integers(1, 3 * SECOND, 500)).tolist():
+        often = often.commanded(twist, instant)
+    close(often.at(3 * SECOND), once.at(3 * SECOND))
+
+
+def test_between_events_the_state_is_one_exact_arc_with_its_covariance():
+    robot = start(HELD).commanded((0.15, 1.1), 7)
+    there = robot.at(7 + 2 * SECOND)
+    assert np.array_equal(there.pose, integrate(START, (0.15, 1.1), 2.0))
+    k, separation = HELD.wheel_travel_variance, HELD.wheel_separation
+    expected = propagate_covariance(COVARIANCE, START, (0.15, 1.1), 2.0, separation, k)
+    assert np.array_equal(there.covariance, expected)
+    expected = twist_covariance((0.15, 1.1), separation, k, 0.02)
+    assert np.array_equal(robot.twist_covariance(0.02), expected)
+
+
+def test_a_robot_cannot_go_back():
+    robot = start().commanded((0.1, 0.0), 100)
+    assert robot.at(100).stamp == 100
+    for call in (
+        lambda: robot.at(99),
+        lambda: robot.commanded((0.1, 0.0), 99),
+        lambda: robot.remodelled(HELD, 99),
+    ):
+        with pytest.raises(ValueError, match='cannot go back from 100 ns to 99 ns'):
+            call()
+
+
+# --- Twist, wheels
+
+
+def test_the_driven_twist_keeps_the_commanded_curvature_and_the_wheels_turn_with_it():
+    rng = np.random.default_rng(21)
+    for v, omega in rng.normal(0.0, [0.5, 5.0], (200, 2)).tolist():
+        robot = start(HELD).commanded((v, omega), 0)
+        assert robot.command == (v, omega)
+        assert robot.twist[0] * omega == pytest.approx(robot.twist[1] * v, rel=1e-12)
+        assert np.abs(robot.wheel_speeds).max() <= LIMITS.max_wheel_speed * (1.0 + 1e-12)
+        r, separation = HELD.wheel_radius, HELD.wheel_separation
+        assert wheel_to_body(*robot.wheel_speeds, r, separation) == pytest.approx(robot.twist, rel=1e-12)
+        there = robot.at(3 * SECOND // 2)
+        assert np.array_equal(there.wheel_angles, np.multiply(robot.wheel_speeds, 1.5))
+        # What the wheels turned is what the body moved: J_w of the angles is way and turn.
+        way, turn = wheel_to_body(*there.wheel_angles, r, separation)
+        assert (way, turn) == pytest.approx((robot.twist[0] * 1.5, robot.twist[1] * 1.5), rel=1e-12)
+        assert wrap_angle(there.pose[2] - START[2] - turn) == pytest.approx(0.0, abs=1e-12)
+
+
+# --- The timeout
+
+
+@pytest.mark.parametrize('stamp', [0, EPOCH])
+@pytest.mark.parametrize('look_after', [250_000_000, 250_000_001, 3 * SECOND])
+def test_the_timeout_strikes_at_its_own_instant(stamp, look_after):
+    robot = start(stamp=stamp).commanded((0.2, 1.0), stamp)
+    assert robot.expiry == stamp + 250_000_000
+    before, after = robot.at(robot.expiry - 1), robot.at(stamp + look_after)
+    assert (before.twist, before.expiry) == ((0.2, 1.0), robot.expiry)
+    assert after.pose.tobytes() == integrate(START, (0.2, 1.0), 0.25).tobytes()
+    assert drive(after) == STANDING
+    assert after.stamp == stamp + look_after
+
+
+def test_a_new_command_starts_the_timeout_anew_and_standing_still_needs_none():
+    robot = start().commanded((0.2, 0.0), 0).commanded((0.2, 0.0), 200_000_000)
+    assert robot.expiry == 450_000_000
+    assert robot.commanded((0.0, 0.0), 300_000_000).expiry is None
+    assert start(HELD).commanded((0.2, 0.0), 0).expiry is None
+    assert start().expiry is None
+
+
+# --- Other models, other places
+
+
+def test_a_timeout_shortened_below_the_age_of_the_command_strikes_at_once():
+    robot = start().commanded((0.2, 1.0), 0)
+    now = 200_000_000
+    longer = robot.remodelled(replace(MODEL, command_timeout=SECOND), now)
+    assert longer.expiry == SECOND
+    still_to_come = robot.remodelled(replace(MODEL, command_timeout=220_000_000), now)
+    assert still_to_come.expiry == 220_000_000
+    late = robot.remodelled(replace(MODEL, command_timeout=100_000_000), now)
+    assert late.expiry == now
+    stopped = late.at(now + SECOND)
+    assert stopped.twist == (0.0, 0.0)
+    assert stopped.pose.tobytes() == robot.at(now).pose.tobytes()
+    assert robot.remodelled(HELD, now).expiry is None
+
+
+def test_new_limits_apply_at_once_and_raised_again_they_give_the_command_back():
+    now, command = 50_000_000, (0.2, 1.5)
+    robot = start().commanded(command, 0)
+    slow = robot.remodelled(replace(MODEL, limits=VelocityLimits(max_v=0.05)), now)
+    assert slow.twist == pytest.approx((0.05, 0.375), rel=1e-12)
+    assert slow.command == command
+    assert slow.pose.tobytes() == robot.at(now).pose.tobytes()
+    restored = slow.remodelled(MODEL, 2 * now)
+    assert restored.twist == robot.twist == command
+    path = START
+    for twist in (command, slow.twist, command):
+        path = integrate(path, twist, 0.05)
+    assert restored.at(3 * now).pose.tobytes() == path.tobytes()
+    # The command is no younger for it.
+    assert restored.expiry == robot.expiry
+    forbidden = robot.remodelled(replace(MODEL, limits=VelocityLimits(max_v=0.0, max_omega=0.0)), now)
+    assert forbidden.twist == (0.0, 0.0)
+    assert forbidden.remodelled(MODEL, SECOND).twist == (0.0, 0.0)
+
+
+def test_new_wheels_turn_from_the_instant_they_are_mounted():
+    now, command = 100_000_000, (0.15, 1.0)
+    robot = start(HELD).commanded(command, 0)
+    twice = replace(HELD, wheel_radius=2.0 * HELD.wheel_radius)
+    here = robot.remodelled(twice, now)
+    assert here.wheel_speeds == pytest.approx(np.divide(robot.wheel_speeds, 2.0))
+    expected = np.add(robot.at(now).wheel_angles, np.multiply(robot.wheel_speeds, 0.05))
+    np.testing.assert_allclose(here.at(2 * now).wheel_angles, expected, rtol=1e-12)
+
+
+def test_placed_begins_anew_and_drives_on():
+    robot, place, now = start().commanded((0.2, 1.0), 0), np.array([5.0, 6.0, -3.0]), 100_000_000
+    placed = robot.placed(place, np.zeros((3, 3)), now)
+    assert placed.pose.tolist() == place.tolist()
+    assert not placed.covariance.any()
+    assert np.array_equal(placed.wheel_angles, robot.at(now).wheel_angles)
+    assert np.any(placed.wheel_angles)
+    assert drive(placed) == drive(robot) == ((0.2, 1.0), (0.2, 1.0), 250_000_000)
+    assert placed.at(2 * now).pose.tobytes() == integrate(place, (0.2, 1.0), 0.1).tobytes()
+    late = robot.placed(place, np.zeros((3, 3)), SECOND)
+    assert drive(late) == STANDING
+    assert late.at(9 * SECOND).pose.tolist() == place.tolist()
+
+
+def test_restarted_stands_still_on_an_earlier_time_line():
+    robot = start(stamp=EPOCH).commanded((0.2, 1.0), EPOCH).at(EPOCH + 100_000_000)
+    restarted = robot.restarted(5)
+    assert restarted.stamp == 5
+    assert drive(restarted) == STANDING
+    assert state(restarted.at(10 * SECOND)) == state(restarted)
+    # It stays where it is, and keeps what it knows of it.
+    assert state(restarted)[:3] == state(robot)[:3]
