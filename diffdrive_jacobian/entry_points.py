@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 
-from diffdrive_jacobian.ros.signals import Signals, ignore_from_now_on
+from diffdrive_jacobian.ros.signals import Signals
 
 
 def _run(module: str, function: str, *arguments: str) -> int:
-    with Signals() as signals:
+    signals = Signals()
+    signals.catch()
+    try:
         run = getattr(importlib.import_module(f'diffdrive_jacobian.tools.{module}'), function)
         code: int = run(*arguments, sys.argv[1:], signals)
-        ignore_from_now_on()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Who read our output went away (as `head` does): nobody is left to tell.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 1
+    finally:
+        signals.ignore()
     return code
 
 

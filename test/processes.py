@@ -5,8 +5,10 @@ from __future__ import annotations
 import itertools
 import os
 import re
+import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from contextlib import ExitStack, contextmanager
@@ -19,13 +21,24 @@ LIMIT = 30.0
 """How long a child may live (s): then it is killed, whatever became of its test."""
 PROGRAM = 'import sys; from diffdrive_jacobian.entry_points import {0}; sys.exit({0}())'
 
+# Fast DDS announces a participant every 3 s, and who comes later is often found at that pace only.
+# It reads this file once in a process: with the first participant, long after this module is loaded.
+_PROFILE = tempfile.NamedTemporaryFile(mode='w', suffix='.xml')  # noqa: SIM115
+_PROFILE.write("""<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
+  <participant profile_name="quick" is_default_profile="true"><rtps><builtin><discovery_config>
+    <leaseAnnouncement><sec>0</sec><nanosec>100000000</nanosec></leaseAnnouncement>
+  </discovery_config></builtin></rtps></participant>
+</profiles>""")
+_PROFILE.flush()
+os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = _PROFILE.name
+
 _numbers = itertools.count()
 
 
 class Child:
     """A running entry point; what it prints goes into files, so that no pipe can fill up."""
 
-    def __init__(self, name, arguments, directory):
+    def __init__(self, name, arguments, directory, stdout=None):
         self.command = ' '.join([name, *arguments])
         number = next(_numbers)
         self._out, self._err = (directory / f'{number}_{name}.{end}' for end in ('out', 'err'))
@@ -33,7 +46,7 @@ class Child:
             self._process = subprocess.Popen(
                 [sys.executable, '-c', PROGRAM.format(name), *arguments],
                 stdin=subprocess.DEVNULL,
-                stdout=out,
+                stdout=out if stdout is None else stdout,
                 stderr=err,
             )
         self._limit = threading.Timer(LIMIT, self._process.kill)
@@ -82,10 +95,14 @@ class Child:
             raise AssertionError(f'not within {patience} s: {self.command} exits') from None
 
     def close(self):
-        """Kill it, stopped or hung as it may be."""
+        """End it, stopped or hung as it may be."""
         self._limit.cancel()
-        self._process.kill()
-        self._process.wait()
+        try:
+            # Who is killed leaves its shared memory behind.
+            self._process.wait(1.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
 
     def _until(self, condition, what):
         deadline = time.monotonic() + PATIENCE
@@ -103,9 +120,9 @@ class World:
         self._children = []
         self._stack = ExitStack()
 
-    def start(self, name, *arguments):
-        """Start an entry point."""
-        child = Child(name, arguments, self._directory)
+    def start(self, name, *arguments, stdout=None):
+        """Start an entry point; its stdout can be given, and is not seen then."""
+        child = Child(name, arguments, self._directory, stdout)
         self._children.append(child)
         return child
 
@@ -133,6 +150,9 @@ class World:
     def close(self):
         """End everything, and show what was printed: pytest hides it unless the test failed."""
         for child in self._children:
+            child.signal(signal.SIGCONT)
+            child.signal(signal.SIGTERM)
+        for child in self._children:
             child.close()
         for child in self._children:
             print(f'--- {child.command}: {child.exit()}\n{child.stdout}{child.stderr}')
@@ -148,6 +168,8 @@ def open_world(directory):
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
         'ROS_DOMAIN_ID': str(domain),
         'ROS_LOG_DIR': str(directory),
+        # Numpy starts a thread for every core otherwise: a fifth of what it costs to start a child.
+        'OPENBLAS_NUM_THREADS': '1',
     }
     with mock.patch.dict(os.environ, environment):
         world = World(directory)

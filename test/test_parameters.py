@@ -19,7 +19,7 @@ from diffdrive_jacobian.nodes.parameters import (
 )
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.ros.parameters import ParameterError, specifications
+from diffdrive_jacobian.ros.parameters import ParameterError, report_unknown, specifications
 from diffdrive_jacobian.ros.runner import ros_context
 
 NODES = {
@@ -143,7 +143,7 @@ def test_one_of_several_changes_that_is_bad_refuses_all_when_atomic(ros):
 
 
 def test_unknown_parameters_are_named_with_what_was_meant(ros, capfd):
-    ros.add(GoToGoal, parameters={'kpp': 1.0, 'colour': 'red'})
+    report_unknown([ros.add(GoToGoal, parameters={'kpp': 1.0, 'colour': 'red'})])
     said = capfd.readouterr().err
     assert "unknown parameter 'kpp' is ignored; did you mean 'kp'?" in said
     assert "unknown parameter 'colour' is ignored; it has: " in said

@@ -56,5 +56,5 @@ def turn_in_place(theta: ArrayLike, heading: ArrayLike, Kp: Any) -> tuple[Any, A
     Returns:
         `(v, omega)`, each of shape (...) (m/s, rad/s).
     """
-    omega = Kp * wrap_angle(operand(heading) - operand(theta))
+    omega = operand(Kp) * wrap_angle(operand(heading) - operand(theta))
     return 0.0 * omega, omega

@@ -62,14 +62,14 @@ def saturate(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tupl
         v: Forward speed, shape (...) (m/s).
         omega: Yaw rate, shape (...) (rad/s).
         limits: The limits.
-        r: Wheel radius, shape (...) (m).
-        L: Wheel separation, shape (...) (m).
+        r: Wheel radius, shape (...) (m); counts only if the wheels have a limit.
+        L: Wheel separation, shape (...) (m); likewise.
 
     Returns:
         The limited `(v, omega)`, each of shape (...).
 
     Raises:
-        ValueError: r or L is not positive and finite.
+        ValueError: The wheels have a limit, and r or L is not positive and finite.
     """
     if limits.unlimited:
         return v, omega

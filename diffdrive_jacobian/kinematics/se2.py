@@ -31,8 +31,8 @@ TURN = 2.0 * np.pi
 def wrap_angle(angle: ArrayLike) -> Any:
     """Wrap angles to (-pi, pi].
 
-    The result is exact with respect to the double nearest to 2 pi, and an angle that is already
-    inside comes back to the last bit.
+    The result is exact with respect to the double nearest to 2 pi; an angle that is already inside
+    keeps its value to the last bit.
 
     Args:
         angle: Angles, any shape (rad).

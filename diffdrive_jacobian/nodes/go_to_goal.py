@@ -66,7 +66,6 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._message: Twist | TwistStamped = TwistStamped() if stamped else Twist()
         self._watchdog = Watchdog(self, self._on_stale_odometry)
         self._configure()
-        self.report_unknown_parameters()
 
     @property
     def waypoint(self) -> int | None:

@@ -59,7 +59,6 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self.subscribe(PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose)
         self.create_service(Trigger, 'reset_odometry', self._on_reset)
         self._timer = self.create_timer(1.0 / self.parameters.publish_rate, self._on_tick)
-        self.report_unknown_parameters()
         self._jumps = self._watch_jumps()
         self._advance()
 

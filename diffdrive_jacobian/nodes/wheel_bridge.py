@@ -39,7 +39,6 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         self._moving = False
         self._watchdog = Watchdog(self, self._on_silence)
         self._watchdog.start(nanoseconds(parameters.cmd_vel_timeout))
-        self.report_unknown_parameters()
 
     def _on_twist(self, message: Twist) -> None:
         self._take(message, 0)

@@ -78,7 +78,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         profile = QoSProfile(depth=10)
         if latched:
             profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
-        with self._naming_other_types(message, topic):
+        with self._naming_the_reason(message, topic):
             return self.create_publisher(
                 message,
                 topic,
@@ -89,7 +89,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
     def subscribe(self, message: type, topic: str, callback: Callable[[Any], None]) -> Subscription:
         """Create a subscription: reliable, keep last 10."""
         self._watched.append((topic, _type_name(message), True))
-        with self._naming_other_types(message, topic):
+        with self._naming_the_reason(message, topic):
             return self.create_subscription(
                 message,
                 topic,
@@ -99,25 +99,31 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
             )
 
     @contextmanager
-    def _naming_other_types(self, message: type, topic: str) -> Iterator[None]:
-        """Within one process Fast DDS refuses a topic of two types, without saying so."""
+    def _naming_the_reason(self, message: type, topic: str) -> Iterator[None]:
+        """Say why a topic cannot be had; rclpy says "invalid allocator".
+
+        Within one process Fast DDS refuses a topic of two types; and users may ask for a quality of
+        service that does not exist.
+        """
         try:
             yield
         except RuntimeError as error:
             name, wanted = self.resolve_topic_name(topic), _type_name(message)
             types = dict(self.get_topic_names_and_types()).get(name, [])
             others = ', '.join(other for other in types if other != wanted)
+            overridden = any(
+                key.startswith(f'qos_overrides.{name}.') for key in self._parameter_overrides
+            )
+            if overridden and not others:
+                raise ParameterError(
+                    f'the quality of service of {name} cannot be what qos_overrides say: {error}'
+                ) from error
             if not others:
                 raise
             raise ParameterError(
                 f'{name} cannot be {wanted} in this node, it is {others} in another node of this '
                 'process; enable_stamped_cmd_vel must be the same for all of them'
             ) from error
-
-    def report_unknown_parameters(self) -> None:
-        """Warn of parameters that the user gave and no part of the node has declared."""
-        for text in ros_parameters.unknown_overrides(self):
-            self.get_logger().warning(text)
 
     def parameters_changed(self, previous: P) -> None:
         """Act on new parameters; called after `parameters` was replaced."""
@@ -140,8 +146,11 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
     def _watch(self) -> None:
         self._watch_clock()
         looks: dict[tuple[str, str, str], int] = {}
+        types = dict(self.get_topic_names_and_types())
         for topic, wanted, reading in self._watched:
             name = self.resolve_topic_name(topic)
+            if types.get(name) == [wanted]:
+                continue
             look = self.get_publishers_info_by_topic if reading else self.get_subscriptions_info_by_topic
             for other in look(name):
                 mismatch = (name, wanted, other.topic_type)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -253,17 +253,23 @@ def judge(parameters: NodeParameters, changes: Iterable[Parameter]) -> SetParame
     return SetParametersResult(successful=True)
 
 
-def unknown_overrides(node: Node) -> list[str]:
-    """Say for each parameter that the user gave and the node does not have what was meant, perhaps."""
-    messages = []
-    declared = sorted(node._parameters)
-    for name in sorted(set(node._parameter_overrides) - set(declared)):
-        close = difflib.get_close_matches(name, declared, n=1)
-        hint = (
-            f"did you mean '{close[0]}'?"
-            if close
-            else 'it has: '
-            + ', '.join(known for known in declared if not known.startswith('qos_overrides.'))
-        )
-        messages.append(f"unknown parameter '{name}' is ignored; {hint}")
-    return messages
+def report_unknown(nodes: Sequence[Node]) -> None:
+    """Warn of parameters that the user gave a node and that neither it nor a node beside it has.
+
+    The nodes of one process share its command line, so what one of them has is not a mistake.
+    """
+    everything = {name for node in nodes for name in node._parameters}
+    for node in nodes:
+        for name in sorted(set(node._parameter_overrides) - everything):
+            declared = sorted(node._parameters)
+            close = difflib.get_close_matches(name, declared, n=1)
+            hint = (
+                f"did you mean '{close[0]}'?"
+                if close
+                else 'it has: '
+                + ', '.join(known for known in declared if not known.startswith(_OF_RCLPY))
+            )
+            node.get_logger().warning(f"unknown parameter '{name}' is ignored; {hint}")
+
+
+_OF_RCLPY = ('qos_overrides.', 'start_type_description_service', 'use_sim_time')

@@ -19,7 +19,7 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.signals import SignalHandlerOptions
 
 from diffdrive_jacobian.ros.node import ParameterizedNode
-from diffdrive_jacobian.ros.parameters import ParameterError
+from diffdrive_jacobian.ros.parameters import ParameterError, report_unknown
 
 N = TypeVar('N', bound=Node)
 
@@ -94,6 +94,7 @@ class Runner:
         self.context = context
         self._executor = executor
         self._nodes: list[Node] = []
+        self._begun = False
 
     def add(self, make: Callable[[], N]) -> N:
         """Make a node and add it.
@@ -119,6 +120,9 @@ class Runner:
 
         The condition is looked at after every callback and at least every LOOK_PERIOD.
         """
+        if not self._begun:
+            self._begun = True
+            report_unknown(self._nodes)
         try:
             while not until():
                 if not self.context.ok():

@@ -15,32 +15,34 @@ class Watchdog:
     """
 
     def __init__(self, node: Node, callback: Callable[[], None]) -> None:
-        """Create it asleep; `start` wakes it."""
+        """Create it; `start` lets it watch."""
         self._clock = node.get_clock()
         self._callback = callback
         self._timeout = 0
         self._fed_at = 0
+        self._awake = False
         self._timer = node.create_timer(1.0, self._on_timer, autostart=False)
 
     def start(self, timeout: int) -> None:
         """Watch from now on with a timeout (ns); 0: never strike."""
+        self.stop()
         self._timeout = timeout
         self.feed(self._clock.now().nanoseconds)
-        if not timeout:
-            self._timer.cancel()
 
     def feed(self, now: int) -> None:
         """Put the strike off to `timeout` after now (ns)."""
         self._fed_at = now
-        if self._timeout and self._timer.is_canceled():
+        if not self._awake and self._timeout:
             self._sleep(self._timeout)
 
     def stop(self) -> None:
         """Watch no longer, until started again."""
         self._timeout = 0
+        self._awake = False
         self._timer.cancel()
 
     def _sleep(self, duration: int) -> None:
+        self._awake = True
         self._timer.timer_period_ns = duration
         self._timer.reset()
 
@@ -50,5 +52,6 @@ class Watchdog:
             self._sleep(self._timeout - waited)
             return
         # Time that went back (waited < 0) is no proof of life.
+        self._awake = False
         self._timer.cancel()
         self._callback()

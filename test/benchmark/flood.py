@@ -115,7 +115,8 @@ def under_flood(name, topic, seconds, arguments=()):
             print(
                 f'{name:14s} under {topic:8s} {float(sent):7.0f} msg/s sent: odometry {idle:6.2f} -> '
                 f'{rate:6.2f} Hz, worst gap {worst * 1e3:5.0f} ms, memory {before:.0f} -> '
-                f'{after_start:.0f} -> {after:.0f} MB, moved: {moved}, at rest after: {not observer.moving}',
+                f'{after_start:.0f} -> {after:.0f} MB, moved: {moved}, '
+                f'at rest after: {not observer.moving}',
                 flush=True,
             )
         finally:
