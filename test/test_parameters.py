@@ -156,3 +156,16 @@ def test_quality_of_service_can_be_overridden(ros):
     assert info.qos_profile.reliability.name == 'BEST_EFFORT'
     (info,) = node.get_publishers_info_by_topic('/joint_states')
     assert info.qos_profile.reliability.name == 'RELIABLE'
+
+
+def test_the_last_word_counts(tmp_path):
+    path = tmp_path / 'parameters.yaml'
+    path.write_text('/**/go_to_goal: {ros__parameters: {kp: 5.0, kv: 2, xy_goal_tolerance: 0.1}}')
+    arguments = ['--params-file', str(path), '-p', 'kp:=6', '-p', 'go_to_goal:kv:=1.5']
+    with ros_context(['test', '--ros-args', *arguments]) as context:
+        node = GoToGoal(context=context)
+        assert (node.parameters.kp, node.parameters.kv) == (6.0, 1.5)
+        node.set_parameters([Parameter('kp', value=7)])
+        assert node.parameters.kp == node.get_parameter('kp').value == 7.0
+        assert node.parameters.xy_goal_tolerance == 0.1
+        node.destroy_node()

@@ -1,0 +1,111 @@
+"""What README.md says holds: its parameters, its topics, its example, its commands."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from diffdrive_jacobian import entry_points
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.parameters import (
+    GoToGoalParameters,
+    VirtualRobotParameters,
+    WheelBridgeParameters,
+)
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.ros.parameters import specifications
+from diffdrive_jacobian.tools import drive_to, send_goal
+
+README = (Path(__file__).parent.parent / 'README.md').read_text()
+NODES = {
+    'virtual_robot': (VirtualRobot, VirtualRobotParameters),
+    'go_to_goal': (GoToGoal, GoToGoalParameters),
+    'wheel_bridge': (WheelBridge, WheelBridgeParameters),
+}
+
+
+def section(name):
+    return re.search(rf'^### {name}\n(.*?)(?=^##)', README, re.MULTILINE | re.DOTALL).group(1)
+
+
+def table(name, header):
+    """The rows of a table of a node's section, as cells."""
+    text = section(name).split(f'| {header}', 1)[1].split('\n\n', 1)[0]
+    return [[cell.strip() for cell in row.strip('|').split('|')] for row in text.splitlines()[2:]]
+
+
+def written(value):
+    if isinstance(value, bool):
+        return str(value).lower()
+    return '.nan' if isinstance(value, float) and math.isnan(value) else str(value)
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_parameters_and_their_defaults(name):
+    _, parameters = NODES[name]
+    told = {}
+    for names, defaults, _ in table(name, 'parameter'):
+        names, defaults = re.findall(r'`([^`]+)`', names), defaults.split(', ')
+        told.update(zip(names, defaults * (len(names) // len(defaults)), strict=True))
+    values = {field.name: field.default for field in fields(parameters)}
+    assert told == {
+        ros_name: written(values[field])
+        for ros_name, (field, _) in specifications(parameters).items()
+    }
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_topics_and_services(ros, name):
+    node = ros.add(NODES[name][0])
+    other = {'cmd_vel': 'joint_command'} if name == 'virtual_robot' else {}
+    told = {re.search(r'`/?(\w+)`', row[0]).group(1) for row in table(name, 'topic')} - {'tf'}
+    names = (
+        node.get_publisher_names_and_types_by_node(name, '/')
+        + node.get_subscriber_names_and_types_by_node(name, '/')
+        + node.get_service_names_and_types_by_node(name, '/')
+    )
+    own = {
+        topic.strip('/')
+        for topic, _ in names
+        if topic.count('/') == 1 and topic not in ('/rosout', '/parameter_events', '/clock')
+    }
+    assert told == own | {alternative for topic, alternative in other.items() if topic in own}
+
+
+def test_example_gives_the_numbers_in_its_comments():
+    (code,) = re.findall(r'```python\n(.*?)```', README, re.DOTALL)
+    names = {}
+    exec(code, names)
+    comments = [
+        [float(number) for number in re.findall(r'-?\d+\.\d{3}', line.split('#')[1])]
+        for line in code.splitlines()
+        if '#' in line
+    ]
+    got = [[names['v'], names['omega']], [names['omega_R'], names['omega_L']], [*names['q_dot']]]
+    for numbers, values in zip(comments, got, strict=False):
+        assert numbers == [round(float(value), 3) for value in values]
+
+
+def test_two_commands_of_one_line_each():
+    commands = re.findall(r'^python3 -m venv .*$', README, re.MULTILINE)
+    assert len(commands) == 2
+    assert commands[0].endswith('drive_to 1 1')
+    assert commands[1].endswith('pytest')
+
+
+@pytest.mark.parametrize('tool', [drive_to, send_goal])
+def test_options_of_the_tools(tool):
+    row = next(line for line in README.splitlines() if line.startswith(f'| `{tool.PROGRAM} X Y'))
+    options = {
+        option
+        for action in tool._parser()._actions
+        for option in action.option_strings
+        if option.startswith('--') and option != '--help'
+    }
+    assert set(re.findall(r'--[a-z][a-z-]*', row)) - {'--ros-args'} == options
+    assert hasattr(entry_points, tool.PROGRAM)
