@@ -10,10 +10,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 
-def components(name: str, value: ArrayLike, size: int) -> list[Any]:
+def components(name: str, value: Any, size: int) -> list[Any]:
     """Split vectors along their last axis of `size` entries; a single vector gives floats.
 
     Raises:
