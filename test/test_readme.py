@@ -54,8 +54,7 @@ def test_parameters_and_their_defaults(name):
         told.update(zip(names, defaults * (len(names) // len(defaults)), strict=True))
     values = {field.name: field.default for field in fields(parameters)}
     assert told == {
-        ros_name: written(values[field])
-        for ros_name, (field, _) in specifications(parameters).items()
+        ros_name: written(values[field]) for ros_name, (field, _) in specifications(parameters).items()
     }
 
 
