@@ -44,11 +44,11 @@ def odometry(x, y, theta, frame='odom'):
 class Controller:
     """A controller whose odometry is ours."""
 
-    def __init__(self, ros, command=Twist, **parameters):
+    def __init__(self, ros, command=Twist, node_class=GoToGoal, **parameters):
         self.ros = ros
         self.commands = ros.listen(command, 'cmd_vel')
         self.status = ros.listen(GoalStatus, 'goal_status', latched=True)
-        self.node = ros.add(GoToGoal, parameters=parameters)
+        self.node = ros.add(node_class, parameters=parameters)
         self._odom = ros.talk(Odometry, 'odom')
         self._goal = ros.talk(PoseStamped, 'goal_pose')
         self._goals = ros.talk(Goals, 'goals')
@@ -101,13 +101,24 @@ def test_each_odometry_is_answered_by_the_law_and_arrival_by_zero(controller):
     controller.ends((7, ACCEPTED), (7, EXECUTING), (7, SUCCEEDED))
 
 
-def test_without_a_goal_it_is_silent(ros, controller):
+class Counting(GoToGoal):
+    odometry = 0
+
+    def _on_odometry(self, message):
+        self.odometry += 1
+        super()._on_odometry(message)
+
+
+def test_without_a_goal_it_is_silent(ros):
+    controller = Controller(ros, node_class=Counting)
     for _ in range(5):
         controller.sees(odometry(0, 0, 0))
+    ros.until(lambda: controller.node.odometry == 5, 'the odometry is seen')
     controller.send(goal(1, 0))
     controller.at(0, 0)
     controller.at(1, 0)
     controller.sees(odometry(1, 0, 0))
+    ros.until(lambda: controller.node.odometry == 8, 'the odometry is seen')
     controller.send(goal(3, 0))
     controller.at(1, 0)
     assert [one.linear.x for one in controller.commands] == [0.5, 0.0, 1.0]

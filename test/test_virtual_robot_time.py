@@ -140,7 +140,7 @@ def test_bad_changes_are_refused_with_the_reason(driving, change, words):
     result = driving.set(**change)
     assert not result.successful
     assert words in result.reason
-    assert driving.robot.parameters == before
+    assert driving.robot.parameters is before
 
 
 def test_integers_are_taken_for_doubles_and_strangers_are_left_alone(driving):

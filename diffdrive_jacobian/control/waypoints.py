@@ -33,7 +33,7 @@ class Arrival:
     """Whether the heading of the last waypoint counts."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Waypoints:
     """Poses to reach in order, and how far along they are."""
 

@@ -126,7 +126,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
             ) from error
 
     def parameters_changed(self, previous: P) -> None:
-        """Act on new parameters; called after `parameters` was replaced."""
+        """Act on new parameters, which may have the old values; called after `parameters` was replaced."""
 
     def stop(self) -> None:
         """Leave what this node commands standing still; called before it is destroyed."""
@@ -140,7 +140,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
     def _after_parameters(self, changes: list[Parameter]) -> None:
         previous = self.parameters
         self.parameters = ros_parameters.changed(previous, changes)
-        if self.parameters != previous:
+        if self.parameters is not previous:
             self.parameters_changed(previous)
 
     def _watch(self) -> None:

@@ -234,14 +234,15 @@ def accept_integers(parameters: type[NodeParameters], changes: list[Parameter]) 
 def changed(parameters: P, changes: Iterable[Parameter]) -> P:
     """Make the set that results from changes; parameters of others among them are passed over.
 
+    Returns:
+        The new set; the very same one if nothing among the changes is of it.
+
     Raises:
         ParameterError: The set would not be valid.
     """
     known = specifications(type(parameters))
-    return dataclasses.replace(
-        parameters,
-        **{known[change.name][0]: change.value for change in changes if change.name in known},
-    )
+    values = {known[change.name][0]: change.value for change in changes if change.name in known}
+    return dataclasses.replace(parameters, **values) if values else parameters
 
 
 def judge(parameters: NodeParameters, changes: Iterable[Parameter]) -> SetParametersResult:

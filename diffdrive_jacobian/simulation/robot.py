@@ -47,7 +47,7 @@ class RobotModel:
         return float(v), float(omega)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Robot:
     """A robot at an instant. Every method returns a new one; none looks at a clock."""
 

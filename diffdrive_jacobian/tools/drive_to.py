@@ -25,6 +25,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.parameters import nanoseconds
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.ros import messages
@@ -33,8 +34,10 @@ from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import _cli
 
 PROGRAM = 'drive_to'
+SETTLING = 0.1
+"""Odometry this much later than the last command knows of it (s)."""
 STOP_PATIENCE = 2.0
-"""How long the robot may take to come to rest at the end (s)."""
+"""How long the robot may take to come to rest at the end, and to say so (s)."""
 
 
 class Observer(Node):  # type: ignore[misc]
@@ -47,6 +50,8 @@ class Observer(Node):  # type: ignore[misc]
         self.index = 0
         """The goal that is driven to."""
         self.pose: NDArray[np.float64] | None = None
+        self.seen = 0
+        """The instant of that pose (ns)."""
         self.moving = False
         self.wheels = (0.0, 0.0)
         """Speeds of the left and right wheel (rad/s)."""
@@ -77,6 +82,7 @@ class Observer(Node):  # type: ignore[misc]
 
     def _on_odometry(self, message: Odometry) -> None:
         self.pose = messages.from_pose(message.pose.pose)
+        self.seen = messages.from_time(message.header.stamp)
         self.moving = messages.from_twist(message.twist.twist) != (0.0, 0.0)
         if self._sent is None:
             self._send()
@@ -128,7 +134,7 @@ def drive(
     """
     context = runner.context
     wheels = Parameter('command_interface', value='wheels')
-    runner.add(lambda: VirtualRobot(context=context, parameter_overrides=[wheels]))
+    robot = runner.add(lambda: VirtualRobot(context=context, parameter_overrides=[wheels]))
     runner.add(lambda: WheelBridge(context=context))
     tolerances = [] if tolerance is None else [Parameter('xy_goal_tolerance', value=tolerance)]
     controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=tolerances))
@@ -151,8 +157,16 @@ def drive(
         seconds = time.monotonic() - begun
         if not observer.ended:
             controller.stop()
-        resting = time.monotonic() + STOP_PATIENCE
-        runner.spin(lambda: not observer.moving or time.monotonic() > resting or signals.count > 1)
+        settled = robot.now() + nanoseconds(SETTLING)
+        before = signals.count
+        patience = time.monotonic() + STOP_PATIENCE + 1.0 / robot.parameters.publish_rate
+        runner.spin(
+            lambda: (
+                (observer.seen >= settled and not observer.moving)
+                or time.monotonic() > patience
+                or signals.count > before
+            )
+        )
     observer.index = len(goals) - 1
     return Outcome(
         arrived=observer.status == GoalStatus.STATUS_SUCCEEDED,
