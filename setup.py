@@ -44,5 +44,7 @@ setup(
         'test': ['hypothesis>=6', 'pytest>=7', 'pyyaml>=5'],
     },
     zip_safe=False,
-    entry_points={'console_scripts': [f'{name} = {PACKAGE}.entry_points:{name}' for name in COMMANDS]},
+    entry_points={
+        'console_scripts': [f'{name} = {PACKAGE}.tools.entry_points:{name}' for name in COMMANDS]
+    },
 )

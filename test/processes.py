@@ -19,7 +19,7 @@ from conftest import PATIENCE, Harness
 
 LIMIT = 30.0
 """How long a child may live (s): then it is killed, whatever became of its test."""
-PROGRAM = 'import sys; from diffdrive_jacobian.entry_points import {0}; sys.exit({0}())'
+PROGRAM = 'import sys; from diffdrive_jacobian.tools.entry_points import {0}; sys.exit({0}())'
 
 # Fast DDS announces a participant every 3 s, and who comes later is often found at that pace only.
 # It reads this file once in a process: with the first participant, long after this module is loaded.

@@ -10,6 +10,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Goals, Odometry
 from rclpy.parameter import Parameter
+from ros_messages import goal, goals, odometry
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.control import go_to_goal
@@ -18,27 +19,6 @@ from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 ACCEPTED, EXECUTING = GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING
 SUCCEEDED, CANCELED = GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED
 ABORTED = GoalStatus.STATUS_ABORTED
-
-
-def goal(x, y, theta=0.0, frame='', stamp=0):
-    message = PoseStamped()
-    message.header.frame_id, message.header.stamp.sec = frame, stamp
-    message.pose.position.x, message.pose.position.y = float(x), float(y)
-    message.pose.orientation.z, message.pose.orientation.w = math.sin(theta / 2), math.cos(theta / 2)
-    return message
-
-
-def goals(*poses, frame='', stamp=0):
-    message = Goals(goals=list(poses))
-    message.header.frame_id, message.header.stamp.sec = frame, stamp
-    return message
-
-
-def odometry(x, y, theta, frame='odom'):
-    message = Odometry()
-    message.header.frame_id = frame
-    message.pose.pose = goal(x, y, theta).pose
-    return message
 
 
 class Controller:

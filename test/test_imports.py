@@ -18,7 +18,7 @@ HOUSE = Path(diffdrive_jacobian.__file__).parent
 LAYERS = ('kinematics', 'control', 'simulation', 'ros', 'nodes', 'tools')
 PURE = LAYERS[:3]
 # Modules beside the layers, and the layers they may import.
-DOORS = {'__init__': (), 'entry_points': LAYERS}
+DOORS = {'__init__': ()}
 
 LOAD = """
 import importlib, sys

@@ -13,7 +13,7 @@ from diffdrive_jacobian.ros.parameters import specifications
 
 NODES = {'virtual_robot': 'odom', 'go_to_goal': 'goal_status', 'wheel_bridge': 'joint_command'}
 """Each node with a topic that it publishes."""
-FAST = ('--ros-args', '-p', 'kp:=6.0', '-p', 'kv:=2.0')
+FAST = ('--ros-args', '-p', 'kp:=8.0', '-p', 'kv:=4.0')
 FAR = ('50', '0')
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from diffdrive_jacobian import entry_points
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.parameters import (
     GoToGoalParameters,
@@ -19,7 +18,7 @@ from diffdrive_jacobian.nodes.parameters import (
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.ros.parameters import specifications
-from diffdrive_jacobian.tools import drive_to, send_goal
+from diffdrive_jacobian.tools import drive_to, entry_points, send_goal
 
 README = (Path(__file__).parent.parent / 'README.md').read_text()
 NODES = {

@@ -8,9 +8,8 @@ import pytest
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Goals, Odometry
+from ros_messages import at_rest, goal, goals, pose_of
 from sensor_msgs.msg import JointState
-from test_go_to_goal_node import goal, goals
-from test_virtual_robot import at_rest, pose_of
 
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot

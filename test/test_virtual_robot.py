@@ -6,47 +6,15 @@ import math
 
 import numpy as np
 import pytest
-from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
+from ros_messages import at_rest, covariance_of, pose_of, twist, twist_stamped
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.ros.messages import from_pose, from_time
-
-PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
-
-
-def stamp(nanoseconds):
-    sec, nanosec = divmod(nanoseconds, 1_000_000_000)
-    return Time(sec=sec, nanosec=nanosec)
-
-
-def twist(v, omega):
-    message = Twist()
-    message.linear.x, message.angular.z = float(v), float(omega)
-    return message
-
-
-def twist_stamped(v, omega, nanoseconds):
-    message = TwistStamped(twist=twist(v, omega))
-    message.header.stamp = stamp(nanoseconds)
-    return message
-
-
-def pose_of(odometry):
-    return from_pose(odometry.pose.pose)
-
-
-def covariance_of(odometry):
-    return np.asarray(odometry.pose.covariance).reshape(6, 6)[PLANAR]
-
-
-def at_rest(odometry):
-    return odometry.twist.twist == Twist()
 
 
 def reproduce(applied, starts, instant):
@@ -296,55 +264,3 @@ def test_bad_initialpose_is_dropped_and_named(ros, capfd, spoil, words):
     ros.until(lambda: len(starts) == 2, 'the good pose is taken')
     assert [one.pose.pose.position.x for one in starts] == [0.0, 8.0]
     assert words in capfd.readouterr().err
-
-
-def test_wheels_and_twist_end_at_the_same_pose(ros, sim_time):
-    stamped = {'use_sim_time': True, 'enable_stamped_cmd_vel': True}
-    limits = {'max_wheel_velocity': 9.0}
-    ros.add(VirtualRobot, namespace='a', parameters={**stamped, **limits})
-    ros.add(
-        VirtualRobot,
-        namespace='b',
-        parameters={'use_sim_time': True, 'command_interface': 'wheels', **limits},
-    )
-    ros.add(WheelBridge, namespace='b', parameters=stamped)
-    odoms = [ros.listen(Odometry, f'/{name}/odom') for name in 'ab']
-    talkers = [ros.talk(TwistStamped, f'/{name}/cmd_vel') for name in 'ab']
-    applied = [ros.listen(TwistStamped, f'/{name}/cmd_vel_out') for name in 'ab']
-    sim_time.set(5_000_000_000)
-    random = np.random.default_rng(3)
-    for _ in range(50):
-        sim_time.set(sim_time.now + int(random.integers(10_000_000, 300_000_000)))
-        command = twist_stamped(
-            random.uniform(-1, 1), random.uniform(-4, 4), sim_time.now - int(random.integers(1e7))
-        )
-        counts = [len(one) for one in applied]
-        for talker in talkers:
-            talker.publish(command)
-        ros.until(lambda counts=counts: all(len(a) > n for a, n in zip(applied, counts, strict=True)))
-    sim_time.advance(1.0, step=0.1)
-    ros.until(lambda: all(from_time(odom[-1].header.stamp) == sim_time.now for odom in odoms))
-    one, other = (odom[-1] for odom in odoms)
-    assert np.hypot(*pose_of(one)[:2]) > 0.01
-    assert pose_of(one) == pytest.approx(pose_of(other), abs=1e-9)
-    assert covariance_of(one) == pytest.approx(covariance_of(other), abs=1e-9)
-
-
-def test_joint_commands_that_cannot_be_are_dropped_and_named(ros, capfd):
-    applied = ros.listen(TwistStamped, 'cmd_vel_out')
-    ros.add(VirtualRobot, parameters={'command_interface': 'wheels'})
-    commands = ros.talk(JointState, 'joint_command')
-    names = ['left_wheel_joint', 'right_wheel_joint']
-    for bad in (
-        JointState(name=names, velocity=[1.0]),
-        JointState(name=['left_wheel_joint', 'other'], velocity=[1.0, 1.0]),
-        JointState(name=names, velocity=[1.0, math.nan]),
-        JointState(name=names, velocity=[1e6, 1e6]),
-    ):
-        commands.publish(bad)
-    commands.publish(JointState(name=['arm', *names], velocity=[5.0, 1.0, 3.0]))
-    ros.until(lambda: applied, 'the good command')
-    assert applied[0].twist.linear.x == pytest.approx(0.033 * 2.0)
-    assert applied[0].twist.angular.z == pytest.approx(0.033 * 2.0 / 0.16)
-    assert len(applied) == 1
-    assert 'a velocity for each name, got 2 names and 1 velocities' in capfd.readouterr().err

@@ -9,8 +9,8 @@ import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.parameter import Parameter
+from ros_messages import at_rest, pose_of, twist
 from std_srvs.srv import Trigger
-from test_virtual_robot import at_rest, pose_of, twist
 
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.ros import node as ros_node

@@ -7,9 +7,9 @@ import math
 import pytest
 from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.parameter import Parameter
+from ros_messages import stamp, twist, twist_stamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
-from test_virtual_robot import stamp, twist, twist_stamped
 
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 

@@ -66,6 +66,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._message: Twist | TwistStamped = TwistStamped() if stamped else Twist()
         self._watchdog = Watchdog(self, self._on_stale_odometry)
         self._configure()
+        self.announce('goals on', 'goal_pose', 'goals')
 
     @property
     def waypoint(self) -> int | None:
@@ -205,6 +206,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         if self._goal is not None:
             self._publish_command(0.0, 0.0)
             self._end(GoalStatus.STATUS_CANCELED, 'given up: shutting down')
+            self.flush(self._cmd_vel)
+            self.flush(self._status)
 
     # --- Parameters
 
@@ -225,6 +228,10 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             yaw_tolerance=parameters.yaw_goal_tolerance,
             use_heading=parameters.use_goal_heading,
         )
+        if self._limits.max_v == 0.0:
+            self.get_logger().warning(
+                'linear.x.max_velocity is 0: the robot may not drive forward, goals stay out of reach'
+            )
         self._judge_gains()
 
     def _judge_gains(self) -> None:

@@ -50,17 +50,20 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self._applied = self.advertise(TwistStamped, 'cmd_vel_out')
         self._start_pose = self.advertise(PoseWithCovarianceStamped, 'start_pose', latched=True)
         self._transforms = self._transform_broadcaster() if self.parameters.enable_odom_tf else None
+        source = 'cmd_vel'
         if self.parameters.command_interface == 'wheels':
-            self.subscribe(JointState, 'joint_command', self._on_joint_command)
+            source = 'joint_command'
+            self.subscribe(JointState, source, self._on_joint_command)
         elif self.parameters.enable_stamped_cmd_vel:
-            self.subscribe(TwistStamped, 'cmd_vel', self._on_twist_stamped)
+            self.subscribe(TwistStamped, source, self._on_twist_stamped)
         else:
-            self.subscribe(Twist, 'cmd_vel', self._on_twist)
+            self.subscribe(Twist, source, self._on_twist)
         self.subscribe(PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose)
         self.create_service(Trigger, 'reset_odometry', self._on_reset)
         self._timer = self.create_timer(1.0 / self.parameters.publish_rate, self._on_tick)
         self._jumps = self._watch_jumps()
         self._advance()
+        self.announce('driven by and reporting on', source, 'odom')
 
     # --- Time
 
@@ -240,7 +243,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         try:
             from tf2_ros import TransformBroadcaster
         except ImportError:
-            self.get_logger().info('tf2_ros is not installed: no transform odom -> base is sent')
+            self.get_logger().info('tf2_ros is not installed: the pose is not sent as a transform')
             return None
         return TransformBroadcaster(self)
 

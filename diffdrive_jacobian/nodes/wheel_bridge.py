@@ -39,6 +39,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         self._moving = False
         self._watchdog = Watchdog(self, self._on_silence)
         self._watchdog.start(nanoseconds(parameters.cmd_vel_timeout))
+        self.announce('from and to', 'cmd_vel', 'joint_command')
 
     def _on_twist(self, message: Twist) -> None:
         self._take(message, 0)
@@ -92,6 +93,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         """Stop the wheels, if they turn."""
         if self._moving:
             self._publish((0.0, 0.0), self.now())
+            self.flush(self._joint_command)
 
     def parameters_changed(self, previous: WheelBridgeParameters) -> None:
         """Follow a new timeout; the rest counts from the next command on."""

@@ -14,6 +14,7 @@ from typing import Any, Generic, TypeVar
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -28,6 +29,8 @@ P = TypeVar('P', bound=NodeParameters)
 
 THROTTLE = 2.0
 """What may go wrong with every message is said so often at most (s). rclpy counts per line of code."""
+FLUSH_PATIENCE = Duration(seconds=0.5)
+"""How long the last message may take to be acknowledged."""
 WATCH_PERIOD = 1.0
 """How often the graph and the clock are looked at (s)."""
 CLOCK_PATIENCE = 5
@@ -126,10 +129,20 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
             ) from error
 
     def parameters_changed(self, previous: P) -> None:
-        """Act on new parameters, which may have the old values; called after `parameters` was replaced."""
+        """Act on new parameters, which may equal the old; `parameters` was replaced before."""
 
     def stop(self) -> None:
         """Leave what this node commands standing still; called before it is destroyed."""
+
+    def announce(self, what: str, *topics: str) -> None:
+        """Say that the node is ready, and on which topics."""
+        names = ', '.join(self.resolve_topic_name(topic) for topic in topics)
+        self.get_logger().info(f'ready: {what} {names}')
+
+    @staticmethod
+    def flush(publisher: Publisher) -> None:
+        """Give the last message time to arrive: a publisher that is destroyed takes it along."""
+        publisher.wait_for_all_acked(FLUSH_PATIENCE)
 
     def _before_parameters(self, changes: list[Parameter]) -> list[Parameter]:
         return ros_parameters.accept_integers(type(self.parameters), changes)

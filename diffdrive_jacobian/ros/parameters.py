@@ -255,22 +255,20 @@ def judge(parameters: NodeParameters, changes: Iterable[Parameter]) -> SetParame
 
 
 def report_unknown(nodes: Sequence[Node]) -> None:
-    """Warn of parameters that the user gave a node and that neither it nor a node beside it has.
+    """Warn of parameters that the user gave and that no node of this process has.
 
     The nodes of one process share its command line, so what one of them has is not a mistake.
     """
-    everything = {name for node in nodes for name in node._parameters}
+    declared = {name for node in nodes for name in node._parameters}
+    unknown: dict[str, Node] = {}
     for node in nodes:
-        for name in sorted(set(node._parameter_overrides) - everything):
-            declared = sorted(node._parameters)
-            close = difflib.get_close_matches(name, declared, n=1)
-            hint = (
-                f"did you mean '{close[0]}'?"
-                if close
-                else 'it has: '
-                + ', '.join(known for known in declared if not known.startswith(_OF_RCLPY))
-            )
-            node.get_logger().warning(f"unknown parameter '{name}' is ignored; {hint}")
+        for name in set(node._parameter_overrides) - declared:
+            unknown.setdefault(name, node)
+    known = sorted(name for name in declared if not name.startswith(_OF_RCLPY))
+    for name, node in sorted(unknown.items()):
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean '{close[0]}'?" if close else f'there are: {", ".join(known)}'
+        node.get_logger().warning(f"unknown parameter '{name}' is ignored; {hint}")
 
 
 _OF_RCLPY = ('qos_overrides.', 'start_type_description_service', 'use_sim_time')

@@ -6,8 +6,10 @@ node could send its last zero.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import TypeVar
 
 import rclpy
@@ -41,6 +43,9 @@ def ros_context(arguments: Sequence[str]) -> Iterator[Context]:
     Raises:
         UserError: rcl does not understand the arguments or the environment.
     """
+    for flag, value in pairwise(arguments):
+        if flag == '--params-file' and not os.access(value, os.R_OK):
+            raise UserError(f'--params-file must name a file that can be read, got {value!r}')
     context = Context()
     try:
         rclpy.init(
@@ -50,7 +55,7 @@ def ros_context(arguments: Sequence[str]) -> Iterator[Context]:
         )
     except RuntimeError as error:
         # rcl appends where in its sources it gave up.
-        raise UserError(str(error).split(', at /')[0].strip()) from error
+        raise UserError(f'ROS arguments: {str(error).split(", at /")[0].strip()}') from error
     try:
         yield context
     finally:
@@ -122,7 +127,7 @@ class Runner:
         """
         if not self._begun:
             self._begun = True
-            report_unknown(self._nodes)
+            report_unknown([node for node in self._nodes if isinstance(node, ParameterizedNode)])
         try:
             while not until():
                 if not self.context.ok():

@@ -12,7 +12,9 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
+from diffdrive_jacobian.nodes.parameters import GoToGoalParameters
 from diffdrive_jacobian.ros.messages import MAX_POSITION
+from diffdrive_jacobian.ros.parameters import ParameterError
 
 DONE, FAILED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
 """Exit codes: done as asked, not done, a user's mistake, interrupted by a signal."""
@@ -71,6 +73,16 @@ def positive(text: str) -> float:
     return value
 
 
+def tolerance(text: str) -> float:
+    """Read a distance that go_to_goal takes as xy_goal_tolerance (m)."""
+    value = number(text)
+    try:
+        GoToGoalParameters(xy_goal_tolerance=value)
+    except ParameterError as error:
+        raise argparse.ArgumentTypeError(str(error).split("' ", 1)[1]) from error
+    return value
+
+
 def readable_file(text: str) -> str:
     """Read the name of a file that can be read."""
     if not os.path.isfile(text):
@@ -78,6 +90,20 @@ def readable_file(text: str) -> str:
     if not os.access(text, os.R_OK):
         raise argparse.ArgumentTypeError(f'file cannot be read: {text!r}')
     return text
+
+
+def add_params_file(parser: argparse.ArgumentParser) -> None:
+    """Add the option that spares `--ros-args` for the commonest of ROS arguments."""
+    parser.add_argument(
+        '--params-file', metavar='FILE', type=readable_file, help='ROS parameters (YAML)'
+    )
+
+
+def with_params_file(ros: list[str], options: argparse.Namespace) -> list[str]:
+    """Give the ROS arguments with what that option says; what the user gave there comes later."""
+    if options.params_file is None:
+        return ros
+    return ['--ros-args', '--params-file', options.params_file, '--', *ros]
 
 
 def complain(program: str, message: object) -> int:

@@ -183,13 +183,11 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     parser = _parser()
     options = parser.parse_args(own)
     if len(options.coordinates) % 2:
-        parser.error(f'coordinates come in pairs X Y, got {len(options.coordinates)} numbers')
+        parser.error(f'coordinates come in pairs X Y, got {len(options.coordinates)} of them')
     goals = np.reshape(options.coordinates, (-1, 2))
     if not options.open:
         os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
-    ros = ['--ros-args', '--log-level', 'warn', '--', *ros]
-    if options.params_file:
-        ros += ['--ros-args', '--params-file', options.params_file, '--']
+    ros = ['--ros-args', '--log-level', 'warn', '--', *_cli.with_params_file(ros, options)]
     try:
         with (
             ros_context([PROGRAM, *ros]) as context,
@@ -241,14 +239,12 @@ def _parser() -> argparse.ArgumentParser:
         '--timeout',
         type=_cli.positive,
         default=300.0,
-        help='give up after this long (s); %(default)s',
+        help='give up after this long, all goals together (s); %(default)s',
     )
     parser.add_argument(
-        '--tolerance', type=_cli.positive, help='distance that counts as arrived (m); 0.02'
+        '--tolerance', type=_cli.tolerance, help='distance that counts as arrived (m); 0.02'
     )
-    parser.add_argument(
-        '--params-file', metavar='FILE', type=_cli.readable_file, help='ROS parameters (YAML)'
-    )
+    _cli.add_params_file(parser)
     parser.add_argument(
         '--open',
         action='store_true',

@@ -37,11 +37,11 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
         signals: What was caught so far.
     """
     make, parameters = NODES[name]
-    own, _ = _cli.split_arguments(arguments)
-    _parser(name, make, parameters).parse_args(own)
+    own, ros = _cli.split_arguments(arguments)
+    ros = _cli.with_params_file(ros, _parser(name, make, parameters).parse_args(own))
     try:
         with (
-            ros_context([name, *arguments]) as context,
+            ros_context([name, *ros]) as context,
             running(context, closed_world=False) as runner,
         ):
             runner.add(lambda: make(context=context))
@@ -61,10 +61,12 @@ def _parser(name: str, node: Any, parameters: type[NodeParameters]) -> argparse.
             f'  {ros_name}',
             *textwrap.wrap(text, 90, initial_indent='      ', subsequent_indent='      '),
         ]
-    return argparse.ArgumentParser(
+    parser = argparse.ArgumentParser(
         prog=name,
-        usage=f'{name} [-h] [--ros-args -p PARAMETER:=VALUE -r NAME:=NAME --params-file FILE ...]',
+        usage=f'{name} [-h] [--params-file FILE] [--ros-args -p PARAMETER:=VALUE -r NAME:=NAME ...]',
         description=textwrap.dedent('    ' + (node.__doc__ or '')),
         epilog='\n'.join(['parameters:', *lines]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    _cli.add_params_file(parser)
+    return parser

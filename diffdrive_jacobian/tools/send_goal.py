@@ -115,10 +115,15 @@ def follow(sender: Sender, runner: Runner, signals: Signals, options: argparse.N
         )
         return _cli.FAILED
     with _cli.Drive() as progress:
+        blind_at = time.monotonic() + ANSWER_PATIENCE
 
         def over() -> bool:
+            nonlocal blind_at
             if sender.pose is not None:
                 progress.show(f'goal ({x:g}, {y:g})', sender.distance)
+            elif time.monotonic() > blind_at:
+                blind_at = math.inf
+                print(f'no odometry on {sender.resolve_topic_name("odom")}: is the robot running?')
             return sender.status in ENDS or sender.publisher.get_subscription_count() == 0
 
         ended = _spin(runner, signals, options.timeout, over)
@@ -199,7 +204,7 @@ def _parser() -> argparse.ArgumentParser:
         '--heading',
         type=_cli.number,
         default=0.0,
-        help='heading at the goal (rad); counts if the controller has use_goal_heading',
+        help='heading at the goal (rad), 0 without it; counts if the controller has use_goal_heading',
     )
     parser.add_argument(
         '--frame', default='', help="frame of the goal; without it the odometry's is meant"

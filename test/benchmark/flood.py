@@ -25,7 +25,7 @@ from rclpy.node import Node
 from diffdrive_jacobian.ros.runner import ros_context
 
 TYPES = {'odom': Odometry, 'cmd_vel': Twist}
-ENTRY = 'import sys; from diffdrive_jacobian.entry_points import {0}; sys.exit({0}())'
+ENTRY = 'import sys; from diffdrive_jacobian.tools.entry_points import {0}; sys.exit({0}())'
 
 
 def flood(topic, seconds):

@@ -1,0 +1,64 @@
+"""Messages as the tests of the nodes write and read them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from nav_msgs.msg import Goals, Odometry
+
+from diffdrive_jacobian.ros.messages import from_pose
+
+PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+
+
+def stamp(nanoseconds):
+    sec, nanosec = divmod(nanoseconds, 1_000_000_000)
+    return Time(sec=sec, nanosec=nanosec)
+
+
+def twist(v, omega):
+    message = Twist()
+    message.linear.x, message.angular.z = float(v), float(omega)
+    return message
+
+
+def twist_stamped(v, omega, nanoseconds):
+    message = TwistStamped(twist=twist(v, omega))
+    message.header.stamp = stamp(nanoseconds)
+    return message
+
+
+def pose_of(odometry):
+    return from_pose(odometry.pose.pose)
+
+
+def covariance_of(odometry):
+    return np.asarray(odometry.pose.covariance).reshape(6, 6)[PLANAR]
+
+
+def at_rest(odometry):
+    return odometry.twist.twist == Twist()
+
+
+def goal(x, y, theta=0.0, frame='', stamp=0):
+    message = PoseStamped()
+    message.header.frame_id, message.header.stamp.sec = frame, stamp
+    message.pose.position.x, message.pose.position.y = float(x), float(y)
+    message.pose.orientation.z, message.pose.orientation.w = math.sin(theta / 2), math.cos(theta / 2)
+    return message
+
+
+def goals(*poses, frame='', stamp=0):
+    message = Goals(goals=list(poses))
+    message.header.frame_id, message.header.stamp.sec = frame, stamp
+    return message
+
+
+def odometry(x, y, theta, frame='odom'):
+    message = Odometry()
+    message.header.frame_id = frame
+    message.pose.pose = goal(x, y, theta).pose
+    return message
