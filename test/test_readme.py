@@ -76,7 +76,7 @@ def test_topics_and_services(ros, name):
 
 
 def test_example_gives_the_numbers_in_its_comments():
-    (code,) = re.findall(r'```python\n(.*?)```', README, re.DOTALL)
+    _, code = re.findall(r'```python\n(.*?)```', README, re.DOTALL)
     names = {}
     exec(code, names)
     comments = [
