@@ -57,6 +57,10 @@ class Controller:
         command = command.twist if isinstance(command, TwistStamped) else command
         return command.linear.x, command.angular.z
 
+    def publish(self, message):
+        """Send a goal pose without waiting."""
+        self._goal.publish(message)
+
     def sees(self, message):
         """Send odometry that may go unanswered."""
         self._odom.publish(message)
@@ -218,6 +222,28 @@ def test_bad_odometry_is_dropped_and_stops_the_robot_in_time(ros, capfd, message
     assert 'odometry is back' in said
 
 
+def test_odometry_that_dies_around_a_new_goal_stops_the_robot(ros, capfd):
+    controller = Controller(ros, odom_timeout=0.2)
+    controller.send(goal(1, 0, stamp=1))
+    controller.at(0, 0)
+    again = ros.peer.create_timer(0.05, lambda: controller.publish(goal(-1, 0, stamp=2)))
+    ros.until(lambda: len(controller.commands) == 2, 'zero, whatever is sent anew')
+    ros.peer.destroy_timer(again)
+    assert controller.commands[-1] == Twist()
+    assert 'no valid odometry on /odom for 0.2 s' in capfd.readouterr().err
+
+
+def test_new_goal_is_not_judged_by_a_stray_frame(ros, controller):
+    controller.send(goal(1, 0, frame='odom', stamp=1))
+    controller.at(0, 0)
+    controller.send(goal(-1, 0, stamp=2))
+    controller.sees(odometry(5, 5, 0, frame='other'))
+    assert controller.at(0, 0, math.pi)[0] == pytest.approx(0.5)
+    controller.ends(
+        (1, ACCEPTED), (1, EXECUTING), (1, CANCELED), (2, ACCEPTED), (2, EXECUTING)
+    )  # fmt: skip
+
+
 def test_final_heading_is_taken_when_asked_for(ros):
     controller = Controller(ros, use_goal_heading=True, yaw_goal_tolerance=0.1)
     controller.send(goals(goal(1, 0, 2.0), goal(1, 1, -2.0)))
@@ -284,7 +310,7 @@ def test_missing_odometry_is_said(ros, capfd):
 def test_stop_gives_the_goal_up(ros, controller):
     controller.send(goal(1, 0))
     controller.at(0, 0)
-    controller.node.stop()
+    controller.node.stop('the test says so')
     ros.until(lambda: len(controller.commands) == 2, 'the zero')
     assert controller.commands[-1] == Twist()
     controller.ends((0, CANCELED))

@@ -55,5 +55,5 @@ def test_other_type_in_another_process_is_said_once(monkeypatch, capfd, stranger
 
 def test_two_types_in_one_process_are_a_clear_error(ros):
     ros.add(VirtualRobot)
-    with pytest.raises(ParameterError, match='enable_stamped_cmd_vel must be the same'):
+    with pytest.raises(ParameterError, match='is enable_stamped_cmd_vel the same for all'):
         ros.add(WheelBridge, parameters={'enable_stamped_cmd_vel': True})

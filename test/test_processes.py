@@ -181,7 +181,7 @@ def test_a_second_ctrl_c_ends_the_wait_for_a_controller_that_hangs(world):
 def test_send_goal_without_a_controller_says_so(world):
     sender = world.run('send_goal', '-1', '-1e-1', '--wait', '1', '--ros-args', '-r', '__ns:=/here')
     assert sender.exit() == 1
-    assert sender.last_line.startswith('not sent: nobody read /here/goal_pose within 1 s')
+    assert sender.last_line.startswith('not sent within 1 s: nobody reads /here/goal_pose and publishes')
     assert sender.stderr == ''
 
 

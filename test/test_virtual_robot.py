@@ -241,6 +241,10 @@ def spoil_covariance(message):
     message.pose.covariance[0] = -1.0
 
 
+def spoil_scale(message):
+    message.pose.covariance[0] = 1e308
+
+
 @pytest.mark.parametrize(
     ('spoil', 'words'),
     [
@@ -248,6 +252,7 @@ def spoil_covariance(message):
         (spoil_position, 'position must be finite'),
         (spoil_orientation, 'quaternion of length 1'),
         (spoil_covariance, 'positive semidefinite'),
+        (spoil_scale, 'at most 1e+12'),
     ],
 )
 def test_bad_initialpose_is_dropped_and_named(ros, capfd, spoil, words):

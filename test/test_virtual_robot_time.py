@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -116,8 +117,9 @@ def test_timeout_and_rate_change_live(ros, driving, sim_time):
     assert pose_of(odometry)[0] == pytest.approx(0.1, abs=1e-12)
     before = len(driving.odom)
     sim_time.advance(1.0, step=0.01)
-    driving.seen(102 * SECOND)
-    assert len(driving.odom) - before == 10
+    ros.until(lambda: len(driving.odom) - before >= 10, 'odometry at the new rate')
+    stamps = [from_time(one.header.stamp) for one in driving.odom[before:]]
+    assert np.diff(stamps) == pytest.approx(SECOND // 10)
 
 
 @pytest.mark.parametrize(
@@ -149,6 +151,28 @@ def test_integers_are_taken_for_doubles_and_strangers_are_left_alone(driving):
     assert driving.robot.get_parameter('wheel_separation').value == 1.0
     driving.robot.declare_parameter('foreign', 3)
     assert driving.robot.set_parameters([Parameter('foreign', value=4)])[0].successful
+
+
+def test_rate_that_keeps_changing_starves_nobody(ros):
+    odom = ros.listen(Odometry, 'odom')
+    robot = ros.add(VirtualRobot, parameters={'publish_rate': 20.0})
+    rates = itertools.cycle([21.0, 20.0])
+    changed = []
+
+    def change():
+        changed.append(robot.set_parameters([Parameter('publish_rate', value=next(rates))]))
+
+    ros.peer.create_timer(0.01, change)
+    ros.until(lambda: len(odom) >= 10, 'odometry')
+    assert len(changed) > 2 * len(odom)
+
+
+def test_the_shortest_timeout_is_not_for_ever(ros):
+    odom, applied = ros.listen(Odometry, 'odom'), ros.listen(TwistStamped, 'cmd_vel_out')
+    ros.add(VirtualRobot, parameters={'cmd_vel_timeout': 1e-10})
+    ros.talk(Twist, 'cmd_vel').publish(twist(1.0, 0.0))
+    ros.until(lambda: len(applied) == 2 and odom, 'the stop')
+    assert applied[1].twist == Twist()
 
 
 def test_heading_and_pose_stay_sound_over_many_commands(ros, sim_time):

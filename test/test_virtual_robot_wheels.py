@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
+from rclpy.parameter import Parameter
 from ros_messages import covariance_of, pose_of, twist_stamped
 from sensor_msgs.msg import JointState
 
@@ -58,6 +59,7 @@ def test_joint_commands_that_cannot_be_are_dropped_and_named(ros, capfd):
         JointState(name=['left_wheel_joint', 'other'], velocity=[1.0, 1.0]),
         JointState(name=names, velocity=[1.0, math.nan]),
         JointState(name=names, velocity=[1e6, 1e6]),
+        JointState(name=[*names, names[0]], velocity=[1.0, 1.0, -1.0]),
     ):
         commands.publish(bad)
     commands.publish(JointState(name=['arm', *names], velocity=[5.0, 1.0, 3.0]))
@@ -66,3 +68,20 @@ def test_joint_commands_that_cannot_be_are_dropped_and_named(ros, capfd):
     assert applied[0].twist.angular.z == pytest.approx(0.033 * 2.0 / 0.16)
     assert len(applied) == 1
     assert 'a velocity for each name, got 2 names and 1 velocities' in capfd.readouterr().err
+
+
+def test_wheel_speeds_stay_when_the_wheels_change(ros, sim_time):
+    odom, applied = ros.listen(Odometry, 'odom'), ros.listen(TwistStamped, 'cmd_vel_out')
+    robot = ros.add(VirtualRobot, parameters={'use_sim_time': True, 'command_interface': 'wheels'})
+    commands = ros.talk(JointState, 'joint_command')
+    sim_time.set(5_000_000_000)
+    commands.publish(JointState(name=['left_wheel_joint', 'right_wheel_joint'], velocity=[5.0, 10.0]))
+    ros.until(lambda: applied, 'the command')
+    sim_time.set(5_200_000_000)
+    assert robot.set_parameters([Parameter('wheel_radius', value=0.066)])[0].successful
+    ros.until(lambda: len(applied) == 2, 'the twist of the larger wheels')
+    assert applied[1].twist.linear.x == pytest.approx(2.0 * applied[0].twist.linear.x)
+    assert applied[1].twist.angular.z == pytest.approx(2.0 * applied[0].twist.angular.z)
+    sim_time.set(9_000_000_000)
+    ros.until(lambda: len(applied) == 3 and odom, 'the timeout counts from the command')
+    assert from_time(applied[2].header.stamp) == 5_500_000_000

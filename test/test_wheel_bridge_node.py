@@ -12,6 +12,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.ros import node as ros_node
 
 R, L = 0.033, 0.16
 
@@ -113,9 +114,32 @@ def test_rubbish_and_old_commands_are_dropped(ros, sim_time, capfd):
 def test_stop_leaves_the_wheels_standing(ros):
     out = ros.listen(JointState, 'joint_command')
     node = ros.add(WheelBridge)
-    node.stop()
+    node.stop('the test says so')
     ros.talk(Twist, 'cmd_vel').publish(twist(0.2, 0.0))
     ros.until(lambda: len(out) == 1, 'wheel speeds')
-    node.stop()
+    node.stop('the test says so')
     ros.until(lambda: len(out) == 2, 'the stop')
     assert list(out[1].velocity) == [0.0, 0.0]
+
+
+def test_without_a_clock_nothing_moves(ros, capfd, monkeypatch):
+    monkeypatch.setattr(ros_node, 'WATCH_PERIOD', 0.05)
+    out = ros.listen(JointState, 'joint_command')
+    node = ros.add(WheelBridge)
+    commands = ros.talk(Twist, 'cmd_vel')
+    commands.publish(twist(0.2, 0.0))
+    ros.until(lambda: len(out) == 1, 'wheel speeds')
+    # Switched to simulated time while the wheels turn: no timeout would ever strike.
+    assert node.set_parameters([Parameter('use_sim_time', value=True)])[0].successful
+    ros.until(lambda: len(out) == 2, 'the stop')
+    assert list(out[1].velocity) == [0.0, 0.0]
+    commands.publish(twist(0.2, 0.0))
+    said = ''
+
+    def told():
+        nonlocal said
+        said += capfd.readouterr().err
+        return 'command dropped: simulated time has not begun' in said
+
+    ros.until(told, 'the warning')
+    assert len(out) == 2

@@ -56,6 +56,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         super().__init__('go_to_goal', GoToGoalParameters, **kwargs)
         self._goal: Goal | None = None
         self._odom_frame = ''
+        # Whether the last command makes the robot move: it outlives a goal that is replaced.
+        self._driving = False
         stamped = self.parameters.enable_stamped_cmd_vel
         self._cmd_vel = self.advertise(TwistStamped if stamped else Twist, 'cmd_vel')
         self._status = self.advertise(GoalStatus, 'goal_status', latched=True)
@@ -95,10 +97,12 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
                 self._publish_status(self._goal.info, self._goal_status(self._goal))
             return
         if self._goal is not None:
-            self._end(GoalStatus.STATUS_CANCELED, 'replaced by another')
+            self._publish_status(self._goal.info, GoalStatus.STATUS_CANCELED)
+        if not self._driving:
+            # A robot that moves is watched already; a new goal is no sign of life of its odometry.
+            self._watchdog.start(nanoseconds(self.parameters.odom_timeout))
         self._goal = goal
         self._publish_status(info, GoalStatus.STATUS_ACCEPTED)
-        self._watchdog.start(nanoseconds(self.parameters.odom_timeout))
         x, y, _ = goal.waypoints.poses[-1]
         more = f' by way of {count} more' if (count := len(goal.waypoints.poses) - 1) else ''
         self.get_logger().info(f'goal accepted: x {x:.3f}, y {y:.3f}{more}')
@@ -106,8 +110,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
     def _match_frames(self, goal: Goal) -> None:
         if goal.frame and self._odom_frame and goal.frame != self._odom_frame:
             raise MessageError(
-                f"it must be given in the frame of the odometry, '{self._odom_frame}' or '' for it, "
-                f"got '{goal.frame}'"
+                f"it must be given in the frame of the odometry, {self._odom_frame!r} or '' for it, "
+                f'got {goal.frame!r}'
             )
 
     def _on_cancel(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -120,7 +124,9 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         return response
 
     def _end(self, status: int, what: str) -> None:
-        """Let go of the active goal."""
+        """Let go of the active goal, the robot standing."""
+        if self._driving:
+            self._publish_command(0.0, 0.0)
         if self._goal is not None:
             self._publish_status(self._goal.info, status)
             self._goal = None
@@ -140,10 +146,13 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         goal = self._goal
         try:
             pose = messages.from_pose(message.pose.pose)
-            if goal is not None and goal.executing and message.header.frame_id != self._odom_frame:
+            underway = self._driving or (goal is not None and goal.executing)
+            if underway and message.header.frame_id != self._odom_frame:
                 raise MessageError(
-                    f"it must stay in frame '{self._odom_frame}', got '{message.header.frame_id}'"
+                    f'it must stay in frame {self._odom_frame!r}, got {message.header.frame_id!r}'
                 )
+            if goal is not None and self.now() == 0:
+                raise MessageError('simulated time has not begun, nothing came on /clock')
         except MessageError as error:
             self.get_logger().warning(f'odometry dropped: {error}', throttle_duration_sec=THROTTLE)
             return
@@ -184,16 +193,17 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         if goal is None:
             return
         topic, timeout = self.resolve_topic_name('odom'), self.parameters.odom_timeout
-        if not goal.executing:
-            self.get_logger().warning(f'the goal waits for odometry on {topic}: is the robot running?')
-        elif not goal.stale:
-            goal.stale = True
+        goal.stale = goal.executing
+        if self._driving:
             self._publish_command(0.0, 0.0)
             self.get_logger().warning(
                 f'no valid odometry on {topic} for {timeout:g} s: zero sent, waiting'
             )
+        else:
+            self.get_logger().warning(f'the goal waits for odometry on {topic}: is the robot running?')
 
     def _publish_command(self, v: float, omega: float) -> None:
+        self._driving = (v, omega) != (0.0, 0.0)
         if isinstance(self._message, TwistStamped):
             # No frame: the twist is the robot's own, and its name is not ours to know.
             messages.set_twist_stamped(self._message, (v, omega), self.now())
@@ -201,11 +211,11 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             messages.set_twist(self._message, (v, omega))
         self._cmd_vel.publish(self._message)
 
-    def stop(self) -> None:
+    def stop(self, why: str) -> None:
         """Send zero and give the goal up, if there is one."""
         if self._goal is not None:
             self._publish_command(0.0, 0.0)
-            self._end(GoalStatus.STATUS_CANCELED, 'given up: shutting down')
+            self._end(GoalStatus.STATUS_CANCELED, f'given up: {why}')
             self.flush(self._cmd_vel)
             self.flush(self._status)
 

@@ -208,5 +208,5 @@ def _differ(first: str, value: str, second: str, other: str) -> None:
 
 
 def nanoseconds(seconds: float) -> int:
-    """Turn a duration parameter (s) into nanoseconds."""
-    return round(seconds * NANOSECONDS)
+    """Turn a duration parameter (s) into nanoseconds; only zero becomes zero, which means never."""
+    return max(1, round(seconds * NANOSECONDS)) if seconds else 0

@@ -173,7 +173,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             if advanced is None:
                 raise MessageError('simulated time has not begun, nothing came on /clock')
             if frame not in ('', ours):
-                raise MessageError(f"it must be given in frame '{ours}', got '{frame}'")
+                raise MessageError(f'it must be given in frame {ours!r}, got {frame!r}')
             pose, covariance = messages.from_pose_with_covariance(message.pose)
         except MessageError as error:
             self.get_logger().warning(f'initialpose dropped: {error}', throttle_duration_sec=THROTTLE)
@@ -204,15 +204,22 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         parameters = self.parameters
         self._name_messages()
         if parameters.publish_rate != previous.publish_rate:
-            self._timer.timer_period_ns = nanoseconds(1.0 / parameters.publish_rate)
-            self._timer.reset()
+            self._change_period(nanoseconds(1.0 / parameters.publish_rate))
         model = self._model()
         advanced = self._advance()
         if advanced is not None and model != advanced[1].model:
             now, robot = advanced
-            self._robot = robot.remodelled(model, now)
+            wheels = parameters.command_interface == 'wheels'
+            self._robot = robot.remodelled(model, now, wheels_commanded=wheels)
             if self._robot.twist != robot.twist:
                 self._publish_applied(self._robot)
+
+    def _change_period(self, period: int) -> None:
+        """Tick at a new period (ns); a tick that is due sooner stays due."""
+        self._timer.timer_period_ns = period
+        due = self._timer.time_until_next_call()
+        if due is None or due > period:
+            self._timer.reset()
 
     def _model(self) -> RobotModel:
         parameters = self.parameters

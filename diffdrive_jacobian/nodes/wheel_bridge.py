@@ -52,6 +52,8 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         # After time went back the last command's instant means nothing any more.
         last = self._last if self._last <= now else 0
         try:
+            if now == 0:
+                raise MessageError('simulated time has not begun, nothing came on /clock')
             v, omega = messages.from_twist(twist)
             timeout = nanoseconds(self.parameters.cmd_vel_timeout)
             self._last = messages.command_instant(stamp, now, last, timeout)
@@ -89,10 +91,11 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
                 f'for {self.parameters.cmd_vel_timeout:g} s: the wheels are stopped'
             )
 
-    def stop(self) -> None:
+    def stop(self, why: str) -> None:
         """Stop the wheels, if they turn."""
         if self._moving:
             self._publish((0.0, 0.0), self.now())
+            self.get_logger().info(f'the wheels are stopped: {why}')
             self.flush(self._joint_command)
 
     def parameters_changed(self, previous: WheelBridgeParameters) -> None:

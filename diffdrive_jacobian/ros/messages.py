@@ -108,7 +108,7 @@ def command_instant(stamp: int, now: int, last: int, timeout: int) -> int:
     if stamp < last:
         raise MessageError(
             f'its stamp lies {(last - stamp) / NANOSECONDS:.6f} s before the last command, '
-            'stop or placement'
+            'stop, placement or change of parameters'
         )
     return stamp
 
@@ -155,12 +155,13 @@ def from_pose_with_covariance(
     covariance = np.asarray(message.covariance)[_PLANAR].reshape(3, 3)
     scale = np.abs(covariance).max()
     if not (
-        np.isfinite(scale)
+        scale <= MAX_POSITION**2
         and np.allclose(covariance, covariance.T, rtol=0.0, atol=1e-9 * scale)
         and np.linalg.eigvalsh(covariance).min() >= -1e-9 * scale
     ):
         raise MessageError(
-            'covariance of x, y, yaw must be finite, symmetric and positive semidefinite, '
+            f'covariance of x, y, yaw must be finite, at most {MAX_POSITION**2:g}, symmetric and '
+            'positive semidefinite, '
             f'got {covariance.tolist()}'
         )
     return pose, (covariance + covariance.T) / 2.0
@@ -204,9 +205,10 @@ def from_joint_state(message: JointState, names: tuple[str, str]) -> tuple[float
             f'and {len(message.velocity)} velocities'
         )
     speeds = dict(zip(message.name, message.velocity, strict=True))
-    missing = [name for name in names if name not in speeds]
-    if missing:
-        raise MessageError(f'joint command lacks {missing}, it names {list(message.name)}')
+    if any(message.name.count(name) != 1 for name in names):
+        raise MessageError(
+            f'joint command must name each of {list(names)} once, got {list(message.name)}'
+        )
     left, right = (speeds[name] for name in names)
     if not (math.isfinite(left) and math.isfinite(right)):
         raise MessageError(f'wheel speeds must be finite, got left {left}, right {right}')

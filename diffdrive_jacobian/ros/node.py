@@ -119,20 +119,21 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
             )
             if overridden and not others:
                 raise ParameterError(
-                    f'the quality of service of {name} cannot be what qos_overrides say: {error}'
+                    f'the quality of service of {name} cannot be what qos_overrides say: '
+                    f'{str(error).split(", at /")[0]}'
                 ) from error
             if not others:
                 raise
             raise ParameterError(
                 f'{name} cannot be {wanted} in this node, it is {others} in another node of this '
-                'process; enable_stamped_cmd_vel must be the same for all of them'
+                'process (is enable_stamped_cmd_vel the same for all of them?)'
             ) from error
 
     def parameters_changed(self, previous: P) -> None:
         """Act on new parameters, which may equal the old; `parameters` was replaced before."""
 
-    def stop(self) -> None:
-        """Leave what this node commands standing still; called before it is destroyed."""
+    def stop(self, why: str) -> None:
+        """Leave what this node commands standing still: it is destroyed next, or time stands still."""
 
     def announce(self, what: str, *topics: str) -> None:
         """Say that the node is ready, and on which topics."""
@@ -183,7 +184,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         who = f'{other.node_namespace.rstrip("/")}/{other.node_name}'
         they_do, we_do = ('publishes', 'reads') if reading else ('reads', 'publishes')
         hint = ''
-        if self.has_parameter('enable_stamped_cmd_vel') and 'Twist' in wanted:
+        if 'Twist' in wanted and 'Twist' in theirs:
             hint = '; enable_stamped_cmd_vel chooses between Twist and TwistStamped'
         self.get_logger().error(
             f'{who} {they_do} {theirs} on {name}, but this node {we_do} {wanted}: '
@@ -194,6 +195,8 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         if self.now() != 0:
             self._looks_without_clock = 0
             return
+        # No timeout strikes while time stands still, so nothing may be left moving.
+        self.stop('time stands still')
         self._looks_without_clock += 1
         if self._looks_without_clock == CLOCK_PATIENCE:
             self.get_logger().warning(

@@ -25,6 +25,8 @@ from diffdrive_jacobian.ros.parameters import ParameterError, report_unknown
 
 N = TypeVar('N', bound=Node)
 
+MAX_DOMAIN_ID = 232
+"""Beyond it a domain's ports do not exist."""
 LOOK_PERIOD = 0.1
 """How long the loop may wait before it looks at its condition again (s)."""
 
@@ -43,6 +45,9 @@ def ros_context(arguments: Sequence[str]) -> Iterator[Context]:
     Raises:
         UserError: rcl does not understand the arguments or the environment.
     """
+    domain = os.environ.get('ROS_DOMAIN_ID', '')
+    if domain and not (domain.isdecimal() and int(domain) <= MAX_DOMAIN_ID):
+        raise UserError(f'ROS_DOMAIN_ID must be in 0 to {MAX_DOMAIN_ID}, got {domain!r}')
     for flag, value in pairwise(arguments):
         if flag == '--params-file' and not os.access(value, os.R_OK):
             raise UserError(f'--params-file must name a file that can be read, got {value!r}')
@@ -53,7 +58,7 @@ def ros_context(arguments: Sequence[str]) -> Iterator[Context]:
             context=context,
             signal_handler_options=SignalHandlerOptions.NO,
         )
-    except RuntimeError as error:
+    except (RuntimeError, UnicodeError) as error:
         # rcl appends where in its sources it gave up.
         raise UserError(f'ROS arguments: {str(error).split(", at /")[0].strip()}') from error
     try:
@@ -142,7 +147,7 @@ class Runner:
         if self.context.ok():
             for node in self._nodes:
                 if isinstance(node, ParameterizedNode):
-                    node.stop()
+                    node.stop('shutting down')
         self._executor.shutdown()
         for node in self._nodes:
             node.destroy_node()

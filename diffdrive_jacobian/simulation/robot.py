@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.control.saturation import VelocityLimits, saturate
-from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
+from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
 from diffdrive_jacobian.kinematics.se2 import integrate
 from diffdrive_jacobian.simulation.odometry_noise import propagate_covariance, twist_covariance
 
@@ -122,10 +122,18 @@ class Robot:
         """Begin anew at a pose; the command and the wheel angles go on."""
         return replace(self.at(stamp), pose=pose, covariance=covariance)
 
-    def remodelled(self, model: RobotModel, stamp: int) -> Robot:
-        """Go on with another model: the running command is held to the new limits and timeout."""
+    def remodelled(self, model: RobotModel, stamp: int, *, wheels_commanded: bool = False) -> Robot:
+        """Go on with another model: the running command is held to the new limits and timeout.
+
+        With `wheels_commanded` the command was one of wheel speeds: on other wheels these stay, and
+        the twist changes.
+        """
         here = self.at(stamp)
-        return replace(here, model=model, twist=model.limited(here.command))
+        command = here.command
+        if wheels_commanded:
+            speeds = body_to_wheel(*command, self.model.wheel_radius, self.model.wheel_separation)
+            command = wheel_to_body(*speeds, model.wheel_radius, model.wheel_separation)
+        return replace(here, model=model, command=command, twist=model.limited(command))
 
     def restarted(self, stamp: int) -> Robot:
         """Stand still in the same place on another time line, where old instants mean nothing."""

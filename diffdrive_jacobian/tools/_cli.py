@@ -40,6 +40,9 @@ def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def _is_number(text: str) -> bool:
+    # Python reads more as a number than people write on a command line.
+    if '_' in text or not text.isascii():
+        return False
     try:
         float(text)
     except ValueError:
@@ -142,7 +145,7 @@ class Drive:
             self._progress.stop()
 
     def show(self, what: str, distance: float, wheels: tuple[float, float] | None = None) -> None:
-        """Show how far it still is (m) and how fast the wheels turn, `(left, right)` (rad/s)."""
+        """Show how far it still is (m) and how fast the wheels turn, `(right, left)` (rad/s)."""
         period = 0.1 if self._console.is_terminal else 1.0
         if time.monotonic() - self._shown < period:
             return
@@ -150,7 +153,7 @@ class Drive:
         self._farthest = max(self._farthest, distance)
         state = f'{distance:7.3f} m to go'
         if wheels is not None:
-            state += f', wheels left {wheels[0]:7.2f}, right {wheels[1]:7.2f} rad/s'
+            state += f', wheels left {wheels[1]:7.2f}, right {wheels[0]:7.2f} rad/s'
         if not self._console.is_terminal:
             print(f'{what} {state}', flush=True)
             return

@@ -11,6 +11,7 @@ import math
 import os
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,8 @@ from diffdrive_jacobian.nodes.parameters import nanoseconds
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.ros import messages
+from diffdrive_jacobian.ros.messages import MessageError
+from diffdrive_jacobian.ros.node import THROTTLE
 from diffdrive_jacobian.ros.runner import Runner, UserError, ros_context, running
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import _cli
@@ -43,10 +46,13 @@ STOP_PATIENCE = 2.0
 class Observer(Node):  # type: ignore[misc]
     """Sends the goals and watches what becomes of them."""
 
-    def __init__(self, goals: NDArray[np.float64], context: Context) -> None:
-        """Prepare to send goals `[x, y]`, shape (n, 2)."""
+    def __init__(
+        self, goals: NDArray[np.float64], wheel_names: tuple[str, str], context: Context
+    ) -> None:
+        """Prepare to send goals `[x, y]`, shape (n, 2); `wheel_names` are left, right."""
         super().__init__('drive_to', context=context)
         self.goals = goals
+        self._wheel_names = wheel_names
         self.index = 0
         """The goal that is driven to."""
         self.pose: NDArray[np.float64] | None = None
@@ -54,7 +60,7 @@ class Observer(Node):  # type: ignore[misc]
         """The instant of that pose (ns)."""
         self.moving = False
         self.wheels = (0.0, 0.0)
-        """Speeds of the left and right wheel (rad/s)."""
+        """Speeds of the right and left wheel (rad/s)."""
         self.status = GoalStatus.STATUS_UNKNOWN
         self._sent: Goals | None = None
         self._publisher = self.create_publisher(Goals, 'goals', 10)
@@ -81,9 +87,15 @@ class Observer(Node):  # type: ignore[misc]
         )
 
     def _on_odometry(self, message: Odometry) -> None:
-        self.pose = messages.from_pose(message.pose.pose)
+        # With --open anybody may publish, and anything.
+        try:
+            self.pose = messages.from_pose(message.pose.pose)
+        except MessageError as error:
+            self.get_logger().warning(f'odometry dropped: {error}', throttle_duration_sec=THROTTLE)
+            return
         self.seen = messages.from_time(message.header.stamp)
-        self.moving = messages.from_twist(message.twist.twist) != (0.0, 0.0)
+        twist = message.twist.twist
+        self.moving = (twist.linear.x, twist.angular.z) != (0.0, 0.0)
         if self._sent is None:
             self._send()
 
@@ -97,8 +109,8 @@ class Observer(Node):  # type: ignore[misc]
         self._publisher.publish(self._sent)
 
     def _on_joint_states(self, message: JointState) -> None:
-        left, right = message.velocity
-        self.wheels = left, right
+        with suppress(MessageError):
+            self.wheels = messages.from_joint_state(message, self._wheel_names)
 
     def _on_status(self, message: GoalStatus) -> None:
         if self._sent is not None and message.goal_info.stamp == self._sent.header.stamp:
@@ -109,7 +121,8 @@ class Observer(Node):  # type: ignore[misc]
 class Outcome:
     """How a drive ended."""
 
-    arrived: bool
+    status: int
+    """What became of the goals, as in GoalStatus."""
     interrupted: bool
     pose: NDArray[np.float64] | None
     """Where the robot stopped; None: it never reported."""
@@ -138,7 +151,8 @@ def drive(
     runner.add(lambda: WheelBridge(context=context))
     tolerances = [] if tolerance is None else [Parameter('xy_goal_tolerance', value=tolerance)]
     controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=tolerances))
-    observer = runner.add(lambda: Observer(goals, context))
+    names = robot.parameters.left_wheel_name, robot.parameters.right_wheel_name
+    observer = runner.add(lambda: Observer(goals, names, context))
     begun = time.monotonic()
     with _cli.Drive() as progress:
 
@@ -154,9 +168,9 @@ def drive(
             return bool(observer.ended or signals.count or time.monotonic() - begun > timeout)
 
         runner.spin(over)
-        seconds = time.monotonic() - begun
+        seconds, status = time.monotonic() - begun, observer.status
         if not observer.ended:
-            controller.stop()
+            controller.stop('interrupted' if signals.count else 'out of time')
         settled = robot.now() + nanoseconds(SETTLING)
         before = signals.count
         patience = time.monotonic() + STOP_PATIENCE + 1.0 / robot.parameters.publish_rate
@@ -169,7 +183,7 @@ def drive(
         )
     observer.index = len(goals) - 1
     return Outcome(
-        arrived=observer.status == GoalStatus.STATUS_SUCCEEDED,
+        status=status,
         interrupted=signals.count > 0,
         pose=observer.pose,
         distance=observer.distance,
@@ -187,6 +201,9 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     goals = np.reshape(options.coordinates, (-1, 2))
     if not options.open:
         os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
+        # These would be obeyed before it.
+        for name in ('ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER'):
+            os.environ.pop(name, None)
     ros = ['--ros-args', '--log-level', 'warn', '--', *_cli.with_params_file(ros, options)]
     try:
         with (
@@ -215,13 +232,19 @@ def _report(outcome: Outcome, timeout: float) -> int:
             f'the robot stopped at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, '
             f'{outcome.distance:.3f} m from the goal, after {outcome.seconds:.1f} s'
         )
-    if outcome.arrived:
+    if outcome.status == GoalStatus.STATUS_SUCCEEDED:
         print(f'arrived: {where}')
         return _cli.DONE
     if outcome.interrupted:
         print(f'interrupted: {where}')
         return _cli.INTERRUPTED
-    reason = f'--timeout {timeout:g} s was too short' if outcome.seconds > timeout else 'goal refused'
+    reasons = {
+        GoalStatus.STATUS_ABORTED: 'goal refused',
+        GoalStatus.STATUS_CANCELED: 'goal canceled by somebody else',
+    }
+    reason = f'--timeout {timeout:g} s was too short'
+    if outcome.seconds <= timeout:
+        reason = reasons.get(outcome.status, 'ROS was shut down')
     print(f'not arrived ({reason}): {where}')
     return _cli.FAILED
 

@@ -12,6 +12,10 @@ from diffdrive_jacobian.ros.signals import Signals
 def _run(module: str, function: str, *arguments: str) -> int:
     signals = Signals()
     signals.catch()
+    for name in ('stdout', 'stderr'):
+        if getattr(sys, name) is None:
+            # Started without it, as by cron; what we load writes there all the same.
+            setattr(sys, name, open(os.devnull, 'w'))  # noqa: SIM115
     try:
         run = getattr(importlib.import_module(f'diffdrive_jacobian.tools.{module}'), function)
         code: int = run(*arguments, sys.argv[1:], signals)
@@ -19,6 +23,9 @@ def _run(module: str, function: str, *arguments: str) -> int:
     except BrokenPipeError:
         # Who read our output went away (as `head` does): nobody is left to tell.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 1
+    except OSError as error:
+        print(f'{function}: error: {error}', file=sys.stderr)
         code = 1
     finally:
         signals.ignore()

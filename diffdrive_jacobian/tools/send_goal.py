@@ -28,6 +28,9 @@ PROGRAM = 'send_goal'
 ANSWER_PATIENCE = 5.0
 """How long the controller may take to say whether it accepts, or that it canceled (s)."""
 
+LOOK_PERIOD = 1.0
+"""How often the tool looks whether the controller is still there (s)."""
+
 ENDS = {
     GoalStatus.STATUS_SUCCEEDED: 'arrived',
     GoalStatus.STATUS_CANCELED: 'canceled',
@@ -44,9 +47,11 @@ class Sender(Node):  # type: ignore[misc]
         self.goal = goal
         self.status = GoalStatus.STATUS_UNKNOWN
         self.pose: NDArray[np.float64] | None = None
+        self.seen = time.monotonic()
+        """When odometry came last, or the watch for it began (s, monotonic)."""
         self._frame = frame
         self._message: PoseStamped | None = None
-        self.publisher = self.create_publisher(PoseStamped, 'goal_pose', 10)
+        self._publisher = self.create_publisher(PoseStamped, 'goal_pose', 10)
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.create_subscription(GoalStatus, 'goal_status', self._on_status, latched)
         self.create_subscription(Odometry, 'odom', self._on_odometry, 10)
@@ -59,6 +64,28 @@ class Sender(Node):  # type: ignore[misc]
             return math.inf
         return math.hypot(self.goal[0] - self.pose[0], self.goal[1] - self.pose[1])
 
+    def controllers(self) -> set[bytes]:
+        """Tell who publishes goal_status: others than controllers read goal_pose, too."""
+        topic = self.resolve_topic_name('goal_status')
+        return {bytes(info.endpoint_gid) for info in self.get_publishers_info_by_topic(topic)}
+
+    def obstacle(self) -> str | None:
+        """Say what is missing before a goal can be sent; None: nothing."""
+        if self.get_clock().now().nanoseconds == 0:
+            return 'use_sim_time is true, but nothing came on /clock'
+        if not (self._publisher.get_subscription_count() and self.controllers()):
+            return (
+                f'nobody reads {self.resolve_topic_name("goal_pose")} and publishes '
+                f'{self.resolve_topic_name("goal_status")}; is go_to_goal running, in the same '
+                'namespace and the same ROS_DOMAIN_ID?'
+            )
+        return None
+
+    def confirmed(self) -> bool:
+        """Wait until the readers have the goal."""
+        arrived: bool = self._publisher.wait_for_all_acked(Duration(seconds=ANSWER_PATIENCE))
+        return arrived
+
     def send(self) -> None:
         """Publish the goal; its stamp tells it from older ones."""
         message = PoseStamped()
@@ -68,7 +95,8 @@ class Sender(Node):  # type: ignore[misc]
         )
         messages.set_pose(message.pose, self.goal)
         self._message = message
-        self.publisher.publish(message)
+        self._publisher.publish(message)
+        self.seen = time.monotonic()
 
     def cancel(self) -> None:
         """Ask the controller to let go of the goal."""
@@ -82,27 +110,26 @@ class Sender(Node):  # type: ignore[misc]
     def _on_odometry(self, message: Odometry) -> None:
         try:
             self.pose = messages.from_pose(message.pose.pose)
+            self.seen = time.monotonic()
         except MessageError as error:
             self.get_logger().warning(f'odometry dropped: {error}', throttle_duration_sec=2.0)
 
 
 def follow(sender: Sender, runner: Runner, signals: Signals, options: argparse.Namespace) -> int:
-    """Send the goal once its reader is there, and wait for the end; gives the exit code."""
-    topic = sender.resolve_topic_name('goal_pose')
-    if not _spin(runner, signals, options.wait, lambda: sender.publisher.get_subscription_count() > 0):
+    """Send the goal once a controller is there, and wait for the end; gives the exit code."""
+    if not _spin(runner, signals, options.wait, lambda: sender.obstacle() is None):
         if signals.count:
             print('interrupted: nothing was sent')
             return _cli.INTERRUPTED
-        print(
-            f'not sent: nobody read {topic} within {options.wait:g} s; is go_to_goal running, '
-            'in the same namespace and the same ROS_DOMAIN_ID?'
-        )
+        print(f'not sent within {options.wait:g} s: {sender.obstacle()}')
         return _cli.FAILED
+    controllers = sender.controllers()
     sender.send()
     x, y, _ = sender.goal
+    topic = sender.resolve_topic_name('goal_pose')
     if options.no_wait:
-        if not sender.publisher.wait_for_all_acked(Duration(seconds=ANSWER_PATIENCE)):
-            print(f'sent, but its reader on {topic} has not confirmed it')
+        if not sender.confirmed():
+            print(f'sent, but its readers on {topic} have not confirmed it')
             return _cli.FAILED
         print(f'sent: goal ({x:g}, {y:g}) on {topic}')
         return _cli.DONE
@@ -110,23 +137,11 @@ def follow(sender: Sender, runner: Runner, signals: Signals, options: argparse.N
         if signals.count:
             return _cancel(sender, runner, signals, _cli.INTERRUPTED)
         print(
-            f'no answer: who reads {topic} says nothing on '
+            f'no answer: the controller says nothing on '
             f'{sender.resolve_topic_name("goal_status")} within {ANSWER_PATIENCE:g} s'
         )
         return _cli.FAILED
-    with _cli.Drive() as progress:
-        blind_at = time.monotonic() + ANSWER_PATIENCE
-
-        def over() -> bool:
-            nonlocal blind_at
-            if sender.pose is not None:
-                progress.show(f'goal ({x:g}, {y:g})', sender.distance)
-            elif time.monotonic() > blind_at:
-                blind_at = math.inf
-                print(f'no odometry on {sender.resolve_topic_name("odom")}: is the robot running?')
-            return sender.status in ENDS or sender.publisher.get_subscription_count() == 0
-
-        ended = _spin(runner, signals, options.timeout, over)
+    ended = _watch(sender, runner, signals, options.timeout, controllers)
     where = '' if sender.pose is None else f', {sender.distance:.3f} m from the goal'
     if sender.status in ENDS:
         print(f'{ENDS[sender.status]}{where}{_hint(sender.status)}')
@@ -138,6 +153,36 @@ def follow(sender: Sender, runner: Runner, signals: Signals, options: argparse.N
         print(f'not arrived within --timeout {options.timeout:g} s{where}')
         return _cancel(sender, runner, signals, _cli.FAILED)
     return _cancel(sender, runner, signals, _cli.INTERRUPTED)
+
+
+def _watch(
+    sender: Sender, runner: Runner, signals: Signals, timeout: float, controllers: set[bytes]
+) -> bool:
+    """Show the drive until the goal ends or its controllers are gone; False: time out or a signal."""
+    x, y, _ = sender.goal
+    looked = time.monotonic()
+    said = False
+    with _cli.Drive() as progress:
+
+        def over() -> bool:
+            nonlocal looked, said
+            now = time.monotonic()
+            blind = now - sender.seen > ANSWER_PATIENCE
+            if blind and not said:
+                topic = sender.resolve_topic_name('odom')
+                print(f'no odometry on {topic} for {ANSWER_PATIENCE:g} s: is the robot running?')
+            said = blind
+            if sender.pose is not None and not blind:
+                progress.show(f'goal ({x:g}, {y:g})', sender.distance)
+            if sender.status in ENDS:
+                return True
+            if now - looked < LOOK_PERIOD:
+                return False
+            looked = now
+            # A controller that was started anew knows nothing of the goal.
+            return not controllers & sender.controllers()
+
+        return _spin(runner, signals, timeout, over)
 
 
 def _hint(status: int) -> str:
