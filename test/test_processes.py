@@ -178,6 +178,21 @@ def test_a_second_ctrl_c_ends_the_wait_for_a_controller_that_hangs(world):
     assert 'Traceback' not in sender.stderr
 
 
+def test_another_reader_of_goals_is_no_controller(world):
+    from geometry_msgs.msg import PoseStamped
+
+    recorded = world.harness.listen(PoseStamped, 'goal_pose')
+    sender = world.start('send_goal', '0', '0')
+    # It waits, though its goal would be read.
+    world.until_published('goal_pose')
+    drive = Drive(world, *FAST)
+    assert (sender.exit(), sender.last_line[:7]) == (0, 'arrived')
+    world.harness.until(lambda: len(recorded) == 1, 'the goal was sent once')
+    assert not recorded[0].header.frame_id
+    drive.controller.signal(signal.SIGINT)
+    assert drive.controller.exit() == 0
+
+
 def test_send_goal_without_a_controller_says_so(world):
     sender = world.run('send_goal', '-1', '-1e-1', '--wait', '1', '--ros-args', '-r', '__ns:=/here')
     assert sender.exit() == 1

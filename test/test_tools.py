@@ -71,8 +71,11 @@ def test_drive_to_gives_up_after_the_timeout(world):
     )
 
 
-def test_drive_to_is_not_seen(world):
+@pytest.mark.parametrize('older', [{}, {'ROS_LOCALHOST_ONLY': '1'}], ids=['usual', 'localhost only'])
+def test_drive_to_is_not_seen(world, monkeypatch, older):
     peer = world.harness.peer
+    for name, value in older.items():
+        monkeypatch.setenv(name, value)
     child = world.start('drive_to', '0.05', '0', *QUICK)
     seen = set()
     while child.running:
@@ -104,6 +107,25 @@ def test_drive_to_open_is_seen_and_tells_truly_where_the_robot_stopped(world):
         patience=3.0,
     )
     assert reported > 0.0
+
+
+def test_drive_to_open_survives_what_strangers_publish(world):
+    from nav_msgs.msg import Odometry
+    from sensor_msgs.msg import JointState
+
+    child = world.start('drive_to', '0.2', '0', '--open', *QUICK)
+    bad = Odometry()
+    bad.pose.pose.position.x = float('nan')
+    odom = world.harness.talk(Odometry, 'odom')
+    states = world.harness.talk(JointState, 'joint_states')
+    while child.running:
+        odom.publish(bad)
+        states.publish(JointState(name=['a', 'b', 'c']))
+        world.harness.executor.spin_once(timeout_sec=0.02)
+    assert child.exit() == 0
+    assert child.last_line.startswith('arrived: ')
+    assert 'odometry dropped: position must be finite' in child.stderr
+    assert 'Traceback' not in child.stderr
 
 
 # --- Signals

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from action_msgs.msg import GoalStatus
@@ -73,7 +74,15 @@ class Sender(Node):  # type: ignore[misc]
         """Say what is missing before a goal can be sent; None: nothing."""
         if self.get_clock().now().nanoseconds == 0:
             return 'use_sim_time is true, but nothing came on /clock'
-        if not (self._publisher.get_subscription_count() and self.controllers()):
+        readers = [
+            reader
+            for reader in self.get_subscriptions_info_by_topic(self.resolve_topic_name('goal_pose'))
+            # One that wants to hear what was latched is never matched with us.
+            if reader.qos_profile.durability != DurabilityPolicy.TRANSIENT_LOCAL
+        ]
+        tellers = self.get_publishers_info_by_topic(self.resolve_topic_name('goal_status'))
+        matched = self._publisher.get_subscription_count() >= len(readers)
+        if not (matched and _nodes(readers) & _nodes(tellers)):
             return (
                 f'nobody reads {self.resolve_topic_name("goal_pose")} and publishes '
                 f'{self.resolve_topic_name("goal_status")}; is go_to_goal running, in the same '
@@ -113,6 +122,15 @@ class Sender(Node):  # type: ignore[misc]
             self.seen = time.monotonic()
         except MessageError as error:
             self.get_logger().warning(f'odometry dropped: {error}', throttle_duration_sec=2.0)
+
+
+def _nodes(endpoints: Iterable[Any]) -> set[tuple[str, str]]:
+    """Tell which nodes endpoints belong to; the name of a node may be found out later."""
+    return {
+        (endpoint.node_namespace, endpoint.node_name)
+        for endpoint in endpoints
+        if not endpoint.node_name.startswith('_')
+    }
 
 
 def follow(sender: Sender, runner: Runner, signals: Signals, options: argparse.Namespace) -> int:
