@@ -1,0 +1,75 @@
+"""The one runner: which executor it takes, when its loop ends, and what it does last."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.ros.runner import UserError, make_executor, ros_context, running
+
+
+def test_strangers_meet_the_fair_executor_and_a_closed_world_has_the_fast_one(ros):
+    open_to_all = make_executor(ros.context, closed_world=False)
+    assert isinstance(open_to_all, SingleThreadedExecutor)
+    open_to_all.shutdown()
+    closed = make_executor(ros.context, closed_world=True)
+    assert type(closed).__name__ == 'EventsExecutor'
+    closed.shutdown()
+
+
+def test_older_jazzy_has_only_the_fair_one(ros, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'rclpy.experimental.events_executor', None)
+    executor = make_executor(ros.context, closed_world=True)
+    assert isinstance(executor, SingleThreadedExecutor)
+    executor.shutdown()
+
+
+@pytest.mark.parametrize('closed_world', [False, True])
+def test_loop_ends_when_its_condition_holds_or_ros_shuts_down(closed_world):
+    with ros_context(['test']) as context, running(context, closed_world=closed_world) as runner:
+        node = runner.add(lambda: Node('ticking', context=context))
+        ticks = []
+        node.create_timer(0.01, lambda: ticks.append(1))
+        assert runner.spin(lambda: len(ticks) == 3)
+        node.create_timer(0.01, context.try_shutdown)
+        assert not runner.spin(lambda: False)
+
+
+def test_every_node_is_stopped_before_any_is_destroyed():
+    told = []
+
+    class Telling(GoToGoal):
+        def stop(self, why):
+            told.append((why, self.context.ok(), len(self.get_node_names())))
+
+    with ros_context(['test']) as context:
+        with running(context, closed_world=True) as runner:
+            runner.add(lambda: VirtualRobot(context=context))
+            runner.add(lambda: Telling(context=context))
+        assert told == [('shutting down', True, 2)]
+
+
+def test_mistakes_of_the_user_are_named():
+    with (
+        pytest.raises(UserError, match=r"'wheel_radius' must be in \[0.001, 10\], got 0.0"),
+        ros_context(['test', '--ros-args', '-p', 'wheel_radius:=0.0']) as context,
+        running(context, closed_world=True) as runner,
+    ):
+        runner.add(lambda: VirtualRobot(context=context))
+    with (
+        pytest.raises(UserError, match=r"ROS arguments: .*'--bogus'"),
+        ros_context(['test', '--ros-args', '--bogus']),
+    ):
+        pass
+
+
+@pytest.mark.parametrize('domain', ['233', '-1', 'home'])
+def test_domains_that_do_not_exist_are_named(monkeypatch, domain):
+    monkeypatch.setenv('ROS_DOMAIN_ID', domain)
+    with pytest.raises(UserError, match=f'must be in 0 to 232, got {domain!r}'), ros_context(['test']):
+        pass
