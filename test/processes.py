@@ -159,6 +159,45 @@ class World:
         self._stack.close()
 
 
+class Drive:
+    """A robot, a controller and what is heard of them."""
+
+    def __init__(self, world, *gains):
+        from action_msgs.msg import GoalStatus
+        from geometry_msgs.msg import Twist
+        from nav_msgs.msg import Odometry
+
+        self.world, self.harness = world, world.harness
+        self.robot = world.start('virtual_robot')
+        self.controller = world.start('go_to_goal', *gains)
+        self.odometry = self.harness.listen(Odometry, 'odom')
+        self.commands = self.harness.listen(Twist, 'cmd_vel')
+        self.status = self.harness.listen(GoalStatus, 'goal_status', latched=True)
+        self.harness.until(lambda: self.odometry, 'the robot is heard')
+        world.until_published('goal_status')
+
+    def send(self, *arguments):
+        """Start send_goal; returns it once the robot drives and the progress is shown."""
+        sender = self.world.start('send_goal', *arguments)
+        self.harness.until(lambda: self.drives() and self.commands, 'the robot drives')
+        sender.until_says('m to go')
+        return sender
+
+    def drives(self):
+        return bool(self.odometry) and self.odometry[-1].twist.twist.linear.x > 0.1
+
+    def stands(self):
+        twist = self.odometry[-1].twist.twist
+        return twist.linear.x == twist.angular.z == 0.0
+
+    def until_canceled(self):
+        """Wait for the end of the last goal and of the robot's motion."""
+        self.harness.until(
+            lambda: self.status and self.status[-1].status == self.status[-1].STATUS_CANCELED, 'canceled'
+        )
+        self.harness.until(self.stands, 'the robot stands')
+
+
 @contextmanager
 def open_world(directory):
     """Hold a world of its own; files go into a directory."""

@@ -7,12 +7,11 @@ import signal
 import time
 
 import pytest
-from processes import open_world
+from processes import Drive, open_world
 
 from diffdrive_jacobian.ros.parameters import specifications
 
-NODES = {'virtual_robot': 'odom', 'go_to_goal': 'goal_status', 'wheel_bridge': 'joint_command'}
-"""Each node with a topic that it publishes."""
+NODES = ('virtual_robot', 'go_to_goal', 'wheel_bridge')
 FAST = ('--ros-args', '-p', 'kp:=8.0', '-p', 'kv:=4.0')
 FAR = ('50', '0')
 
@@ -23,61 +22,18 @@ def world(tmp_path):
         yield made
 
 
-class Drive:
-    """A robot, a controller and what is heard of them."""
-
-    def __init__(self, world, *gains):
-        from action_msgs.msg import GoalStatus
-        from geometry_msgs.msg import Twist
-        from nav_msgs.msg import Odometry
-
-        self.world, self.harness = world, world.harness
-        self.robot = world.start('virtual_robot')
-        self.controller = world.start('go_to_goal', *gains)
-        self.odometry = self.harness.listen(Odometry, 'odom')
-        self.commands = self.harness.listen(Twist, 'cmd_vel')
-        self.status = self.harness.listen(GoalStatus, 'goal_status', latched=True)
-        self.harness.until(lambda: self.odometry, 'the robot is heard')
-        world.until_published('goal_status')
-
-    def send(self, *arguments):
-        """Start send_goal; returns it once the robot drives and the progress is shown."""
-        sender = self.world.start('send_goal', *arguments)
-        self.harness.until(lambda: self.drives() and self.commands, 'the robot drives')
-        sender.until_says('m to go')
-        return sender
-
-    def drives(self):
-        return bool(self.odometry) and self.odometry[-1].twist.twist.linear.x > 0.1
-
-    def stands(self):
-        twist = self.odometry[-1].twist.twist
-        return twist.linear.x == twist.angular.z == 0.0
-
-    def until_canceled(self):
-        """Wait for the end of the last goal and of the robot's motion."""
-        self.harness.until(
-            lambda: self.status and self.status[-1].status == self.status[-1].STATUS_CANCELED, 'canceled'
-        )
-        self.harness.until(self.stands, 'the robot stands')
-
-
 # --- Signals
 
 
-@pytest.mark.parametrize(
-    'signals',
-    [(signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT, signal.SIGINT)],
-    ids=lambda signals: '+'.join(number.name for number in signals),
-)
-def test_nodes_exit_0_on_a_signal(world, signals):
-    children = [world.start(name) for name in NODES]
-    world.until_published(*NODES.values())
-    for number in signals:
-        for child in children:
+def test_nodes_exit_0_on_a_signal(world):
+    signals = [(signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT, signal.SIGINT)]
+    children = [(world.start(name), numbers) for name in NODES for numbers in signals]
+    for child, numbers in children:
+        child.until_says('ready: ')
+        for number in numbers:
             child.signal(number)
-    assert [child.exit(5.0) for child in children] == [0, 0, 0]
-    for child in children:
+    for child, _ in children:
+        assert child.exit(5.0) == 0
         assert 'Traceback' not in child.stderr
 
 
@@ -138,20 +94,17 @@ def test_each_goal_has_its_own_end_whatever_became_of_older_ones(world):
         )
 
 
-def test_timeout_cancels_the_goal_and_no_wait_leaves_it(world):
+def test_no_wait_leaves_the_goal_and_timeout_cancels_it(world):
     drive = Drive(world)
+    left = world.start('send_goal', *FAR, '--no-wait')
+    drive.harness.until(drive.drives, 'the robot drives')
     sender = world.run('send_goal', *FAR, '--timeout', '0.5')
     assert sender.exit() == 1
     lines = sender.stdout.splitlines()
     assert lines[-2].startswith('not arrived within --timeout 0.5 s')
     assert lines[-1] == 'canceled: the robot was stopped'
     drive.until_canceled()
-    sender = world.run('send_goal', *FAR, '--no-wait')
-    assert sender.exit() == 0
-    assert sender.stdout == 'sent: goal (50, 0) on /goal_pose\n'
-    drive.harness.until(drive.drives, 'the robot drives')
-    drive.controller.signal(signal.SIGINT)
-    drive.until_canceled()
+    assert (left.exit(), left.stdout) == (0, 'sent: goal (50, 0) on /goal_pose\n')
 
 
 def test_ctrl_c_cancels_the_goal(world):
@@ -176,6 +129,7 @@ def test_a_second_ctrl_c_ends_the_wait_for_a_controller_that_hangs(world):
     assert sender.exit(0.1) == 130
     assert sender.last_line.endswith('the robot may still drive')
     assert 'Traceback' not in sender.stderr
+    drive.controller.signal(signal.SIGKILL)
 
 
 def test_another_reader_of_goals_is_no_controller(world):
@@ -250,11 +204,13 @@ def test_an_integer_is_taken_for_a_double_and_an_unknown_parameter_is_named(worl
     assert [value.double_value for value in future.result().values] == [4.0, 1.0]
 
 
-def test_help_lists_every_parameter(world):
-    from diffdrive_jacobian.tools.run_node import NODES as CLASSES
+@pytest.mark.parametrize('name', NODES)
+def test_help_lists_every_parameter(capsys, name):
+    from diffdrive_jacobian.ros.signals import Signals
+    from diffdrive_jacobian.tools import run_node
 
-    children = {name: world.start(name, '--help') for name in NODES}
-    for name, child in children.items():
-        assert (child.exit(), child.stderr) == (0, '')
-        lines = [line.strip() for line in child.stdout.splitlines()]
-        assert set(specifications(CLASSES[name][1])) <= set(lines)
+    with pytest.raises(SystemExit) as end:
+        run_node.run_node(name, ['--help'], Signals())
+    assert end.value.code == 0
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    assert set(specifications(run_node.NODES[name][1])) <= set(lines)

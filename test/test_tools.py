@@ -38,37 +38,59 @@ def assert_arrived(child, x, y, tolerance=0.02):
 
 
 @pytest.fixture(scope='module', autouse=True)
-def usual(tmp_path_factory):
-    """A drive of six seconds with nothing but defaults; it goes on behind the other tests."""
-    with open_world(tmp_path_factory.mktemp('usual')) as world:
-        yield world.start('drive_to', '0.3', '0.2')
+def drives(tmp_path_factory):
+    """Drives that need nobody's help; they go on behind the other tests, all at once."""
+    directory = tmp_path_factory.mktemp('drives')
+    malformed = directory / 'malformed.yaml'
+    malformed.write_text('go_to_goal: [1, 2\n  b: }')
+    commands = {
+        'usual': ('0.3', '0.2'),
+        'waypoints': ('0.3', '0', '0.3', '0.3', *QUICK),
+        'behind': ('-1e-1', '-.1', '--tolerance', '0.01', *QUICK),
+        'late': (*FAR, '--timeout', '0.5'),
+        'all nodes': ('0', '0', '--ros-args', '-p', 'kp:=6.0', '-p', 'wheel_radius:=0.05'),
+        'kp': ('1', '1', '--ros-args', '-p', 'kp:=0.0'),
+        'malformed': ('1', '1', '--params-file', str(malformed)),
+    }
+    for config in CONFIGS:
+        commands[config.stem] = ('0.2', '0.1', '--tolerance', '0.1', '--params-file', str(config))
+    with open_world(directory) as world:
+        yield {name: world.start('drive_to', *command) for name, command in commands.items()}
 
 
 # --- Driving
 
 
-def test_drive_to_arrives(world):
-    waypoints = world.start('drive_to', '0.3', '0', '0.3', '0.3', *QUICK)
-    behind = world.start('drive_to', '-1e-1', '-.1', '--tolerance', '0.01', *QUICK)
-    assert_arrived(behind, -0.1, -0.1, 0.01)
-    assert_arrived(waypoints, 0.3, 0.3)
-    assert 'goal 1/2 (0.3, 0)' in waypoints.stdout
-    assert 'goal 2/2 (0.3, 0.3)' in waypoints.stdout
+def test_drive_to_arrives(drives):
+    assert_arrived(drives['behind'], -0.1, -0.1, 0.01)
+    assert_arrived(drives['waypoints'], 0.3, 0.3)
+    assert re.search(r'goal 1/2 \(0.3, 0\)(.|\n)*goal 2/2 \(0.3, 0.3\)', drives['waypoints'].stdout)
 
 
-@pytest.mark.skipif(not CONFIGS, reason='config/ is empty')
-def test_drive_to_takes_the_files_in_config(world):
-    arguments = ('0.2', '0.1', '--tolerance', '0.1', '--params-file')
-    for child in [world.start('drive_to', *arguments, str(config)) for config in CONFIGS]:
-        assert_arrived(child, 0.2, 0.1, 0.1)
+def test_a_parameter_of_one_of_its_nodes_is_not_unknown_to_drive_to(drives):
+    assert_arrived(drives['all nodes'], 0.0, 0.0)
 
 
-def test_drive_to_gives_up_after_the_timeout(world):
-    child = world.run('drive_to', *FAR, '--timeout', '0.5')
-    assert (child.exit(), child.stderr) == (1, '')
-    assert child.last_line.startswith(
-        'not arrived (--timeout 0.5 s was too short): the robot stopped at'
-    )
+@pytest.mark.parametrize('config', [config.stem for config in CONFIGS])
+def test_drive_to_takes_the_files_in_config(drives, config):
+    assert_arrived(drives[config], 0.2, 0.1, 0.1)
+
+
+def test_drive_to_gives_up_after_the_timeout(drives):
+    late = drives['late']
+    assert (late.exit(), late.stderr) == (1, '')
+    assert late.last_line.startswith('not arrived (--timeout 0.5 s was too short): the robot')
+
+
+def test_drive_to_says_what_its_nodes_cannot_take(drives):
+    refused = {'malformed': 'malformed.yaml', 'kp': "'kp' must be in (0, 100], got 0.0"}
+    for name, words in refused.items():
+        assert (drives[name].exit(), drives[name].stdout) == (2, '')
+        assert 'Traceback' not in drives[name].stderr
+        assert words in drives[name].stderr.splitlines()[-1]
+
+
+# --- Who sees it
 
 
 @pytest.mark.parametrize('older', [{}, {'ROS_LOCALHOST_ONLY': '1'}], ids=['usual', 'localhost only'])
@@ -86,15 +108,16 @@ def test_drive_to_is_not_seen(world, monkeypatch, older):
 
 
 def test_drive_to_open_is_seen_and_tells_truly_where_the_robot_stopped(world):
-    from geometry_msgs.msg import Twist
+    from geometry_msgs.msg import TwistStamped
     from nav_msgs.msg import Odometry
 
-    odometry, commands = world.harness.listen(Odometry, 'odom'), world.harness.listen(Twist, 'cmd_vel')
+    odometry = world.harness.listen(Odometry, 'odom')
+    applied = world.harness.listen(TwistStamped, 'cmd_vel_out')
     # So slow that the robot drives already when the last odometry still says that it stands.
     child = world.start(
         'drive_to', *FAR, '--open', '--ros-args', '-p', 'virtual_robot:publish_rate:=4.0'
     )
-    world.harness.until(lambda: commands and odometry, 'it drives')
+    world.harness.until(lambda: applied and odometry, 'it drives')
     child.signal(signal.SIGINT)
     assert child.exit(5.0) == 130
     reported = float(re.search(r'stopped at x (\S+) m', child.last_line)[1])
@@ -122,10 +145,8 @@ def test_drive_to_open_survives_what_strangers_publish(world):
         odom.publish(bad)
         states.publish(JointState(name=['a', 'b', 'c']))
         world.harness.executor.spin_once(timeout_sec=0.02)
-    assert child.exit() == 0
-    assert child.last_line.startswith('arrived: ')
+    assert (child.exit(), child.last_line[:9]) == (0, 'arrived: ')
     assert 'odometry dropped: position must be finite' in child.stderr
-    assert 'Traceback' not in child.stderr
 
 
 # --- Signals
@@ -153,15 +174,10 @@ def test_drive_to_exits_130_on_signals_that_do_not_cease(world):
             assert time.monotonic() < deadline
             child.signal(signal.SIGINT)
             time.sleep(0.002)
-    assert [child.exit() for child in children] == [130, 130]
     for child in children:
+        assert child.exit() == 130
         assert child.last_line.startswith('interrupted: the robot')
         assert 'Traceback' not in child.stderr
-
-
-def test_drive_to_arrives_with_nothing_but_defaults(usual):
-    assert_arrived(usual, 0.3, 0.2)
-    assert re.match(r'goal 1/1 \(0.3, 0.2\) +0.361 m to go, wheels left +0.00, right', usual.stdout)
 
 
 def test_drive_to_survives_a_reader_that_goes_away(world):
@@ -170,14 +186,13 @@ def test_drive_to_survives_a_reader_that_goes_away(world):
     os.close(read)
     child = world.start('drive_to', *FAR, '--timeout', '0.2', stdout=write)
     os.close(write)
-    child.exit()
-    assert 'Traceback' not in child.stderr
-    assert 'BrokenPipeError' not in child.stderr
+    assert (child.exit(), child.stderr) == (1, '')
 
 
-def test_a_parameter_of_one_of_its_nodes_is_not_unknown_to_drive_to(world):
-    child = world.run('drive_to', '0', '0', '--ros-args', '-p', 'kp:=6.0', '-p', 'wheel_radius:=0.05')
-    assert_arrived(child, 0.0, 0.0)
+def test_drive_to_arrives_with_nothing_but_defaults(drives):
+    assert_arrived(drives['usual'], 0.3, 0.2)
+    first = drives['usual'].stdout.splitlines()[0]
+    assert re.match(r'goal 1/1 \(0.3, 0.2\) +0.361 m to go, wheels left +0.00, right', first)
 
 
 # --- Arguments
@@ -201,7 +216,6 @@ def test_a_parameter_of_one_of_its_nodes_is_not_unknown_to_drive_to(world):
         (('1', '1', '--timeout', '-1e-3'), "--timeout: must be positive, got '-1e-3'"),
         (('1', '1', '--timeout', 'inf'), "'inf'"),
         (('1', '1', '--params-file', 'nowhere.yaml'), "no such file: 'nowhere.yaml'"),
-        (('1', '1', '--params-file', '.'), "'.'"),
         (('1', '1', '--bogus'), '--bogus'),
     ],
     ids=lambda value: ' '.join(value) if isinstance(value, tuple) else '',
@@ -218,20 +232,6 @@ def test_drive_to_says_what_it_cannot_take(capsys, arguments, words):
     assert words in line
 
 
-def test_drive_to_says_what_its_nodes_cannot_take(world, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / 'malformed.yaml').write_text('go_to_goal: [1, 2\n  b: }')
-    refused = {
-        ('--params-file', 'malformed.yaml'): 'malformed.yaml',
-        ('--ros-args', '-p', 'kp:=0.0'): "'kp' must be in (0, 100], got 0.0",
-    }
-    children = [world.start('drive_to', '1', '1', *arguments) for arguments in refused]
-    for child, words in zip(children, refused.values(), strict=True):
-        assert (child.exit(), child.stdout) == (2, '')
-        assert 'Traceback' not in child.stderr
-        assert words in child.stderr.splitlines()[-1]
-
-
 ROS = ['--ros-args', '-p', 'x:=-1', '-r', '__ns:=/a']
 
 
@@ -240,8 +240,7 @@ ROS = ['--ros-args', '-p', 'x:=-1', '-r', '__ns:=/a']
     [
         ([], [], []),
         (['1', '-1'], ['1', ' -1'], []),
-        (['-1e-1', '-.5', '-1E+3'], [' -1e-1', ' -.5', ' -1E+3'], []),
-        (['-inf', '-nan'], [' -inf', ' -nan'], []),
+        (['-1e-1', '-.5', '-1E+3', '-inf'], [' -1e-1', ' -.5', ' -1E+3', ' -inf'], []),
         (['--tolerance', '-1', '--timeout=-1'], ['--tolerance', ' -1', '--timeout=-1'], []),
         (['-h', '--open', '-', '-1m'], ['-h', '--open', '-', '-1m'], []),
         (['1', '1', *ROS], ['1', '1'], ROS),
@@ -249,7 +248,6 @@ ROS = ['--ros-args', '-p', 'x:=-1', '-r', '__ns:=/a']
         ([*ROS, '--', '1', *ROS, '--', '1'], ['1', '1'], [*ROS, '--', *ROS, '--']),
         (['1', '--', '-1'], ['1', '--', ' -1'], []),
         (['--ros-args', '--ros-args', '-1'], [], ['--ros-args', '--ros-args', '-1']),
-        (['1', '1', '--ros-args', '--'], ['1', '1'], ['--ros-args', '--']),
     ],
 )
 def test_arguments_of_tool_and_ros_are_told_apart(arguments, own, ros):
