@@ -63,6 +63,18 @@ class Harness:
             assert time.monotonic() < deadline, f'not within {patience} s: {what}'
             self.executor.spin_once(timeout_sec=0.01)
 
+    def until_said(self, capfd, *words):
+        """Serve the nodes until all words stand in the log; returns the log so far."""
+        said = ''
+
+        def told():
+            nonlocal said
+            said += capfd.readouterr().err
+            return all(word in said for word in words)
+
+        self.until(told, f'the log says {words}')
+        return said
+
     def call(self, service_type, name):
         """Call a service without arguments; returns the response."""
         client = self.peer.create_client(service_type, name)

@@ -295,14 +295,7 @@ def test_gains_that_spiral_are_warned_about(controller, capfd):
 def test_missing_odometry_is_said(ros, capfd):
     controller = Controller(ros, odom_timeout=0.1)
     controller.send(goal(1, 0))
-    said = ''
-
-    def told():
-        nonlocal said
-        said += capfd.readouterr().err
-        return 'the goal waits for odometry on /odom' in said
-
-    ros.until(told, 'the warning')
+    ros.until_said(capfd, 'the goal waits for odometry on /odom')
     assert not controller.commands
     controller.ends((0, ACCEPTED))
 

@@ -32,14 +32,7 @@ def test_other_type_in_another_process_is_said_once(monkeypatch, capfd, stranger
             peer.create_publisher(TwistStamped, 'cmd_vel', 10)
         else:
             peer.create_subscription(TwistStamped, 'cmd_vel', lambda _: None, 10)
-        said = ''
-
-        def told():
-            nonlocal said
-            said += capfd.readouterr().err
-            return 'enable_stamped_cmd_vel' in said
-
-        harness.until(told, 'the error')
+        said = harness.until_said(capfd, 'enable_stamped_cmd_vel')
         looks = []
         harness.peer.create_timer(0.05, lambda: looks.append(capfd.readouterr().err))
         harness.until(lambda: len(looks) == 5, 'more looks')

@@ -54,14 +54,7 @@ def test_without_clock_nothing_moves_and_that_is_said(ros, capfd, monkeypatch):
     odom, applied = ros.listen(Odometry, 'odom'), ros.listen(TwistStamped, 'cmd_vel_out')
     ros.add(VirtualRobot, parameters={'use_sim_time': True})
     ros.talk(Twist, 'cmd_vel').publish(twist(1.0, 0.0))
-    said = ''
-
-    def both_said():
-        nonlocal said
-        said += capfd.readouterr().err
-        return 'nothing came on /clock for' in said and 'command dropped: simulated time' in said
-
-    ros.until(both_said, 'both warnings')
+    ros.until_said(capfd, 'nothing came on /clock for', 'command dropped: simulated time')
     assert not ros.call(Trigger, 'reset_odometry').success
     assert not odom
     assert not applied

@@ -134,12 +134,5 @@ def test_without_a_clock_nothing_moves(ros, capfd, monkeypatch):
     ros.until(lambda: len(out) == 2, 'the stop')
     assert list(out[1].velocity) == [0.0, 0.0]
     commands.publish(twist(0.2, 0.0))
-    said = ''
-
-    def told():
-        nonlocal said
-        said += capfd.readouterr().err
-        return 'command dropped: simulated time has not begun' in said
-
-    ros.until(told, 'the warning')
+    ros.until_said(capfd, 'command dropped: simulated time has not begun')
     assert len(out) == 2

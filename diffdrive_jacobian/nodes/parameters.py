@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.ros.messages import MAX_POSITION, MAX_SPEED
@@ -70,18 +71,16 @@ def _or(value: float, otherwise: float) -> float:
     return otherwise if math.isnan(value) else value
 
 
-def _wheel_radius() -> float:
-    return parameter(0.033, 'Wheel radius [m].', bounds=(1e-3, 10.0))  # type: ignore[no-any-return]
+def _wheel_radius() -> Any:
+    return parameter(0.033, 'Wheel radius [m].', bounds=(1e-3, 10.0))
 
 
-def _wheel_separation() -> float:
-    return parameter(  # type: ignore[no-any-return]
-        0.16, 'Wheel separation, also called track width [m].', bounds=(1e-3, 100.0)
-    )
+def _wheel_separation() -> Any:
+    return parameter(0.16, 'Wheel separation, also called track width [m].', bounds=(1e-3, 100.0))
 
 
-def _max_wheel_velocity() -> float:
-    return parameter(  # type: ignore[no-any-return]
+def _max_wheel_velocity() -> Any:
+    return parameter(
         math.nan,
         'Fastest speed of either wheel [rad/s]; both are slowed alike, so the path stays; .nan: none.',
         bounds=(1e-3, 1e6),
@@ -89,14 +88,12 @@ def _max_wheel_velocity() -> float:
     )
 
 
-def _timeout(default: float, description: str) -> float:
-    return parameter(default, description, bounds=(0.0, 3600.0))  # type: ignore[no-any-return]
+def _timeout(default: float, description: str) -> Any:
+    return parameter(default, description, bounds=(0.0, 3600.0))
 
 
-def _multiplier(what: str) -> float:
-    return parameter(  # type: ignore[no-any-return]
-        1.0, f'Calibration factor on the {what} [-].', bounds=(0.1, 10.0)
-    )
+def _multiplier(what: str) -> Any:
+    return parameter(1.0, f'Calibration factor on the {what} [-].', bounds=(0.1, 10.0))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
