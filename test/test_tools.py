@@ -90,9 +90,6 @@ def test_drive_to_says_what_its_nodes_cannot_take(drives):
         assert words in drives[name].stderr.splitlines()[-1]
 
 
-# --- Who sees it
-
-
 @pytest.mark.parametrize('older', [{}, {'ROS_LOCALHOST_ONLY': '1'}], ids=['usual', 'localhost only'])
 def test_drive_to_is_not_seen(world, monkeypatch, older):
     peer = world.harness.peer
@@ -121,15 +118,13 @@ def test_drive_to_open_is_seen_and_tells_truly_where_the_robot_stopped(world):
     child.signal(signal.SIGINT)
     assert child.exit(5.0) == 130
     reported = float(re.search(r'stopped at x (\S+) m', child.last_line)[1])
-    world.harness.until(
-        lambda: (
-            odometry[-1].twist.twist.linear.x == 0.0
-            and abs(odometry[-1].pose.pose.position.x - reported) < 0.001
-        ),
-        'it stands where it was said to',
-        patience=3.0,
-    )
     assert reported > 0.0
+
+    def stands_there():
+        pose, twist = odometry[-1].pose.pose, odometry[-1].twist.twist
+        return twist.linear.x == 0.0 and abs(pose.position.x - reported) < 0.001
+
+    world.harness.until(stands_there, 'it stands where it was said to', patience=3.0)
 
 
 def test_drive_to_open_survives_what_strangers_publish(world):
