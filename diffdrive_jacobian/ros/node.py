@@ -29,8 +29,8 @@ P = TypeVar('P', bound=NodeParameters)
 
 THROTTLE = 2.0
 """What may go wrong with every message is said so often at most (s). rclpy counts per line of code."""
-FLUSH_PATIENCE = Duration(seconds=0.5)
-"""How long the last message may take to be acknowledged."""
+FLUSH_PATIENCE = Duration(seconds=0.1)
+"""How long the last message may take to be acknowledged; it arrives long before (s)."""
 WATCH_PERIOD = 1.0
 """How often the graph and the clock are looked at (s)."""
 CLOCK_PATIENCE = 5
