@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -224,14 +224,14 @@ def _cancel(sender: Sender, runner: Runner, signals: Signals, code: int) -> int:
     return code
 
 
-def _spin(runner: Runner, signals: Signals, seconds: float, until: object) -> bool:
+def _spin(runner: Runner, signals: Signals, seconds: float, until: Callable[[], bool]) -> bool:
     """Spin until a condition holds; False after so many seconds or on a signal."""
     deadline = time.monotonic() + seconds
     held = False
 
     def over() -> bool:
         nonlocal held
-        held = until()  # type: ignore[operator]
+        held = until()
         return held or signals.count > 0 or time.monotonic() > deadline
 
     runner.spin(over)
