@@ -14,6 +14,8 @@ os.environ.setdefault('ROS_LOG_DIR', os.path.join(os.environ.get('TMPDIR', '/tmp
 
 import pytest
 
+pytest_plugins = ['diffdrive_jacobian.testing.fixtures', 'pytester']
+
 PATIENCE = 20.0
 """How long a condition may take to come true before the test fails (s)."""
 

@@ -36,11 +36,31 @@ class UserError(Exception):
 
 
 @contextmanager
-def ros_context(arguments: Sequence[str]) -> Iterator[Context]:
+def closed_world() -> Iterator[None]:
+    """Make contexts that no other process can reach, nor another context of this one."""
+    # The first is what counts; the others would be obeyed before it.
+    names = (
+        'ROS_AUTOMATIC_DISCOVERY_RANGE',
+        'ROS_LOCALHOST_ONLY',
+        'ROS_STATIC_PEERS',
+        'ROS_DISCOVERY_SERVER',
+    )
+    before = {name: os.environ.pop(name, None) for name in names}
+    os.environ[names[0]] = 'OFF'
+    try:
+        yield
+    finally:
+        del os.environ[names[0]]
+        os.environ.update({name: value for name, value in before.items() if value is not None})
+
+
+@contextmanager
+def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[Context]:
     """Hold a ROS context without signal handlers of rclpy.
 
     Args:
         arguments: The command line with the program's name; what follows `--ros-args` counts.
+        default: Whether it is rclpy's default context, which nodes take that name none.
 
     Raises:
         UserError: rcl does not understand the arguments or the environment.
@@ -51,7 +71,7 @@ def ros_context(arguments: Sequence[str]) -> Iterator[Context]:
     for flag, value in pairwise(arguments):
         if flag == '--params-file' and not os.access(value, os.R_OK):
             raise UserError(f'--params-file must name a file that can be read, got {value!r}')
-    context = Context()
+    context = rclpy.get_default_context() if default else Context()
     try:
         rclpy.init(
             args=list(arguments),
@@ -64,7 +84,8 @@ def ros_context(arguments: Sequence[str]) -> Iterator[Context]:
     try:
         yield context
     finally:
-        context.try_shutdown()
+        # Of the default context rclpy makes a new one then.
+        rclpy.try_shutdown(context=None if default else context)
 
 
 def make_executor(context: Context, *, closed_world: bool) -> Executor:

@@ -1,0 +1,422 @@
+"""An executor that knows when nothing is left to do, and does everything in a reproducible order.
+
+Messages, service calls and tasks run on rclpy's EventsExecutor, in the order in which they were sent:
+within one process Fast DDS hands a message to its readers before publish() returns. The timers are
+kept from it, for it fires them from a second thread, at an instant and in an order of that thread's
+own; here they are called one by one, the most overdue first, each after all messages were handled.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from functools import partial
+from types import FrameType
+from typing import Any
+
+from rclpy.clock_type import ClockType
+from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy
+from rclpy.service import Service
+from rclpy.subscription import Subscription
+from rclpy.task import Task
+from rclpy.timer import Timer
+
+from diffdrive_jacobian.testing._errors import LockstepError
+
+LATCHED_PATIENCE = Duration(seconds=5.0)
+"""How long a latched message may take to reach a late reader (s); it takes microseconds."""
+
+
+class QuiescentExecutor:
+    """Serves nodes until nothing is left to do at the present instant."""
+
+    def __init__(self, context: Context, on_registered: Callable[[Node], None]) -> None:
+        """Begin without nodes.
+
+        Args:
+            context: The context of the nodes.
+            on_registered: Called with each node whose entities are new or changed.
+
+        Raises:
+            LockstepError: This rclpy has no EventsExecutor.
+        """
+        try:
+            from rclpy.experimental.events_executor import EventsExecutor
+        except ImportError as error:
+            raise LockstepError(
+                'lockstep needs the EventsExecutor of rclpy, which this ROS installation is too old '
+                'for (Jazzy has it since rclpy 7.1.5): update it'
+            ) from error
+        self._events = EventsExecutor(context=context)
+        self._on_registered = on_registered
+        self._served: dict[Node, _Served] = {}
+        self._facade = _Facade(self)
+        self._changed = False
+        self._tasks: list[_Task] = []
+        # Handles with their timers: asking the handle for its time costs a third of asking the timer.
+        self._sim_timers: list[tuple[Any, Timer]] = []
+        self._wall_timers: list[tuple[Any, Timer]] = []
+
+    # --- Nodes
+
+    @property
+    def nodes(self) -> list[Node]:
+        """The nodes served, in the order in which they were added."""
+        return list(self._served)
+
+    def add(self, node: Node) -> None:
+        """Serve a node."""
+        self._served[node] = _Served(node, self.create_task)
+        node.executor = self._facade
+        self._events.add_node(self._served[node])
+        self._changed = True
+
+    def remove(self, node: Node) -> None:
+        """Serve a node no longer."""
+        served = self._served.pop(node)
+        node.executor = None
+        self._events.remove_node(served)
+        self._events.wake()
+        self._changed = True
+        self.settle()
+
+    def close(self) -> None:
+        """Serve nobody any more."""
+        for task in self._tasks:
+            task.future.cancel()
+        for node in self.nodes:
+            node.executor = None
+        self._served.clear()
+        self._events.shutdown()
+
+    # --- Work
+
+    def settle(self) -> int | None:
+        """Handle what there is to handle at this instant, and all that follows from it.
+
+        Returns:
+            The time until the next timer of simulated time is due (ns); None: there is no such timer.
+        """
+        while True:
+            self._handle_all()
+            due, until_next = self._due_timers()
+            if not due:
+                return until_next
+            for handle, timer in due:
+                if _is_due(handle):
+                    self._call(handle, timer)
+                    self._handle_all()
+
+    def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
+        """Run a function or a coroutine at this instant, or as far as it comes; gives its future."""
+        if _is_async(callback):
+            callback, args, kwargs = callback(*args, **kwargs), (), {}
+        task = _Task(callback, Task(callback, args, kwargs, executor=self._facade))
+        self._tasks.append(task)
+        return task.future
+
+    def _handle_all(self) -> None:
+        """Handle messages, service calls and tasks until none is left that can go on."""
+        while True:
+            self._drain()
+            if self._changed:
+                self._register()
+            elif not (self._tasks and self._run_tasks()):
+                return
+
+    def _run_tasks(self) -> bool:
+        """Let each task go on once; whether any of them did.
+
+        A coroutine does not tell what it waits for, so it is asked to go on and may wait again.
+        """
+        progress = False
+        tasks, self._tasks = self._tasks, []
+        for index, task in enumerate(tasks):
+            progress |= task.go_on()
+            if (error := task.future.exception()) is not None:
+                self._tasks += tasks[index + 1 :]
+                raise error
+            if not (task.future.done() or task.future.cancelled()):
+                self._tasks.append(task)
+        return progress
+
+    def _drain(self) -> None:
+        """Handle events until none is left.
+
+        A task runs after all that was in the queue before it: if it is the first to run, there was
+        nothing else.
+        """
+        create_task, spin_once = self._events.create_task, self._events.spin_once
+        while True:
+            last = create_task(_nothing)
+            done, events = last.done, 0
+            while not done():
+                spin_once()
+                events += 1
+            if events == 1:
+                return
+
+    def _due_timers(self) -> tuple[list[tuple[Any, Timer]], int | None]:
+        """Find the timers that are due, the most overdue first, and the time until the next one (ns)."""
+        due, until_next = [], None
+        for pair in self._sim_timers:
+            left = pair[0].time_until_next_call()
+            if left is None:
+                continue
+            if left <= 0:
+                due.append((left, pair))
+            elif until_next is None or left < until_next:
+                until_next = left
+        for pair in self._wall_timers:
+            left = pair[0].time_until_next_call()
+            if left is not None and left <= 0:
+                due.append((left, pair))
+        # Sorting is stable: equals stay in the order of their creation.
+        due.sort(key=lambda one: one[0])
+        return [pair for _, pair in due], until_next
+
+    def _call(self, handle: Any, timer: Timer) -> None:
+        handle.call_timer()
+        result = timer.callback()
+        if inspect.iscoroutine(result):
+            self.create_task(result)
+
+    # --- Entities
+
+    def changed(self) -> None:
+        """Take note that a node has made or destroyed something."""
+        self._changed = True
+
+    def _register(self) -> None:
+        """Look for what the nodes have made or destroyed since the last time.
+
+        A latched message reaches a late reader from another thread: it is waited for, and the readers
+        of latched topics are registered one by one, so that their messages come in one order.
+        """
+        self._changed = False
+        for node, served in self._served.items():
+            if list(node.guards):
+                raise LockstepError(
+                    f'{node.get_fully_qualified_name()} has a guard condition, which the executor of '
+                    'this world cannot serve'
+                )
+            for publisher in node.publishers:
+                if _is_latched(publisher):
+                    publisher.wait_for_all_acked(LATCHED_PATIENCE)
+            served.update()
+            self._on_registered(node)
+        self._events.wake()
+        self._drain()
+        for served in self._served.values():
+            while served.admit_latched():
+                self._events.wake()
+                self._drain()
+        timers = [timer for node in self._served for timer in node.timers]
+        self._sim_timers = [(timer.handle, timer) for timer in timers if _follows_sim_time(timer)]
+        self._wall_timers = [(timer.handle, timer) for timer in timers if not _follows_sim_time(timer)]
+
+    def describe(self, frame: FrameType) -> str:
+        """Name the callback that a frame runs: its function, what calls it, its node."""
+        where = f'{frame.f_code.co_filename}:{frame.f_code.co_firstlineno}'
+        for node in self._served:
+            named = f'node {node.get_fully_qualified_name()}, {where}'
+            for subscription in node.subscriptions:
+                if name := _runs(frame, subscription.callback):
+                    return f'{name} (reads {subscription.topic_name}, {named})'
+            for timer in node.timers:
+                if name := _runs(frame, timer.callback):
+                    return f'{name} (timer of {timer.timer_period_ns / 1e9:g} s, {named})'
+            for service in node.services:
+                if name := _runs(frame, service.callback):
+                    return f'{name} (service {node.resolve_service_name(service.srv_name)}, {named})'
+        return f'{frame.f_code.co_name} ({where})'
+
+
+def _runs(frame: FrameType, callback: Any) -> str:
+    """Give the name of a callback if a frame runs it."""
+    while isinstance(callback, partial):
+        callback = callback.func
+    function = getattr(callback, '__func__', callback)
+    if getattr(function, '__code__', None) is not frame.f_code:
+        return ''
+    owner = getattr(callback, '__self__', None)
+    if owner is not None and frame.f_locals.get(frame.f_code.co_varnames[0]) is not owner:
+        return ''
+    return str(getattr(callback, '__qualname__', frame.f_code.co_name))
+
+
+def _nothing() -> None:
+    """Be a task."""
+
+
+def _follows_sim_time(timer: Timer) -> bool:
+    clock = timer.clock
+    return clock.clock_type == ClockType.ROS_TIME and bool(clock.ros_time_is_active)
+
+
+def _is_due(handle: Any) -> bool:
+    try:
+        left = handle.time_until_next_call()
+    except rclpy_implementation.RCLError:
+        # A callback has destroyed it.
+        return False
+    return left is not None and left <= 0
+
+
+class _Task:
+    """A task and how far its coroutine came."""
+
+    def __init__(self, handler: Any, future: Task) -> None:
+        self.future = future
+        self._handler = handler
+        self._waits_at: object = None
+
+    def go_on(self) -> bool:
+        """Run it as far as it comes; whether it came any farther."""
+        before = self._waits_at
+        self.future()
+        self._waits_at = self._await_point()
+        return self._waits_at is not before or not inspect.iscoroutine(self._handler)
+
+    def _await_point(self) -> object:
+        """Give the innermost thing that the coroutine waits for; None at its end.
+
+        It is kept, so that no later one can take its identity.
+        """
+        point: Any = self._handler
+        while point is not None:
+            inner = getattr(point, 'cr_await', None) or getattr(point, 'gi_yieldfrom', None)
+            if inner is None:
+                break
+            point = inner
+        return point if getattr(point, 'gi_frame', None) is not None else None
+
+
+class _Facade:
+    """What a node takes for its executor."""
+
+    def __init__(self, executor: QuiescentExecutor) -> None:
+        self._executor = executor
+
+    def add_node(self, node: Node) -> bool:
+        """Accept what `Node.executor` announces; the world added the node before."""
+        return True
+
+    def remove_node(self, node: Node) -> None:
+        """Accept it likewise."""
+
+    def wake(self) -> None:
+        """Hear that a node has made or destroyed something."""
+        self._executor.changed()
+
+    def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
+        """Run a function or a coroutine."""
+        return self._executor.create_task(callback, *args, **kwargs)
+
+    def __getattr__(self, name: str) -> Any:
+        raise LockstepError(
+            f'a node in lockstep cannot call executor.{name}: the world does the spinning'
+        )
+
+
+class _Served:
+    """A node as the EventsExecutor sees it: without timers, and with what was registered so far."""
+
+    def __init__(self, node: Node, create_task: Callable[..., Any]) -> None:
+        self.node = node
+        self.executor: Any = None
+        self.timers: tuple[Timer, ...] = ()
+        self.subscriptions: list[Any] = []
+        self.services: list[Any] = []
+        self._latecomers: list[Any] = []
+        self._create_task = create_task
+        self._readers: dict[Any, Any] = {}
+        self._servers: dict[Any, Any] = {}
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.node, name)
+
+    def update(self) -> None:
+        """Take over the node's subscriptions and services; those of latched topics wait."""
+        known, self._readers = self._readers, {}
+        for reader in self.node.subscriptions:
+            self._readers[reader] = known.get(reader) or _Subscription(reader, self._create_task)
+        readers = list(self._readers.values())
+        new = [reader for reader in readers if reader not in self.subscriptions]
+        self._latecomers = [reader for reader in new if _is_latched(reader)]
+        self.subscriptions = [reader for reader in readers if reader not in self._latecomers]
+        known, self._servers = self._servers, {}
+        for server in self.node.services:
+            self._servers[server] = known.get(server) or _Service(server, self._create_task)
+        self.services = list(self._servers.values())
+
+    def admit_latched(self) -> bool:
+        """Add one reader of a latched topic; False if none waits."""
+        if not self._latecomers:
+            return False
+        self.subscriptions = [*self.subscriptions, self._latecomers.pop(0)]
+        return True
+
+
+def _is_latched(endpoint: Any) -> bool:
+    return bool(endpoint.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def _is_async(callback: Any) -> bool:
+    return inspect.iscoroutinefunction(callback) or inspect.iscoroutinefunction(
+        getattr(callback, '__call__', None)  # noqa: B004
+    )
+
+
+class _Subscription:
+    """A subscription that the EventsExecutor of Jazzy cannot serve as it is.
+
+    It never awaits coroutines, and hands a message with its info over as one argument.
+    """
+
+    CallbackType = Subscription.CallbackType
+
+    def __init__(self, subscription: Subscription, create_task: Callable[..., Any]) -> None:
+        self._subscription = subscription
+        self._create_task = create_task
+        # What is asked for with every message, without a detour. The EventsExecutor only borrows the
+        # callback: it must be an attribute that lasts.
+        self.handle = subscription.handle
+        self.msg_type, self.raw = subscription.msg_type, subscription.raw
+        self.callback = self._on_message
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._subscription, name)
+
+    def _on_message(self, *received: Any) -> None:
+        if isinstance(received[0], tuple):
+            received = received[0]
+        result = self._subscription.callback(*received)
+        if inspect.iscoroutine(result):
+            self._create_task(result)
+
+
+class _Service:
+    """A service whose callback may be a coroutine: its answer is sent when that has ended."""
+
+    def __init__(self, service: Service, create_task: Callable[..., Any]) -> None:
+        self._service = service
+        self._create_task = create_task
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._service, name)
+
+    def send_response(self, response: Any, header: Any) -> None:
+        """Send what the callback answers in the end."""
+        if not inspect.iscoroutine(response):
+            self._service.send_response(response, header)
+            return
+
+        async def answer() -> None:
+            self._service.send_response(await response, header)
+
+        self._create_task(answer)

@@ -1,0 +1,129 @@
+"""What ends a test when simulated time cannot pass: a callback that blocks, or callbacks without end.
+
+After `patience` seconds of wall time at one instant a second thread sends the main thread a signal. Its
+handler runs between two steps of the interpreter, also within a sleeping callback, looks for a moment at
+which callbacks are called, and raises.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import sysconfig
+import threading
+import time
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import Any
+
+import rclpy
+
+from diffdrive_jacobian.testing import _executor
+
+SIGNAL = signal.SIGUSR2
+"""Neither pytest nor its plugins use it; pytest-timeout uses SIGALRM."""
+LOOK = 0.25
+"""For how long the callbacks are looked at, and how often the guard looks at the clock (s)."""
+MOST_NAMED = 8
+"""How many callbacks are named at most."""
+_STANDARD = sysconfig.get_path('stdlib') + os.sep
+_PACKAGES = sysconfig.get_path('platlib') + os.sep
+_INFRASTRUCTURE = (os.path.dirname(rclpy.__file__) + os.sep, os.path.dirname(__file__) + os.sep)
+
+
+class Stuck(BaseException):
+    """Raised within the callback that does not let time pass; `except Exception` does not hold it."""
+
+
+class Guard:
+    """Watches over the wall time that passes while simulated time stands."""
+
+    def __init__(self, patience: float, describe: Callable[[FrameType], str]) -> None:
+        """Begin to watch.
+
+        Args:
+            patience: Wall time that one instant may take (s).
+            describe: Names the callback that a frame belongs to.
+        """
+        self._patience = patience
+        self._describe = describe
+        self._since: float | None = None
+        self._seen: dict[str, None] | None = None
+        self._profiler: Any = None
+        self._main = threading.get_ident()
+        self._closed = threading.Event()
+        self._previous = signal.signal(SIGNAL, self._on_signal)
+        self._thread = threading.Thread(target=self._watch, name='lockstep guard', daemon=True)
+        self._thread.start()
+
+    def arm(self) -> None:
+        """Let an instant begin."""
+        self._since = time.monotonic()
+
+    def disarm(self) -> None:
+        """Let it end."""
+        self._since = None
+
+    def close(self) -> None:
+        """Watch no longer."""
+        self._closed.set()
+        self._thread.join()
+        signal.signal(SIGNAL, self._previous)
+
+    def _overdue(self) -> bool:
+        return self._since is not None and time.monotonic() - self._since > self._patience
+
+    def _watch(self) -> None:
+        while not self._closed.wait(LOOK):
+            if self._overdue():
+                signal.pthread_kill(self._main, SIGNAL)
+
+    def _on_signal(self, _: int, frame: FrameType | None) -> None:
+        if not self._overdue():
+            return
+        if self._seen is None:
+            self._seen = {}
+            self._profiler = sys.getprofile()
+            sys.setprofile(self._on_call)
+            return
+        sys.setprofile(self._profiler)
+        seen, self._seen = list(self._seen), None
+        self.disarm()
+        raise Stuck(self._diagnose(seen, frame))
+
+    def _on_call(self, frame: FrameType, event: str, _: Any) -> None:
+        if event == 'call' and self._seen is not None and len(self._seen) < MOST_NAMED:
+            below = iter(_stack(frame))
+            if _is_user(next(below, None)) and not any(map(_is_user, below)) and not _is_standard(frame):
+                self._seen[self._describe(frame)] = None
+
+    def _diagnose(self, seen: list[str], frame: FrameType | None) -> str:
+        stack = list(filter(_is_user, _stack(frame)))
+        if not seen and stack:
+            inner, outer = stack[0], stack[-1]
+            return (
+                f'{self._describe(outer)} has not returned for {self._patience:g} s of wall time; it '
+                f'stands at {inner.f_code.co_filename}:{inner.f_lineno} in {inner.f_code.co_name}'
+            )
+        return (
+            f'no end of callbacks for {self._patience:g} s of wall time without time passing: '
+            f'{"; ".join(seen) or "none that is known"}'
+        )
+
+
+def _stack(frame: FrameType | None) -> Iterator[FrameType]:
+    """Give the frames of the callback that runs, the innermost first, down to the executor's own."""
+    while frame is not None and frame.f_code.co_filename != _executor.__file__:
+        yield frame
+        frame = frame.f_back
+
+
+def _is_user(frame: FrameType | None) -> bool:
+    return frame is not None and not frame.f_code.co_filename.startswith(_INFRASTRUCTURE)
+
+
+def _is_standard(frame: FrameType) -> bool:
+    """Whether it is the standard library's, that is, Python's own."""
+    name = frame.f_code.co_filename
+    return name.startswith(_STANDARD) and not name.startswith(_PACKAGES)

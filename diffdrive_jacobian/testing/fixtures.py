@@ -1,0 +1,60 @@
+"""Fixtures of pytest: `pytest_plugins = ['diffdrive_jacobian.testing.fixtures']` in a conftest.py.
+
+`lockstep` is a world of its own for each test, `robot_at(x, y, theta)` puts the virtual robot into it.
+The marker `lockstep(args=..., start=..., patience=...)` makes the world with these arguments. The report
+of a test that fails ends with the last messages of every topic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from rclpy.parameter import Parameter
+
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.testing import Lockstep, LockstepError
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Register the marker."""
+    config.addinivalue_line(
+        'markers', 'lockstep(args, start, patience): make the world of this test so (see Lockstep)'
+    )
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[None]:
+    """Add the last messages to the report of a failure that does not tell them itself."""
+    outcome: Any = yield
+    report = outcome.get_result()
+    world = getattr(item, 'funcargs', {}).get('lockstep')
+    told = call.excinfo is not None and call.excinfo.errisinstance(LockstepError)
+    if call.when == 'call' and report.failed and isinstance(world, Lockstep) and not told:
+        report.sections.append(('lockstep', world.report()))
+
+
+@pytest.fixture
+def lockstep(request: pytest.FixtureRequest) -> Iterator[Lockstep]:
+    """A world without nodes."""
+    marker = request.node.get_closest_marker('lockstep')
+    with Lockstep(**(marker.kwargs if marker else {})) as world:
+        yield world
+
+
+@pytest.fixture
+def robot_at(lockstep: Lockstep) -> Callable[..., VirtualRobot]:
+    """Put virtual robots into the world: `robot_at(x, y, theta, namespace='', **parameters)`."""
+
+    def place(
+        x: float = 0.0, y: float = 0.0, theta: float = 0.0, *, namespace: str = '', **parameters: Any
+    ) -> VirtualRobot:
+        pose = {'x': float(x), 'y': float(y), 'theta': float(theta)}
+        overrides = [
+            Parameter(name.replace('__', '.'), value=value)
+            for name, value in {**pose, **parameters}.items()
+        ]
+        return lockstep.add(VirtualRobot(namespace=namespace, parameter_overrides=overrides))
+
+    return place

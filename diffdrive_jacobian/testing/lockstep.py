@@ -1,0 +1,395 @@
+"""A world in which simulated time advances only when every node has answered.
+
+One step: publish /clock, let every node handle all messages, service calls and due timers, and all that
+follows from them; then go on to the instant at which the next timer is due. Nothing waits for the wall
+clock and nothing depends on it, so a run is as fast as the machine, and gives the same bits each time.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any, ClassVar, TypeVar
+
+import rclpy
+from rclpy.exceptions import InvalidHandle
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+
+from diffdrive_jacobian.ros.runner import UserError, closed_world, ros_context
+from diffdrive_jacobian.testing._errors import LockstepError
+from diffdrive_jacobian.testing._executor import QuiescentExecutor
+from diffdrive_jacobian.testing._guard import Guard, Stuck
+from diffdrive_jacobian.testing._report import Traffic
+
+N = TypeVar('N', bound=Node)
+
+NANOSECONDS = 1_000_000_000
+LISTENING_DEPTH = 1000
+"""How many messages of a topic may come at one instant until `listen` loses one."""
+
+
+class Lockstep:
+    """Nodes in the default context of rclpy, with simulated time that this world drives.
+
+    Nodes are made as always, after the world, and added to it; `use_sim_time` is true for all of them.
+    No other process hears them, nor another world in another process.
+
+        with Lockstep() as world:
+            controller = world.add(MyController())
+            world.run_for(2.0)
+
+    What a callback raises is raised by the call during which it ran. Nodes must not start threads that
+    send messages, for nobody could tell when those are done; timers on another clock than the node's own
+    run on wall time. Only for the main thread, and on systems with POSIX signals.
+    """
+
+    _open: ClassVar[Lockstep | None] = None
+
+    def __init__(self, args: Sequence[str] = (), *, start: float = 1.0, patience: float = 10.0) -> None:
+        """Begin a world without nodes but its own.
+
+        Args:
+            args: ROS arguments for all nodes, as for `rclpy.init`: `['--ros-args', '-p', 'x:=1.0']`.
+            start: Simulated time at the beginning (s).
+            patience: Wall time that one instant may take before it is called stuck (s).
+
+        Raises:
+            LockstepError: rclpy is initialised already, by another world for example, or does not
+                understand the arguments, or this is not the main thread.
+            ValueError: `start` or `patience` is not positive and finite.
+        """
+        self._now = _nanoseconds('start', start)
+        _nanoseconds('patience', patience)
+        if Lockstep._open is not None:
+            raise LockstepError('another world is open in this process: close it first')
+        if rclpy.ok():
+            raise LockstepError('rclpy is initialised already: the world does that, leave it to it')
+        self._start = self._now
+        self._clock = Clock()
+        self._publishers: dict[tuple[type, str], Publisher] = {}
+        self._until_next: int | None = None
+        self._traffic = Traffic(lambda: self._now)
+        self._closing = ExitStack()
+        try:
+            self._enter(args, patience)
+        except BaseException:
+            self._closing.close()
+            raise
+        Lockstep._open = self
+
+    def _enter(self, args: Sequence[str], patience: float) -> None:
+        arguments = ['lockstep', *args, '--ros-args', '-p', 'use_sim_time:=true']
+        try:
+            with closed_world():
+                context = self._closing.enter_context(ros_context(arguments, default=True))
+        except UserError as error:
+            raise LockstepError(str(error)) from error
+        self._executor = QuiescentExecutor(context, self._on_registered)
+        self._closing.callback(self._destroy_nodes)
+        try:
+            self._guard = Guard(patience, self._executor.describe)
+        except ValueError as error:
+            raise LockstepError('a world must be made and used in the main thread') from error
+        self._closing.callback(self._guard.close)
+        self.node = Node('lockstep', start_parameter_services=False, enable_rosout=False)
+        """The world's own node, for the publishers, subscriptions and clients of a test."""
+        self._clock_publisher = self.node.create_publisher(Clock, '/clock', 1)
+        self._executor.add(self.node)
+        self._tell_time()
+
+    # --- Life
+
+    def __enter__(self) -> Lockstep:
+        """Hold the world."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End it."""
+        self.close()
+
+    def close(self) -> None:
+        """Destroy the nodes and shut rclpy down; a second time it does nothing."""
+        if Lockstep._open is self:
+            Lockstep._open = None
+            self._closing.close()
+
+    def _destroy_nodes(self) -> None:
+        nodes = self._executor.nodes
+        self._executor.close()
+        for node in nodes:
+            node.destroy_node()
+
+    def add(self, node: N) -> N:
+        """Serve a node; it learns the time and does at once what it has to do.
+
+        Raises:
+            LockstepError: It is in this world already, in another context, served by another executor,
+                or runs on wall time.
+        """
+        self._check_open()
+        try:
+            name = node.get_fully_qualified_name()
+        except InvalidHandle as error:
+            raise LockstepError('the node was destroyed before it was added') from error
+        if node in self._executor.nodes:
+            raise LockstepError(f'node {name} was added already')
+        if node.context is not self.node.context:
+            raise LockstepError(
+                f'node {name} is in another context: make it without context=, after the world'
+            )
+        if node.executor is not None:
+            raise LockstepError(f'node {name} is served by an executor of its own: remove it from there')
+        self._check_sim_time(node)
+        self._executor.add(node)
+        self._tell_time()
+        return node
+
+    def remove(self, node: Node) -> None:
+        """Let a node vanish, as one that was killed; it is destroyed.
+
+        Raises:
+            LockstepError: It is not in this world.
+        """
+        self._check_open()
+        if node is self.node or node not in self._executor.nodes:
+            raise LockstepError('the node to remove is not in this world')
+        with self._watched():
+            self._executor.remove(node)
+        node.destroy_node()
+
+    def _check_open(self) -> None:
+        if Lockstep._open is not self:
+            raise LockstepError('this world is closed')
+
+    def _on_registered(self, node: Node) -> None:
+        self._check_sim_time(node)
+        self._traffic.watch(node)
+
+    @staticmethod
+    def _check_sim_time(node: Node) -> None:
+        if not node.get_parameter('use_sim_time').value:
+            raise LockstepError(
+                f'node {node.get_fully_qualified_name()} runs on wall time: '
+                'its parameter use_sim_time must be true'
+            )
+
+    # --- Time
+
+    @property
+    def now(self) -> int:
+        """Simulated time (ns)."""
+        return self._now
+
+    @property
+    def elapsed(self) -> float:
+        """How much of it has passed (s)."""
+        return (self._now - self._start) / NANOSECONDS
+
+    def settle(self) -> None:
+        """Let every node handle what there is to handle, without time passing."""
+        self._check_open()
+        with self._watched():
+            self._until_next = self._executor.settle()
+
+    def step(self, at_most: float | None = None) -> None:
+        """Advance to the instant at which the next timer is due.
+
+        Args:
+            at_most: Advance no further than this (s).
+
+        Raises:
+            ValueError: `at_most` is not positive and finite.
+            LockstepError: No timer is running and `at_most` is not given; or time cannot pass.
+        """
+        end = None if at_most is None else self._now + _nanoseconds('at_most', at_most)
+        self.settle()
+        if self._until_next is None and end is None:
+            raise LockstepError('no timer is running that a step could lead to: give at_most')
+        self._advance(end)
+
+    def run_for(self, seconds: float) -> None:
+        """Advance by so much simulated time, from one due timer to the next.
+
+        Raises:
+            ValueError: `seconds` is not positive and finite.
+            LockstepError: Time cannot pass.
+        """
+        end = self._now + _nanoseconds('seconds', seconds)
+        self.settle()
+        while self._now < end:
+            self._advance(end)
+
+    def run_until(self, condition: Callable[[], object], timeout: float, what: str = '') -> None:
+        """Advance until a condition holds. It is looked at once at each instant, when all is handled.
+
+        Args:
+            condition: What must become true.
+            timeout: In how much simulated time (s).
+            what: What the condition means, for the message of the error.
+
+        Raises:
+            ValueError: `timeout` is not positive and finite.
+            LockstepError: It did not come true in time; or time cannot pass.
+        """
+        end = self._now + _nanoseconds('timeout', timeout)
+        self.settle()
+        while not condition():
+            if self._now >= end:
+                what = what or _place(condition)
+                raise LockstepError(
+                    f'not within {timeout:g} s of simulated time: {what}\n{self.report()}'
+                )
+            self._advance(end)
+
+    def jump(self, seconds: float) -> None:
+        """Let time jump, also back: as when a simulator is reset, a bag looped, or a clock set.
+
+        The timers in between do not tick one by one; what they do about it is up to rcl.
+
+        Raises:
+            ValueError: `seconds` is zero or not finite, or time would begin before it exists.
+        """
+        if not math.isfinite(seconds) or seconds == 0.0:
+            raise ValueError(f'seconds must be finite and not zero, got {seconds!r}')
+        now = self._now + round(seconds * NANOSECONDS)
+        if now <= 0:
+            raise ValueError(
+                f'seconds must not lead to time 0 or before it, got {seconds!r} '
+                f'at {self._now / NANOSECONDS:g} s'
+            )
+        self.settle()
+        self._now = now
+        self._tell_time()
+
+    def _advance(self, end: int | None) -> None:
+        """Go on to the next due timer, but not past an end (ns)."""
+        left = self._until_next
+        if left is None or (end is not None and self._now + left > end):
+            assert end is not None
+            self._now = end
+        else:
+            self._now += left
+        self._tell_time()
+
+    def _tell_time(self) -> None:
+        stamp = self._clock.clock
+        stamp.sec, stamp.nanosec = divmod(self._now, NANOSECONDS)
+        self._clock_publisher.publish(self._clock)
+        with self._watched():
+            self._until_next = self._executor.settle()
+
+    @contextmanager
+    def _watched(self) -> Iterator[None]:
+        self._guard.arm()
+        try:
+            yield
+        except Stuck as stuck:
+            raise LockstepError(f'at {self._now / NANOSECONDS:g} s: {stuck}\n{self.report()}') from stuck
+        finally:
+            self._guard.disarm()
+
+    # --- Talking to the nodes
+
+    def publish(self, topic: str, message: Any) -> None:
+        """Publish a message, reliably, and let every node answer it.
+
+        Raises:
+            LockstepError: Nobody reads the topic, or it is of another type.
+        """
+        self._check_open()
+        key = type(message), topic
+        if key not in self._publishers:
+            create = self.node.create_publisher
+            self._publishers[key] = self._with_type(topic, create, *key, 10)
+        publisher = self._publishers[key]
+        self.settle()
+        if publisher.get_subscription_count() == 0:
+            raise LockstepError(
+                f'nobody reads {publisher.topic_name} as {_type_name(type(message))}\n{self.report()}'
+            )
+        publisher.publish(message)
+        self.settle()
+
+    def listen(self, message_type: type, topic: str, *, latched: bool = False) -> list[Any]:
+        """Collect the messages of a topic in the list that is returned.
+
+        Args:
+            message_type: Type of the topic.
+            topic: Its name.
+            latched: Also those that were sent before, if it is a latched topic.
+
+        Raises:
+            LockstepError: The topic is of another type.
+        """
+        self._check_open()
+        received: list[Any] = []
+        profile = QoSProfile(depth=LISTENING_DEPTH)
+        if latched:
+            profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        else:
+            # It matches every publisher, and within a process nothing is lost.
+            profile.reliability = ReliabilityPolicy.BEST_EFFORT
+        create = self.node.create_subscription
+        self._with_type(topic, create, message_type, topic, received.append, profile)
+        self.settle()
+        return received
+
+    def call(self, service_type: type, name: str, request: Any = None, *, timeout: float = 10.0) -> Any:
+        """Call a service and give its response.
+
+        Args:
+            service_type: Type of the service.
+            name: Its name.
+            request: The request; None: an empty one.
+            timeout: Simulated time that the response may take (s); most take none.
+
+        Raises:
+            LockstepError: There is no such service, or no response in time.
+        """
+        self._check_open()
+        name = self.node.resolve_service_name(name)
+        client = self.node.create_client(service_type, name)
+        try:
+            if not client.service_is_ready():
+                raise LockstepError(f'there is no service {name} of {service_type.__name__}')
+            future = client.call_async(request or service_type.Request())  # type: ignore[attr-defined]
+            self.run_until(future.done, timeout, f'a response of {name}')
+            return future.result()
+        finally:
+            self.node.destroy_client(client)
+
+    def report(self) -> str:
+        """Tell the last message of every topic."""
+        return self._traffic.describe(self._executor.nodes)
+
+    def _with_type(self, topic: str, create: Callable[..., Any], *args: Any) -> Any:
+        try:
+            return create(*args)
+        except RuntimeError as error:
+            # Within one process Fast DDS refuses a topic of two types.
+            name = self.node.resolve_topic_name(topic)
+            types = dict(self.node.get_topic_names_and_types()).get(name, [])
+            raise LockstepError(
+                f'{name} is {", ".join(types) or "not to be had"}, not {_type_name(args[0])}'
+            ) from error
+
+
+def _nanoseconds(name: str, seconds: float) -> int:
+    if not math.isfinite(seconds) or round(seconds * NANOSECONDS) <= 0:
+        raise ValueError(f'{name} must be a positive finite number of seconds, got {seconds!r}')
+    return round(seconds * NANOSECONDS)
+
+
+def _type_name(message_type: type) -> str:
+    return f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
+
+
+def _place(condition: Callable[[], object]) -> str:
+    code = getattr(inspect.unwrap(condition), '__code__', None)
+    where = f' ({code.co_filename}:{code.co_firstlineno})' if code else ''
+    return f'condition {getattr(condition, "__qualname__", condition)}{where}'

@@ -1,0 +1,538 @@
+"""The lockstep world, with nodes that know nothing of it."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+import rclpy
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Twist, Vector3
+from nav_msgs.msg import Odometry
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_srvs.srv import Trigger
+
+from diffdrive_jacobian.testing import Lockstep, LockstepError
+
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class Blinker(Node):
+    """A user's own node: a timer, a service, a parameter, nothing about lockstep."""
+
+    def __init__(self, name='blinker', rate=100.0, **kwargs):
+        super().__init__(name, **kwargs)
+        self.rate = self.declare_parameter('rate', rate).value
+        self.ticks = []
+        self.publisher = self.create_publisher(Time, 'blink', 10)
+        self.create_timer(1.0 / self.rate, self.on_tick)
+        self.create_service(Trigger, f'{name}/forget', self.on_forget)
+
+    def on_tick(self):
+        now = self.get_clock().now()
+        self.ticks.append(now.nanoseconds)
+        self.publisher.publish(now.to_msg())
+
+    def on_forget(self, request, response):
+        self.ticks.clear()
+        response.success = True
+        return response
+
+
+class Echo(Node):
+    """Answers each message of one topic by one on another."""
+
+    def __init__(self, name, source, sink):
+        super().__init__(name)
+        self.publisher = self.create_publisher(Vector3, sink, 10)
+        self.create_subscription(Vector3, source, self.on_message, 10)
+
+    def on_message(self, message):
+        self.publisher.publish(message)
+
+
+@pytest.fixture
+def impatient():
+    with Lockstep(patience=0.5) as world:
+        yield world
+
+
+# --- Time
+
+
+@pytest.mark.parametrize('rate', [100.0, 50.0, 7.0, 30.0, 1.0])
+def test_timer_ticks_as_often_as_its_period_fits_whatever_else_runs(lockstep, rate):
+    lockstep.add(Blinker('other', 33.0))
+    blinker = lockstep.add(Blinker(rate=rate))
+    blinks = lockstep.listen(Time, 'blink')
+    blinker.ticks.clear()
+    blinks.clear()
+    lockstep.run_for(2.0)
+    assert len(blinker.ticks) == 2 * rate
+    assert all(tick <= lockstep.now for tick in blinker.ticks)
+    assert len(blinks) == 2 * rate + 66
+
+
+def test_step_goes_to_the_next_due_timer_and_no_further(lockstep):
+    slow, quick = lockstep.add(Blinker('slow', 4.0)), lockstep.add(Blinker('quick', 10.0))
+    for instant in (0.1, 0.2, 0.25, 0.3):
+        lockstep.step()
+        assert lockstep.elapsed == instant
+    assert [len(slow.ticks), len(quick.ticks)] == [2, 4]
+    lockstep.step(at_most=0.03)
+    assert lockstep.elapsed == 0.33
+    lockstep.step(at_most=1.0)
+    assert lockstep.elapsed == 0.4
+
+
+def test_run_for_ends_exactly_there_and_without_timers_too(lockstep):
+    lockstep.run_for(1e-9)
+    lockstep.run_for(12.345)
+    assert lockstep.elapsed == 12.345000001
+    with pytest.raises(LockstepError, match='no timer is running'):
+        lockstep.step()
+
+
+def test_a_timer_made_or_reset_in_a_callback_counts_from_there(lockstep):
+    ticks = []
+
+    def later():
+        ticks.append(lockstep.elapsed)
+        if len(ticks) == 1:
+            lockstep.node.create_timer(0.25, lambda: ticks.append(('new', lockstep.elapsed)))
+            timer.cancel()
+
+    timer = lockstep.node.create_timer(0.1, later)
+    lockstep.run_for(1.0)
+    assert ticks == [0.1, ('new', 0.35), ('new', 0.6), ('new', 0.85)]
+
+
+def test_a_timer_destroyed_by_another_at_the_same_instant_does_not_tick(lockstep):
+    ticks = []
+    first = lockstep.node.create_timer(
+        0.1, lambda: (ticks.append(1), lockstep.node.destroy_timer(second), first.cancel())
+    )
+    second = lockstep.node.create_timer(0.1, lambda: ticks.append(2))
+    lockstep.run_for(0.5)
+    assert ticks == [1]
+
+
+def test_timers_due_at_one_instant_come_one_by_one_with_what_follows_from_each(lockstep):
+    order = []
+    for name in 'ab':
+        publisher = lockstep.node.create_publisher(Vector3, name, 10)
+        lockstep.node.create_subscription(
+            Vector3, name, lambda m, name=name: order.append(f'/{name}'), 10
+        )
+        lockstep.node.create_timer(
+            0.1, lambda p=publisher, name=name: (order.append(name), p.publish(Vector3()))
+        )
+    lockstep.run_for(0.2)
+    assert order == ['a', '/a', 'b', '/b'] * 2
+
+
+def test_run_until_looks_once_at_each_instant(lockstep):
+    blinker = lockstep.add(Blinker(rate=10.0))
+    looks = []
+    lockstep.run_until(lambda: looks.append(lockstep.elapsed) or len(blinker.ticks) == 4, timeout=9.0)
+    assert looks == [0.0, 0.1, 0.2, 0.3]
+    lockstep.run_until(lambda: True, timeout=1.0)
+    assert lockstep.elapsed == 0.3
+
+
+def test_jump_is_seen_as_one_and_time_may_go_back(lockstep):
+    blinker = lockstep.add(Blinker(rate=10.0))
+    blinker.ticks.clear()
+    lockstep.jump(100.0)
+    assert len(blinker.ticks) == 1
+    lockstep.jump(-100.5)
+    assert lockstep.now == 500_000_000
+    blinker.ticks.clear()
+    lockstep.run_for(1.0)
+    assert len(blinker.ticks) == 10
+
+
+def test_timers_on_a_wall_clock_run_on_wall_time(lockstep):
+    ticks = []
+    lockstep.node.create_timer(
+        0.02, lambda: ticks.append(1), clock=Clock(clock_type=ClockType.STEADY_TIME)
+    )
+    lockstep.run_for(100.0)
+    before = len(ticks)
+    assert before < 50
+    deadline = time.monotonic() + 10.0
+    while len(ticks) == before and time.monotonic() < deadline:
+        lockstep.step(at_most=0.001)
+    assert len(ticks) > before
+
+
+# --- Nodes
+
+
+def test_a_users_node_unchanged_with_timer_service_and_parameter(lockstep):
+    blinker = lockstep.add(Blinker())
+    assert lockstep.call(Trigger, 'blinker/forget').success
+    assert blinker.ticks == []
+    blinker.set_parameters([Parameter('rate', value=5.0)])
+    lockstep.run_for(0.05)
+    assert len(blinker.ticks) == 5
+
+
+@pytest.mark.lockstep(args=['--ros-args', '-p', 'rate:=20.0', '-r', '__ns:=/house'], start=5.0)
+def test_ros_arguments_reach_the_nodes(lockstep):
+    blinker = lockstep.add(Blinker())
+    assert blinker.get_fully_qualified_name() == '/house/blinker'
+    assert blinker.rate == 20.0
+    assert lockstep.now == 5_000_000_000
+
+
+class Asking(Node):
+    """A node whose callbacks are coroutines that wait for a service."""
+
+    def __init__(self):
+        super().__init__('asking')
+        self.client = self.create_client(Trigger, 'slow')
+        self.create_subscription(Vector3, 'question', self.on_question, 10)
+        self.create_service(Trigger, 'relay', self.on_relay)
+        self.answers = []
+
+    async def on_question(self, message):
+        response = await self.client.call_async(Trigger.Request())
+        self.answers.append((message.x, response.message))
+
+    async def on_relay(self, request, response):
+        return await self.client.call_async(request)
+
+
+class Slow(Node):
+    """A service that takes a second of simulated time."""
+
+    def __init__(self):
+        super().__init__('slow')
+        self.create_service(Trigger, 'slow', self.on_call)
+
+    async def on_call(self, request, response):
+        woken = rclpy.task.Future()
+        timer = self.create_timer(1.0, lambda: woken.set_result(None))
+        await woken
+        self.destroy_timer(timer)
+        response.message = f'at {self.get_clock().now().nanoseconds}'
+        return response
+
+
+def test_coroutines_are_awaited(lockstep):
+    asking = lockstep.add(Asking())
+    lockstep.add(Slow())
+    lockstep.publish('question', Vector3(x=7.0))
+    lockstep.run_for(0.9)
+    assert asking.answers == []
+    lockstep.run_for(0.2)
+    assert asking.answers == [(7.0, 'at 2000000000')]
+    assert lockstep.call(Trigger, 'relay').message == 'at 3100000000'
+
+
+def test_subscriptions_with_message_info_are_served(lockstep):
+    seen = []
+    lockstep.node.create_subscription(
+        Vector3, 'a', lambda message, info: seen.append((message, info)), 10
+    )
+    lockstep.publish('a', Vector3(x=1.0))
+    assert seen[0][0].x == 1.0
+    assert seen[0][1]['source_timestamp'] > 0
+
+
+def test_latched_messages_reach_those_who_come_later_in_one_order(lockstep):
+    speaker = lockstep.add(Node('speaker'))
+    for topic in 'abcdefgh':
+        publisher = speaker.create_publisher(Vector3, topic, LATCHED)
+        for index in range(3):
+            publisher.publish(Vector3(x=float(index)))
+    heard = []
+    late = Node('late')
+    for topic in 'hgfedcba':
+        late.create_subscription(
+            Vector3, topic, lambda m, topic=topic: heard.append((topic, m.x)), LATCHED
+        )
+    lockstep.add(late)
+    assert heard == [(topic, x) for topic in 'hgfedcba' for x in (0.0, 1.0, 2.0)]
+    assert [message.x for message in lockstep.listen(Vector3, 'c', latched=True)] == [0.0, 1.0, 2.0]
+
+
+def test_what_is_made_in_a_callback_is_served_from_then_on(lockstep):
+    heard = []
+    node = lockstep.add(Node('growing'))
+    node.create_subscription(
+        Vector3, 'a', lambda _: node.create_subscription(Vector3, 'b', heard.append, 10), 10
+    )
+    lockstep.publish('a', Vector3())
+    lockstep.publish('b', Vector3(x=2.0))
+    assert [message.x for message in heard] == [2.0]
+    node.destroy_subscription(list(node.subscriptions)[-1])
+    with pytest.raises(LockstepError, match='nobody reads /b'):
+        lockstep.publish('b', Vector3())
+
+
+def test_removed_node_is_gone(lockstep):
+    blinker = lockstep.add(Blinker())
+    blinks = lockstep.listen(Time, 'blink')
+    lockstep.run_for(0.1)
+    lockstep.remove(blinker)
+    blinks.clear()
+    lockstep.run_for(0.1)
+    assert blinks == []
+    with pytest.raises(LockstepError, match='is not in this world'):
+        lockstep.remove(blinker)
+
+
+def test_a_burst_loses_nothing(lockstep):
+    heard = []
+    lockstep.node.create_subscription(Vector3, 'a', heard.append, 500)
+    publisher = lockstep.node.create_publisher(Vector3, 'a', 500)
+    lockstep.node.create_timer(0.1, lambda: [publisher.publish(Vector3(x=float(i))) for i in range(500)])
+    lockstep.run_for(0.3)
+    assert [message.x for message in heard] == [float(i) for i in range(500)] * 3
+
+
+# --- What goes wrong
+
+
+def test_condition_that_never_holds_is_named_with_the_last_messages(lockstep):
+    lockstep.add(Echo('parrot', 'a', 'b'))
+    lockstep.publish('a', Vector3(x=0.5))
+    with pytest.raises(LockstepError) as caught:
+        lockstep.run_until(lambda: False, timeout=3.0, what='pigs fly')
+    first, *rest = str(caught.value).splitlines()
+    assert first == 'not within 3 s of simulated time: pigs fly'
+    assert rest[0] == 'last messages, at 4 s:'
+    assert '  /b: 1 from /parrot, last at 1 s: Vector3(x=0.5)' in rest
+    with pytest.raises(LockstepError, match=r'condition .*never \(.*test_lockstep.py:\d+\)'):
+        lockstep.run_until(never, timeout=0.1)
+
+
+def never():
+    return False
+
+
+def test_report_tells_topics_that_nobody_spoke_on(lockstep):
+    lockstep.add(Echo('parrot', 'a', 'b'))
+    assert '  /a: nothing; read by /parrot' in lockstep.report().splitlines()
+
+
+def test_report_shortens_messages(lockstep):
+    lockstep.listen(Odometry, 'odom')
+    message = Odometry()
+    message.header.stamp.sec, message.header.frame_id = 3, 'odom'
+    message.pose.covariance[7] = 1.0
+    message.twist.twist.linear.x = 1.0 / 3.0
+    lockstep.publish('odom', message)
+    assert (
+        "Odometry(header.stamp=3 s, header.frame_id='odom', pose.pose.orientation.w=1, "
+        'pose.covariance=[0, 0, 0, 0, ... 36 in all], twist.twist.linear.x=0.333333)'
+    ) in lockstep.report()
+
+
+def test_what_a_callback_raises_fails_the_test_with_its_traceback(lockstep):
+    def on_tick():
+        raise ZeroDivisionError('in a tick')
+
+    def on_message(_):
+        raise KeyError('in a message')
+
+    async def on_question(_):
+        raise ValueError('in a coroutine')
+
+    lockstep.node.create_timer(0.1, on_tick)
+    lockstep.node.create_subscription(Vector3, 'a', on_message, 10)
+    lockstep.node.create_subscription(Vector3, 'b', on_question, 10)
+    with pytest.raises(ZeroDivisionError, match='in a tick') as caught:
+        lockstep.run_for(1.0)
+    assert caught.traceback[-1].name == 'on_tick'
+    with pytest.raises(KeyError, match='in a message') as caught:
+        lockstep.publish('a', Vector3())
+    assert caught.traceback[-1].name == 'on_message'
+    with pytest.raises(ValueError, match='in a coroutine') as caught:
+        lockstep.publish('b', Vector3())
+    assert caught.traceback[-1].name == 'on_question'
+
+
+class Blocking(Node):
+    def __init__(self, wait):
+        super().__init__('blocking')
+        self.wait = wait
+        self.create_subscription(Vector3, 'a', self.on_message, 10)
+        self.create_timer(0.1, self.on_tick)
+
+    def on_message(self, message):
+        pass
+
+    def on_tick(self):
+        self.wait()
+
+
+def forever():
+    while True:
+        pass
+
+
+@pytest.mark.parametrize('wait', [lambda: time.sleep(1000), threading.Event().wait, forever])
+def test_callback_that_blocks_is_named(impatient, wait):
+    impatient.add(Echo('innocent', 'a', 'b'))
+    begun = time.monotonic()
+    with pytest.raises(LockstepError) as caught:
+        impatient.add(Blocking(wait))
+    assert time.monotonic() - begun < 60.0
+    first = str(caught.value).splitlines()[0]
+    assert first.startswith('at 1 s: Blocking.on_tick (timer of 0.1 s, node /blocking, ')
+    assert 'has not returned for 0.5 s of wall time; it stands at ' in first
+    assert 'innocent' not in first
+
+
+def test_service_that_calls_another_and_waits_is_named(impatient):
+    node = Node('deadlocked')
+    client = node.create_client(Trigger, 'other')
+    impatient.node.create_service(Trigger, 'other', lambda _, response: response)
+    node.create_service(Trigger, 'ask', lambda request, _: client.call(request))
+    impatient.add(node)
+    with pytest.raises(LockstepError, match=r'service /ask, node /deadlocked.* in wait'):
+        impatient.call(Trigger, 'ask')
+
+
+def test_nodes_that_answer_each_other_for_ever_are_named(impatient):
+    impatient.add(Echo('ping', 'a', 'b'))
+    impatient.add(Echo('pong', 'b', 'a'))
+    with pytest.raises(LockstepError, match='no end of callbacks for') as caught:
+        impatient.publish('a', Vector3())
+    first, *rest = str(caught.value).splitlines()
+    assert 'Echo.on_message (reads /a, node /ping' in first
+    assert 'Echo.on_message (reads /b, node /pong' in first
+    assert any('/a: ' in line and 'from /pong' in line for line in rest)
+
+
+def test_timer_without_a_period_is_named(impatient):
+    impatient.node.create_timer(0.0, lambda: None)
+    with pytest.raises(LockstepError, match=r'no end of callbacks .*timer of 0 s, node /lockstep'):
+        impatient.run_for(1.0)
+
+
+def test_the_world_goes_on_after_a_failure(impatient):
+    blocking = impatient.node.create_timer(0.1, lambda: time.sleep(1000))
+    with pytest.raises(LockstepError):
+        impatient.run_for(1.0)
+    impatient.node.destroy_timer(blocking)
+    blinker = impatient.add(Blinker())
+    impatient.run_for(1.0)
+    assert len(blinker.ticks) >= 100
+
+
+@pytest.mark.parametrize('seconds', [0.0, -1.0, float('nan'), float('inf'), 1e-10])
+def test_times_that_cannot_be_are_refused(lockstep, seconds):
+    for advance in (lockstep.run_for, lockstep.step):
+        with pytest.raises(
+            ValueError, match=f'must be a positive finite number of seconds, got {seconds}'
+        ):
+            advance(seconds)
+    with pytest.raises(ValueError, match='timeout must be'):
+        lockstep.run_until(never, timeout=seconds)
+    assert lockstep.elapsed == 0.0
+
+
+@pytest.mark.parametrize(
+    ('seconds', 'words'), [(0.0, 'not zero'), (-1.0, 'time 0'), (float('nan'), 'nan')]
+)
+def test_jumps_that_cannot_be_are_refused(lockstep, seconds, words):
+    with pytest.raises(ValueError, match=words):
+        lockstep.jump(seconds)
+
+
+def test_worlds_that_cannot_be_are_refused(lockstep):
+    with pytest.raises(LockstepError, match='another world is open in this process'):
+        Lockstep()
+    lockstep.close()
+    for wrong in ({'start': 0.0}, {'start': -1.0}, {'patience': 0.0}):
+        with pytest.raises(ValueError, match='positive finite'):
+            Lockstep(**wrong)
+    with pytest.raises(LockstepError, match='ROS arguments'):
+        Lockstep(['--ros-args', '--no-such-option'])
+    rclpy.init()
+    try:
+        with pytest.raises(LockstepError, match='rclpy is initialised already'):
+            Lockstep()
+    finally:
+        rclpy.shutdown()
+    failures = []
+
+    def in_a_thread():
+        try:
+            Lockstep()
+        except LockstepError as error:
+            failures.append(str(error))
+
+    thread = threading.Thread(target=in_a_thread)
+    thread.start()
+    thread.join()
+    assert failures == ['a world must be made and used in the main thread']
+    with Lockstep() as world:
+        world.add(Blinker())
+
+
+def test_nodes_that_do_not_belong_are_refused(lockstep):
+    blinker = lockstep.add(Blinker())
+    with pytest.raises(LockstepError, match='node /blinker was added already'):
+        lockstep.add(blinker)
+    with Context() as context:
+        stranger = Node('stranger', context=context)
+        with pytest.raises(LockstepError, match='node /stranger is in another context'):
+            lockstep.add(stranger)
+        stranger.destroy_node()
+    wall = Node('wall', parameter_overrides=[Parameter('use_sim_time', value=False)])
+    with pytest.raises(LockstepError, match='node /wall runs on wall time: its parameter use_sim_time'):
+        lockstep.add(wall)
+    wall.destroy_node()
+    taken = Node('taken')
+    executor = SingleThreadedExecutor()
+    executor.add_node(taken)
+    with pytest.raises(LockstepError, match='node /taken is served by an executor of its own'):
+        lockstep.add(taken)
+    executor.shutdown()
+    taken.destroy_node()
+    blinker.set_parameters([Parameter('use_sim_time', value=False)])
+    with pytest.raises(LockstepError, match='node /blinker runs on wall time'):
+        lockstep.run_for(1.0)
+
+
+def test_closed_world_is_of_no_use(lockstep):
+    blinker = lockstep.add(Blinker())
+    lockstep.close()
+    lockstep.close()
+    for use in (
+        lambda: lockstep.run_for(1.0),
+        lambda: lockstep.step(),
+        lambda: lockstep.add(blinker),
+        lambda: lockstep.publish('a', Vector3()),
+        lambda: lockstep.jump(1.0),
+    ):
+        with pytest.raises(LockstepError, match='this world is closed'):
+            use()
+
+
+def test_topics_and_services_that_are_not_there_are_named(lockstep):
+    lockstep.listen(Twist, 'cmd_vel')
+    with pytest.raises(LockstepError, match='nobody reads /cmd_vell as geometry_msgs/msg/Twist'):
+        lockstep.publish('cmd_vell', Twist())
+    with pytest.raises(
+        LockstepError, match=r'/cmd_vel is geometry_msgs/msg/Twist, not geometry_msgs/msg/V'
+    ):
+        lockstep.publish('cmd_vel', Vector3())
+    with pytest.raises(
+        LockstepError, match=r'/cmd_vel is geometry_msgs/msg/Twist, not geometry_msgs/msg/V'
+    ):
+        lockstep.listen(Vector3, 'cmd_vel')
+    with pytest.raises(LockstepError, match='there is no service /nowhere of Trigger'):
+        lockstep.call(Trigger, 'nowhere')
