@@ -44,6 +44,10 @@ def written(value):
     return '.nan' if isinstance(value, float) and math.isnan(value) else str(value)
 
 
+def blocks(language):
+    return re.findall(rf'```{language}\n(.*?)```', README, re.DOTALL)
+
+
 @pytest.mark.parametrize('name', NODES)
 def test_parameters_and_their_defaults(name):
     _, parameters = NODES[name]
@@ -58,8 +62,8 @@ def test_parameters_and_their_defaults(name):
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_topics_and_services(ros, name):
-    node = ros.add(NODES[name][0])
+def test_topics_and_services(lockstep, name):
+    node = lockstep.add(NODES[name][0]())
     other = {'cmd_vel': 'joint_command'} if name == 'virtual_robot' else {}
     told = {re.search(r'`/?(\w+)`', row[0]).group(1) for row in table(name, 'topic')} - {'tf'}
     names = (
@@ -76,7 +80,7 @@ def test_topics_and_services(ros, name):
 
 
 def test_example_gives_the_numbers_in_its_comments():
-    _, code = re.findall(r'```python\n(.*?)```', README, re.DOTALL)
+    code = next(block for block in blocks('python') if 'import numpy' in block)
     names = {}
     exec(code, names)
     comments = [
@@ -87,6 +91,24 @@ def test_example_gives_the_numbers_in_its_comments():
     got = [[names['v'], names['omega']], [names['omega_R'], names['omega_L']], [*names['q_dot']]]
     for numbers, values in zip(comments, got, strict=False):
         assert numbers == [round(float(value), 3) for value in values]
+
+
+def test_tested_controller_fails_as_told_and_passes_when_mended(pytester):
+    controller, test = (
+        next(block for block in blocks('python') if block.startswith(f'# {name}.py'))
+        for name in ('face', 'test_face')
+    )
+    mended = blocks('python')[blocks('python').index(test) + 1]
+    told = next(block for block in blocks('text') if 'assert' in block).splitlines()
+    plugins = re.search(r'^`(pytest_plugins = .*)`:$', README, re.MULTILINE).group(1)
+    pytester.makeconftest(plugins)
+    pytester.makepyfile(face=controller, test_face=test)
+    result = pytester.runpytest_subprocess()
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(told)
+    wrong = next(line for line in controller.splitlines() if 'error =' in line)
+    pytester.makepyfile(face=controller.replace(wrong, mended.rstrip()))
+    pytester.runpytest_subprocess().assert_outcomes(passed=1)
 
 
 def test_two_commands_of_one_line_each():

@@ -7,6 +7,7 @@ node could send its last zero.
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
@@ -117,6 +118,23 @@ def running(context: Context, *, closed_world: bool) -> Iterator[Runner]:
         runner.close()
 
 
+def made(make: Callable[[], N]) -> N:
+    """Make a node.
+
+    Raises:
+        UserError: The name, the parameters or the QoS that its user gave cannot be.
+    """
+    try:
+        return make()
+    except (
+        ParameterError,
+        ParameterException,
+        NameValidationException,
+        InvalidQosOverridesError,
+    ) as error:
+        raise UserError(str(error)) from error
+
+
 class Runner:
     """An executor with its nodes."""
 
@@ -127,21 +145,17 @@ class Runner:
         self._nodes: list[Node] = []
         self._begun = False
 
+    def seconds(self) -> float:
+        """Give the time by which the nodes live, from an arbitrary beginning (s)."""
+        return time.monotonic()
+
     def add(self, make: Callable[[], N]) -> N:
         """Make a node and add it.
 
         Raises:
             UserError: The name, the parameters or the QoS that its user gave cannot be.
         """
-        try:
-            node = make()
-        except (
-            ParameterError,
-            ParameterException,
-            NameValidationException,
-            InvalidQosOverridesError,
-        ) as error:
-            raise UserError(str(error)) from error
+        node = made(make)
         self._nodes.append(node)
         self._executor.add_node(node)
         return node

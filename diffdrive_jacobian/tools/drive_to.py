@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
-import time
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from action_msgs.msg import GoalStatus
@@ -32,9 +31,12 @@ from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.ros import messages
 from diffdrive_jacobian.ros.messages import MessageError
 from diffdrive_jacobian.ros.node import THROTTLE
-from diffdrive_jacobian.ros.runner import Runner, UserError, ros_context, running
+from diffdrive_jacobian.ros.runner import Runner, UserError, closed_world, ros_context, running
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import _cli
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.testing.runner import LockstepRunner
 
 PROGRAM = 'drive_to'
 SETTLING = 0.1
@@ -129,12 +131,12 @@ class Outcome:
     distance: float
     """Distance to the last goal (m)."""
     seconds: float
-    """How long it took (s)."""
+    """How long it took (s); in lockstep, of simulated time."""
 
 
 def drive(
     goals: NDArray[np.float64],
-    runner: Runner,
+    runner: Runner | LockstepRunner,
     signals: Signals,
     *,
     timeout: float,
@@ -153,7 +155,7 @@ def drive(
     controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=tolerances))
     names = robot.parameters.left_wheel_name, robot.parameters.right_wheel_name
     observer = runner.add(lambda: Observer(goals, names, context))
-    begun = time.monotonic()
+    begun = runner.seconds()
     with _cli.Drive() as progress:
 
         def over() -> bool:
@@ -165,19 +167,19 @@ def drive(
                 x, y = goals[observer.index]
                 what = f'goal {observer.index + 1}/{len(goals)} ({x:g}, {y:g})'
                 progress.show(what, observer.distance, observer.wheels)
-            return bool(observer.ended or signals.count or time.monotonic() - begun > timeout)
+            return bool(observer.ended or signals.count or runner.seconds() - begun > timeout)
 
         runner.spin(over)
-        seconds, status = time.monotonic() - begun, observer.status
+        seconds, status = runner.seconds() - begun, observer.status
         if not observer.ended:
             controller.stop('interrupted' if signals.count else 'out of time')
         settled = robot.now() + nanoseconds(SETTLING)
         before = signals.count
-        patience = time.monotonic() + STOP_PATIENCE + 1.0 / robot.parameters.publish_rate
+        patience = runner.seconds() + STOP_PATIENCE + 1.0 / robot.parameters.publish_rate
         runner.spin(
             lambda: (
                 (observer.seen >= settled and not observer.moving)
-                or time.monotonic() > patience
+                or runner.seconds() > patience
                 or signals.count > before
             )
         )
@@ -198,18 +200,13 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     options = parser.parse_args(own)
     if len(options.coordinates) % 2:
         parser.error(f'coordinates come in pairs X Y, got {len(options.coordinates)} of them')
+    if options.lockstep and options.open:
+        parser.error('--lockstep cannot be open: others have another clock')
     goals = np.reshape(options.coordinates, (-1, 2))
-    if not options.open:
-        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
-        # These would be obeyed before it.
-        for name in ('ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER'):
-            os.environ.pop(name, None)
     ros = ['--ros-args', '--log-level', 'warn', '--', *_cli.with_params_file(ros, options)]
+    stage = _lockstep(ros) if options.lockstep else _real_time(ros, open_to_all=options.open)
     try:
-        with (
-            ros_context([PROGRAM, *ros]) as context,
-            running(context, closed_world=not options.open) as runner,
-        ):
+        with stage as runner:
             outcome = drive(
                 goals,
                 runner,
@@ -219,18 +216,43 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             )
     except UserError as error:
         return _cli.complain(PROGRAM, error)
-    return _report(outcome, options.timeout)
+    return _report(outcome, options.timeout, ' of simulated time' if options.lockstep else '')
 
 
-def _report(outcome: Outcome, timeout: float) -> int:
-    """Say how it ended in one line; gives the exit code."""
+@contextmanager
+def _real_time(ros: list[str], *, open_to_all: bool) -> Iterator[Runner]:
+    """Hold nodes that live by the wall clock."""
+    with (
+        nullcontext() if open_to_all else closed_world(),
+        ros_context([PROGRAM, *ros]) as context,
+        running(context, closed_world=not open_to_all) as runner,
+    ):
+        yield runner
+
+
+@contextmanager
+def _lockstep(ros: list[str]) -> Iterator[LockstepRunner]:
+    """Hold nodes that live as fast as they can."""
+    # Not needed otherwise, and slow to import.
+    from diffdrive_jacobian.testing import LockstepError
+    from diffdrive_jacobian.testing.runner import running_in_lockstep
+
+    try:
+        with running_in_lockstep(ros) as runner:
+            yield runner
+    except LockstepError as error:
+        raise UserError(str(error)) from error
+
+
+def _report(outcome: Outcome, timeout: float, time: str) -> int:
+    """Say how it ended in one line, and of which time its seconds are; gives the exit code."""
     if outcome.pose is None:
         where = 'the robot never reported where it is'
     else:
         x, y, theta = outcome.pose
         where = (
             f'the robot stopped at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, '
-            f'{outcome.distance:.3f} m from the goal, after {outcome.seconds:.1f} s'
+            f'{outcome.distance:.3f} m from the goal, after {outcome.seconds:.1f} s{time}'
         )
     if outcome.status == GoalStatus.STATUS_SUCCEEDED:
         print(f'arrived: {where}')
@@ -268,6 +290,11 @@ def _parser() -> argparse.ArgumentParser:
         '--tolerance', type=_cli.tolerance, help='distance that counts as arrived (m); 0.02'
     )
     _cli.add_params_file(parser)
+    parser.add_argument(
+        '--lockstep',
+        action='store_true',
+        help='drive in simulated time, as fast as this machine can, and the same way each time',
+    )
     parser.add_argument(
         '--open',
         action='store_true',

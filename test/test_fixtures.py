@@ -1,0 +1,127 @@
+"""The fixtures of pytest, as a user of the package has them: in a directory and a process of their own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+SETTING = """
+    import pytest
+    from geometry_msgs.msg import Twist
+    from nav_msgs.msg import Odometry
+    from diffdrive_jacobian.testing import LockstepError
+"""
+
+
+@pytest.fixture
+def run(pytester):
+    """Run tests that have nothing but the fixtures; gives the result."""
+    pytester.makeconftest("pytest_plugins = ['diffdrive_jacobian.testing.fixtures']")
+
+    def run(tests, *options):
+        pytester.makepyfile(SETTING + tests)
+        return pytester.runpytest_subprocess('-W', 'error::pytest.PytestUnknownMarkWarning', *options)
+
+    return run
+
+
+def test_robots_stand_where_they_are_put_with_their_parameters(run):
+    run("""
+    def test_two_robots(lockstep, robot_at):
+        robot_at(1.0, -2.0, 0.5, namespace='one', linear__x__max_velocity=0.2)
+        robot_at(namespace='two')
+        one, two = (lockstep.listen(Odometry, f'/{name}/odom') for name in ('one', 'two'))
+        twist = Twist()
+        twist.linear.x = 1.0
+        lockstep.publish('/one/cmd_vel', twist)
+        lockstep.run_for(0.5)
+        assert one[-2].twist.twist.linear.x == 0.2
+        x, y = one[-1].pose.pose.position.x, one[-1].pose.pose.position.y
+        assert (x - 1.0) ** 2 + (y + 2.0) ** 2 == pytest.approx(0.1 ** 2)
+        assert two[-1].pose.pose.position.x == 0.0
+    """).assert_outcomes(passed=1)
+
+
+def test_each_test_has_a_world_of_its_own(run):
+    run("""
+    @pytest.mark.parametrize('turn', range(3))
+    def test_begins_anew(lockstep, robot_at, turn):
+        assert lockstep.elapsed == 0.0
+        robot_at()
+        lockstep.run_for(1.0)
+
+    @pytest.mark.lockstep(start=7.0, patience=1.0, args=['--ros-args', '-r', '__ns:=/a'])
+    def test_is_made_as_marked(lockstep, robot_at):
+        assert lockstep.now == 7_000_000_000
+        assert robot_at().get_namespace() == '/a'
+
+    def test_marks_do_not_last(lockstep):
+        assert lockstep.now == 1_000_000_000
+    """).assert_outcomes(passed=5)
+
+
+def test_a_failure_tells_the_last_messages_once(run):
+    result = run("""
+    def test_fails(lockstep, robot_at):
+        robot_at()
+        lockstep.publish('cmd_vel', Twist())
+        assert False
+
+    def test_waits_in_vain(lockstep, robot_at):
+        robot_at()
+        lockstep.run_until(lambda: False, timeout=1.0, what='the end of the world')
+
+    def test_passes(lockstep, robot_at):
+        robot_at()
+    """)
+    result.assert_outcomes(failed=2, passed=1)
+    text = result.stdout.str()
+    assert text.count('  /cmd_vel: 1 from /lockstep, last at 1 s: Twist()') == 1
+    assert 'not within 1 s of simulated time: the end of the world' in text
+    assert text.count('- lockstep -') == 1
+
+
+def test_a_callback_that_raises_fails_the_test_with_its_traceback(run):
+    result = run("""
+    def test_raises(lockstep):
+        def on_tick():
+            raise KeyError('no such wheel')
+        lockstep.node.create_timer(0.1, on_tick)
+        lockstep.run_for(1.0)
+    """)
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*raise KeyError('no such wheel')", "E * KeyError: 'no such wheel'"])
+
+
+def test_parallel_worlds_do_not_hear_each_other(run, pytester):
+    """Two processes at once, on one domain, with one topic."""
+    tests = """
+    import os, pathlib, time
+
+    def test_hears_only_itself(lockstep, robot_at):
+        robot_at()
+        odom = lockstep.listen(Odometry, 'odom')
+        twist = Twist()
+        twist.linear.x = float(os.environ['SPEED'])
+        me, other = (pathlib.Path(os.environ[name]) for name in ('ME', 'OTHER'))
+        me.touch()
+        met, begun = 0, time.monotonic()
+        while met < 50 and time.monotonic() - begun < 30.0:
+            lockstep.publish('cmd_vel', twist)
+            lockstep.run_for(0.1)
+            met += other.exists()
+        assert met == 50
+        assert odom[-1].pose.pose.position.x == pytest.approx(lockstep.elapsed * twist.linear.x)
+        assert len(odom) == round(50 * lockstep.elapsed)
+    """
+    run(tests, '--collect-only')
+    command = [sys.executable, '-m', 'pytest', '-q', '-p', 'no:cacheprovider']
+    processes = []
+    for me, other, speed in (('a', 'b', '1.0'), ('b', 'a', '-1.0')):
+        environment = {**os.environ, 'SPEED': speed, 'ME': me, 'OTHER': other}
+        environment.pop('ROS_AUTOMATIC_DISCOVERY_RANGE')
+        processes.append(subprocess.Popen(command, cwd=pytester.path, env=environment))
+    assert [process.wait(timeout=60) for process in processes] == [0, 0]
