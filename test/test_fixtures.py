@@ -1,4 +1,4 @@
-"""The fixtures of pytest, as a user of the package has them: in a directory and a process of their own."""
+"""The fixtures of pytest as a user of the package has them: in a directory and process of their own."""
 
 from __future__ import annotations
 
@@ -43,6 +43,18 @@ def test_robots_stand_where_they_are_put_with_their_parameters(run):
         assert (x - 1.0) ** 2 + (y + 2.0) ** 2 == pytest.approx(0.1 ** 2)
         assert two[-1].pose.pose.position.x == 0.0
     """).assert_outcomes(passed=1)
+
+
+@pytest.mark.parametrize('capture', ['fd', 'sys', 'no'])
+def test_runs_whatever_pytest_captures(run, capture):
+    run(
+        """
+    def test_drives(lockstep, robot_at, capsys):
+        robot_at()
+        lockstep.run_for(0.1)
+    """,
+        f'--capture={capture}',
+    ).assert_outcomes(passed=1)
 
 
 def test_each_test_has_a_world_of_its_own(run):

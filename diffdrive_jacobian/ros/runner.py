@@ -7,9 +7,10 @@ node could send its last zero.
 from __future__ import annotations
 
 import os
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from itertools import pairwise
 from typing import TypeVar
 
@@ -98,14 +99,19 @@ def make_executor(context: Context, *, closed_world: bool) -> Executor:
             the time per message, is safe; its queue knows no bound and no fairness, so a node that
             strangers can flood needs the SingleThreadedExecutor. Older Jazzy has only that one.
     """
-    if closed_world:
-        try:
-            from rclpy.experimental.events_executor import EventsExecutor
-        except ImportError:
-            pass
-        else:
-            return EventsExecutor(context=context)
-    return SingleThreadedExecutor(context=context)
+    executor = events_executor(context) if closed_world else None
+    return executor or SingleThreadedExecutor(context=context)
+
+
+def events_executor(context: Context) -> Executor | None:
+    """Make an EventsExecutor; None if this rclpy has none."""
+    try:
+        from rclpy.experimental.events_executor import EventsExecutor
+    except ImportError:
+        return None
+    # It has the faulthandler write to sys.stderr, which then must be a file; in some tests it is none.
+    with redirect_stderr(sys.__stderr__):
+        return EventsExecutor(context=context)
 
 
 @contextmanager

@@ -25,6 +25,7 @@ from rclpy.subscription import Subscription
 from rclpy.task import Task
 from rclpy.timer import Timer
 
+from diffdrive_jacobian.ros.runner import events_executor
 from diffdrive_jacobian.testing._errors import LockstepError
 
 LATCHED_PATIENCE = Duration(seconds=5.0)
@@ -44,14 +45,12 @@ class QuiescentExecutor:
         Raises:
             LockstepError: This rclpy has no EventsExecutor.
         """
-        try:
-            from rclpy.experimental.events_executor import EventsExecutor
-        except ImportError as error:
+        events: Any = events_executor(context)
+        if events is None:
             raise LockstepError(
-                'lockstep needs the EventsExecutor of rclpy, which this ROS installation is too old '
-                'for (Jazzy has it since rclpy 7.1.5): update it'
-            ) from error
-        self._events = EventsExecutor(context=context)
+                'lockstep needs the EventsExecutor of rclpy, which this ROS installation is too old for'
+            )
+        self._events = events
         self._on_registered = on_registered
         self._served: dict[Node, _Served] = {}
         self._facade = _Facade(self)

@@ -1,0 +1,81 @@
+"""The tool drive_to in simulated time."""
+
+from __future__ import annotations
+
+import math
+import re
+import signal
+
+import pytest
+from processes import open_world
+
+from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.tools import drive_to
+
+CRAWL = ('50', '0', '--timeout', '1e6', '--ros-args', '-p', 'linear.x.max_velocity:=0.001')
+
+
+def last_line(capsys):
+    return capsys.readouterr().out.splitlines()[-1]
+
+
+@pytest.mark.parametrize('goals', [(1, 1), (-3, 0), (0.5, 0, 0.5, 0.5, 0, 0), (0, 0)])
+def test_arrives_and_says_the_same_each_time(capsys, goals):
+    said = set()
+    for _ in range(2):
+        assert drive_to.main([*map(str, goals), '--lockstep'], Signals()) == 0
+        said.add(last_line(capsys))
+    (line,) = said
+    numbers = re.fullmatch(
+        r'arrived: the robot stopped at x (\S+) m, y (\S+) m, heading \S+ rad, '
+        r'(\S+) m from the goal, after (\S+) s of simulated time',
+        line,
+    )
+    x, y, distance, _ = map(float, numbers.groups())
+    assert distance <= 0.02
+    assert math.dist((x, y), goals[-2:]) <= 0.021
+
+
+def test_takes_as_long_as_the_law_says(capsys):
+    """Straight ahead the distance decays as exp(-kv t), in steps of the odometry's period."""
+    assert drive_to.main(['1', '0', '--lockstep', '--ros-args', '-p', 'kv:=0.5'], Signals()) == 0
+    seconds = float(re.search(r'after (\S+) s of simulated time', last_line(capsys)).group(1))
+    period, kv = 0.02, 0.5
+    steps = math.ceil(math.log(0.02) / math.log(1.0 - kv * period))
+    assert seconds == pytest.approx(steps * period, abs=0.1)
+
+
+def test_timeout_is_of_simulated_time(capsys):
+    assert drive_to.main(['50', '0', '--lockstep', '--timeout', '3'], Signals()) == 1
+    line = last_line(capsys)
+    assert line.startswith('not arrived (--timeout 3 s was too short): ')
+    assert line.endswith('after 3.0 s of simulated time')
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (['--open'], '--lockstep cannot be open'),
+        (['--ros-args', '-p', 'wheel_radius:=-1.0'], "parameter 'wheel_radius' must be in [0.001, 10]"),
+        (['--ros-args', '--no-such-option'], 'ROS arguments: '),
+    ],
+)
+def test_says_what_it_cannot_take(capsys, arguments, words):
+    with pytest.raises(SystemExit) as caught:
+        raise SystemExit(drive_to.main(['1', '1', '--lockstep', *arguments], Signals()))
+    assert caught.value.code == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith('drive_to: error: ')
+    assert words in line
+
+
+def test_ends_on_a_signal(tmp_path):
+    signals = (signal.SIGINT, signal.SIGTERM)
+    with open_world(tmp_path) as world:
+        children = [world.start('drive_to', '--lockstep', *CRAWL) for _ in signals]
+        for child, number in zip(children, signals, strict=True):
+            child.until_says('m to go')
+            child.signal(number)
+        for child in children:
+            assert child.exit() == 130
+            assert child.last_line.startswith('interrupted: the robot stopped at x ')
