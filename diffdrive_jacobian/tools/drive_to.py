@@ -34,6 +34,7 @@ from diffdrive_jacobian.ros.node import THROTTLE
 from diffdrive_jacobian.ros.runner import Runner, UserError, closed_world, ros_context, running
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools._progress import Drive
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.testing.runner import LockstepRunner
@@ -156,7 +157,7 @@ def drive(
     names = robot.parameters.left_wheel_name, robot.parameters.right_wheel_name
     observer = runner.add(lambda: Observer(goals, names, context))
     begun = runner.seconds()
-    with _cli.Drive() as progress:
+    with Drive() as progress:
 
         def over() -> bool:
             if observer.pose is not None and not observer.ended:

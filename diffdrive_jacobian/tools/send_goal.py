@@ -24,6 +24,7 @@ from diffdrive_jacobian.ros.messages import MessageError
 from diffdrive_jacobian.ros.runner import Runner, UserError, ros_context, running
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools._progress import Drive
 
 PROGRAM = 'send_goal'
 ANSWER_PATIENCE = 5.0
@@ -180,7 +181,7 @@ def _watch(
     x, y, _ = sender.goal
     looked = time.monotonic()
     said = False
-    with _cli.Drive() as progress:
+    with Drive() as progress:
 
         def over() -> bool:
             nonlocal looked, said
