@@ -238,6 +238,36 @@ def test_coroutines_are_awaited(lockstep):
     assert lockstep.call(Trigger, 'relay').message == 'at 3100000000'
 
 
+def test_what_follows_from_a_coroutine_follows_at_once(lockstep):
+    heard = []
+    publisher = lockstep.node.create_publisher(Vector3, 'b', 10)
+
+    async def relay(message):
+        publisher.publish(message)
+
+    async def on_tick():
+        await relay(Vector3(x=2.0))
+
+    lockstep.node.create_subscription(Vector3, 'a', relay, 10)
+    lockstep.node.create_subscription(Vector3, 'b', lambda m: heard.append((lockstep.elapsed, m.x)), 10)
+    lockstep.publish('a', Vector3(x=1.0))
+    lockstep.node.create_timer(0.5, on_tick)
+    lockstep.run_for(0.5)
+    assert heard == [(0.0, 1.0), (0.5, 2.0)]
+
+
+def test_tasks_of_a_node_run_at_once(lockstep):
+    done = []
+    task = lockstep.node.executor.create_task(done.append, 1)
+    lockstep.settle()
+    assert done == [1]
+    assert task.done()
+    with pytest.raises(
+        LockstepError, match=r'cannot call executor.spin_once: the world does the spinning'
+    ):
+        lockstep.node.executor.spin_once()
+
+
 def test_subscriptions_with_message_info_are_served(lockstep):
     seen = []
     lockstep.node.create_subscription(

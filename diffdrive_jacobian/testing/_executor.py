@@ -100,8 +100,8 @@ class QuiescentExecutor:
         Returns:
             The time until the next timer of simulated time is due (ns); None: there is no such timer.
         """
+        self._handle_all()
         while True:
-            self._handle_all()
             due, until_next = self._due_timers()
             if not due:
                 return until_next
@@ -272,27 +272,24 @@ class _Task:
     def __init__(self, handler: Any, future: Task) -> None:
         self.future = future
         self._handler = handler
-        self._waits_at: object = None
+        # Kept, so that no later one can take its identity.
+        self._waits_for: Any = self
 
     def go_on(self) -> bool:
         """Run it as far as it comes; whether it came any farther."""
-        before = self._waits_at
+        before = self._waits_for
         self.future()
-        self._waits_at = self._await_point()
-        return self._waits_at is not before or not inspect.iscoroutine(self._handler)
+        self._waits_for = self._innermost()
+        return bool(self.future.done()) or self._waits_for is not before
 
-    def _await_point(self) -> object:
-        """Give the innermost thing that the coroutine waits for; None at its end.
-
-        It is kept, so that no later one can take its identity.
-        """
-        point: Any = self._handler
-        while point is not None:
-            inner = getattr(point, 'cr_await', None) or getattr(point, 'gi_yieldfrom', None)
-            if inner is None:
-                break
+    def _innermost(self) -> Any:
+        """Follow the coroutine through all that it awaits."""
+        point = self._handler
+        while (
+            inner := getattr(point, 'cr_await', None) or getattr(point, 'gi_yieldfrom', None)
+        ) is not None:
             point = inner
-        return point if getattr(point, 'gi_frame', None) is not None else None
+        return point
 
 
 class _Facade:
