@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 
@@ -145,6 +146,16 @@ def test_run_until_looks_once_at_each_instant(lockstep):
     assert looks == [0.0, 0.1, 0.2, 0.3]
     lockstep.run_until(lambda: True, timeout=1.0)
     assert lockstep.elapsed == 0.3
+
+
+def test_what_a_condition_does_is_handled_before_time_passes(lockstep):
+    heard = []
+    publisher = lockstep.node.create_publisher(Vector3, 'a', 10)
+    lockstep.node.create_subscription(Vector3, 'a', lambda _: heard.append(lockstep.elapsed), 10)
+    lockstep.node.create_timer(0.1, lambda: None)
+    lockstep.run_until(lambda: publisher.publish(Vector3()) or lockstep.elapsed > 0.25, timeout=1.0)
+    lockstep.settle()
+    assert heard == [0.0, 0.1, 0.2, 0.3]
 
 
 def test_jump_is_seen_as_one_and_time_may_go_back(lockstep):
@@ -461,11 +472,11 @@ def test_the_world_goes_on_after_a_failure(impatient):
     assert len(blinker.ticks) >= 100
 
 
-@pytest.mark.parametrize('seconds', [0.0, -1.0, float('nan'), float('inf'), 1e-10])
+@pytest.mark.parametrize('seconds', [0.0, -1.0, float('nan'), float('inf'), 1e-10, 1e10])
 def test_times_that_cannot_be_are_refused(lockstep, seconds):
     for advance in (lockstep.run_for, lockstep.step):
         with pytest.raises(
-            ValueError, match=f'must be a positive finite number of seconds, got {seconds}'
+            ValueError, match=f'must be a positive number of seconds, .*, got {re.escape(str(seconds))}'
         ):
             advance(seconds)
     with pytest.raises(ValueError, match='timeout must be'):
@@ -486,7 +497,7 @@ def test_worlds_that_cannot_be_are_refused(lockstep):
         Lockstep()
     lockstep.close()
     for wrong in ({'start': 0.0}, {'start': -1.0}, {'patience': 0.0}):
-        with pytest.raises(ValueError, match='positive finite'):
+        with pytest.raises(ValueError, match='positive number'):
             Lockstep(**wrong)
     with pytest.raises(LockstepError, match='ROS arguments'):
         Lockstep(['--ros-args', '--no-such-option'])

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from functools import partial
-from types import FrameType
 from typing import Any
 
 from rclpy.clock_type import ClockType
@@ -19,14 +17,12 @@ from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy
-from rclpy.service import Service
-from rclpy.subscription import Subscription
 from rclpy.task import Task
 from rclpy.timer import Timer
 
 from diffdrive_jacobian.ros.runner import events_executor
 from diffdrive_jacobian.testing._errors import LockstepError
+from diffdrive_jacobian.testing._served import Served, is_latched
 
 LATCHED_PATIENCE = Duration(seconds=5.0)
 """How long a latched message may take to reach a late reader (s); it takes microseconds."""
@@ -52,7 +48,7 @@ class QuiescentExecutor:
             )
         self._events = events
         self._on_registered = on_registered
-        self._served: dict[Node, _Served] = {}
+        self._served: dict[Node, Served] = {}
         self._facade = _Facade(self)
         self._changed = False
         self._tasks: list[_Task] = []
@@ -69,7 +65,7 @@ class QuiescentExecutor:
 
     def add(self, node: Node) -> None:
         """Serve a node."""
-        self._served[node] = _Served(node, self.create_task)
+        self._served[node] = Served(node, self.create_task)
         node.executor = self._facade
         self._events.add_node(self._served[node])
         self._changed = True
@@ -204,7 +200,7 @@ class QuiescentExecutor:
                     'this world cannot serve'
                 )
             for publisher in node.publishers:
-                if _is_latched(publisher):
+                if is_latched(publisher):
                     publisher.wait_for_all_acked(LATCHED_PATIENCE)
             served.update()
             self._on_registered(node)
@@ -217,35 +213,6 @@ class QuiescentExecutor:
         timers = [timer for node in self._served for timer in node.timers]
         self._sim_timers = [(timer.handle, timer) for timer in timers if _follows_sim_time(timer)]
         self._wall_timers = [(timer.handle, timer) for timer in timers if not _follows_sim_time(timer)]
-
-    def describe(self, frame: FrameType) -> str:
-        """Name the callback that a frame runs: its function, what calls it, its node."""
-        where = f'{frame.f_code.co_filename}:{frame.f_code.co_firstlineno}'
-        for node in self._served:
-            named = f'node {node.get_fully_qualified_name()}, {where}'
-            for subscription in node.subscriptions:
-                if name := _runs(frame, subscription.callback):
-                    return f'{name} (reads {subscription.topic_name}, {named})'
-            for timer in node.timers:
-                if name := _runs(frame, timer.callback):
-                    return f'{name} (timer of {timer.timer_period_ns / 1e9:g} s, {named})'
-            for service in node.services:
-                if name := _runs(frame, service.callback):
-                    return f'{name} (service {node.resolve_service_name(service.srv_name)}, {named})'
-        return f'{frame.f_code.co_name} ({where})'
-
-
-def _runs(frame: FrameType, callback: Any) -> str:
-    """Give the name of a callback if a frame runs it."""
-    while isinstance(callback, partial):
-        callback = callback.func
-    function = getattr(callback, '__func__', callback)
-    if getattr(function, '__code__', None) is not frame.f_code:
-        return ''
-    owner = getattr(callback, '__self__', None)
-    if owner is not None and frame.f_locals.get(frame.f_code.co_varnames[0]) is not owner:
-        return ''
-    return str(getattr(callback, '__qualname__', frame.f_code.co_name))
 
 
 def _nothing() -> None:
@@ -292,6 +259,12 @@ class _Task:
         return point
 
 
+def _is_async(callback: Any) -> bool:
+    return inspect.iscoroutinefunction(callback) or inspect.iscoroutinefunction(
+        getattr(callback, '__call__', None)  # noqa: B004
+    )
+
+
 class _Facade:
     """What a node takes for its executor."""
 
@@ -317,102 +290,3 @@ class _Facade:
         raise LockstepError(
             f'a node in lockstep cannot call executor.{name}: the world does the spinning'
         )
-
-
-class _Served:
-    """A node as the EventsExecutor sees it: without timers, and with what was registered so far."""
-
-    def __init__(self, node: Node, create_task: Callable[..., Any]) -> None:
-        self.node = node
-        self.executor: Any = None
-        self.timers: tuple[Timer, ...] = ()
-        self.subscriptions: list[Any] = []
-        self.services: list[Any] = []
-        self._latecomers: list[Any] = []
-        self._create_task = create_task
-        self._readers: dict[Any, Any] = {}
-        self._servers: dict[Any, Any] = {}
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.node, name)
-
-    def update(self) -> None:
-        """Take over the node's subscriptions and services; those of latched topics wait."""
-        known, self._readers = self._readers, {}
-        for reader in self.node.subscriptions:
-            self._readers[reader] = known.get(reader) or _Subscription(reader, self._create_task)
-        readers = list(self._readers.values())
-        new = [reader for reader in readers if reader not in self.subscriptions]
-        self._latecomers = [reader for reader in new if _is_latched(reader)]
-        self.subscriptions = [reader for reader in readers if reader not in self._latecomers]
-        known, self._servers = self._servers, {}
-        for server in self.node.services:
-            self._servers[server] = known.get(server) or _Service(server, self._create_task)
-        self.services = list(self._servers.values())
-
-    def admit_latched(self) -> bool:
-        """Add one reader of a latched topic; False if none waits."""
-        if not self._latecomers:
-            return False
-        self.subscriptions = [*self.subscriptions, self._latecomers.pop(0)]
-        return True
-
-
-def _is_latched(endpoint: Any) -> bool:
-    return bool(endpoint.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-def _is_async(callback: Any) -> bool:
-    return inspect.iscoroutinefunction(callback) or inspect.iscoroutinefunction(
-        getattr(callback, '__call__', None)  # noqa: B004
-    )
-
-
-class _Subscription:
-    """A subscription that the EventsExecutor of Jazzy cannot serve as it is.
-
-    It never awaits coroutines, and hands a message with its info over as one argument.
-    """
-
-    CallbackType = Subscription.CallbackType
-
-    def __init__(self, subscription: Subscription, create_task: Callable[..., Any]) -> None:
-        self._subscription = subscription
-        self._create_task = create_task
-        # What is asked for with every message, without a detour. The EventsExecutor only borrows the
-        # callback: it must be an attribute that lasts.
-        self.handle = subscription.handle
-        self.msg_type, self.raw = subscription.msg_type, subscription.raw
-        self.callback = self._on_message
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._subscription, name)
-
-    def _on_message(self, *received: Any) -> None:
-        if isinstance(received[0], tuple):
-            received = received[0]
-        result = self._subscription.callback(*received)
-        if inspect.iscoroutine(result):
-            self._create_task(result)
-
-
-class _Service:
-    """A service whose callback may be a coroutine: its answer is sent when that has ended."""
-
-    def __init__(self, service: Service, create_task: Callable[..., Any]) -> None:
-        self._service = service
-        self._create_task = create_task
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._service, name)
-
-    def send_response(self, response: Any, header: Any) -> None:
-        """Send what the callback answers in the end."""
-        if not inspect.iscoroutine(response):
-            self._service.send_response(response, header)
-            return
-
-        async def answer() -> None:
-            self._service.send_response(await response, header)
-
-        self._create_task(answer)

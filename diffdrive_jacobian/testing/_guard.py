@@ -13,11 +13,13 @@ import sys
 import sysconfig
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from types import FrameType
 from typing import Any
 
 import rclpy
+from rclpy.node import Node
 
 from diffdrive_jacobian.testing import _executor
 
@@ -39,15 +41,15 @@ class Stuck(BaseException):
 class Guard:
     """Watches over the wall time that passes while simulated time stands."""
 
-    def __init__(self, patience: float, describe: Callable[[FrameType], str]) -> None:
+    def __init__(self, patience: float, nodes: Callable[[], Iterable[Node]]) -> None:
         """Begin to watch.
 
         Args:
             patience: Wall time that one instant may take (s).
-            describe: Names the callback that a frame belongs to.
+            nodes: Gives the nodes whose callbacks may be to blame.
         """
         self._patience = patience
-        self._describe = describe
+        self._nodes = nodes
         self._since: float | None = None
         self._seen: dict[str, None] | None = None
         self._profiler: Any = None
@@ -64,6 +66,8 @@ class Guard:
     def disarm(self) -> None:
         """Let it end."""
         self._since = None
+        if self._seen is not None:
+            self._stop_looking()
 
     def close(self) -> None:
         """Watch no longer."""
@@ -80,30 +84,34 @@ class Guard:
                 signal.pthread_kill(self._main, SIGNAL)
 
     def _on_signal(self, _: int, frame: FrameType | None) -> None:
-        if not self._overdue():
+        if not self._overdue() or any(one.f_code.co_name == '__del__' for one in _stack(frame)):
+            # What is raised while an object is destroyed is lost: the next signal comes soon.
             return
         if self._seen is None:
             self._seen = {}
             self._profiler = sys.getprofile()
             sys.setprofile(self._on_call)
             return
+        raise Stuck(self._diagnose(self._stop_looking(), frame))
+
+    def _stop_looking(self) -> list[str]:
         sys.setprofile(self._profiler)
-        seen, self._seen = list(self._seen), None
-        self.disarm()
-        raise Stuck(self._diagnose(seen, frame))
+        seen, self._seen = list(self._seen or ()), None
+        return seen
 
     def _on_call(self, frame: FrameType, event: str, _: Any) -> None:
         if event == 'call' and self._seen is not None and len(self._seen) < MOST_NAMED:
             below = iter(_stack(frame))
             if _is_user(next(below, None)) and not any(map(_is_user, below)) and not _is_standard(frame):
-                self._seen[self._describe(frame)] = None
+                self._seen[describe(frame, self._nodes())] = None
 
     def _diagnose(self, seen: list[str], frame: FrameType | None) -> str:
         stack = list(filter(_is_user, _stack(frame)))
         if not seen and stack:
             inner, outer = stack[0], stack[-1]
+            callback = describe(outer, self._nodes())
             return (
-                f'{self._describe(outer)} has not returned for {self._patience:g} s of wall time; it '
+                f'{callback} has not returned for {self._patience:g} s of wall time; it '
                 f'stands at {inner.f_code.co_filename}:{inner.f_lineno} in {inner.f_code.co_name}'
             )
         return (
@@ -127,3 +135,33 @@ def _is_standard(frame: FrameType) -> bool:
     """Whether it is the standard library's, that is, Python's own."""
     name = frame.f_code.co_filename
     return name.startswith(_STANDARD) and not name.startswith(_PACKAGES)
+
+
+def describe(frame: FrameType, nodes: Iterable[Node]) -> str:
+    """Name the callback that a frame runs: its function, what calls it, its node."""
+    where = f'{frame.f_code.co_filename}:{frame.f_code.co_firstlineno}'
+    for node in nodes:
+        named = f'node {node.get_fully_qualified_name()}, {where}'
+        for subscription in node.subscriptions:
+            if name := _runs(frame, subscription.callback):
+                return f'{name} (reads {subscription.topic_name}, {named})'
+        for timer in node.timers:
+            if name := _runs(frame, timer.callback):
+                return f'{name} (timer of {timer.timer_period_ns / 1e9:g} s, {named})'
+        for service in node.services:
+            if name := _runs(frame, service.callback):
+                return f'{name} (service {node.resolve_service_name(service.srv_name)}, {named})'
+    return f'{frame.f_code.co_name} ({where})'
+
+
+def _runs(frame: FrameType, callback: Any) -> str:
+    """Give the name of a callback if a frame runs it."""
+    while isinstance(callback, partial):
+        callback = callback.func
+    function = getattr(callback, '__func__', callback)
+    if getattr(function, '__code__', None) is not frame.f_code:
+        return ''
+    owner = getattr(callback, '__self__', None)
+    if owner is not None and frame.f_locals.get(frame.f_code.co_varnames[0]) is not owner:
+        return ''
+    return str(getattr(callback, '__qualname__', frame.f_code.co_name))

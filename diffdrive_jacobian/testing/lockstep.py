@@ -7,10 +7,8 @@ clock and nothing depends on it, so a run is as fast as the machine, and gives t
 
 from __future__ import annotations
 
-import inspect
-import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import Any, ClassVar, TypeVar
 
 import rclpy
@@ -23,17 +21,16 @@ from rosgraph_msgs.msg import Clock
 from diffdrive_jacobian.ros.runner import UserError, closed_world, ros_context
 from diffdrive_jacobian.testing._errors import LockstepError
 from diffdrive_jacobian.testing._executor import QuiescentExecutor
-from diffdrive_jacobian.testing._guard import Guard, Stuck
-from diffdrive_jacobian.testing._report import Traffic
+from diffdrive_jacobian.testing._guard import Guard
+from diffdrive_jacobian.testing._simulated_time import SimulatedTime, nanoseconds
 
 N = TypeVar('N', bound=Node)
 
-NANOSECONDS = 1_000_000_000
 LISTENING_DEPTH = 1000
 """How many messages of a topic may come at one instant until `listen` loses one."""
 
 
-class Lockstep:
+class Lockstep(SimulatedTime):
     """Nodes in the default context of rclpy, with simulated time that this world drives.
 
     Nodes are made as always, after the world, and added to it; `use_sim_time` is true for all of them.
@@ -61,19 +58,15 @@ class Lockstep:
         Raises:
             LockstepError: rclpy is initialised already, by another world for example, or does not
                 understand the arguments, or this is not the main thread.
-            ValueError: `start` or `patience` is not positive and finite.
+            ValueError: `start` or `patience` is not positive, or too long.
         """
-        self._now = _nanoseconds('start', start)
-        _nanoseconds('patience', patience)
+        super().__init__(nanoseconds('start', start))
+        nanoseconds('patience', patience)
         if Lockstep._open is not None:
             raise LockstepError('another world is open in this process: close it first')
         if rclpy.ok():
             raise LockstepError('rclpy is initialised already: the world does that, leave it to it')
-        self._start = self._now
-        self._clock = Clock()
         self._publishers: dict[tuple[type, str], Publisher] = {}
-        self._until_next: int | None = None
-        self._traffic = Traffic(lambda: self._now)
         self._closing = ExitStack()
         try:
             self._enter(args, patience)
@@ -92,7 +85,7 @@ class Lockstep:
         self._executor = QuiescentExecutor(context, self._on_registered)
         self._closing.callback(self._destroy_nodes)
         try:
-            self._guard = Guard(patience, self._executor.describe)
+            self._guard = Guard(patience, lambda: self._executor.nodes)
         except ValueError as error:
             raise LockstepError('a world must be made and used in the main thread') from error
         self._closing.callback(self._guard.close)
@@ -178,121 +171,6 @@ class Lockstep:
                 'its parameter use_sim_time must be true'
             )
 
-    # --- Time
-
-    @property
-    def now(self) -> int:
-        """Simulated time (ns)."""
-        return self._now
-
-    @property
-    def elapsed(self) -> float:
-        """How much of it has passed (s)."""
-        return (self._now - self._start) / NANOSECONDS
-
-    def settle(self) -> None:
-        """Let every node handle what there is to handle, without time passing."""
-        self._check_open()
-        with self._watched():
-            self._until_next = self._executor.settle()
-
-    def step(self, at_most: float | None = None) -> None:
-        """Advance to the instant at which the next timer is due.
-
-        Args:
-            at_most: Advance no further than this (s).
-
-        Raises:
-            ValueError: `at_most` is not positive and finite.
-            LockstepError: No timer is running and `at_most` is not given; or time cannot pass.
-        """
-        end = None if at_most is None else self._now + _nanoseconds('at_most', at_most)
-        self.settle()
-        if self._until_next is None and end is None:
-            raise LockstepError('no timer is running that a step could lead to: give at_most')
-        self._advance(end)
-
-    def run_for(self, seconds: float) -> None:
-        """Advance by so much simulated time, from one due timer to the next.
-
-        Raises:
-            ValueError: `seconds` is not positive and finite.
-            LockstepError: Time cannot pass.
-        """
-        end = self._now + _nanoseconds('seconds', seconds)
-        self.settle()
-        while self._now < end:
-            self._advance(end)
-
-    def run_until(self, condition: Callable[[], object], timeout: float, what: str = '') -> None:
-        """Advance until a condition holds. It is looked at once at each instant, when all is handled.
-
-        Args:
-            condition: What must become true.
-            timeout: In how much simulated time (s).
-            what: What the condition means, for the message of the error.
-
-        Raises:
-            ValueError: `timeout` is not positive and finite.
-            LockstepError: It did not come true in time; or time cannot pass.
-        """
-        end = self._now + _nanoseconds('timeout', timeout)
-        self.settle()
-        while not condition():
-            if self._now >= end:
-                what = what or _place(condition)
-                raise LockstepError(
-                    f'not within {timeout:g} s of simulated time: {what}\n{self.report()}'
-                )
-            self._advance(end)
-
-    def jump(self, seconds: float) -> None:
-        """Let time jump, also back: as when a simulator is reset, a bag looped, or a clock set.
-
-        The timers in between do not tick one by one; what they do about it is up to rcl.
-
-        Raises:
-            ValueError: `seconds` is zero or not finite, or time would begin before it exists.
-        """
-        if not math.isfinite(seconds) or seconds == 0.0:
-            raise ValueError(f'seconds must be finite and not zero, got {seconds!r}')
-        now = self._now + round(seconds * NANOSECONDS)
-        if now <= 0:
-            raise ValueError(
-                f'seconds must not lead to time 0 or before it, got {seconds!r} '
-                f'at {self._now / NANOSECONDS:g} s'
-            )
-        self.settle()
-        self._now = now
-        self._tell_time()
-
-    def _advance(self, end: int | None) -> None:
-        """Go on to the next due timer, but not past an end (ns)."""
-        left = self._until_next
-        if left is None or (end is not None and self._now + left > end):
-            assert end is not None
-            self._now = end
-        else:
-            self._now += left
-        self._tell_time()
-
-    def _tell_time(self) -> None:
-        stamp = self._clock.clock
-        stamp.sec, stamp.nanosec = divmod(self._now, NANOSECONDS)
-        self._clock_publisher.publish(self._clock)
-        with self._watched():
-            self._until_next = self._executor.settle()
-
-    @contextmanager
-    def _watched(self) -> Iterator[None]:
-        self._guard.arm()
-        try:
-            yield
-        except Stuck as stuck:
-            raise LockstepError(f'at {self._now / NANOSECONDS:g} s: {stuck}\n{self.report()}') from stuck
-        finally:
-            self._guard.disarm()
-
     # --- Talking to the nodes
 
     def publish(self, topic: str, message: Any) -> None:
@@ -339,7 +217,7 @@ class Lockstep:
         self.settle()
         return received
 
-    def call(self, service_type: type, name: str, request: Any = None, *, timeout: float = 10.0) -> Any:
+    def call(self, service_type: Any, name: str, request: Any = None, *, timeout: float = 10.0) -> Any:
         """Call a service and give its response.
 
         Args:
@@ -357,15 +235,11 @@ class Lockstep:
         try:
             if not client.service_is_ready():
                 raise LockstepError(f'there is no service {name} of {service_type.__name__}')
-            future = client.call_async(request or service_type.Request())  # type: ignore[attr-defined]
+            future = client.call_async(request or service_type.Request())
             self.run_until(future.done, timeout, f'a response of {name}')
             return future.result()
         finally:
             self.node.destroy_client(client)
-
-    def report(self) -> str:
-        """Tell the last message of every topic."""
-        return self._traffic.describe(self._executor.nodes)
 
     def _with_type(self, topic: str, create: Callable[..., Any], *args: Any) -> Any:
         try:
@@ -379,17 +253,5 @@ class Lockstep:
             ) from error
 
 
-def _nanoseconds(name: str, seconds: float) -> int:
-    if not math.isfinite(seconds) or round(seconds * NANOSECONDS) <= 0:
-        raise ValueError(f'{name} must be a positive finite number of seconds, got {seconds!r}')
-    return round(seconds * NANOSECONDS)
-
-
 def _type_name(message_type: type) -> str:
     return f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
-
-
-def _place(condition: Callable[[], object]) -> str:
-    code = getattr(inspect.unwrap(condition), '__code__', None)
-    where = f' ({code.co_filename}:{code.co_firstlineno})' if code else ''
-    return f'condition {getattr(condition, "__qualname__", condition)}{where}'
