@@ -1,0 +1,261 @@
+"""What goes wrong in a lockstep world is named."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+
+import pytest
+import rclpy
+from geometry_msgs.msg import Twist, Vector3
+from nav_msgs.msg import Odometry
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+from users_nodes import Blinker, Echo
+
+from diffdrive_jacobian.testing import Lockstep, LockstepError
+
+
+@pytest.fixture
+def impatient():
+    with Lockstep(patience=0.5) as world:
+        yield world
+
+
+def test_condition_that_never_holds_is_named_with_the_last_messages(lockstep):
+    lockstep.add(Echo('parrot', 'a', 'b'))
+    lockstep.publish('a', Vector3(x=0.5))
+    with pytest.raises(LockstepError) as caught:
+        lockstep.run_until(lambda: False, timeout=3.0, what='pigs fly')
+    first, *rest = str(caught.value).splitlines()
+    assert first == 'not within 3 s of simulated time: pigs fly'
+    assert rest[0] == 'last messages, at 4 s:'
+    assert '  /b: 1 from /parrot, last at 1 s: Vector3(x=0.5)' in rest
+    with pytest.raises(LockstepError, match=r'condition .*never \(.*test_lockstep_failures.py:\d+\)'):
+        lockstep.run_until(never, timeout=0.1)
+
+
+def never():
+    return False
+
+
+def test_report_tells_topics_that_nobody_spoke_on(lockstep):
+    lockstep.add(Echo('parrot', 'a', 'b'))
+    assert '  /a: nothing; read by /parrot' in lockstep.report().splitlines()
+
+
+def test_report_shortens_messages(lockstep):
+    lockstep.listen(Odometry, 'odom')
+    message = Odometry()
+    message.header.stamp.sec, message.header.frame_id = 3, 'odom'
+    message.pose.covariance[7] = 1.0
+    message.twist.twist.linear.x = 1.0 / 3.0
+    lockstep.publish('odom', message)
+    assert (
+        "Odometry(header.stamp=3 s, header.frame_id='odom', pose.pose.orientation.w=1, "
+        'pose.covariance=[0, 0, 0, 0, ... 36 in all], twist.twist.linear.x=0.333333)'
+    ) in lockstep.report()
+
+
+def test_what_a_callback_raises_fails_the_test_with_its_traceback(lockstep):
+    def on_tick():
+        raise ZeroDivisionError('in a tick')
+
+    def on_message(_):
+        raise KeyError('in a message')
+
+    async def on_question(_):
+        raise ValueError('in a coroutine')
+
+    lockstep.node.create_timer(0.1, on_tick)
+    lockstep.node.create_subscription(Vector3, 'a', on_message, 10)
+    lockstep.node.create_subscription(Vector3, 'b', on_question, 10)
+    with pytest.raises(ZeroDivisionError, match='in a tick') as caught:
+        lockstep.run_for(1.0)
+    assert caught.traceback[-1].name == 'on_tick'
+    with pytest.raises(KeyError, match='in a message') as caught:
+        lockstep.publish('a', Vector3())
+    assert caught.traceback[-1].name == 'on_message'
+    with pytest.raises(ValueError, match='in a coroutine') as caught:
+        lockstep.publish('b', Vector3())
+    assert caught.traceback[-1].name == 'on_question'
+
+
+class Blocking(Node):
+    def __init__(self, wait):
+        super().__init__('blocking')
+        self.wait = wait
+        self.create_subscription(Vector3, 'a', self.on_message, 10)
+        self.create_timer(0.1, self.on_tick)
+
+    def on_message(self, message):
+        pass
+
+    def on_tick(self):
+        self.wait()
+
+
+def forever():
+    while True:
+        pass
+
+
+@pytest.mark.parametrize('wait', [lambda: time.sleep(1000), threading.Event().wait, forever])
+def test_callback_that_blocks_is_named(impatient, wait):
+    impatient.add(Echo('innocent', 'a', 'b'))
+    begun = time.monotonic()
+    with pytest.raises(LockstepError) as caught:
+        impatient.add(Blocking(wait))
+    assert time.monotonic() - begun < 60.0
+    first = str(caught.value).splitlines()[0]
+    assert first.startswith('at 1 s: Blocking.on_tick (timer of 0.1 s, node /blocking, ')
+    assert 'has not returned for 0.5 s of wall time; it stands at ' in first
+    assert 'innocent' not in first
+
+
+def test_service_that_calls_another_and_waits_is_named(impatient):
+    node = Node('deadlocked')
+    client = node.create_client(Trigger, 'other')
+    impatient.node.create_service(Trigger, 'other', lambda _, response: response)
+    node.create_service(Trigger, 'ask', lambda request, _: client.call(request))
+    impatient.add(node)
+    with pytest.raises(LockstepError, match=r'service /ask, node /deadlocked.* in wait'):
+        impatient.call(Trigger, 'ask')
+
+
+def test_nodes_that_answer_each_other_for_ever_are_named(impatient):
+    impatient.add(Echo('ping', 'a', 'b'))
+    impatient.add(Echo('pong', 'b', 'a'))
+    with pytest.raises(LockstepError, match='no end of callbacks for') as caught:
+        impatient.publish('a', Vector3())
+    first, *rest = str(caught.value).splitlines()
+    assert 'Echo.on_message (reads /a, node /ping' in first
+    assert 'Echo.on_message (reads /b, node /pong' in first
+    assert any('/a: ' in line and 'from /pong' in line for line in rest)
+
+
+def test_timer_without_a_period_is_named(impatient):
+    impatient.node.create_timer(0.0, lambda: None)
+    with pytest.raises(LockstepError, match=r'no end of callbacks .*timer of 0 s, node /lockstep'):
+        impatient.run_for(1.0)
+
+
+def test_the_world_goes_on_after_a_failure(impatient):
+    blocking = impatient.node.create_timer(0.1, lambda: time.sleep(1000))
+    with pytest.raises(LockstepError):
+        impatient.run_for(1.0)
+    impatient.node.destroy_timer(blocking)
+    blinker = impatient.add(Blinker())
+    impatient.run_for(1.0)
+    assert len(blinker.ticks) >= 100
+
+
+@pytest.mark.parametrize('seconds', [0.0, -1.0, float('nan'), float('inf'), 1e-10, 1e10])
+def test_times_that_cannot_be_are_refused(lockstep, seconds):
+    for advance in (lockstep.run_for, lockstep.step):
+        with pytest.raises(
+            ValueError, match=f'must be a positive number of seconds, .*, got {re.escape(str(seconds))}'
+        ):
+            advance(seconds)
+    with pytest.raises(ValueError, match='timeout must be'):
+        lockstep.run_until(never, timeout=seconds)
+    assert lockstep.elapsed == 0.0
+
+
+@pytest.mark.parametrize(
+    ('seconds', 'words'), [(0.0, 'not zero'), (-1.0, 'time 0'), (float('nan'), 'nan')]
+)
+def test_jumps_that_cannot_be_are_refused(lockstep, seconds, words):
+    with pytest.raises(ValueError, match=words):
+        lockstep.jump(seconds)
+
+
+def test_worlds_that_cannot_be_are_refused(lockstep):
+    with pytest.raises(LockstepError, match='another world is open in this process'):
+        Lockstep()
+    lockstep.close()
+    for wrong in ({'start': 0.0}, {'start': -1.0}, {'patience': 0.0}):
+        with pytest.raises(ValueError, match='positive number'):
+            Lockstep(**wrong)
+    with pytest.raises(LockstepError, match='ROS arguments'):
+        Lockstep(['--ros-args', '--no-such-option'])
+    rclpy.init()
+    try:
+        with pytest.raises(LockstepError, match='rclpy is initialised already'):
+            Lockstep()
+    finally:
+        rclpy.shutdown()
+    failures = []
+
+    def in_a_thread():
+        try:
+            Lockstep()
+        except LockstepError as error:
+            failures.append(str(error))
+
+    thread = threading.Thread(target=in_a_thread)
+    thread.start()
+    thread.join()
+    assert failures == ['a world must be made and used in the main thread']
+    with Lockstep() as world:
+        world.add(Blinker())
+
+
+def test_nodes_that_do_not_belong_are_refused(lockstep):
+    blinker = lockstep.add(Blinker())
+    with pytest.raises(LockstepError, match='node /blinker was added already'):
+        lockstep.add(blinker)
+    with Context() as context:
+        stranger = Node('stranger', context=context)
+        with pytest.raises(LockstepError, match='node /stranger is in another context'):
+            lockstep.add(stranger)
+        stranger.destroy_node()
+    wall = Node('wall', parameter_overrides=[Parameter('use_sim_time', value=False)])
+    with pytest.raises(LockstepError, match='node /wall runs on wall time: its parameter use_sim_time'):
+        lockstep.add(wall)
+    wall.destroy_node()
+    taken = Node('taken')
+    executor = SingleThreadedExecutor()
+    executor.add_node(taken)
+    with pytest.raises(LockstepError, match='node /taken is served by an executor of its own'):
+        lockstep.add(taken)
+    executor.shutdown()
+    taken.destroy_node()
+    blinker.set_parameters([Parameter('use_sim_time', value=False)])
+    with pytest.raises(LockstepError, match='node /blinker runs on wall time'):
+        lockstep.run_for(1.0)
+
+
+def test_closed_world_is_of_no_use(lockstep):
+    blinker = lockstep.add(Blinker())
+    lockstep.close()
+    lockstep.close()
+    for use in (
+        lambda: lockstep.run_for(1.0),
+        lambda: lockstep.step(),
+        lambda: lockstep.add(blinker),
+        lambda: lockstep.publish('a', Vector3()),
+        lambda: lockstep.jump(1.0),
+    ):
+        with pytest.raises(LockstepError, match='this world is closed'):
+            use()
+
+
+def test_topics_and_services_that_are_not_there_are_named(lockstep):
+    lockstep.listen(Twist, 'cmd_vel')
+    with pytest.raises(LockstepError, match='nobody reads /cmd_vell as geometry_msgs/msg/Twist'):
+        lockstep.publish('cmd_vell', Twist())
+    with pytest.raises(
+        LockstepError, match=r'/cmd_vel is geometry_msgs/msg/Twist, not geometry_msgs/msg/V'
+    ):
+        lockstep.publish('cmd_vel', Vector3())
+    with pytest.raises(
+        LockstepError, match=r'/cmd_vel is geometry_msgs/msg/Twist, not geometry_msgs/msg/V'
+    ):
+        lockstep.listen(Vector3, 'cmd_vel')
+    with pytest.raises(LockstepError, match='there is no service /nowhere of Trigger'):
+        lockstep.call(Trigger, 'nowhere')
