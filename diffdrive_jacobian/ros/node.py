@@ -7,13 +7,17 @@ second, on the wall clock, and said once.
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
+from weakref import WeakKeyDictionary
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -160,7 +164,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
     def _watch(self) -> None:
         self._watch_clock()
         looks: dict[tuple[str, str, str], int] = {}
-        types = dict(self.get_topic_names_and_types())
+        types = _topic_types(self)
         for topic, wanted, reading in self._watched:
             name = self.resolve_topic_name(topic)
             if types.get(name) == [wanted]:
@@ -203,6 +207,23 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
                 f'use_sim_time is true, but nothing came on /clock for {CLOCK_PATIENCE} s: '
                 'time stands still, and so does this node; publish /clock or set use_sim_time to false'
             )
+
+
+def _topic_types(node: Node) -> dict[str, list[str]]:
+    """Give the types of all topics in the graph.
+
+    The nodes of a context share a look: with many of them in one process each would see the topics of
+    all, and the looks would cost more than the robots.
+    """
+    now = time.monotonic()
+    looked_at, types = _topic_types_seen.get(node.context, (-math.inf, {}))
+    if now - looked_at > WATCH_PERIOD / 2:
+        types = dict(node.get_topic_names_and_types())
+        _topic_types_seen[node.context] = now, types
+    return types
+
+
+_topic_types_seen: WeakKeyDictionary[Context, tuple[float, dict[str, list[str]]]] = WeakKeyDictionary()
 
 
 def _type_name(message: type) -> str:

@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import textwrap
 from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
-from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.parameters import (
     GoToGoalParameters,
     VirtualRobotParameters,
     WheelBridgeParameters,
 )
-from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.ros.parameters import NodeParameters, specifications
 from diffdrive_jacobian.ros.runner import UserError, ros_context, running
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import _cli
 
-NODES: dict[str, tuple[Any, type[NodeParameters]]] = {
-    'virtual_robot': (VirtualRobot, VirtualRobotParameters),
-    'go_to_goal': (GoToGoal, GoToGoalParameters),
-    'wheel_bridge': (WheelBridge, WheelBridgeParameters),
+NODES: dict[str, tuple[str, type[NodeParameters]]] = {
+    'virtual_robot': ('VirtualRobot', VirtualRobotParameters),
+    'go_to_goal': ('GoToGoal', GoToGoalParameters),
+    'wheel_bridge': ('WheelBridge', WheelBridgeParameters),
 }
+"""Name of a node, which is that of its module, to its class and its parameters."""
 
 
 def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
@@ -36,7 +35,9 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
         arguments: The command line without the program's name.
         signals: What was caught so far.
     """
-    make, parameters = NODES[name]
+    class_name, parameters = NODES[name]
+    # Only the one that runs, for each costs time at the start.
+    make = getattr(importlib.import_module(f'diffdrive_jacobian.nodes.{name}'), class_name)
     own, ros = _cli.split_arguments(arguments)
     ros = _cli.with_params_file(ros, _parser(name, make, parameters).parse_args(own))
     try:
