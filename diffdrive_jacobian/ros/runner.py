@@ -18,6 +18,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.logging import get_logger_level, set_logger_level
 from rclpy.node import Node
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.signals import SignalHandlerOptions
@@ -74,6 +75,8 @@ def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[
         if flag == '--params-file' and not os.access(value, os.R_OK):
             raise UserError(f'--params-file must name a file that can be read, got {value!r}')
     context = rclpy.get_default_context() if default else Context()
+    # `--log-level` is for the whole process, and would outlast the context.
+    log_level = get_logger_level('')
     try:
         rclpy.init(
             args=list(arguments),
@@ -88,6 +91,7 @@ def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[
     finally:
         # Of the default context rclpy makes a new one then.
         rclpy.try_shutdown(context=None if default else context)
+        set_logger_level('', log_level)
 
 
 def make_executor(context: Context, *, closed_world: bool) -> Executor:

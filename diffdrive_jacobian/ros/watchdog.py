@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from rclpy.clock import JumpThreshold, TimeJump
+from rclpy.duration import Duration
 from rclpy.node import Node
 
 
@@ -22,6 +24,8 @@ class Watchdog:
         self._fed_at = 0
         self._awake = False
         self._timer = node.create_timer(1.0, self._on_timer, autostart=False)
+        back = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1))
+        self._jumps = self._clock.create_jump_callback(back, post_callback=self._on_jump_back)
 
     def start(self, timeout: int) -> None:
         """Watch from now on with a timeout (ns); 0: never strike."""
@@ -45,6 +49,12 @@ class Watchdog:
         self._awake = True
         self._timer.timer_period_ns = duration
         self._timer.reset()
+
+    def _on_jump_back(self, _: TimeJump) -> None:
+        # rcl may leave the timer waiting for an instant of the old time line.
+        if self._awake:
+            self._fed_at = self._clock.now().nanoseconds
+            self._sleep(self._timeout)
 
     def _on_timer(self) -> None:
         waited = self._clock.now().nanoseconds - self._fed_at
