@@ -1,5 +1,5 @@
-"""What the tests of the nodes share: one context per test that no other test can hear, and waiting for
-conditions instead of sleeping."""
+"""What the tests of the nodes share: the lockstep world, and for what must run in real time one context
+per test that no other test can hear, and waiting for conditions instead of sleeping."""
 
 from __future__ import annotations
 
@@ -91,39 +91,6 @@ class Harness:
             node.destroy_node()
 
 
-class SimTime:
-    """A publisher of /clock: simulated time stands unless a test moves it."""
-
-    def __init__(self, harness):
-        from rosgraph_msgs.msg import Clock
-
-        self._harness = harness
-        self._message = Clock()
-        self._publisher = harness.peer.create_publisher(Clock, '/clock', 10)
-        self.now = 0
-
-    def set(self, nanoseconds):
-        """Let every node with simulated time see this instant."""
-        self.now = nanoseconds
-        stamp = self._message.clock
-        stamp.sec, stamp.nanosec = divmod(nanoseconds, 1_000_000_000)
-        self._publisher.publish(self._message)
-        watching = [
-            node
-            for node in self._harness.nodes
-            if node.has_parameter('use_sim_time') and node.get_parameter('use_sim_time').value
-        ]
-        self._harness.until(
-            lambda: all(node.get_clock().now().nanoseconds == nanoseconds for node in watching),
-            'the clock is seen by all nodes',
-        )
-
-    def advance(self, seconds, step=0.02):
-        """Let time pass in steps."""
-        for _ in range(round(seconds / step)):
-            self.set(self.now + round(step * 1e9))
-
-
 @pytest.fixture(params=['events', 'single'])
 def executor_kind(request):
     """Both executors; tests that do not ask for this run on the faster one."""
@@ -135,8 +102,7 @@ def ros(request):
     """A harness in a context of its own."""
     from diffdrive_jacobian.ros.runner import make_executor, ros_context
 
-    # The EventsExecutor's timers may miss a step of simulated time when another follows at once.
-    single = 'sim_time' in request.fixturenames or (
+    single = (
         'executor_kind' in request.fixturenames and request.getfixturevalue('executor_kind') == 'single'
     )
     with ros_context(['test']) as context:
@@ -146,6 +112,20 @@ def ros(request):
 
 
 @pytest.fixture
-def sim_time(ros):
-    """The /clock of the harness."""
-    return SimTime(ros)
+def add(lockstep):
+    """Put one of our nodes into the world; see `lockstep_nodes.make`."""
+    from lockstep_nodes import make
+
+    return lambda node_class, namespace='', **parameters: lockstep.add(
+        make(node_class, namespace, **parameters)
+    )
+
+
+@pytest.fixture
+def team(lockstep):
+    """The topics of a robot with bridge and quick controller, and the nodes."""
+    from lockstep_nodes import QUICK, Topics, add_team
+
+    topics = Topics(lockstep)
+    topics.robot, topics.bridge, topics.controller = add_team(lockstep, **QUICK)
+    return topics

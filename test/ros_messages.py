@@ -6,12 +6,14 @@ import math
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from geometry_msgs.msg import Pose, PoseStamped, PoseWithCovarianceStamped, Twist, TwistStamped
 from nav_msgs.msg import Goals, Odometry
+from sensor_msgs.msg import JointState
 
-from diffdrive_jacobian.ros.messages import from_pose
+from diffdrive_jacobian.ros.messages import from_pose, from_time, set_pose
 
 PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+WHEELS = ['left_wheel_joint', 'right_wheel_joint']
 
 
 def stamp(nanoseconds):
@@ -29,6 +31,38 @@ def twist_stamped(v, omega, nanoseconds):
     message = TwistStamped(twist=twist(v, omega))
     message.header.stamp = stamp(nanoseconds)
     return message
+
+
+def joint_command(left, right, nanoseconds=0):
+    message = JointState(name=WHEELS, velocity=[float(left), float(right)])
+    message.header.stamp = stamp(nanoseconds)
+    return message
+
+
+def placement(x, y=0.0, theta=0.0, *, variances=(0.0, 0.0, 0.0), frame=''):
+    message = PoseWithCovarianceStamped()
+    message.header.frame_id = frame
+    message.pose.pose = pose_message([x, y, theta])
+    planar = np.zeros((6, 6))
+    planar[PLANAR] = np.diag(variances)
+    message.pose.covariance = planar.ravel()
+    return message
+
+
+def pose_message(pose):
+    """Write a pose exactly as the robot writes it."""
+    message = Pose()
+    set_pose(message, np.asarray(pose, dtype=float))
+    return message
+
+
+def instants(messages):
+    return [from_time(one.header.stamp) for one in messages]
+
+
+def twists(messages):
+    bare = [getattr(one, 'twist', one) for one in messages]
+    return [(one.linear.x, one.angular.z) for one in bare]
 
 
 def pose_of(odometry):
@@ -61,4 +95,17 @@ def odometry(x, y, theta, frame='odom'):
     message = Odometry()
     message.header.frame_id = frame
     message.pose.pose = goal(x, y, theta).pose
+    return message
+
+
+def spoiled(message, path, value):
+    """Set a field by its path, such as `linear.x` or `covariance.0`."""
+    target = message
+    *way, last = path.split('.')
+    for name in way:
+        target = getattr(target, name)
+    if last.isdecimal():
+        target[int(last)] = value
+    else:
+        setattr(target, last, value)
     return message

@@ -46,7 +46,9 @@ def test_other_type_in_another_process_is_said_once(monkeypatch, capfd, stranger
     assert 'nothing will arrive' not in ''.join(looks)
 
 
-def test_two_types_in_one_process_are_a_clear_error(ros):
-    ros.add(VirtualRobot)
+@pytest.mark.parametrize('node_class', [GoToGoal, WheelBridge])
+def test_two_types_in_one_process_are_a_clear_error(add, node_class):
+    add(VirtualRobot)
     with pytest.raises(ParameterError, match='is enable_stamped_cmd_vel the same for all'):
-        ros.add(WheelBridge, parameters={'enable_stamped_cmd_vel': True})
+        add(node_class, enable_stamped_cmd_vel=True)
+    add(node_class, 'elsewhere', enable_stamped_cmd_vel=True)

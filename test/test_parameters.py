@@ -64,9 +64,9 @@ def test_config_files_agree_with_themselves():
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_every_parameter_is_described_as_declared(ros, name):
+def test_every_parameter_is_described_as_declared(add, name):
     node_class, parameters = NODES[name]
-    node = ros.add(node_class)
+    node = add(node_class)
     defaults = {field.name: field.default for field in fields(parameters)}
     for ros_name, (field, specification) in specifications(parameters).items():
         description = node.describe_parameter(ros_name)
@@ -124,15 +124,16 @@ def test_limits_follow_diff_drive_controller():
     assert (limits.min_omega, limits.max_omega) == (-1.0, math.inf)
 
 
-def test_a_refused_start_leaves_no_node(ros):
-    before = ros.peer.get_node_names()
+def test_a_refused_start_leaves_no_node(lockstep, add):
     with pytest.raises(ParameterError, match='wheel_radius'):
-        ros.add(VirtualRobot, parameters={'wheel_radius': -1.0})
-    assert ros.peer.get_node_names() == before
+        add(VirtualRobot, wheel_radius=-1.0)
+    assert lockstep.node.get_node_names() == ['lockstep']
+    add(VirtualRobot)
+    assert lockstep.node.get_node_names() == ['lockstep', 'virtual_robot']
 
 
-def test_one_of_several_changes_that_is_bad_refuses_all_when_atomic(ros):
-    node = ros.add(GoToGoal)
+def test_one_of_several_changes_that_is_bad_refuses_all_when_atomic(add):
+    node = add(GoToGoal)
     changes = [Parameter('kp', value=4.0), Parameter('kv', value=-1.0)]
     assert not node.set_parameters_atomically(changes).successful
     assert (node.parameters.kp, node.parameters.kv) == (3.0, 0.5)
@@ -142,16 +143,16 @@ def test_one_of_several_changes_that_is_bad_refuses_all_when_atomic(ros):
     assert (node.parameters.kp, node.parameters.kv) == (4.0, 0.5)
 
 
-def test_unknown_parameters_are_named_with_what_was_meant(ros, capfd):
-    report_unknown([ros.add(GoToGoal, parameters={'kpp': 1.0, 'colour': 'red'})])
+def test_unknown_parameters_are_named_with_what_was_meant(add, capfd):
+    report_unknown([add(GoToGoal, kpp=1.0, colour='red')])
     said = capfd.readouterr().err
     assert "unknown parameter 'kpp' is ignored; did you mean 'kp'?" in said
     assert "unknown parameter 'colour' is ignored; there are: " in said
     assert 'qos_overrides' not in said
 
 
-def test_quality_of_service_can_be_overridden(ros):
-    node = ros.add(VirtualRobot, parameters={'qos_overrides./odom.publisher.reliability': 'best_effort'})
+def test_quality_of_service_can_be_overridden(add):
+    node = add(VirtualRobot, **{'qos_overrides./odom.publisher.reliability': 'best_effort'})
     (info,) = node.get_publishers_info_by_topic('/odom')
     assert info.qos_profile.reliability.name == 'BEST_EFFORT'
     (info,) = node.get_publishers_info_by_topic('/joint_states')

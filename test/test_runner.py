@@ -6,6 +6,7 @@ import sys
 
 import pytest
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.logging import get_logger
 from rclpy.node import Node
 
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
@@ -73,3 +74,13 @@ def test_domains_that_do_not_exist_are_named(monkeypatch, domain):
     monkeypatch.setenv('ROS_DOMAIN_ID', domain)
     with pytest.raises(UserError, match=f'must be in 0 to 232, got {domain!r}'), ros_context(['test']):
         pass
+
+
+def test_log_level_does_not_outlast_the_context(capfd):
+    with ros_context(['test', '--ros-args', '--log-level', 'error']):
+        get_logger('somebody').info('not to be heard')
+    with ros_context(['test']):
+        get_logger('somebody').info('to be heard')
+    said = capfd.readouterr().err
+    assert 'to be heard' in said
+    assert 'not to be heard' not in said

@@ -1,184 +1,148 @@
-"""The node virtual_robot when time does what it likes, and when its parameters change."""
+"""The node virtual_robot when time does what it likes: timeouts at their own instants, jumps."""
 
 from __future__ import annotations
 
-import itertools
 import math
 
-import numpy as np
 import pytest
-from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
-from nav_msgs.msg import Odometry
-from rclpy.parameter import Parameter
-from ros_messages import at_rest, pose_of, twist
-from std_srvs.srv import Trigger
+from geometry_msgs.msg import Twist
+from lockstep_nodes import NANOSECOND, SECOND, Topics
+from ros_messages import at_rest, instants, pose_message, pose_of, twist, twists
 
-from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.ros import node as ros_node
-from diffdrive_jacobian.ros.messages import from_time
+from diffdrive_jacobian.kinematics import se2
 
-SECOND = 1_000_000_000
+pytestmark = pytest.mark.lockstep(start=100.0)
+"""Late enough that time may go back."""
 
 
 @pytest.fixture
-def driving(ros, sim_time):
-    """A robot in simulated time that was told to drive at 1 m/s at t = 100 s, and its topics."""
-
-    class Driving:
-        odom = ros.listen(Odometry, 'odom')
-        applied = ros.listen(TwistStamped, 'cmd_vel_out')
-        starts = ros.listen(PoseWithCovarianceStamped, 'start_pose', latched=True)
-        robot = ros.add(VirtualRobot, parameters={'use_sim_time': True})
-        commands = ros.talk(Twist, 'cmd_vel')
-
-        def seen(self, nanoseconds):
-            ros.until(
-                lambda: self.odom and from_time(self.odom[-1].header.stamp) == nanoseconds,
-                f'odometry of {nanoseconds} ns',
-            )
-            return self.odom[-1]
-
-        def set(self, **parameters):
-            changes = [Parameter(n.replace('__', '.'), value=v) for n, v in parameters.items()]
-            return self.robot.set_parameters_atomically(changes)
-
-    it = Driving()
-    sim_time.set(100 * SECOND)
-    it.commands.publish(twist(1.0, 0.0))
-    ros.until(lambda: it.applied, 'the command is applied')
-    return it
+def driving(lockstep, robot_at):
+    """The topics of a robot that is told at t = 100 s to drive at 1 m/s."""
+    topics = Topics(lockstep)
+    robot_at()
+    lockstep.publish('cmd_vel', twist(1.0, 0.0))
+    return topics
 
 
-def test_without_clock_nothing_moves_and_that_is_said(ros, capfd, monkeypatch):
-    monkeypatch.setattr(ros_node, 'WATCH_PERIOD', 0.05)
-    odom, applied = ros.listen(Odometry, 'odom'), ros.listen(TwistStamped, 'cmd_vel_out')
-    ros.add(VirtualRobot, parameters={'use_sim_time': True})
-    ros.talk(Twist, 'cmd_vel').publish(twist(1.0, 0.0))
-    ros.until_said(capfd, 'nothing came on /clock for', 'command dropped: simulated time')
-    assert not ros.call(Trigger, 'reset_odometry').success
-    assert not odom
-    assert not applied
+@pytest.mark.parametrize('rate', [3.0, 50.0])
+@pytest.mark.parametrize('timeout', [1e-9, 0.001, 0.0333, 0.5, 2.0])
+def test_timeout_strikes_at_its_own_instant_whatever_the_rate(lockstep, robot_at, timeout, rate):
+    topics = Topics(lockstep)
+    robot_at(cmd_vel_timeout=timeout, publish_rate=rate)
+    begun = lockstep.now
+    lockstep.publish('cmd_vel', twist(1.0, -3.0))
+    lockstep.run_for(timeout + 1.1 / rate)
+    assert instants(topics.applied) == [begun, begun + round(timeout * SECOND)]
+    assert twists(topics.applied) == [(1.0, -3.0), (0.0, 0.0)]
+    assert topics.odom[-1].pose.pose == pose_message(se2.integrate(3 * [0.0], [1.0, -3.0], timeout))
+    assert at_rest(topics.odom[-1])
 
 
-def test_jump_forward_drives_on_to_the_timeout_only(ros, driving, sim_time):
-    sim_time.set(3700 * SECOND)
-    odometry = driving.seen(3700 * SECOND)
-    assert pose_of(odometry) == pytest.approx([0.5, 0.0, 0.0], abs=1e-12)
+def test_the_shortest_timeout_is_not_for_ever(lockstep, robot_at):
+    topics = Topics(lockstep)
+    robot_at(cmd_vel_timeout=1e-10)
+    lockstep.publish('cmd_vel', twist(1.0, 0.0))
+    lockstep.run_for(0.02)
+    assert instants(topics.applied) == [100 * SECOND, 100 * SECOND + 1]
+
+
+def test_without_a_timeout_a_command_holds_for_ever(lockstep, robot_at):
+    topics = Topics(lockstep)
+    robot_at(cmd_vel_timeout=0.0, publish_rate=0.1)
+    lockstep.publish('cmd_vel', twist(1.0, 0.0))
+    lockstep.run_for(3600.0)
+    assert len(topics.applied) == 1
+    assert pose_of(topics.odom[-1]).tolist() == [3600.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize('period', [0.1, 0.4, 0.5 - NANOSECOND])
+def test_commands_in_time_keep_it_going(lockstep, robot_at, period):
+    topics = Topics(lockstep)
+    robot_at()
+    for _ in range(10):
+        lockstep.publish('cmd_vel', twist(1.0, 0.0))
+        lockstep.run_for(period)
+    assert twists(topics.applied) == [(1.0, 0.0)] * 10
+    lockstep.run_for(1.0)
+    assert twists(topics.applied) == [(1.0, 0.0)] * 10 + [(0.0, 0.0)]
+    assert pose_of(topics.odom[-1])[0] == pytest.approx(9.0 * period + 0.5, abs=1e-14)
+
+
+def test_a_command_in_the_instant_of_the_timeout_costs_no_way(lockstep, driving):
+    lockstep.run_for(0.5)
+    lockstep.publish('cmd_vel', twist(1.0, 0.0))
+    lockstep.run_for(1.0)
+    now = 100 * SECOND
+    half = now + SECOND // 2
+    assert instants(driving.applied) == [now, half, half, now + SECOND]
+    assert pose_of(driving.odom[-1]).tolist() == [1.0, 0.0, 0.0]
+
+
+def test_zero_stops_at_once_and_no_timeout_follows(lockstep, driving):
+    lockstep.run_for(0.123)
+    lockstep.publish('cmd_vel', Twist())
+    lockstep.run_for(2.0)
+    assert instants(driving.applied) == [100 * SECOND, 100 * SECOND + 123_000_000]
+    assert pose_of(driving.odom[-1]).tolist() == [0.123, 0.0, 0.0]
+
+
+@pytest.mark.parametrize('seconds', [0.5, 0.51, 3.0, 3600.0, 1e9])
+def test_jump_forward_drives_on_to_the_timeout_only(lockstep, driving, seconds):
+    lockstep.jump(seconds)
+    odometry = driving.odom[-1]
+    assert instants([odometry]) == [lockstep.now]
+    assert pose_of(odometry).tolist() == [0.5, 0.0, 0.0]
     assert at_rest(odometry)
-    ros.until(lambda: len(driving.applied) == 2, 'the stop is told')
-    assert [from_time(one.header.stamp) for one in driving.applied] == [
-        100 * SECOND,
-        100 * SECOND + SECOND // 2,
-    ]
+    assert instants(driving.applied) == [100 * SECOND, 100 * SECOND + SECOND // 2]
 
 
-def test_time_that_goes_back_leaves_the_robot_where_it_is(ros, driving, sim_time, capfd):
-    sim_time.set(100 * SECOND + SECOND // 4)
-    driving.seen(100 * SECOND + SECOND // 4)
-    sim_time.set(50 * SECOND)
-    ros.until(lambda: len(driving.starts) == 2, 'a new start')
-    assert from_time(driving.starts[1].header.stamp) == 50 * SECOND
-    assert driving.starts[1].pose.pose.position.x == pytest.approx(0.25, abs=1e-12)
-    ros.until(lambda: driving.applied[-1].twist == Twist(), 'the stop is told')
-    sim_time.advance(1.0)
-    odometry = driving.seen(51 * SECOND)
-    assert pose_of(odometry) == pytest.approx([0.25, 0.0, 0.0], abs=1e-12)
-    driving.commands.publish(twist(-1.0, 0.0))
-    ros.until(lambda: driving.applied[-1].twist.linear.x == -1.0, 'it can be driven again')
-    sim_time.advance(0.8)
-    sim_time.set(52 * SECOND)
-    assert pose_of(driving.seen(52 * SECOND)) == pytest.approx([-0.25, 0.0, 0.0], abs=1e-12)
-    assert 'time went back by 50.250 s' in capfd.readouterr().err
+def test_jump_forward_within_the_timeout_is_no_more_than_time_that_passes(lockstep, driving):
+    lockstep.jump(0.25)
+    assert pose_of(driving.odom[-1]).tolist() == [0.25, 0.0, 0.0]
+    lockstep.run_for(1.0)
+    assert pose_of(driving.odom[-1]).tolist() == [0.5, 0.0, 0.0]
 
 
-def test_limits_hold_for_the_running_command(ros, driving, sim_time):
-    sim_time.set(100 * SECOND + SECOND // 5)
-    assert driving.set(linear__x__max_velocity=0.25).successful
-    sim_time.set(100 * SECOND + 2 * SECOND // 5)
-    odometry = driving.seen(100 * SECOND + 2 * SECOND // 5)
-    assert pose_of(odometry)[0] == pytest.approx(0.2 + 0.05, abs=1e-12)
-    assert driving.applied[-1].twist.linear.x == 0.25
-    sim_time.set(200 * SECOND)
-    # The timeout still counts from the command.
-    assert pose_of(driving.seen(200 * SECOND))[0] == pytest.approx(0.2 + 0.075, abs=1e-12)
+@pytest.mark.parametrize('seconds', [1e-9, 0.01, 0.25, 50.25, 99.0])
+def test_time_that_goes_back_leaves_the_robot_where_it_is(lockstep, driving, capfd, seconds):
+    lockstep.run_for(0.24)
+    lockstep.jump(-seconds)
+    back = lockstep.now
+    assert instants(driving.starts) == [100 * SECOND, back]
+    assert driving.starts[1].pose.pose.position.x == 0.24
+    # The stop is told at once, on the new time line.
+    assert instants(driving.applied) == [100 * SECOND, back]
+    assert twists(driving.applied)[1] == (0.0, 0.0)
+    driving.odom.clear()
+    lockstep.run_for(1.0)
+    assert {tuple(pose_of(one)) for one in driving.odom} == {(0.24, 0.0, 0.0)}
+    assert len(driving.odom) in (49, 50)
+    lockstep.publish('cmd_vel', twist(-1.0, 0.0))
+    lockstep.run_for(1.0)
+    assert pose_of(driving.odom[-1]).tolist() == [-0.26, 0.0, 0.0]
+    assert instants(driving.applied)[2:] == [back + SECOND, back + SECOND + SECOND // 2]
+    assert f'time went back by {seconds:.3f} s' in capfd.readouterr().err
 
 
-def test_timeout_and_rate_change_live(ros, driving, sim_time):
-    assert driving.set(cmd_vel_timeout=0.1, publish_rate=10.0).successful
-    sim_time.advance(1.0, step=0.1)
-    odometry = driving.seen(101 * SECOND)
-    assert pose_of(odometry)[0] == pytest.approx(0.1, abs=1e-12)
-    before = len(driving.odom)
-    sim_time.advance(1.0, step=0.01)
-    ros.until(lambda: len(driving.odom) - before >= 10, 'odometry at the new rate')
-    stamps = [from_time(one.header.stamp) for one in driving.odom[before:]]
-    assert np.diff(stamps) == pytest.approx(SECOND // 10)
+def test_time_that_goes_back_again_and_again_adds_no_way(lockstep, driving):
+    for count in range(1, 6):
+        lockstep.publish('cmd_vel', twist(1.0, 0.0))
+        lockstep.run_for(0.24)
+        lockstep.jump(-2.0)
+        assert len(driving.starts) == count + 1
+        assert driving.starts[-1].pose.pose.position.x == pytest.approx(0.24 * count, abs=1e-15)
+    lockstep.run_for(3.0)
+    assert pose_of(driving.odom[-1]).tolist() == pytest.approx([1.2, 0.0, 0.0], abs=1e-15)
 
 
-@pytest.mark.parametrize(
-    ('change', 'words'),
-    [
-        ({'wheel_radius': 0.0}, 'wheel_radius'),
-        ({'wheel_radius': math.nan}, 'wheel_radius'),
-        ({'wheel_radius': 'big'}, 'expected'),
-        ({'linear__x__max_velocity': -1.0}, "'linear.x.max_velocity' must be in [0, 1000]"),
-        ({'linear__x__min_velocity': 0.5}, 'got 0.5'),
-        ({'max_wheel_velocity': math.inf}, 'or .nan for none'),
-        ({'base_frame_id': ''}, "'base_frame_id' must be not empty"),
-        ({'base_frame_id': 'odom'}, 'must differ'),
-        ({'command_interface': 'wheels'}, 'read-only'),
-        ({'publish_rate': 2000.0}, 'publish_rate'),
-    ],
-)
-def test_bad_changes_are_refused_with_the_reason(driving, change, words):
-    before = driving.robot.parameters
-    result = driving.set(**change)
-    assert not result.successful
-    assert words in result.reason
-    assert driving.robot.parameters is before
-
-
-def test_integers_are_taken_for_doubles_and_strangers_are_left_alone(driving):
-    assert driving.robot.set_parameters([Parameter('wheel_separation', value=1)])[0].successful
-    assert driving.robot.parameters.wheel_separation == 1.0
-    assert driving.robot.get_parameter('wheel_separation').value == 1.0
-    driving.robot.declare_parameter('foreign', 3)
-    assert driving.robot.set_parameters([Parameter('foreign', value=4)])[0].successful
-
-
-def test_rate_that_keeps_changing_starves_nobody(ros):
-    odom = ros.listen(Odometry, 'odom')
-    robot = ros.add(VirtualRobot, parameters={'publish_rate': 20.0})
-    rates = itertools.cycle([21.0, 20.0])
-    changed = []
-
-    def change():
-        changed.append(robot.set_parameters([Parameter('publish_rate', value=next(rates))]))
-
-    ros.peer.create_timer(0.01, change)
-    ros.until(lambda: len(odom) >= 10, 'odometry')
-    assert len(changed) > 2 * len(odom)
-
-
-def test_the_shortest_timeout_is_not_for_ever(ros):
-    odom, applied = ros.listen(Odometry, 'odom'), ros.listen(TwistStamped, 'cmd_vel_out')
-    ros.add(VirtualRobot, parameters={'cmd_vel_timeout': 1e-10})
-    ros.talk(Twist, 'cmd_vel').publish(twist(1.0, 0.0))
-    ros.until(lambda: len(applied) == 2 and odom, 'the stop')
-    assert applied[1].twist == Twist()
-
-
-def test_heading_and_pose_stay_sound_over_many_commands(ros, sim_time):
-    odom, applied = ros.listen(Odometry, 'odom'), ros.listen(TwistStamped, 'cmd_vel_out')
-    ros.add(VirtualRobot, parameters={'use_sim_time': True, 'publish_rate': 1.0})
-    commands = ros.talk(Twist, 'cmd_vel')
-    sim_time.set(SECOND)
-    random = np.random.default_rng(4)
-    for index in range(500):
-        commands.publish(twist(*random.uniform(-1000, 1000, 2)))
-        ros.until(lambda index=index: len(applied) > index)
-        sim_time.set(sim_time.now + SECOND // 10)
-    ros.until(lambda: len(odom) > 40, 'odometry')
-    poses = np.array([pose_of(one) for one in odom])
-    assert np.all(np.isfinite(poses))
-    assert np.all(np.abs(poses[:, 2]) <= math.pi)
+def test_time_that_goes_back_keeps_the_wheel_angles_and_the_heading(lockstep, robot_at):
+    topics = Topics(lockstep)
+    robot_at(0.0, 0.0, 3.0)
+    lockstep.publish('cmd_vel', twist(0.0, 1.0))
+    lockstep.run_for(0.4)
+    before = topics.states[-1]
+    lockstep.jump(-10.0)
+    lockstep.run_for(0.1)
+    assert topics.states[-1].position == before.position
+    assert list(before.position) == pytest.approx([-0.4 * 0.08 / 0.033, 0.4 * 0.08 / 0.033], rel=1e-15)
+    assert pose_of(topics.odom[-1])[2] == pytest.approx(3.4 - math.tau, abs=1e-15)

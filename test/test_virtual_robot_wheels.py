@@ -7,81 +7,118 @@ import math
 import numpy as np
 import pytest
 from geometry_msgs.msg import TwistStamped
-from nav_msgs.msg import Odometry
-from rclpy.parameter import Parameter
-from ros_messages import covariance_of, pose_of, twist_stamped
-from sensor_msgs.msg import JointState
+from lockstep_nodes import SECOND, Topics, change
+from ros_messages import (
+    covariance_of,
+    instants,
+    joint_command,
+    pose_message,
+    pose_of,
+    twist,
+    twist_stamped,
+    twists,
+)
 
+from diffdrive_jacobian.kinematics import se2
+from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.ros.messages import from_time
 
 
-def test_wheels_and_twist_end_at_the_same_pose(ros, sim_time):
-    stamped = {'use_sim_time': True, 'enable_stamped_cmd_vel': True}
-    limits = {'max_wheel_velocity': 9.0}
-    ros.add(VirtualRobot, namespace='a', parameters={**stamped, **limits})
-    ros.add(
-        VirtualRobot,
-        namespace='b',
-        parameters={'use_sim_time': True, 'command_interface': 'wheels', **limits},
-    )
-    ros.add(WheelBridge, namespace='b', parameters=stamped)
-    odoms = [ros.listen(Odometry, f'/{name}/odom') for name in 'ab']
-    talkers = [ros.talk(TwistStamped, f'/{name}/cmd_vel') for name in 'ab']
-    applied = [ros.listen(TwistStamped, f'/{name}/cmd_vel_out') for name in 'ab']
-    sim_time.set(5_000_000_000)
-    random = np.random.default_rng(3)
-    for _ in range(50):
-        sim_time.set(sim_time.now + int(random.integers(10_000_000, 300_000_000)))
+@pytest.mark.parametrize(
+    ('left', 'right'),
+    [(0.0, 0.0), (5.0, 5.0), (-5.0, 5.0), (0.0, 10.0), (10.0, 0.0), (-3.0, -8.0), (100.0, -99.0)],
+)
+def test_wheel_speeds_give_the_exact_arc_of_their_twist(lockstep, robot_at, left, right):
+    topics = Topics(lockstep)
+    start = [1.0, -1.0, 0.5]
+    robot_at(*start, command_interface='wheels')
+    lockstep.publish('joint_command', joint_command(left, right))
+    lockstep.run_for(0.48)
+    expected = wheel_to_body(right, left, 0.033, 0.16)
+    assert twists(topics.applied) == [expected]
+    assert topics.odom[-1].pose.pose == pose_message(se2.integrate(start, expected, 0.48))
+    assert list(topics.states[-1].velocity) == pytest.approx([left, right], abs=1e-13)
+    assert list(topics.states[-1].position) == pytest.approx([0.48 * left, 0.48 * right], abs=1e-13)
+    lockstep.run_for(0.52)
+    assert topics.odom[-1].pose.pose == pose_message(se2.integrate(start, expected, 0.5))
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_wheels_and_twist_end_at_the_same_pose(lockstep, add, seed):
+    stamped, limits = {'enable_stamped_cmd_vel': True}, {'max_wheel_velocity': 9.0}
+    add(VirtualRobot, 'a', **stamped, **limits)
+    add(VirtualRobot, 'b', command_interface='wheels', **limits)
+    add(WheelBridge, 'b', **stamped)
+    one, other = (Topics(lockstep, name, command=TwistStamped) for name in 'ab')
+    random = np.random.default_rng(seed)
+    lockstep.run_for(0.3)
+    for _ in range(15):
+        lockstep.run_for(int(random.integers(10_000_000, 300_000_000)) / 1e9)
         command = twist_stamped(
-            random.uniform(-1, 1), random.uniform(-4, 4), sim_time.now - int(random.integers(1e7))
+            random.uniform(-1, 1), random.uniform(-4, 4), lockstep.now - int(random.integers(1e7))
         )
-        counts = [len(one) for one in applied]
-        for talker in talkers:
-            talker.publish(command)
-        ros.until(lambda counts=counts: all(len(a) > n for a, n in zip(applied, counts, strict=True)))
-    sim_time.advance(1.0, step=0.1)
-    ros.until(lambda: all(from_time(odom[-1].header.stamp) == sim_time.now for odom in odoms))
-    one, other = (odom[-1] for odom in odoms)
-    assert np.hypot(*pose_of(one)[:2]) > 0.01
-    assert pose_of(one) == pytest.approx(pose_of(other), abs=1e-9)
-    assert covariance_of(one) == pytest.approx(covariance_of(other), abs=1e-9)
+        sent = lockstep.now
+        for name in 'ab':
+            lockstep.publish(f'{name}/cmd_vel', command)
+    lockstep.run_for(1.2)
+    # The bridge sends a zero of its own; the timeout of the robot counts from the stamp, and is first.
+    ours, theirs = instants(one.applied), instants(other.applied)
+    assert theirs == [*ours, sent + SECOND // 2]
+    assert len(ours) == 16
+    assert np.hypot(*pose_of(one.odom[-1])[:2]) > 0.01
+    assert pose_of(one.odom[-1]) == pytest.approx(pose_of(other.odom[-1]), abs=1e-14)
+    assert covariance_of(one.odom[-1]) == pytest.approx(covariance_of(other.odom[-1]), abs=1e-14)
 
 
-def test_joint_commands_that_cannot_be_are_dropped_and_named(ros, capfd):
-    applied = ros.listen(TwistStamped, 'cmd_vel_out')
-    ros.add(VirtualRobot, parameters={'command_interface': 'wheels'})
-    commands = ros.talk(JointState, 'joint_command')
-    names = ['left_wheel_joint', 'right_wheel_joint']
-    for bad in (
-        JointState(name=names, velocity=[1.0]),
-        JointState(name=['left_wheel_joint', 'other'], velocity=[1.0, 1.0]),
-        JointState(name=names, velocity=[1.0, math.nan]),
-        JointState(name=names, velocity=[1e6, 1e6]),
-        JointState(name=[*names, names[0]], velocity=[1.0, 1.0, -1.0]),
-    ):
-        commands.publish(bad)
-    commands.publish(JointState(name=['arm', *names], velocity=[5.0, 1.0, 3.0]))
-    ros.until(lambda: applied, 'the good command')
-    assert applied[0].twist.linear.x == pytest.approx(0.033 * 2.0)
-    assert applied[0].twist.angular.z == pytest.approx(0.033 * 2.0 / 0.16)
-    assert len(applied) == 1
-    assert 'a velocity for each name, got 2 names and 1 velocities' in capfd.readouterr().err
+@pytest.mark.parametrize(
+    'command', [(0.2, 0.0), (0.0, 2.0), (-0.1, -1.0), (0.5, 3.0), (1e-9, 1e-9)], ids=str
+)
+@pytest.mark.parametrize('wheels', [(0.033, 0.16), (0.03575, 0.233), (0.5, 2.0)], ids=str)
+def test_bridge_and_wheels_are_inverse_to_each_other(lockstep, add, wheels, command):
+    radius, separation = wheels
+    geometry = {'wheel_radius': radius, 'wheel_separation': separation}
+    topics = Topics(lockstep)
+    add(VirtualRobot, command_interface='wheels', **geometry)
+    add(WheelBridge, **geometry)
+    lockstep.publish('cmd_vel', twist(*command))
+    (driven,) = twists(topics.applied)
+    assert driven == pytest.approx(command, rel=1e-14, abs=1e-16)
 
 
-def test_wheel_speeds_stay_when_the_wheels_change(ros, sim_time):
-    odom, applied = ros.listen(Odometry, 'odom'), ros.listen(TwistStamped, 'cmd_vel_out')
-    robot = ros.add(VirtualRobot, parameters={'use_sim_time': True, 'command_interface': 'wheels'})
-    commands = ros.talk(JointState, 'joint_command')
-    sim_time.set(5_000_000_000)
-    commands.publish(JointState(name=['left_wheel_joint', 'right_wheel_joint'], velocity=[5.0, 10.0]))
-    ros.until(lambda: applied, 'the command')
-    sim_time.set(5_200_000_000)
-    assert robot.set_parameters([Parameter('wheel_radius', value=0.066)])[0].successful
-    ros.until(lambda: len(applied) == 2, 'the twist of the larger wheels')
-    assert applied[1].twist.linear.x == pytest.approx(2.0 * applied[0].twist.linear.x)
-    assert applied[1].twist.angular.z == pytest.approx(2.0 * applied[0].twist.angular.z)
-    sim_time.set(9_000_000_000)
-    ros.until(lambda: len(applied) == 3 and odom, 'the timeout counts from the command')
-    assert from_time(applied[2].header.stamp) == 5_500_000_000
+def test_wheel_speeds_stay_when_the_wheels_change(lockstep, robot_at):
+    topics = Topics(lockstep)
+    robot = robot_at(command_interface='wheels')
+    lockstep.publish('joint_command', joint_command(5.0, 10.0))
+    lockstep.run_for(0.2)
+    assert change(robot, wheel_radius=0.066).successful
+    lockstep.run_for(1.0)
+    first, second, zero = twists(topics.applied)
+    assert second == pytest.approx((2.0 * first[0], 2.0 * first[1]), rel=1e-15)
+    assert zero == (0.0, 0.0)
+    # The timeout counts from the command.
+    assert instants(topics.applied) == [SECOND, SECOND + SECOND // 5, SECOND + SECOND // 2]
+    assert list(topics.states[-1].position) == pytest.approx([2.5, 5.0], rel=1e-14)
+
+
+@pytest.mark.parametrize(('fastest', 'factor'), [(5.0, 0.5), (10.0, 1.0), (math.nan, 1.0), (1.0, 0.1)])
+def test_wheel_limit_slows_both_wheels_alike(lockstep, robot_at, fastest, factor):
+    topics = Topics(lockstep)
+    robot_at(command_interface='wheels', max_wheel_velocity=fastest)
+    lockstep.publish('joint_command', joint_command(-4.0, 10.0))
+    lockstep.run_for(0.1)
+    speeds = list(topics.states[-1].velocity)
+    assert speeds == pytest.approx([-4.0 * factor, 10.0 * factor], rel=1e-14)
+
+
+def test_stamped_wheel_speeds_act_from_their_stamp_on(lockstep, robot_at):
+    topics = Topics(lockstep)
+    robot_at(command_interface='wheels')
+    lockstep.run_for(1.0)
+    now = lockstep.now
+    lockstep.publish('joint_command', joint_command(5.0, 5.0, now - SECOND // 10))
+    lockstep.publish('joint_command', joint_command(5.0, 5.0, now + 1))
+    lockstep.publish('joint_command', joint_command(5.0, 5.0, now - SECOND // 5))
+    lockstep.run_for(1.0)
+    assert instants(topics.applied) == [now - SECOND // 10, now + 4 * (SECOND // 10)]
+    assert pose_of(topics.odom[-1])[0] == pytest.approx(0.5 * 5.0 * 0.033, rel=1e-15)

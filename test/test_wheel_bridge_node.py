@@ -5,134 +5,237 @@ from __future__ import annotations
 import math
 
 import pytest
-from geometry_msgs.msg import Twist, TwistStamped
-from rclpy.parameter import Parameter
-from ros_messages import stamp, twist, twist_stamped
+from geometry_msgs.msg import TwistStamped
+from lockstep_nodes import SECOND, change, comes_after
+from ros_messages import WHEELS, instants, twist, twist_stamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
+from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.ros import node as ros_node
 
 R, L = 0.033, 0.16
+TWISTS = [(0.5, 3.0 * math.pi / 4.0), (0.2, 0.0), (0.0, -2.0), (-0.3, 1.0), (1000.0, -1000.0)]
 
 
-def test_golden_wheel_speeds_of_document_a(ros, executor_kind):
-    out = ros.listen(JointState, 'joint_command')
-    ros.add(WheelBridge)
-    ros.talk(Twist, 'cmd_vel').publish(twist(0.5, 3.0 * math.pi / 4.0))
-    ros.until(lambda: out, 'wheel speeds')
-    assert list(out[0].name) == ['left_wheel_joint', 'right_wheel_joint']
-    assert [round(speed, 3) for speed in out[0].velocity] == [9.440, 20.864]
-    assert out[0].header.stamp.sec > 0
+@pytest.fixture
+def out(lockstep):
+    return lockstep.listen(JointState, 'joint_command')
 
 
-def test_multi_array_holds_left_and_right(ros):
-    out = ros.listen(Float64MultiArray, 'joint_command')
-    ros.add(WheelBridge, parameters={'joint_command_type': 'Float64MultiArray'})
-    ros.talk(Twist, 'cmd_vel').publish(twist(0.5, 3.0 * math.pi / 4.0))
-    ros.until(lambda: out, 'wheel speeds')
-    assert [round(speed, 3) for speed in out[0].data] == [9.440, 20.864]
+def test_golden_wheel_speeds_of_document_a(lockstep, add, out):
+    add(WheelBridge)
+    lockstep.publish('cmd_vel', twist(0.5, 3.0 * math.pi / 4.0))
+    (message,) = out
+    assert message.name == WHEELS
+    assert [round(speed, 3) for speed in message.velocity] == [9.440, 20.864]
+    assert list(message.position) == list(message.effort) == []
 
 
-def test_calibration_acts_on_each_wheel(ros):
-    out = ros.listen(JointState, 'joint_command')
-    ros.add(
+@pytest.mark.parametrize('command', TWISTS, ids=str)
+@pytest.mark.parametrize('kind', ['JointState', 'Float64MultiArray'])
+def test_each_command_gives_one_message_with_left_and_right(lockstep, add, kind, command):
+    message_type = {'JointState': JointState, 'Float64MultiArray': Float64MultiArray}[kind]
+    out = lockstep.listen(message_type, 'joint_command')
+    add(WheelBridge, joint_command_type=kind)
+    right, left = body_to_wheel(*command, R, L)
+    for count in (1, 2, 3):
+        lockstep.publish('cmd_vel', twist(*command))
+        assert len(out) == count
+        assert list(out[-1].data if kind == 'Float64MultiArray' else out[-1].velocity) == [left, right]
+        lockstep.run_for(0.1)
+
+
+@pytest.mark.parametrize('separation', [1.0, 1.5, 0.1])
+@pytest.mark.parametrize(('left', 'right'), [(1.0, 1.0), (1.1, 0.9), (10.0, 0.1)])
+def test_calibration_acts_on_each_wheel(lockstep, add, out, separation, left, right):
+    add(
         WheelBridge,
-        parameters={
-            'wheel_separation_multiplier': 1.5,
-            'left_wheel_radius_multiplier': 1.1,
-            'right_wheel_radius_multiplier': 0.9,
-            'left_wheel_name': 'l',
-            'right_wheel_name': 'r',
-        },
+        wheel_separation_multiplier=separation,
+        left_wheel_radius_multiplier=left,
+        right_wheel_radius_multiplier=right,
+        left_wheel_name='l',
+        right_wheel_name='r',
     )
-    ros.talk(Twist, 'cmd_vel').publish(twist(0.2, 1.0))
-    ros.until(lambda: out, 'wheel speeds')
-    rim = 1.0 * 1.5 * L / 2.0
+    lockstep.publish('cmd_vel', twist(0.2, 1.0))
+    rim = 1.0 * separation * L / 2.0
     speeds = dict(zip(out[0].name, out[0].velocity, strict=True))
-    assert speeds == pytest.approx({'l': (0.2 - rim) / (1.1 * R), 'r': (0.2 + rim) / (0.9 * R)})
+    assert speeds == pytest.approx({'l': (0.2 - rim) / (left * R), 'r': (0.2 + rim) / (right * R)})
 
 
-def test_limit_slows_both_wheels_alike(ros):
-    out = ros.listen(JointState, 'joint_command')
-    node = ros.add(WheelBridge, parameters={'max_wheel_velocity': 6.0})
-    commands = ros.talk(Twist, 'cmd_vel')
-    commands.publish(twist(0.5, -2.0))
-    ros.until(lambda: out, 'wheel speeds')
-    left, right = out[0].velocity
-    assert left == pytest.approx(6.0, rel=1e-12)
-    assert right / left == pytest.approx((0.5 - L) / (0.5 + L), rel=1e-12)
-    assert node.set_parameters([Parameter('max_wheel_velocity', value=math.nan)])[0].successful
-    commands.publish(twist(0.5, -2.0))
-    ros.until(lambda: len(out) == 2, 'wheel speeds without a limit')
-    assert out[1].velocity[0] == pytest.approx((0.5 + L) / R)
+@pytest.mark.parametrize('command', TWISTS, ids=str)
+def test_limit_slows_both_wheels_alike_until_it_is_lifted(lockstep, add, out, command):
+    node = add(WheelBridge, max_wheel_velocity=6.0)
+    lockstep.publish('cmd_vel', twist(*command))
+    assert change(node, max_wheel_velocity=math.nan).successful
+    lockstep.publish('cmd_vel', twist(*command))
+    limited, free = (list(one.velocity) for one in out)
+    excess = max(1.0, max(map(abs, free)) / 6.0)
+    assert limited == pytest.approx([speed / excess for speed in free], rel=1e-15)
+    assert max(map(abs, limited)) <= 6.0 * (1.0 + 1e-15)
 
 
-def test_silence_stops_the_wheels_once(ros, sim_time, capfd):
-    out = ros.listen(JointState, 'joint_command')
-    ros.add(WheelBridge, parameters={'use_sim_time': True, 'enable_stamped_cmd_vel': True})
-    commands = ros.talk(TwistStamped, 'cmd_vel')
-    sim_time.set(10_000_000_000)
-    commands.publish(twist_stamped(0.2, 0.0, sim_time.now))
-    ros.until(lambda: len(out) == 1, 'wheel speeds')
-    assert out[0].header.stamp == stamp(sim_time.now)
-    sim_time.advance(0.4)
-    commands.publish(twist_stamped(0.1, 0.0, sim_time.now))
-    ros.until(lambda: len(out) == 2, 'wheel speeds')
-    sim_time.advance(0.48)
+def test_every_parameter_counts_from_the_next_command_on(lockstep, add, out):
+    node = add(WheelBridge)
+
+    def speeds(**parameters):
+        assert not parameters or change(node, **parameters).successful
+        lockstep.publish('cmd_vel', twist(1.0, 1.0))
+        return list(out[-1].velocity)
+
+    assert speeds() == pytest.approx([0.92 / R, 1.08 / R])
+    assert speeds(wheel_radius=0.1) == pytest.approx([9.2, 10.8])
+    assert speeds(wheel_separation=1.0) == pytest.approx([5.0, 15.0])
+    assert speeds(wheel_separation_multiplier=2.0) == pytest.approx([0.0, 20.0], abs=1e-14)
+    assert speeds(right_wheel_radius_multiplier=4.0) == pytest.approx([0.0, 5.0], abs=1e-14)
+    assert speeds(wheel_separation_multiplier=1.0, left_wheel_radius_multiplier=0.5) == [10.0, 3.75]
+    assert speeds(max_wheel_velocity=4.0) == [4.0, 1.5]
+    assert speeds(left_wheel_name='l', right_wheel_name='r') == [4.0, 1.5]
+    assert out[-1].name == ['l', 'r']
+    assert len(out) == 8
+
+
+@pytest.mark.parametrize('timeout', [1e-9, 0.001, 0.5, 3.0, 3600.0])
+def test_silence_stops_the_wheels_once_exactly_then(lockstep, add, out, capfd, timeout):
+    add(WheelBridge, cmd_vel_timeout=timeout)
+    lockstep.run_for(1.234)
+    lockstep.publish('cmd_vel', twist(0.2, 0.0))
+    if timeout > 1e-6:
+        for fraction in (0.5, 0.9, 0.3):
+            lockstep.run_for(fraction * timeout)
+            lockstep.publish('cmd_vel', twist(0.1, 0.0))
+        comes_after(lockstep, out, timeout)
+    else:
+        lockstep.run_for(timeout)
+    assert list(out[-1].velocity) == [0.0, 0.0]
+    assert instants(out)[-1] == lockstep.now
+    count = len(out)
+    lockstep.run_for(3.0 * timeout)
+    assert len(out) == count
+    assert f'no command on /cmd_vel for {timeout:g} s' in capfd.readouterr().err
+    lockstep.publish('cmd_vel', twist(0.3, 0.0))
+    assert list(out[-1].velocity) == [0.3 / R] * 2
+
+
+def test_standing_wheels_are_not_stopped(lockstep, add, out):
+    add(WheelBridge)
+    lockstep.publish('cmd_vel', twist(0.2, 0.0))
+    lockstep.publish('cmd_vel', twist(0.0, 0.0))
+    lockstep.run_for(10.0)
     assert len(out) == 2
-    sim_time.advance(3.0)
-    ros.until(lambda: len(out) == 3, 'the stop')
-    assert list(out[2].velocity) == [0.0, 0.0]
-    commands.publish(twist_stamped(0.3, 0.0, sim_time.now))
-    ros.until(lambda: len(out) == 4, 'it goes on')
-    assert out[3].velocity[0] == pytest.approx(0.3 / R)
-    assert 'no command on /cmd_vel for 0.5 s' in capfd.readouterr().err
 
 
-def test_rubbish_and_old_commands_are_dropped(ros, sim_time, capfd):
-    out = ros.listen(JointState, 'joint_command')
-    ros.add(WheelBridge, parameters={'use_sim_time': True, 'enable_stamped_cmd_vel': True})
-    commands = ros.talk(TwistStamped, 'cmd_vel')
-    now = 10_000_000_000
-    sim_time.set(now)
-    for v, at in [(math.nan, now), (1e4, now), (0.1, now + 1), (0.2, now - 500_000_001)]:
-        commands.publish(twist_stamped(v, 0.0, at))
-    commands.publish(twist_stamped(0.3, 0.0, now - 5))
-    commands.publish(twist_stamped(0.4, 0.0, now - 6))
-    commands.publish(twist_stamped(0.5, 0.0, 0))
-    ros.until(lambda: out and out[-1].velocity[0] == pytest.approx(0.5 / R), 'the last one')
-    assert [one.velocity[0] * R for one in out] == pytest.approx([0.3, 0.5])
-    assert 'command dropped: twist must be finite' in capfd.readouterr().err
-    # Time that goes back makes the old instants mean nothing.
-    sim_time.set(now // 2)
-    commands.publish(twist_stamped(0.6, 0.0, now // 2))
-    ros.until(lambda: len(out) == 3, 'a command on the new time line')
+@pytest.mark.parametrize('timeout', [0.1, 2.0])
+def test_new_timeout_counts_from_its_change_on(lockstep, add, out, timeout):
+    node = add(WheelBridge)
+    lockstep.publish('cmd_vel', twist(0.2, 0.0))
+    lockstep.run_for(0.3)
+    assert change(node, cmd_vel_timeout=timeout).successful
+    assert list(comes_after(lockstep, out, timeout).velocity) == [0.0, 0.0]
 
 
-def test_stop_leaves_the_wheels_standing(ros):
-    out = ros.listen(JointState, 'joint_command')
-    node = ros.add(WheelBridge)
+def test_without_a_timeout_the_wheels_turn_for_ever(lockstep, add, out):
+    node = add(WheelBridge)
+    lockstep.publish('cmd_vel', twist(0.2, 0.0))
+    assert change(node, cmd_vel_timeout=0.0).successful
+    lockstep.run_for(1e5)
+    assert len(out) == 1
+
+
+@pytest.mark.parametrize(
+    ('v', 'offset', 'words'),
+    [
+        (math.nan, 0, 'twist must be finite'),
+        (math.inf, 0, 'twist must be finite'),
+        (1e4, 0, 'twist must be within 1000 m/s'),
+        (0.1, 1, 'in the future'),
+        (0.1, -SECOND // 2 - 1, 'allowed is the timeout of 0.5 s'),
+        (0.1, -6, 'before the last command'),
+    ],
+)
+def test_rubbish_and_old_commands_are_dropped_and_named(lockstep, add, out, capfd, v, offset, words):
+    add(WheelBridge, enable_stamped_cmd_vel=True)
+    lockstep.run_for(9.0)
+    now = lockstep.now
+    lockstep.publish('cmd_vel', twist_stamped(0.3, 0.0, now - 5))
+    lockstep.publish('cmd_vel', twist_stamped(v, 0.0, now + offset))
+    lockstep.publish('cmd_vel', twist_stamped(0.4, 0.0, now - 5))
+    lockstep.publish('cmd_vel', twist_stamped(0.5, 0.0, 0))
+    assert [one.velocity[0] for one in out] == [0.3 / R, 0.4 / R, 0.5 / R]
+    assert instants(out) == [now - 5, now - 5, now]
+    error = capfd.readouterr().err
+    assert error.count('command dropped: ') == 1
+    assert words in error
+
+
+def test_dropped_commands_do_not_keep_the_wheels_turning(lockstep, add, out):
+    add(WheelBridge)
+    lockstep.publish('cmd_vel', twist(0.2, 0.0))
+    for _ in range(4):
+        lockstep.run_for(0.1)
+        lockstep.publish('cmd_vel', twist(math.nan, 0.0))
+    assert list(comes_after(lockstep, out, 0.1).velocity) == [0.0, 0.0]
+
+
+@pytest.mark.lockstep(start=100.0)
+@pytest.mark.parametrize('seconds', [-40.0, -0.1, -1e-9, 0.3, 100.0])
+def test_jumps_of_time_neither_deafen_it_nor_keep_the_wheels_turning(lockstep, add, out, seconds):
+    add(WheelBridge, enable_stamped_cmd_vel=True)
+    lockstep.publish('cmd_vel', twist_stamped(0.2, 0.0, lockstep.now))
+    lockstep.jump(seconds)
+    stopped = len(out) == 2
+    assert stopped == (seconds >= 0.5)
+    lockstep.publish('cmd_vel', twist_stamped(0.6, 0.0, lockstep.now))
+    assert out[-1].velocity[0] == 0.6 / R
+    comes_after(lockstep, out, 0.5)
+    lockstep.jump(seconds)
+    lockstep.run_for(1.0)
+    assert list(out[-1].velocity) == [0.0, 0.0]
+    assert len(out) == 3 + stopped
+
+
+@pytest.mark.lockstep(start=100.0)
+@pytest.mark.parametrize('seconds', [-50.0, -0.6, -0.5, -0.1, -1e-9, 0.3])
+def test_jump_puts_the_stop_off_by_a_timeout_at_most(lockstep, add, out, seconds):
+    add(WheelBridge)
+    lockstep.publish('cmd_vel', twist(0.2, 0.0))
+    lockstep.jump(seconds)
+    # After a jump back the timeout begins anew.
+    left = 0.5 - max(seconds, 0.0)
+    assert list(comes_after(lockstep, out, left).velocity) == [0.0, 0.0]
+
+
+@pytest.mark.lockstep(start=100.0)
+def test_jump_back_after_a_long_silence_puts_the_stop_off_by_a_timeout_at_most(lockstep, add, out):
+    add(WheelBridge)
+    lockstep.run_for(60.0)
+    lockstep.publish('cmd_vel', twist(0.2, 0.0))
+    lockstep.jump(-50.0)
+    lockstep.run_for(0.5)
+    assert [list(one.velocity) for one in out] == [[0.2 / R] * 2, [0.0, 0.0]]
+
+
+def test_stop_leaves_the_wheels_standing_and_says_so_once(lockstep, add, out, capfd):
+    node = add(WheelBridge)
+    node.stop('too early')
+    lockstep.publish('cmd_vel', twist(0.2, 0.0))
     node.stop('the test says so')
-    ros.talk(Twist, 'cmd_vel').publish(twist(0.2, 0.0))
-    ros.until(lambda: len(out) == 1, 'wheel speeds')
-    node.stop('the test says so')
-    ros.until(lambda: len(out) == 2, 'the stop')
-    assert list(out[1].velocity) == [0.0, 0.0]
+    node.stop('too late')
+    lockstep.settle()
+    assert [list(one.velocity) for one in out] == [[0.2 / R] * 2, [0.0, 0.0]]
+    said = capfd.readouterr().err
+    assert 'the wheels are stopped: the test says so' in said
+    assert 'too' not in said
 
 
-def test_without_a_clock_nothing_moves(ros, capfd, monkeypatch):
-    monkeypatch.setattr(ros_node, 'WATCH_PERIOD', 0.05)
-    out = ros.listen(JointState, 'joint_command')
-    node = ros.add(WheelBridge)
-    commands = ros.talk(Twist, 'cmd_vel')
-    commands.publish(twist(0.2, 0.0))
-    ros.until(lambda: len(out) == 1, 'wheel speeds')
-    # Switched to simulated time while the wheels turn: no timeout would ever strike.
-    assert node.set_parameters([Parameter('use_sim_time', value=True)])[0].successful
-    ros.until(lambda: len(out) == 2, 'the stop')
-    assert list(out[1].velocity) == [0.0, 0.0]
-    commands.publish(twist(0.2, 0.0))
-    ros.until_said(capfd, 'command dropped: simulated time has not begun')
-    assert len(out) == 2
+def test_stamped_and_unstamped_commands_give_the_same_wheel_speeds(lockstep, add):
+    outs = [lockstep.listen(JointState, f'{name}/joint_command') for name in 'ab']
+    lockstep.listen(TwistStamped, 'b/cmd_vel')
+    add(WheelBridge, 'a')
+    add(WheelBridge, 'b', enable_stamped_cmd_vel=True)
+    for v, omega in TWISTS:
+        lockstep.publish('a/cmd_vel', twist(v, omega))
+        lockstep.publish('b/cmd_vel', twist_stamped(v, omega, lockstep.now))
+        lockstep.run_for(0.7)
+    assert outs[0] == outs[1]
+    assert len(outs[0]) == 2 * len(TWISTS)
