@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import re
 import threading
 import time
 
 import pytest
-import rclpy
-from geometry_msgs.msg import Twist, Vector3
+from geometry_msgs.msg import Vector3
 from nav_msgs.msg import Odometry
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 from users_nodes import Blinker, Echo
 
@@ -152,110 +147,3 @@ def test_the_world_goes_on_after_a_failure(impatient):
     blinker = impatient.add(Blinker())
     impatient.run_for(1.0)
     assert len(blinker.ticks) >= 100
-
-
-@pytest.mark.parametrize('seconds', [0.0, -1.0, float('nan'), float('inf'), 1e-10, 1e10])
-def test_times_that_cannot_be_are_refused(lockstep, seconds):
-    for advance in (lockstep.run_for, lockstep.step):
-        with pytest.raises(
-            ValueError, match=f'must be a positive number of seconds, .*, got {re.escape(str(seconds))}'
-        ):
-            advance(seconds)
-    with pytest.raises(ValueError, match='timeout must be'):
-        lockstep.run_until(never, timeout=seconds)
-    assert lockstep.elapsed == 0.0
-
-
-@pytest.mark.parametrize(
-    ('seconds', 'words'), [(0.0, 'not zero'), (-1.0, 'time 0'), (float('nan'), 'nan')]
-)
-def test_jumps_that_cannot_be_are_refused(lockstep, seconds, words):
-    with pytest.raises(ValueError, match=words):
-        lockstep.jump(seconds)
-
-
-def test_worlds_that_cannot_be_are_refused(lockstep):
-    with pytest.raises(LockstepError, match='another world is open in this process'):
-        Lockstep()
-    lockstep.close()
-    for wrong in ({'start': 0.0}, {'start': -1.0}, {'patience': 0.0}):
-        with pytest.raises(ValueError, match='positive number'):
-            Lockstep(**wrong)
-    with pytest.raises(LockstepError, match='ROS arguments'):
-        Lockstep(['--ros-args', '--no-such-option'])
-    rclpy.init()
-    try:
-        with pytest.raises(LockstepError, match='rclpy is initialised already'):
-            Lockstep()
-    finally:
-        rclpy.shutdown()
-    failures = []
-
-    def in_a_thread():
-        try:
-            Lockstep()
-        except LockstepError as error:
-            failures.append(str(error))
-
-    thread = threading.Thread(target=in_a_thread)
-    thread.start()
-    thread.join()
-    assert failures == ['a world must be made and used in the main thread']
-    with Lockstep() as world:
-        world.add(Blinker())
-
-
-def test_nodes_that_do_not_belong_are_refused(lockstep):
-    blinker = lockstep.add(Blinker())
-    with pytest.raises(LockstepError, match='node /blinker was added already'):
-        lockstep.add(blinker)
-    with Context() as context:
-        stranger = Node('stranger', context=context)
-        with pytest.raises(LockstepError, match='node /stranger is in another context'):
-            lockstep.add(stranger)
-        stranger.destroy_node()
-    wall = Node('wall', parameter_overrides=[Parameter('use_sim_time', value=False)])
-    with pytest.raises(LockstepError, match='node /wall runs on wall time: its parameter use_sim_time'):
-        lockstep.add(wall)
-    wall.destroy_node()
-    taken = Node('taken')
-    executor = SingleThreadedExecutor()
-    executor.add_node(taken)
-    with pytest.raises(LockstepError, match='node /taken is served by an executor of its own'):
-        lockstep.add(taken)
-    executor.shutdown()
-    taken.destroy_node()
-    blinker.set_parameters([Parameter('use_sim_time', value=False)])
-    with pytest.raises(LockstepError, match='node /blinker runs on wall time'):
-        lockstep.run_for(1.0)
-
-
-def test_closed_world_is_of_no_use(lockstep):
-    blinker = lockstep.add(Blinker())
-    lockstep.close()
-    lockstep.close()
-    for use in (
-        lambda: lockstep.run_for(1.0),
-        lambda: lockstep.step(),
-        lambda: lockstep.add(blinker),
-        lambda: lockstep.publish('a', Vector3()),
-        lambda: lockstep.jump(1.0),
-    ):
-        with pytest.raises(LockstepError, match='this world is closed'):
-            use()
-
-
-def test_topics_and_services_that_are_not_there_are_named(lockstep):
-    lockstep.listen(Twist, 'cmd_vel')
-    with pytest.raises(LockstepError, match='nobody reads /cmd_vell as geometry_msgs/msg/Twist'):
-        lockstep.publish('cmd_vell', Twist())
-    with pytest.raises(
-        LockstepError, match=r'/cmd_vel is geometry_msgs/msg/Twist, not geometry_msgs/msg/V'
-    ):
-        lockstep.publish('cmd_vel', Vector3())
-    with pytest.raises(
-        LockstepError, match=r'/cmd_vel is geometry_msgs/msg/Twist, not geometry_msgs/msg/V'
-    ):
-        lockstep.listen(Vector3, 'cmd_vel')
-    with pytest.raises(LockstepError, match='there is no service /nowhere of Trigger'):
-        lockstep.call(Trigger, 'nowhere')

@@ -73,7 +73,7 @@ class QuiescentExecutor:
     def remove(self, node: Node) -> None:
         """Serve a node no longer."""
         served = self._served.pop(node)
-        node.executor = None
+        self._release(node)
         self._events.remove_node(served)
         self._events.wake()
         self._changed = True
@@ -84,9 +84,13 @@ class QuiescentExecutor:
         for task in self._tasks:
             task.future.cancel()
         for node in self.nodes:
-            node.executor = None
+            self._release(node)
         self._served.clear()
         self._events.shutdown()
+
+    def _release(self, node: Node) -> None:
+        self._facade.released = node
+        node.executor = None
 
     # --- Work
 
@@ -130,13 +134,17 @@ class QuiescentExecutor:
         """
         progress = False
         tasks, self._tasks = self._tasks, []
-        for index, task in enumerate(tasks):
-            progress |= task.go_on()
-            if (error := task.future.exception()) is not None:
-                self._tasks += tasks[index + 1 :]
-                raise error
-            if not (task.future.done() or task.future.cancelled()):
-                self._tasks.append(task)
+        waiting = []
+        try:
+            while tasks:
+                task = tasks.pop(0)
+                progress |= task.go_on()
+                if (error := task.future.exception()) is not None:
+                    raise error
+                if not (task.future.done() or task.future.cancelled()):
+                    waiting.append(task)
+        finally:
+            self._tasks = [*waiting, *tasks, *self._tasks]
         return progress
 
     def _drain(self) -> None:
@@ -270,13 +278,19 @@ class _Facade:
 
     def __init__(self, executor: QuiescentExecutor) -> None:
         self._executor = executor
+        self.released: Node | None = None
 
     def add_node(self, node: Node) -> bool:
         """Accept what `Node.executor` announces; the world added the node before."""
         return True
 
     def remove_node(self, node: Node) -> None:
-        """Accept it likewise."""
+        """Accept it from the world only: else another executor is about to take the node."""
+        if node is not self.released:
+            raise LockstepError(
+                f'node {node.get_fully_qualified_name()} cannot be spun by somebody else: it is in '
+                'lockstep, and the world does the spinning'
+            )
 
     def wake(self) -> None:
         """Hear that a node has made or destroyed something."""

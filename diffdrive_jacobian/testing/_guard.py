@@ -7,6 +7,7 @@ which callbacks are called, and raises.
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import signal
 import sys
@@ -27,6 +28,8 @@ SIGNAL = signal.SIGUSR2
 """Neither pytest nor its plugins use it; pytest-timeout uses SIGALRM."""
 LOOK = 0.25
 """For how long the callbacks are looked at, and how often the guard looks at the clock (s)."""
+UNANSWERED = 20
+"""After how many signals without effect the tracebacks of all threads are written to stderr."""
 MOST_NAMED = 8
 """How many callbacks are named at most."""
 _STANDARD = sysconfig.get_path('stdlib') + os.sep
@@ -79,9 +82,16 @@ class Guard:
         return self._since is not None and time.monotonic() - self._since > self._patience
 
     def _watch(self) -> None:
+        unanswered = 0
         while not self._closed.wait(LOOK):
-            if self._overdue():
-                signal.pthread_kill(self._main, SIGNAL)
+            if not self._overdue():
+                unanswered = 0
+                continue
+            signal.pthread_kill(self._main, SIGNAL)
+            unanswered += 1
+            if unanswered == UNANSWERED:
+                # Blocked outside of Python, where no signal is heard: say at least where.
+                faulthandler.dump_traceback()
 
     def _on_signal(self, _: int, frame: FrameType | None) -> None:
         if not self._overdue() or any(one.f_code.co_name == '__del__' for one in _stack(frame)):

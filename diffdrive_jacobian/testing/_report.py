@@ -8,20 +8,22 @@ from dataclasses import dataclass
 from typing import Any
 
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 
 NANOSECONDS = 1_000_000_000
 LONGEST_ARRAY = 4
 """Longer ones are told by their length and their first elements."""
+LONG_ARRAY = 100
+"""Longer ones are told without a look at whether they are all zero."""
 SILENT = ('/clock', '/parameter_events', '/rosout')
 """Topics that tell nothing of a run."""
 
 
 @dataclass(slots=True)
 class _Line:
-    """What one node said on one topic."""
+    """What one publisher said."""
 
     topic: str
-    node: str
     count: int = 0
     at: int = 0
     message: Any = None
@@ -30,43 +32,52 @@ class _Line:
 class Traffic:
     """Counts the messages of every publisher and remembers the last one.
 
-    The publishers' own `publish` is wrapped for that: a reader for each topic would cost as much as
-    the run, and change the counts of readers that nodes may look at.
+    rclpy's `Publisher.publish` is wrapped for that while the world is open: a reader for each topic
+    would cost as much as the run, and change the counts of readers that nodes may look at. The message
+    is not copied: one that its node changes after publishing is told as changed.
     """
 
     def __init__(self, now: Callable[[], int]) -> None:
-        """Begin without publishers; `now` gives the instant (ns)."""
+        """Begin without messages; `now` gives the instant (ns)."""
         self._now = now
-        self._lines: list[_Line] = []
+        self._lines: dict[Publisher, _Line] = {}
+        self._publish = Publisher.publish
 
-    def watch(self, node: Node) -> None:
-        """Watch those publishers of a node that are not watched yet."""
-        for publisher in node.publishers:
-            if 'publish' not in vars(publisher) and publisher.topic_name not in SILENT:
-                self._watch(publisher, node.get_fully_qualified_name())
+    def listen(self) -> None:
+        """Count from here on."""
+        lines, publish, now = self._lines, self._publish, self._now
 
-    def _watch(self, publisher: Any, node: str) -> None:
-        line = _Line(publisher.topic_name, node)
-        self._lines.append(line)
-        publish, now = publisher.publish, self._now
-
-        def counted(message: Any) -> None:
+        def counted(self: Publisher, msg: Any) -> None:
+            line = lines.get(self)
+            if line is None:
+                line = lines[self] = _Line(self.topic_name)
             line.count += 1
             line.at = now()
-            line.message = message
-            publish(message)
+            line.message = msg
+            publish(self, msg)
 
-        publisher.publish = counted
+        Publisher.publish = counted
+
+    def close(self) -> None:
+        """Count no longer."""
+        Publisher.publish = self._publish
 
     def describe(self, nodes: list[Node]) -> str:
         """Tell the last message of every topic, and the topics that are read but were silent."""
-        said = [line for line in self._lines if line.count]
-        lines = [
-            f'  {line.topic}: {line.count} from {line.node}, last at {line.at / NANOSECONDS:g} s: '
-            f'{brief(line.message)}'
-            for line in sorted(said, key=lambda one: (one.topic, one.node))
+        names = {
+            publisher: node.get_fully_qualified_name() for node in nodes for publisher in node.publishers
+        }
+        said = [
+            (line.topic, names.get(publisher, 'a node that is gone'), line)
+            for publisher, line in self._lines.items()
+            if line.topic not in SILENT
         ]
-        spoken = {line.topic for line in said}
+        lines = [
+            f'  {topic}: {line.count} from {node}, last at {line.at / NANOSECONDS:g} s: '
+            f'{brief(line.message)}'
+            for topic, node, line in sorted(said, key=lambda one: one[:2])
+        ]
+        spoken = {topic for topic, _, _ in said}
         readers: dict[str, list[str]] = {}
         for node in nodes:
             for subscription in node.subscriptions:
@@ -100,7 +111,7 @@ def _fields(message: Any, prefix: str) -> Iterator[tuple[str, str]]:
             if value:
                 yield path, repr(value)
         elif hasattr(value, '__len__'):
-            if any(not _is_zero(one) for one in value):
+            if len(value) > LONG_ARRAY or any(not _is_zero(one) for one in value):
                 yield path, _array(value)
         elif not _is_zero(value):
             yield path, _scalar(value)
@@ -119,6 +130,6 @@ def _scalar(value: Any) -> str:
 
 
 def _array(values: Any) -> str:
-    plain = values.tolist() if hasattr(values, 'tolist') else list(values)
-    shown = ', '.join(_scalar(value) for value in plain[:LONGEST_ARRAY])
-    return f'[{shown}]' if len(plain) <= LONGEST_ARRAY else f'[{shown}, ... {len(plain)} in all]'
+    first = values[:LONGEST_ARRAY]
+    shown = ', '.join(map(_scalar, first.tolist() if hasattr(first, 'tolist') else first))
+    return f'[{shown}]' if len(values) <= LONGEST_ARRAY else f'[{shown}, ... {len(values)} in all]'

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from rclpy.executors import ExternalShutdownException
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 
@@ -32,6 +33,7 @@ class SimulatedTime:
         self._now = self._start = start
         self._clock = Clock()
         self._until_next: int | None = None
+        self._busy = False
         self._traffic = Traffic(lambda: self._now)
 
     def _check_open(self) -> None:
@@ -142,13 +144,21 @@ class SimulatedTime:
 
     @contextmanager
     def _watched(self) -> Iterator[None]:
+        if self._busy:
+            raise LockstepError(
+                'time cannot pass and nodes cannot come or go within a callback of theirs'
+            )
+        self._busy = True
         self._guard.arm()
         try:
             yield
+        except ExternalShutdownException:
+            raise LockstepError('rclpy was shut down: leave that to the world') from None
         except Stuck as stuck:
             raise LockstepError(f'at {self._now / NANOSECONDS:g} s: {stuck}\n{self.report()}') from stuck
         finally:
             self._guard.disarm()
+            self._busy = False
 
     def report(self) -> str:
         """Tell the last message of every topic."""

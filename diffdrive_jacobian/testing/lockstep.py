@@ -7,6 +7,7 @@ clock and nothing depends on it, so a run is as fast as the machine, and gives t
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any, ClassVar, TypeVar
@@ -66,14 +67,15 @@ class Lockstep(SimulatedTime):
             raise LockstepError('another world is open in this process: close it first')
         if rclpy.ok():
             raise LockstepError('rclpy is initialised already: the world does that, leave it to it')
+        self._thread = threading.get_ident()
         self._publishers: dict[tuple[type, str], Publisher] = {}
         self._closing = ExitStack()
         try:
             self._enter(args, patience)
         except BaseException:
+            Lockstep._open = None
             self._closing.close()
             raise
-        Lockstep._open = self
 
     def _enter(self, args: Sequence[str], patience: float) -> None:
         arguments = ['lockstep', *args, '--ros-args', '-p', 'use_sim_time:=true']
@@ -89,10 +91,13 @@ class Lockstep(SimulatedTime):
         except ValueError as error:
             raise LockstepError('a world must be made and used in the main thread') from error
         self._closing.callback(self._guard.close)
+        self._traffic.listen()
+        self._closing.callback(self._traffic.close)
         self.node = Node('lockstep', start_parameter_services=False, enable_rosout=False)
         """The world's own node, for the publishers, subscriptions and clients of a test."""
         self._clock_publisher = self.node.create_publisher(Clock, '/clock', 1)
         self._executor.add(self.node)
+        Lockstep._open = self
         self._tell_time()
 
     # --- Life
@@ -138,6 +143,8 @@ class Lockstep(SimulatedTime):
         if node.executor is not None:
             raise LockstepError(f'node {name} is served by an executor of its own: remove it from there')
         self._check_sim_time(node)
+        if self._busy:
+            raise LockstepError(f'node {name} cannot be added within a callback')
         self._executor.add(node)
         self._tell_time()
         return node
@@ -153,15 +160,40 @@ class Lockstep(SimulatedTime):
             raise LockstepError('the node to remove is not in this world')
         with self._watched():
             self._executor.remove(node)
-        node.destroy_node()
+            node.destroy_node()
 
     def _check_open(self) -> None:
         if Lockstep._open is not self:
             raise LockstepError('this world is closed')
+        if threading.get_ident() != self._thread:
+            raise LockstepError('a world must be made and used in the main thread')
 
     def _on_registered(self, node: Node) -> None:
         self._check_sim_time(node)
-        self._traffic.watch(node)
+        if node is not self.node and any(one.topic_name == '/clock' for one in node.publishers):
+            name = node.get_fully_qualified_name()
+            raise LockstepError(f'node {name} publishes /clock, which the world does')
+        self._refuse_sleep(node)
+
+    def _refuse_sleep(self, node: Node) -> None:
+        """Let no callback sleep until an instant that cannot come before it returns.
+
+        rclpy would wait for that where no signal reaches it.
+        """
+        clock = node.get_clock()
+        if 'sleep_until' in vars(clock):
+            return
+        sleep_until, name = clock.sleep_until, node.get_fully_qualified_name()
+
+        def refuse(until: Any, *args: Any, **kwargs: Any) -> Any:
+            if threading.get_ident() == self._thread:
+                raise LockstepError(
+                    f'node {name} sleeps on its clock within a callback: simulated time cannot pass '
+                    'before the callback returns'
+                )
+            return sleep_until(until, *args, **kwargs)
+
+        clock.sleep_until = refuse
 
     @staticmethod
     def _check_sim_time(node: Node) -> None:
@@ -174,7 +206,7 @@ class Lockstep(SimulatedTime):
     # --- Talking to the nodes
 
     def publish(self, topic: str, message: Any) -> None:
-        """Publish a message, reliably, and let every node answer it.
+        """Publish a message, reliably, and let every node answer it (within a callback: later).
 
         Raises:
             LockstepError: Nobody reads the topic, or it is of another type.
@@ -185,13 +217,13 @@ class Lockstep(SimulatedTime):
             create = self.node.create_publisher
             self._publishers[key] = self._with_type(topic, create, *key, 10)
         publisher = self._publishers[key]
-        self.settle()
+        self._settle_unless_busy()
         if publisher.get_subscription_count() == 0:
             raise LockstepError(
                 f'nobody reads {publisher.topic_name} as {_type_name(type(message))}\n{self.report()}'
             )
         publisher.publish(message)
-        self.settle()
+        self._settle_unless_busy()
 
     def listen(self, message_type: type, topic: str, *, latched: bool = False) -> list[Any]:
         """Collect the messages of a topic in the list that is returned.
@@ -214,7 +246,7 @@ class Lockstep(SimulatedTime):
             profile.reliability = ReliabilityPolicy.BEST_EFFORT
         create = self.node.create_subscription
         self._with_type(topic, create, message_type, topic, received.append, profile)
-        self.settle()
+        self._settle_unless_busy()
         return received
 
     def call(self, service_type: Any, name: str, request: Any = None, *, timeout: float = 10.0) -> Any:
@@ -240,6 +272,11 @@ class Lockstep(SimulatedTime):
             return future.result()
         finally:
             self.node.destroy_client(client)
+
+    def _settle_unless_busy(self) -> None:
+        """Settle; within a callback that follows anyway."""
+        if not self._busy:
+            self.settle()
 
     def _with_type(self, topic: str, create: Callable[..., Any], *args: Any) -> Any:
         try:

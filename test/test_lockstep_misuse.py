@@ -1,0 +1,238 @@
+"""Misuse of a lockstep world is named."""
+
+from __future__ import annotations
+
+import re
+import threading
+
+import pytest
+import rclpy
+from geometry_msgs.msg import Twist, Vector3
+from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.task import Future
+from rosgraph_msgs.msg import Clock as ClockMessage
+from std_srvs.srv import Trigger
+from users_nodes import Blinker
+
+from diffdrive_jacobian.testing import Lockstep, LockstepError
+
+
+@pytest.mark.parametrize('seconds', [0.0, -1.0, float('nan'), float('inf'), 1e-10, 1e10])
+def test_times_that_cannot_be_are_refused(lockstep, seconds):
+    for advance in (lockstep.run_for, lockstep.step):
+        with pytest.raises(
+            ValueError, match=f'must be a positive number of seconds, .*, got {re.escape(str(seconds))}'
+        ):
+            advance(seconds)
+    with pytest.raises(ValueError, match='timeout must be'):
+        lockstep.run_until(never, timeout=seconds)
+    assert lockstep.elapsed == 0.0
+
+
+@pytest.mark.parametrize(
+    ('seconds', 'words'), [(0.0, 'not zero'), (-1.0, 'time 0'), (float('nan'), 'nan')]
+)
+def test_jumps_that_cannot_be_are_refused(lockstep, seconds, words):
+    with pytest.raises(ValueError, match=words):
+        lockstep.jump(seconds)
+
+
+def test_worlds_that_cannot_be_are_refused(lockstep):
+    with pytest.raises(LockstepError, match='another world is open in this process'):
+        Lockstep()
+    lockstep.close()
+    for wrong in ({'start': 0.0}, {'start': -1.0}, {'patience': 0.0}):
+        with pytest.raises(ValueError, match='positive number'):
+            Lockstep(**wrong)
+    with pytest.raises(LockstepError, match='ROS arguments'):
+        Lockstep(['--ros-args', '--no-such-option'])
+    rclpy.init()
+    try:
+        with pytest.raises(LockstepError, match='rclpy is initialised already'):
+            Lockstep()
+    finally:
+        rclpy.shutdown()
+    failures = []
+
+    def in_a_thread():
+        try:
+            Lockstep()
+        except LockstepError as error:
+            failures.append(str(error))
+
+    thread = threading.Thread(target=in_a_thread)
+    thread.start()
+    thread.join()
+    assert failures == ['a world must be made and used in the main thread']
+    with Lockstep() as world:
+        world.add(Blinker())
+
+
+def test_nodes_that_do_not_belong_are_refused(lockstep):
+    blinker = lockstep.add(Blinker())
+    with pytest.raises(LockstepError, match='node /blinker was added already'):
+        lockstep.add(blinker)
+    with Context() as context:
+        stranger = Node('stranger', context=context)
+        with pytest.raises(LockstepError, match='node /stranger is in another context'):
+            lockstep.add(stranger)
+        stranger.destroy_node()
+    wall = Node('wall', parameter_overrides=[Parameter('use_sim_time', value=False)])
+    with pytest.raises(LockstepError, match='node /wall runs on wall time: its parameter use_sim_time'):
+        lockstep.add(wall)
+    wall.destroy_node()
+    taken = Node('taken')
+    executor = SingleThreadedExecutor()
+    executor.add_node(taken)
+    with pytest.raises(LockstepError, match='node /taken is served by an executor of its own'):
+        lockstep.add(taken)
+    executor.shutdown()
+    taken.destroy_node()
+    blinker.set_parameters([Parameter('use_sim_time', value=False)])
+    with pytest.raises(LockstepError, match='node /blinker runs on wall time'):
+        lockstep.run_for(1.0)
+
+
+def test_closed_world_is_of_no_use(lockstep):
+    blinker = lockstep.add(Blinker())
+    lockstep.close()
+    lockstep.close()
+    for use in (
+        lambda: lockstep.run_for(1.0),
+        lambda: lockstep.step(),
+        lambda: lockstep.add(blinker),
+        lambda: lockstep.publish('a', Vector3()),
+        lambda: lockstep.jump(1.0),
+    ):
+        with pytest.raises(LockstepError, match='this world is closed'):
+            use()
+
+
+def test_topics_and_services_that_are_not_there_are_named(lockstep):
+    lockstep.listen(Twist, 'cmd_vel')
+    with pytest.raises(LockstepError, match='nobody reads /cmd_vell as geometry_msgs/msg/Twist'):
+        lockstep.publish('cmd_vell', Twist())
+    with pytest.raises(
+        LockstepError, match=r'/cmd_vel is geometry_msgs/msg/Twist, not geometry_msgs/msg/V'
+    ):
+        lockstep.publish('cmd_vel', Vector3())
+    with pytest.raises(
+        LockstepError, match=r'/cmd_vel is geometry_msgs/msg/Twist, not geometry_msgs/msg/V'
+    ):
+        lockstep.listen(Vector3, 'cmd_vel')
+    with pytest.raises(LockstepError, match='there is no service /nowhere of Trigger'):
+        lockstep.call(Trigger, 'nowhere')
+
+
+def test_callback_that_sleeps_on_its_clock_is_named(lockstep):
+    node = lockstep.add(Node('sleeper'))
+    node.create_timer(0.1, lambda: node.get_clock().sleep_for(Duration(seconds=1.0)))
+    with pytest.raises(LockstepError, match='node /sleeper sleeps on its clock within a callback'):
+        lockstep.run_for(0.3)
+
+
+def test_tasks_outlive_the_failure_of_another(impatient):
+    gate, passed = Future(), []
+
+    async def stuck():
+        forever()
+
+    async def waiting():
+        passed.append(await gate)
+
+    impatient.node.executor.create_task(stuck)
+    impatient.node.executor.create_task(waiting)
+    with pytest.raises(LockstepError, match='stuck'):
+        impatient.settle()
+    gate.set_result(1)
+    impatient.settle()
+    assert passed == [1]
+
+
+def test_node_that_is_spun_by_somebody_else_is_named(lockstep):
+    with pytest.raises(LockstepError, match='node /blinker cannot be spun by somebody else'):
+        rclpy.spin_once(lockstep.add(Blinker()), timeout_sec=0.0)
+    waiting = lockstep.add(Blinker('waiting'))
+    waiting.create_timer(0.1, lambda: rclpy.spin_until_future_complete(waiting, Future()))
+    with pytest.raises(LockstepError, match='node /waiting cannot be spun by somebody else'):
+        lockstep.run_for(1.0)
+
+
+def test_world_that_is_called_within_a_callback_says_so(lockstep):
+    heard = lockstep.listen(Vector3, 'a')
+    ticking = lockstep.node.create_timer(0.1, lambda: lockstep.publish('a', Vector3()))
+    lockstep.run_for(0.2)
+    assert len(heard) == 2
+    lockstep.node.destroy_timer(ticking)
+    node = lockstep.add(Node('other'))
+    for call in (
+        lambda: lockstep.run_for(0.5),
+        lockstep.settle,
+        lambda: lockstep.remove(node),
+        lambda: lockstep.add(Node('new')),
+    ):
+        timer = lockstep.node.create_timer(0.1, call)
+        with pytest.raises(LockstepError, match='within a callback'):
+            lockstep.run_for(0.1)
+        lockstep.node.destroy_timer(timer)
+
+
+def test_world_in_another_thread_says_so(lockstep):
+    failures = []
+
+    def in_a_thread():
+        try:
+            lockstep.run_for(1.0)
+        except LockstepError as error:
+            failures.append(str(error))
+
+    thread = threading.Thread(target=in_a_thread)
+    thread.start()
+    thread.join()
+    assert failures == ['a world must be made and used in the main thread']
+
+
+def test_shutdown_of_rclpy_is_named(lockstep):
+    lockstep.node.create_timer(0.1, rclpy.try_shutdown)
+    with pytest.raises(LockstepError, match='rclpy was shut down'):
+        lockstep.run_for(1.0)
+
+
+def test_second_clock_is_named(lockstep):
+    node = Node('rival')
+    node.create_publisher(ClockMessage, '/clock', 10)
+    with pytest.raises(LockstepError, match='node /rival publishes /clock, which the world does'):
+        lockstep.add(node)
+
+
+class Early(Node):
+    """It speaks before anybody can hear it."""
+
+    def __init__(self):
+        super().__init__('early')
+        self.publisher = self.create_publisher(Vector3, 'map', 10)
+        self.publisher.publish(msg=Vector3(x=1.0))
+
+
+def test_report_tells_what_was_said_before_the_node_was_added(lockstep):
+    lockstep.add(Early())
+    assert '  /map: 1 from /early, last at 1 s: Vector3(x=1)' in lockstep.report().splitlines()
+
+
+def test_report_tells_only_what_was_sent(lockstep):
+    node = lockstep.add(LifecycleNode('sleepy'))
+    publisher = node.create_lifecycle_publisher(Vector3, 'a', 10)
+    publisher.publish(Vector3())
+    lockstep.settle()
+    assert '/a' not in lockstep.report()
+
+
+def test_publishing_is_counted_only_while_a_world_is_open(lockstep):
+    lockstep.close()
+    assert Publisher.publish.__module__ == 'rclpy.publisher'
