@@ -8,7 +8,11 @@ import time
 import pytest
 from geometry_msgs.msg import Vector3
 from nav_msgs.msg import Odometry
+from rclpy.duration import Duration
+from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.task import Future
 from std_srvs.srv import Trigger
 from users_nodes import Blinker, Echo
 
@@ -147,3 +151,55 @@ def test_the_world_goes_on_after_a_failure(impatient):
     blinker = impatient.add(Blinker())
     impatient.run_for(1.0)
     assert len(blinker.ticks) >= 100
+
+
+def test_tasks_outlive_the_failure_of_another(impatient):
+    gate, passed = Future(), []
+
+    async def stuck():
+        forever()
+
+    async def waiting():
+        passed.append(await gate)
+
+    impatient.node.executor.create_task(stuck)
+    impatient.node.executor.create_task(waiting)
+    with pytest.raises(LockstepError, match='stuck'):
+        impatient.settle()
+    gate.set_result(1)
+    impatient.settle()
+    assert passed == [1]
+
+
+def test_callback_that_sleeps_on_its_clock_is_named(lockstep):
+    node = lockstep.add(Node('sleeper'))
+    node.create_timer(0.1, lambda: node.get_clock().sleep_for(Duration(seconds=1.0)))
+    with pytest.raises(LockstepError, match='node /sleeper sleeps on its clock within a callback'):
+        lockstep.run_for(0.3)
+
+
+class Early(Node):
+    """It speaks before anybody can hear it."""
+
+    def __init__(self):
+        super().__init__('early')
+        self.publisher = self.create_publisher(Vector3, 'map', 10)
+        self.publisher.publish(msg=Vector3(x=1.0))
+
+
+def test_report_tells_what_was_said_before_the_node_was_added(lockstep):
+    lockstep.add(Early())
+    assert '  /map: 1 from /early, last at 1 s: Vector3(x=1)' in lockstep.report().splitlines()
+
+
+def test_report_tells_only_what_was_sent(lockstep):
+    node = lockstep.add(LifecycleNode('sleepy'))
+    publisher = node.create_lifecycle_publisher(Vector3, 'a', 10)
+    publisher.publish(Vector3())
+    lockstep.settle()
+    assert '/a' not in lockstep.report()
+
+
+def test_publishing_is_counted_only_while_a_world_is_open(lockstep):
+    lockstep.close()
+    assert Publisher.publish.__module__ == 'rclpy.publisher'
