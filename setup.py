@@ -5,7 +5,17 @@ from glob import glob
 from setuptools import find_packages, setup
 
 PACKAGE = 'diffdrive_jacobian'
-COMMANDS = ['virtual_robot', 'go_to_goal', 'wheel_bridge', 'drive_to', 'send_goal']
+COMMANDS = [
+    'virtual_robot',
+    'go_to_goal',
+    'wheel_bridge',
+    'drive_to',
+    'send_goal',
+    'record_run',
+    'recover_run',
+    'replay_run',
+    'plot_run',
+]
 MESSAGES = '5.3.6'
 CORE_MESSAGES = '2.0.3'
 
@@ -24,7 +34,7 @@ setup(
         (f'share/{PACKAGE}/config', sorted(glob('config/*.yaml'))),
     ],
     python_requires='>=3.10',
-    install_requires=['numpy>=1.21', 'rich>=12'],
+    install_requires=['numpy>=1.21', 'rich>=12', 'rosbags>=0.11.9,<0.12', 'ruamel.yaml>=0.17'],
     # rclpy is not required here: a ROS installation brings its own, under another name than PyPI's.
     extras_require={
         'jazzy': [
@@ -41,7 +51,7 @@ setup(
             f'ros-std-srvs=={MESSAGES}',
         ],
         'plot': ['matplotlib>=3.5'],
-        'test': ['hypothesis>=6', 'pytest>=7', 'pyyaml>=5'],
+        'test': ['hypothesis>=6', 'matplotlib>=3.5', 'pytest>=7', 'pyyaml>=5'],
     },
     zip_safe=False,
     entry_points={

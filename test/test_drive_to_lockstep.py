@@ -12,18 +12,34 @@ from processes import open_world
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import drive_to
 
-CRAWL = ('50', '0', '--timeout', '1e6', '--ros-args', '-p', 'linear.x.max_velocity:=0.001')
+CRAWL = (
+    '50',
+    '0',
+    '--timeout',
+    '1e6',
+    '--no-record',
+    '--ros-args',
+    '-p',
+    'linear.x.max_velocity:=0.001',
+)
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    """What it records goes where nobody minds."""
+    monkeypatch.chdir(tmp_path)
 
 
 def last_line(capsys):
-    return capsys.readouterr().out.splitlines()[-1]
+    """What it says of the drive; where it is recorded and drawn comes after."""
+    return next(line for line in capsys.readouterr().out.splitlines() if 'the robot stopped' in line)
 
 
 @pytest.mark.parametrize('goals', [(1, 1), (-3, 0), (0.5, 0, 0.5, 0.5, 0, 0), (0, 0)])
 def test_arrives_and_says_the_same_each_time(capsys, goals):
     said = set()
-    for _ in range(2):
-        assert drive_to.main([*map(str, goals), '--lockstep'], Signals()) == 0
+    for record in (['--no-plot'], ['--no-record']):
+        assert drive_to.main([*map(str, goals), '--lockstep', *record], Signals()) == 0
         said.add(last_line(capsys))
     (line,) = said
     numbers = re.fullmatch(
@@ -38,7 +54,10 @@ def test_arrives_and_says_the_same_each_time(capsys, goals):
 
 def test_takes_as_long_as_the_law_says(capsys):
     """Straight ahead the distance decays as exp(-kv t), in steps of the odometry's period."""
-    assert drive_to.main(['1', '0', '--lockstep', '--ros-args', '-p', 'kv:=0.5'], Signals()) == 0
+    assert (
+        drive_to.main(['1', '0', '--lockstep', '--no-record', '--ros-args', '-p', 'kv:=0.5'], Signals())
+        == 0
+    )
     seconds = float(re.search(r'after (\S+) s of simulated time', last_line(capsys)).group(1))
     period, kv = 0.02, 0.5
     steps = math.ceil(math.log(0.02) / math.log(1.0 - kv * period))
@@ -46,7 +65,7 @@ def test_takes_as_long_as_the_law_says(capsys):
 
 
 def test_timeout_is_of_simulated_time(capsys):
-    assert drive_to.main(['50', '0', '--lockstep', '--timeout', '3'], Signals()) == 1
+    assert drive_to.main(['50', '0', '--lockstep', '--no-record', '--timeout', '3'], Signals()) == 1
     line = last_line(capsys)
     assert line.startswith('not arrived (--timeout 3 s was too short): ')
     assert line.endswith('after 3.0 s of simulated time')
@@ -62,7 +81,7 @@ def test_timeout_is_of_simulated_time(capsys):
 )
 def test_says_what_it_cannot_take(capsys, arguments, words):
     with pytest.raises(SystemExit) as caught:
-        raise SystemExit(drive_to.main(['1', '1', '--lockstep', *arguments], Signals()))
+        raise SystemExit(drive_to.main(['1', '1', '--lockstep', '--no-record', *arguments], Signals()))
     assert caught.value.code == 2
     line = capsys.readouterr().err.splitlines()[-1]
     assert line.startswith('drive_to: error: ')

@@ -18,7 +18,15 @@ from diffdrive_jacobian.nodes.parameters import (
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.ros.parameters import specifications
-from diffdrive_jacobian.tools import drive_to, entry_points, send_goal
+from diffdrive_jacobian.tools import (
+    drive_to,
+    entry_points,
+    plot_run,
+    record_run,
+    recover_run,
+    replay_run,
+    send_goal,
+)
 
 README = (Path(__file__).parent.parent / 'README.md').read_text()
 NODES = {
@@ -118,14 +126,21 @@ def test_two_commands_of_one_line_each():
     assert commands[1].endswith('pytest')
 
 
-@pytest.mark.parametrize('tool', [drive_to, send_goal])
+@pytest.mark.parametrize(
+    'tool',
+    [drive_to, send_goal, record_run, recover_run, replay_run, plot_run],
+    ids=lambda one: one.PROGRAM,
+)
 def test_options_of_the_tools(tool):
-    row = next(line for line in README.splitlines() if line.startswith(f'| `{tool.PROGRAM} X Y'))
+    row = next(line for line in README.splitlines() if line.startswith(f'| `{tool.PROGRAM} '))
     options = {
         option
         for action in tool._parser()._actions
         for option in action.option_strings
-        if option.startswith('--') and option != '--help'
+        if option not in ('-h', '--help')
     }
-    assert set(re.findall(r'--[a-z][a-z-]*', row)) - {'--ros-args'} == options
+    told = {
+        word for text in re.findall(r'`(-[^`]+)`', row) for word in re.findall(r'--?[a-z][a-z-]*', text)
+    }
+    assert told - {'--ros-args'} == options
     assert hasattr(entry_points, tool.PROGRAM)

@@ -55,7 +55,9 @@ def drives(tmp_path_factory):
     for config in CONFIGS:
         commands[config.stem] = ('0.2', '0.1', '--tolerance', '0.1', '--params-file', str(config))
     with open_world(directory) as world:
-        yield {name: world.start('drive_to', *command) for name, command in commands.items()}
+        yield {
+            name: world.start('drive_to', '--no-record', *command) for name, command in commands.items()
+        }
 
 
 # --- Driving
@@ -95,7 +97,7 @@ def test_drive_to_is_not_seen(world, monkeypatch, older):
     peer = world.harness.peer
     for name, value in older.items():
         monkeypatch.setenv(name, value)
-    child = world.start('drive_to', '0.05', '0', *QUICK)
+    child = world.start('drive_to', '--no-record', '0.05', '0', *QUICK)
     seen = set()
     while child.running:
         world.harness.executor.spin_once(timeout_sec=0.01)
@@ -112,7 +114,7 @@ def test_drive_to_open_is_seen_and_tells_truly_where_the_robot_stopped(world):
     applied = world.harness.listen(TwistStamped, 'cmd_vel_out')
     # So slow that the robot drives already when the last odometry still says that it stands.
     child = world.start(
-        'drive_to', *FAR, '--open', '--ros-args', '-p', 'virtual_robot:publish_rate:=4.0'
+        'drive_to', *FAR, '--no-record', '--open', '--ros-args', '-p', 'virtual_robot:publish_rate:=4.0'
     )
     world.harness.until(lambda: applied and odometry, 'it drives')
     child.signal(signal.SIGINT)
@@ -131,7 +133,7 @@ def test_drive_to_open_survives_what_strangers_publish(world):
     from nav_msgs.msg import Odometry
     from sensor_msgs.msg import JointState
 
-    child = world.start('drive_to', '0.2', '0', '--open', *QUICK)
+    child = world.start('drive_to', '--no-record', '0.2', '0', '--open', *QUICK)
     bad = Odometry()
     bad.pose.pose.position.x = float('nan')
     odom = world.harness.talk(Odometry, 'odom')
@@ -149,7 +151,7 @@ def test_drive_to_open_survives_what_strangers_publish(world):
 
 def test_drive_to_exits_130_on_a_signal(world):
     signals = [(signal.SIGINT,), (signal.SIGINT, signal.SIGINT), (signal.SIGTERM,)]
-    children = [world.start('drive_to', *FAR) for _ in signals]
+    children = [world.start('drive_to', '--no-record', *FAR) for _ in signals]
     for child, numbers in zip(children, signals, strict=True):
         child.until_says(r'goal 1/1 \(50, 0\)')
         for number in numbers:
@@ -160,7 +162,10 @@ def test_drive_to_exits_130_on_a_signal(world):
 
 
 def test_drive_to_exits_130_on_signals_that_do_not_cease(world):
-    children = [world.start('drive_to', *FAR), world.start('drive_to', *FAR)]
+    children = [
+        world.start('drive_to', '--no-record', *FAR),
+        world.start('drive_to', '--no-record', *FAR),
+    ]
     children[0].until_catches(signal.SIGHUP)
     children[1].until_says('m to go')
     for child in children:
@@ -179,7 +184,7 @@ def test_drive_to_survives_a_reader_that_goes_away(world):
     # As in `drive_to 1 1 | head -1`.
     read, write = os.pipe()
     os.close(read)
-    child = world.start('drive_to', *FAR, '--timeout', '0.2', stdout=write)
+    child = world.start('drive_to', '--no-record', *FAR, '--timeout', '0.2', stdout=write)
     os.close(write)
     assert (child.exit(), child.stderr) == (1, '')
 

@@ -11,7 +11,7 @@ from typing import Any
 from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.ros.messages import MAX_POSITION, MAX_SPEED
 from diffdrive_jacobian.ros.parameters import NodeParameters, ParameterError, parameter
-from diffdrive_jacobian.simulation.robot import NANOSECONDS
+from diffdrive_jacobian.simulation.robot import NANOSECONDS, RobotModel
 
 _STAMPED = 'cmd_vel is a TwistStamped instead of a Twist. Read-only.'
 
@@ -140,6 +140,16 @@ class VirtualRobotParameters(LimitParameters):
         """Wheels and frames must be told apart."""
         _differ('left_wheel_name', self.left_wheel_name, 'right_wheel_name', self.right_wheel_name)
         _differ('odom_frame_id', self.odom_frame_id, 'base_frame_id', self.base_frame_id)
+
+    def model(self) -> RobotModel:
+        """Give the robot that they describe."""
+        return RobotModel(
+            wheel_radius=self.wheel_radius,
+            wheel_separation=self.wheel_separation,
+            limits=self.limits(max_wheel_speed=self.max_wheel_velocity),
+            command_timeout=nanoseconds(self.cmd_vel_timeout),
+            wheel_travel_variance=self.wheel_travel_variance,
+        )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

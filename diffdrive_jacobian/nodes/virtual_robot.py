@@ -27,7 +27,7 @@ from diffdrive_jacobian.nodes.parameters import VirtualRobotParameters, nanoseco
 from diffdrive_jacobian.ros import messages
 from diffdrive_jacobian.ros.messages import MessageError
 from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
-from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot, RobotModel
+from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot
 
 
 class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
@@ -89,7 +89,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             return None
         robot = self._robot
         if robot is None:
-            robot = Robot(model=self._model(), stamp=now, pose=self._initial_pose())
+            robot = Robot(model=self.parameters.model(), stamp=now, pose=self._initial_pose())
             self._begin(robot)
         elif now < self._latest:
             self.get_logger().warning(
@@ -205,7 +205,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self._name_messages()
         if parameters.publish_rate != previous.publish_rate:
             self._change_period(nanoseconds(1.0 / parameters.publish_rate))
-        model = self._model()
+        model = self.parameters.model()
         advanced = self._advance()
         if advanced is not None and model != advanced[1].model:
             now, robot = advanced
@@ -220,16 +220,6 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         due = self._timer.time_until_next_call()
         if due is None or due > period:
             self._timer.reset()
-
-    def _model(self) -> RobotModel:
-        parameters = self.parameters
-        return RobotModel(
-            wheel_radius=parameters.wheel_radius,
-            wheel_separation=parameters.wheel_separation,
-            limits=parameters.limits(max_wheel_speed=parameters.max_wheel_velocity),
-            command_timeout=nanoseconds(parameters.cmd_vel_timeout),
-            wheel_travel_variance=parameters.wheel_travel_variance,
-        )
 
     def _initial_pose(self) -> Any:
         parameters = self.parameters

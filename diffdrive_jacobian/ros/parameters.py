@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -198,14 +198,7 @@ def declare(node: Node, parameters: type[P]) -> P:
     """
     # rclpy has no public look at the overrides before a parameter is declared.
     overrides = node._parameter_overrides
-    known = specifications(parameters)
-    initial = parameters(
-        **{
-            field: _as_declared(parameters, name, overrides[name].value)
-            for name, (field, _) in known.items()
-            if name in overrides
-        }
-    )
+    initial = from_ros(parameters, {name: given.value for name, given in overrides.items()})
     node.declare_parameters(
         '',
         [
@@ -214,11 +207,27 @@ def declare(node: Node, parameters: type[P]) -> P:
                 getattr(initial, field),
                 descriptor(specification, _default(parameters, field)),
             )
-            for name, (field, specification) in known.items()
+            for name, (field, specification) in specifications(parameters).items()
         ],
         ignore_override=True,
     )
     return initial
+
+
+def from_ros(parameters: type[P], values: Mapping[str, Any]) -> P:
+    """Make the set that a node would have with values by their ROS names; others' are passed over.
+
+    Raises:
+        ParameterError: The set would not be valid.
+    """
+    known = specifications(parameters)
+    return parameters(
+        **{
+            known[name][0]: _as_declared(parameters, name, value)
+            for name, value in values.items()
+            if name in known
+        }
+    )
 
 
 def accept_integers(parameters: type[NodeParameters], changes: list[Parameter]) -> list[Parameter]:

@@ -1,6 +1,7 @@
 """Fixtures of pytest: `pytest_plugins = ['diffdrive_jacobian.testing.fixtures']` in a conftest.py.
 
-`lockstep` is a world of its own for each test, `robot_at(x, y, theta)` puts the virtual robot into it.
+`lockstep` is a world of its own for each test, `robot_at(x, y, theta)` puts the virtual robot into it,
+`recorded_run` records it, as a bag and a picture that are kept where the test fails.
 The marker `lockstep(args=..., start=..., patience=...)` makes the world with these arguments. The report
 of a test that fails ends with the last messages of every topic.
 """
@@ -8,11 +9,16 @@ of a test that fails ends with the last messages of every topic.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from rclpy.parameter import Parameter
 
+from diffdrive_jacobian.bags import BagError, read_run
+from diffdrive_jacobian.bags.figure import draw
+from diffdrive_jacobian.bags.recorder import Recorder, Selection
+from diffdrive_jacobian.bags.recording import Recording
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.testing import Lockstep, LockstepError
 
@@ -31,8 +37,13 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     report = outcome.get_result()
     world = getattr(item, 'funcargs', {}).get('lockstep')
     told = call.excinfo is not None and call.excinfo.errisinstance(LockstepError)
-    if call.when == 'call' and report.failed and isinstance(world, Lockstep) and not told:
+    if call.when != 'call' or not report.failed:
+        return
+    if isinstance(world, Lockstep) and not told:
         report.sections.append(('lockstep', world.report()))
+    recorded = getattr(item, 'funcargs', {}).get('recorded_run')
+    if isinstance(recorded, RecordedRun):
+        report.sections.append(('recorded run', recorded.keep()))
 
 
 @pytest.fixture
@@ -58,3 +69,41 @@ def robot_at(lockstep: Lockstep) -> Callable[..., VirtualRobot]:
         return lockstep.add(VirtualRobot(namespace=namespace, parameter_overrides=overrides))
 
     return place
+
+
+class RecordedRun:
+    """The recording of a test."""
+
+    def __init__(self, world: Lockstep, directory: Path) -> None:
+        """Record all topics of a world from here on, into a directory."""
+        self._recording = Recording(directory / 'run', 'mcap')
+        self._kept = False
+        recorder = Recorder(Selection(everything=True), self._recording.journal)
+        world.add(recorder)
+        world.on_new_topics(recorder.look)
+        recorder.look()
+
+    def keep(self) -> str:
+        """Make the bag and, where there is odometry and matplotlib, the picture; says where they are."""
+        self._kept = True
+        self._recording.finish()
+        bag = self._recording.bag
+        picture = bag.with_suffix('.png')
+        try:
+            draw([read_run(bag)], picture)
+        except (BagError, ModuleNotFoundError) as error:
+            return f'{bag}\nnot drawn: {error}'
+        return f'{bag}\n{picture}'
+
+    def close(self) -> None:
+        """Let go of it, unless it was kept."""
+        if not self._kept:
+            self._recording.discard()
+
+
+@pytest.fixture
+def recorded_run(lockstep: Lockstep, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RecordedRun]:
+    """Record the test; `keep()` makes the bag, a failure does so by itself."""
+    run = RecordedRun(lockstep, tmp_path_factory.mktemp('recorded'))
+    yield run
+    run.close()

@@ -69,6 +69,7 @@ class Lockstep(SimulatedTime):
             raise LockstepError('rclpy is initialised already: the world does that, leave it to it')
         self._thread = threading.get_ident()
         self._publishers: dict[tuple[type, str], Publisher] = {}
+        self._on_new: list[Callable[[], None]] = []
         self._closing = ExitStack()
         try:
             self._enter(args, patience)
@@ -174,6 +175,12 @@ class Lockstep(SimulatedTime):
             name = node.get_fully_qualified_name()
             raise LockstepError(f'node {name} publishes /clock, which the world does')
         self._refuse_sleep(node)
+        for callback in self._on_new:
+            callback()
+
+    def on_new_topics(self, callback: Callable[[], None]) -> None:
+        """Have a function called whenever nodes come, or make or destroy something."""
+        self._on_new.append(callback)
 
     def _refuse_sleep(self, node: Node) -> None:
         """Let no callback sleep until an instant that cannot come before it returns.

@@ -60,3 +60,40 @@ class Drive:
     def next(self) -> None:
         """Begin the bar anew, for another waypoint."""
         self._farthest = 0.0
+
+
+class Playing:
+    """How far a bag is played: a bar on a terminal, nothing elsewhere."""
+
+    def __init__(self, seconds: float) -> None:
+        """Begin a bag of so many seconds."""
+        self._console = Console()
+        self._progress = Progress(
+            TextColumn('{task.description}'),
+            BarColumn(),
+            TextColumn('{task.completed:.1f} of {task.total:.1f} s'),
+            console=self._console,
+            auto_refresh=False,
+        )
+        self._task = self._progress.add_task('playing', total=seconds)
+        self._shown = -math.inf
+
+    def __enter__(self) -> Playing:
+        """Show the bar, where there is a terminal."""
+        if self._console.is_terminal:
+            self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave it as it is."""
+        if self._console.is_terminal:
+            self._progress.refresh()
+            self._progress.stop()
+
+    def show(self, seconds: float, *, paused: bool) -> None:
+        """Show how far it came (s)."""
+        if self._console.is_terminal and time.monotonic() - self._shown >= 0.1:
+            self._shown = time.monotonic()
+            what = 'paused (Enter)' if paused else 'playing'
+            self._progress.update(self._task, completed=seconds, description=what)
+            self._progress.refresh()

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -24,6 +25,10 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 
+from diffdrive_jacobian.bags.figure import draw
+from diffdrive_jacobian.bags.reading import BagError, read_run
+from diffdrive_jacobian.bags.recorder import Recorder, Selection
+from diffdrive_jacobian.bags.recording import Recording
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.parameters import nanoseconds
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
@@ -42,6 +47,8 @@ if TYPE_CHECKING:
 PROGRAM = 'drive_to'
 SETTLING = 0.1
 """Odometry this much later than the last command knows of it (s)."""
+LOOK_PERIOD = 0.5
+"""How often new topics to record are looked for (s)."""
 STOP_PATIENCE = 2.0
 """How long the robot may take to come to rest at the end, and to say so (s)."""
 
@@ -142,8 +149,17 @@ def drive(
     *,
     timeout: float,
     tolerance: float | None,
+    recording: Recording | None = None,
 ) -> Outcome:
     """Drive to goals `[x, y]`, shape (n, 2), in order, with all three nodes in this process.
+
+    Args:
+        goals: The goals (m).
+        runner: What the nodes live in.
+        signals: A signal ends the drive.
+        timeout: How long it may take (s).
+        tolerance: Distance that counts as arrived (m); None: as the parameters say.
+        recording: What is recorded to; None: nothing is.
 
     Raises:
         UserError: A node cannot run with the parameters given.
@@ -156,10 +172,12 @@ def drive(
     controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=tolerances))
     names = robot.parameters.left_wheel_name, robot.parameters.right_wheel_name
     observer = runner.add(lambda: Observer(goals, names, context))
+    tend = _recorder(runner, recording)
     begun = runner.seconds()
     with Drive() as progress:
 
         def over() -> bool:
+            tend()
             if observer.pose is not None and not observer.ended:
                 index = controller.waypoint
                 if index is not None and index != observer.index:
@@ -177,13 +195,13 @@ def drive(
         settled = robot.now() + nanoseconds(SETTLING)
         before = signals.count
         patience = runner.seconds() + STOP_PATIENCE + 1.0 / robot.parameters.publish_rate
-        runner.spin(
-            lambda: (
-                (observer.seen >= settled and not observer.moving)
-                or runner.seconds() > patience
-                or signals.count > before
-            )
-        )
+
+        def settled_or_late() -> bool:
+            tend()
+            still = observer.seen >= settled and not observer.moving
+            return bool(still or runner.seconds() > patience or signals.count > before)
+
+        runner.spin(settled_or_late)
     observer.index = len(goals) - 1
     return Outcome(
         status=status,
@@ -192,6 +210,28 @@ def drive(
         distance=observer.distance,
         seconds=seconds,
     )
+
+
+def _recorder(runner: Runner | LockstepRunner, recording: Recording | None) -> Callable[[], None]:
+    """Record what the nodes say; gives what must be called often."""
+    if recording is None:
+        return lambda: None
+    recorder = runner.add(
+        lambda: Recorder(
+            Selection(), recording.journal, stamped_on_receipt=False, context=runner.context
+        )
+    )
+    looked = -math.inf
+
+    def tend() -> None:
+        nonlocal looked
+        if runner.seconds() - looked >= LOOK_PERIOD:
+            looked = runner.seconds()
+            recorder.look()
+        recording.tend()
+
+    tend()
+    return tend
 
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
@@ -206,6 +246,12 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     goals = np.reshape(options.coordinates, (-1, 2))
     ros = ['--ros-args', '--log-level', 'warn', '--', *_cli.with_params_file(ros, options)]
     stage = _lockstep(ros) if options.lockstep else _real_time(ros, open_to_all=options.open)
+    recording = None
+    try:
+        if not options.no_record:
+            recording = _cli.begin_recording('drive', options.output, 'mcap')
+    except OSError as error:
+        return _cli.complain(PROGRAM, error)
     try:
         with stage as runner:
             outcome = drive(
@@ -214,10 +260,33 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                 signals,
                 timeout=options.timeout,
                 tolerance=options.tolerance,
+                recording=recording,
             )
     except UserError as error:
+        if recording is not None:
+            recording.discard()
         return _cli.complain(PROGRAM, error)
-    return _report(outcome, options.timeout, ' of simulated time' if options.lockstep else '')
+    code = _report(outcome, options.timeout, ' of simulated time' if options.lockstep else '')
+    if recording is None:
+        return code
+    return _keep(recording, plot=not options.no_plot) or code
+
+
+def _keep(recording: Recording, *, plot: bool) -> int:
+    """Make the bag and its picture, and say where they are; gives the exit code."""
+    try:
+        recording.finish()
+        print(f'recorded: {recording.bag}')
+        if plot:
+            picture = recording.bag.with_name(recording.bag.name + '.png')
+            draw([read_run(recording.bag)], picture)
+            print(f'drawn: {picture}')
+    except ModuleNotFoundError:
+        print('not drawn: matplotlib is not installed (the extra plot brings it)')
+    except (OSError, BagError) as error:
+        print(f'{PROGRAM}: error: {error}', file=sys.stderr)
+        return _cli.FAILED
+    return _cli.DONE
 
 
 @contextmanager
@@ -291,6 +360,14 @@ def _parser() -> argparse.ArgumentParser:
         '--tolerance', type=_cli.tolerance, help='distance that counts as arrived (m); 0.02'
     )
     _cli.add_params_file(parser)
+    parser.add_argument(
+        '-o',
+        '--output',
+        metavar='BAG',
+        help='where the run is recorded, as a rosbag2 bag, and drawn, as BAG.png; drive_DATE-TIME',
+    )
+    parser.add_argument('--no-record', action='store_true', help='neither record nor draw')
+    parser.add_argument('--no-plot', action='store_true', help='record, but do not draw')
     parser.add_argument(
         '--lockstep',
         action='store_true',

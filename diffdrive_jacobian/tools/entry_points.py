@@ -55,3 +55,23 @@ def drive_to() -> int:
 def send_goal() -> int:
     """Run the tool send_goal."""
     return _run('send_goal', 'main')
+
+
+def record_run() -> int:
+    """Run the tool record_run."""
+    return _run('record_run', 'main')
+
+
+def replay_run() -> int:
+    """Run the tool replay_run."""
+    return _run('replay_run', 'main')
+
+
+def recover_run() -> int:
+    """Run the tool recover_run."""
+    return _run('recover_run', 'main')
+
+
+def plot_run() -> int:
+    """Run the tool plot_run."""
+    return _run('plot_run', 'main')

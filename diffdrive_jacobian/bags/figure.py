@@ -1,0 +1,309 @@
+"""Runs as one picture.
+
+The plane with the path; over time the distance to the goal and the heading error, v and omega, and the
+wheel speeds, each with its limits. matplotlib is imported when something is drawn; no display is needed.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import warnings
+from collections.abc import Sequence
+from itertools import cycle, product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from diffdrive_jacobian.bags.lines import commanded, limits, line, measured
+from diffdrive_jacobian.bags.reading import Run
+from diffdrive_jacobian.bags.trace import Array, Trace, tolerance, trace
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+FORMATS = ('png', 'svg', 'pdf')
+SIZE, DPI = (11.0, 7.0), 130
+"""Of the picture (inches, dots per inch)."""
+ARROWS = 14
+"""Headings along a path."""
+LABEL = 40
+"""A longer name of a bag is cut in the middle."""
+NUMBERED, MARKED = 12, 30
+"""With more goals than that they bear no numbers; their changes are not marked over time."""
+COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
+"""Okabe and Ito's, those that stand out from white; the lines' styles tell runs apart as well."""
+STYLES: tuple[Any, ...] = ('-', (0, (5, 1.5)), '-.', (0, (1.2, 1)), (0, (7, 1.5, 1, 1.5, 1, 1.5)))
+LIMIT = (0, (6, 3))
+GREY, COMMAND = '#777777', '#d2d2d2'
+LABELS = {
+    'distance': 'distance to goal [m]',
+    'heading_error': 'heading error [rad]',
+    'v': r'speed $v$ [m/s]',
+    'omega': r'yaw rate $\omega$ [rad/s]',
+    'right': r'right wheel $\omega_R$ [rad/s]',
+    'left': r'left wheel $\omega_L$ [rad/s]',
+}
+_ARROW: Any = {
+    'units': 'inches',
+    'scale_units': 'inches',
+    'scale': 5.0,
+    'width': 0.022,
+    'headwidth': 5.0,
+    'headlength': 5.0,
+    'headaxislength': 4.5,
+}
+_STYLE: Any = {
+    'font.size': 9.5,
+    'axes.spines.top': False,
+    'axes.spines.right': False,
+    'axes.grid': True,
+    'grid.color': '#e4e4e4',
+    'axes.axisbelow': True,
+    'legend.frameon': False,
+    'figure.constrained_layout.w_pad': 0.1,
+    'figure.constrained_layout.h_pad': 0.08,
+}
+
+
+def draw(runs: Sequence[Run], path: Path) -> None:
+    """Draw runs, over each other, into a new file.
+
+    Args:
+        runs: One or more, with odometry.
+        path: Ends in .png, .svg or .pdf.
+
+    Raises:
+        BagError: A run has no odometry.
+        FileExistsError: The file exists; it stays as it is.
+        ModuleNotFoundError: matplotlib is not installed.
+        OSError: The file cannot be written; nothing is left of it.
+        ValueError: The ending is another one.
+    """
+    ending = path.suffix.lower().removeprefix('.')
+    if ending not in FORMATS:
+        raise ValueError(f'{path} must end in .{", .".join(FORMATS)}')
+    if path.exists():
+        raise FileExistsError(f'{path} exists already')
+    drawn = io.BytesIO()
+    with warnings.catch_warnings(), _style():
+        # A letter of a bag's name that the font does not have.
+        warnings.filterwarnings('ignore', message='Glyph')
+        # So many runs that there is no room left for their names.
+        warnings.filterwarnings('ignore', message='constrained_layout not applied')
+        figure(runs).savefig(drawn, format=ending, dpi=DPI)
+    create(path, drawn.getvalue())
+
+
+def create(path: Path, data: bytes) -> None:
+    """Write a new file, whole or not at all.
+
+    Raises:
+        FileExistsError: It exists; it stays as it is.
+        OSError: It cannot be written.
+    """
+    with open(path, 'xb') as file:
+        try:
+            file.write(data)
+            file.flush()
+        except BaseException:
+            path.unlink()
+            raise
+
+
+def names(paths: Sequence[Path]) -> list[str]:
+    """Tell bags apart by as much of the ends of their paths as it takes."""
+    parts = [path.resolve().parts for path in paths]
+    count = 1
+    while count < max(map(len, parts)) and len({one[-count:] for one in parts}) < len(set(parts)):
+        count += 1
+    return [os.fsencode('/'.join(one[-count:])).decode(errors='replace') for one in parts]
+
+
+def figure(runs: Sequence[Run]) -> Figure:
+    """Draw runs, over each other; the plane is the first of the axes.
+
+    A single run also shows what was commanded, and when its goals changed; of several that would be
+    too much.
+
+    Raises:
+        BagError: A run has no odometry.
+        ModuleNotFoundError: matplotlib is not installed.
+    """
+    from matplotlib.figure import Figure
+
+    traces = [trace(run) for run in runs]
+    quantities = [
+        *(('distance', 'heading_error') if any(len(run.goals) for run in runs) else ()),
+        *('v', 'omega'),
+        *(('right', 'left') if any(len(run.wheels) + len(run.wheel_commands) for run in runs) else ()),
+    ]
+    columns = 1 if len(quantities) == 2 else 2
+    rows = len(quantities) // columns
+    labels = names([run.path for run in runs])
+    with _style():
+        made = Figure(figsize=SIZE, layout='constrained')
+        grid = made.add_gridspec(
+            rows + 1,
+            columns + 1,
+            width_ratios=[1.55, *[2.0 / columns] * columns],
+            height_ratios=[*[1.0] * rows, 0.03 * rows],
+        )
+        plane, panels = made.add_subplot(grid[:-1, 0]), _panels(made, grid, quantities, columns)
+        for one, label, color, style in zip(traces, labels, cycle(COLORS), cycle(STYLES), strict=False):
+            _draw_path(plane, one, label, color, style)
+            for quantity, panel in panels.items():
+                _draw_over_time(panel, one, quantity, color, style, alone=len(runs) == 1)
+        _draw_goals(plane, traces)
+        _finish(plane, traces)
+        below = made.add_subplot(grid[-1, :])
+        below.axis('off')
+        below.legend(handles=_marks(traces), loc='center', ncol=6, borderaxespad=0.0)
+    return made
+
+
+def _style() -> Any:
+    """Draw in our style, whatever the user has configured; a context manager."""
+    import matplotlib
+
+    # Not the backend, which nothing here needs: it would stay changed.
+    style: Any = {name: value for name, value in matplotlib.rcParamsDefault.items() if name != 'backend'}
+    return matplotlib.rc_context({**style, **_STYLE})
+
+
+def _panels(made: Figure, grid: Any, quantities: Sequence[str], columns: int) -> dict[str, Axes]:
+    """Make the axes over time, one for each quantity; those of the wheels have one scale."""
+    panels: dict[str, Axes] = {}
+    for index, quantity in enumerate(quantities):
+        row, column = divmod(index, columns)
+        panel = made.add_subplot(
+            grid[row, 1 + column],
+            sharex=panels.get(quantities[0]),
+            sharey=panels.get('right') if quantity == 'left' else None,
+        )
+        last = index + columns >= len(quantities)
+        panel.set(ylabel=LABELS[quantity], xlabel='time [s]' if last else '')
+        panel.tick_params(labelbottom=last)
+        panels[quantity] = panel
+    return panels
+
+
+def _draw_path(plane: Axes, one: Trace, name: str, color: str, style: Any) -> None:
+    """Draw the way with evenly spaced headings, where it begins and where it ends."""
+    poses = one.run.odometry.values[:, :3]
+    steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+    steps[one.breaks - 1] = 0.0
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    name = name if len(name) <= LABEL else f'{name[: LABEL // 2]}…{name[-LABEL // 2 :]}'
+    # A dollar begins a formula, and an underscore hides a label.
+    label = f'{name}: {np.ptp(one.time):.1f} s, {way[-1]:.2f} m'.replace('$', r'\$')
+    label = f' {label}' if label.startswith('_') else label
+    plane.plot(*line(poses[:, :2], one.breaks).T, color=color, ls=style, lw=1.8, label=label)
+    evenly = np.searchsorted(way, np.linspace(0.0, way[-1], ARROWS, endpoint=False))
+    x, y, theta = poses[np.unique([*evenly, len(way) - 1])].T
+    plane.quiver(x, y, np.cos(theta), np.sin(theta), color=color, zorder=3, **_ARROW)
+    x, y, _ = poses[[0, *one.breaks[:MARKED]]].T
+    plane.plot(x, y, 'o', ms=9, mfc='white', mec=color, mew=1.8, zorder=2.5)
+    plane.plot(*poses[-1, :2], 's', ms=7, mfc=color, mec='white', mew=0.8, zorder=5)
+
+
+def _draw_goals(plane: Axes, traces: Sequence[Trace]) -> None:
+    """Draw each goal once, with what counts as arrived, in the order in which they were given."""
+    from matplotlib.collections import PatchCollection
+    from matplotlib.patches import Circle
+
+    goals = {
+        (round(x, 6), round(y, 6)): tolerance(one.run)
+        for one in traces
+        for x, y in one.run.goals.values[:, :2].tolist()
+    }
+    size, depth = (13, 6.0) if len(goals) <= MARKED else (4, 1.5)
+    circles = [Circle(place, radius) for place, radius in goals.items()]
+    plane.add_collection(PatchCollection(circles, fc='none', ec='black', lw=1.0, zorder=depth))
+    places = np.reshape([*goals], (-1, 2))
+    plane.plot(*places.T, '+', ms=size, mew=1.4, color='black', zorder=depth)
+    places = np.concatenate([line(one.run.odometry.values[:, :2], one.breaks) for one in traces])
+    for number, place in enumerate(goals if len(goals) <= NUMBERED else (), 1):
+        right, up = _free_corner(places, place)
+        plane.annotate(
+            f'goal {number}' if len(goals) > 1 else 'goal',
+            place,
+            xytext=(7 * right, 7 * up),
+            textcoords='offset points',
+            ha='left' if right > 0 else 'right',
+            va='bottom' if up > 0 else 'top',
+            zorder=7,
+        )
+
+
+def _free_corner(places: Array, place: tuple[float, float]) -> tuple[int, int]:
+    """Find on which side of a place, right 1 or left -1 and above 1 or below -1, least was driven."""
+    reach = 0.2 * np.nanmax(np.nanmax(places, axis=0) - np.nanmin(places, axis=0))
+    dx, dy = (places - place).T
+    near = np.hypot(dx, dy) < reach
+
+    def passages(corner: tuple[int, int]) -> int:
+        return int(np.count_nonzero(near & (corner[0] * dx >= 0.0) & (corner[1] * dy >= 0.0)))
+
+    return min(product((1, -1), (1, -1)), key=passages)
+
+
+def _draw_over_time(
+    panel: Axes, one: Trace, quantity: str, color: str, style: Any, *, alone: bool
+) -> None:
+    """Draw a quantity, its limits, and of a single run what was commanded and when goals changed."""
+    panel.axhline(0.0, color='#bbbbbb', lw=0.8, zorder=1)
+    asked, told = commanded(one, quantity), measured(one, quantity)
+    if not len(told):
+        panel.plot(*asked.T, color=color, ls=style, lw=1.5, drawstyle='steps-post')
+    elif alone:
+        panel.plot(*asked.T, color=COMMAND, lw=4.5, drawstyle='steps-post', zorder=1.5)
+    panel.plot(*told.T, color=color, ls=style, lw=1.5)
+    for bound in limits(one).get(quantity, ()):
+        panel.plot(*bound.T, color='black', ls=LIMIT, lw=1.0, drawstyle='steps-post', zorder=3)
+    changes = np.flatnonzero(np.diff(one.goal)) + 1
+    if alone and len(changes) <= MARKED:
+        for change in changes:
+            panel.axvline(one.time[change], color=GREY, lw=0.9, ls=':', zorder=1)
+
+
+def _finish(plane: Axes, traces: Sequence[Trace]) -> None:
+    """Scale the plane alike along both axes, and name the runs."""
+    places = np.concatenate([one.run.odometry.values[:, :2] for one in traces])
+    # A robot that stands is not to fill the picture with its noise.
+    middle = (places.min(axis=0) + places.max(axis=0)) / 2.0
+    plane.update_datalim([middle - 0.25, middle + 0.25])
+    plane.set_aspect('equal', adjustable='datalim')
+    plane.margins(0.2)
+    plane.set(xlabel='x [m]', ylabel='y [m]')
+    plane.legend(
+        loc='lower left',
+        bbox_to_anchor=(0.0, 1.0),
+        borderaxespad=0.2,
+        handlelength=3.0,
+        fontsize=min(9.5, 90.0 / len(traces)),
+    )
+
+
+def _marks(traces: Sequence[Trace]) -> list[Line2D]:
+    """Say what the marks mean that were drawn."""
+    from matplotlib.lines import Line2D
+
+    alone = len(traces) == 1
+    marks = [
+        Line2D([], [], ls='', marker='o', ms=9, mfc='white', mew=1.8, color=GREY, label='start'),
+        Line2D([], [], ls='', marker='s', ms=7, color=GREY, label='end'),
+    ]
+    if any(len(one.run.goals) for one in traces):
+        label = 'goal with its tolerance'
+        marks.append(Line2D([], [], ls='', marker=r'$\oplus$', ms=12, color='black', label=label))
+    if alone and 0 < np.count_nonzero(np.diff(traces[0].goal)) <= MARKED:
+        marks.append(Line2D([], [], ls=':', lw=0.9, color=GREY, label='goal begins or ends'))
+    if alone and any(len(commanded(traces[0], quantity)) for quantity in LABELS):
+        marks.append(Line2D([], [], lw=4.5, color=COMMAND, label='commanded'))
+    if any(np.isfinite(bounds[..., 1]).any() for one in traces for bounds in limits(one).values()):
+        marks.append(Line2D([], [], ls=LIMIT, lw=1.0, color='black', label='limit'))
+    return marks

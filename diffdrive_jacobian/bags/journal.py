@@ -1,0 +1,161 @@
+"""A journal: what a recorder has received, on the disk within a moment, readable up to its last record.
+
+A bag is complete only when it is closed: a recorder that is killed loses its index, its metadata and up
+to a whole chunk of messages. So messages go into a journal first, in the order in which they came,
+and the bag is made from it at the end, or by whoever finds it after a crash.
+
+Layout: the magic, then records of a kind (1 byte), the payload's length (u32) and its CRC-32 (u32), all
+little-endian, and the payload. A record that was cut off or damaged ends the journal.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import zlib
+from collections.abc import Generator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+MAGIC = b'\x89ddjournal1\r\n\x1a\n'
+_HEAD = struct.Struct('<cII')
+_MESSAGE = struct.Struct('<Hq')
+_CONNECTION, _DATA, _TEXT = b'C', b'M', b'T'
+
+
+class JournalError(Exception):
+    """A file is no journal."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Channel:
+    """A topic as it was recorded."""
+
+    id: int
+    topic: str
+    type_name: str
+    definition: str
+    type_hash: str
+    qos: tuple[dict[str, Any], ...] = ()
+    """The profiles that its publishers offered, in rosbag2's words."""
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A message: when it came (ns), on which channel, as CDR."""
+
+    channel: int
+    stamp: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """Something to be known about the run; a later one with the same key counts."""
+
+    key: str
+    value: str
+
+
+Record = Channel | Message | Text
+
+
+class JournalWriter:
+    """Appends records to a new file."""
+
+    def __init__(self, path: Path) -> None:
+        """Create the file.
+
+        Raises:
+            FileExistsError: It exists.
+            OSError: It cannot be written.
+        """
+        self.path = path
+        # Its own buffer: that of `open` would raise once more for what could not be written.
+        self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
+        self._pending = bytearray(MAGIC)
+        self._written = 0
+
+    @property
+    def size(self) -> int:
+        """Bytes so far."""
+        return self._written + len(self._pending)
+
+    def add(self, record: Record) -> None:
+        """Append a record; it is kept once `flush` has returned."""
+        if isinstance(record, Message):
+            kind, payload = _DATA, _MESSAGE.pack(record.channel, record.stamp) + record.data
+        else:
+            kind = _CONNECTION if isinstance(record, Channel) else _TEXT
+            payload = json.dumps(asdict(record)).encode()
+        self._pending += _HEAD.pack(kind, len(payload), zlib.crc32(payload, ord(kind)))
+        self._pending += payload
+
+    def flush(self) -> None:
+        """Hand everything to the operating system: a killed process loses nothing of it.
+
+        Raises:
+            OSError: The disk is full, or gone; what was not written is dropped.
+        """
+        data, self._pending = memoryview(self._pending), bytearray()
+        while data:
+            written = self._file.write(data)
+            self._written += written
+            data = data[written:]
+
+    def sync(self) -> None:
+        """Wait until everything flushed is on the disk: a power cut loses nothing of it.
+
+        Raises:
+            OSError: The disk is full, or gone.
+        """
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Close the file; flush before."""
+        self._file.close()
+
+
+def read_journal(path: Path) -> Generator[Record, None, int]:
+    """Read a journal up to its end, or to what was cut off or damaged.
+
+    Returns:
+        The records; the generator's value is how many bytes at the end could not be read.
+
+    Raises:
+        JournalError: The file is no journal.
+        OSError: It cannot be read.
+    """
+    with open(path, 'rb') as file:
+        size = os.fstat(file.fileno()).st_size
+        if file.read(len(MAGIC)) != MAGIC:
+            raise JournalError(f'{path} is no journal of record_run')
+        end = file.tell()
+        while (record := _read_record(file, size - end)) is not None:
+            end = file.tell()
+            yield record
+        return size - end
+
+
+def _read_record(file: BinaryIO, left: int) -> Record | None:
+    head = file.read(_HEAD.size)
+    if len(head) < _HEAD.size:
+        return None
+    kind, length, checksum = _HEAD.unpack(head)
+    # A length that was damaged would ask for gigabytes of memory.
+    if kind not in (_CONNECTION, _DATA, _TEXT) or _HEAD.size + length > left:
+        return None
+    payload = file.read(length)
+    if len(payload) < length or zlib.crc32(payload, ord(kind)) != checksum:
+        return None
+    if kind == _DATA and length < _MESSAGE.size:
+        return None
+    if kind == _DATA:
+        channel, stamp = _MESSAGE.unpack_from(payload)
+        return Message(channel, stamp, payload[_MESSAGE.size :])
+    fields = json.loads(payload)
+    if kind == _TEXT:
+        return Text(**fields)
+    return Channel(**{**fields, 'qos': tuple(fields['qos'])})

@@ -1,0 +1,121 @@
+"""The lines that are drawn of a run over time: rows `[time, value]`, NaN where a line is broken."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from diffdrive_jacobian.bags.reading import Run, Series
+from diffdrive_jacobian.bags.trace import Array, Indices, Trace, seconds
+
+BUCKETS = 1500
+"""A longer line shows the least and the greatest of so many stretches."""
+_TWIST = {'v': 0, 'omega': 1}
+_WHEEL = {'right': 0, 'left': 1}
+_BODY = ('virtual_robot', 'go_to_goal')
+_LIMITS = {
+    'v': (_BODY, 'linear.x.max_velocity', 'linear.x.min_velocity'),
+    'omega': (_BODY, 'angular.z.max_velocity', 'angular.z.min_velocity'),
+    'right': (('virtual_robot', 'wheel_bridge'), 'max_wheel_velocity', ''),
+}
+"""Quantity to the nodes that limit it, and their parameters of the upper and the lower limit."""
+
+
+def measured(one: Trace, quantity: str) -> Array:
+    """Give what was measured, shape (m, 2); m may be 0."""
+    run = one.run
+    if quantity in _WHEEL:
+        values = np.column_stack([seconds(run, run.wheels), run.wheels.values[:, _WHEEL[quantity]]])
+        return line(values, np.flatnonzero(np.diff(values[:, 0]) < 0.0) + 1)
+    if quantity in _TWIST:
+        values = run.odometry.values[:, 3 + _TWIST[quantity]]
+        return line(np.column_stack([one.time, values]), one.breaks)
+    values = one.distance if quantity == 'distance' else one.heading_error
+    jumps = np.abs(np.diff(values)) > (np.pi if quantity == 'heading_error' else np.inf)
+    breaks = np.union1d(one.breaks, np.flatnonzero(jumps | (np.diff(one.goal) != 0)) + 1)
+    return line(np.column_stack([one.time, values]), breaks)
+
+
+def commanded(one: Trace, quantity: str) -> Array:
+    """Give what was asked for, each value until the next, shape (m, 2); m may be 0."""
+    run = one.run
+    if quantity in _WHEEL:
+        series, column = run.wheel_commands, _WHEEL[quantity]
+    elif quantity in _TWIST:
+        series, column = run.cmd_vel if len(run.cmd_vel) else run.cmd_vel_out, _TWIST[quantity]
+    else:
+        return np.empty((0, 2))
+    return _held(one, np.column_stack([seconds(run, series), series.values[:, column]]))
+
+
+def limits(one: Trace) -> dict[str, Array]:
+    """Give the narrowest limits that the nodes had, by quantity: the lower and the upper one, each a
+    line (s, and m/s or rad/s), shape (2, m, 2). NaN: none.
+    """
+    rows: dict[str, list[list[list[float]]]] = {name: [] for name in _LIMITS}
+    for time, run in _configurations(one.run):
+        for name, (nodes, upper, lower) in _LIMITS.items():
+            values = [run.of_node(node) for node in nodes]
+            most = [_number(one.get(upper)) for one in values]
+            least = [_number(one.get(lower)) for one in values]
+            least = [-high if np.isnan(low) else low for low, high in zip(least, most, strict=True)]
+            bounds = _tightest(max, least), _tightest(min, most)
+            rows[name].append([[time, bound] for bound in bounds])
+    found = {
+        name: np.array([_held(one, bound) for bound in np.swapaxes(np.array(values), 0, 1)])
+        for name, values in rows.items()
+    }
+    return {**found, 'left': found['right']}
+
+
+def _configurations(run: Run) -> Iterator[tuple[float, Run]]:
+    """Give the run with the parameters as they were, from when on (s)."""
+    yield 0.0, run
+    for received, node, values in run.parameter_events:
+        now = np.array([received])
+        time = seconds(run, Series(received=now, stamps=now, values=np.empty((1, 0))))
+        values = {**run.parameters.get(node, {}), **values}
+        run = replace(run, parameters={**run.parameters, node: values})
+        yield max(0.0, float(time[0])), run
+
+
+def _tightest(choose: Callable[[list[float]], float], bounds: list[float]) -> float:
+    return choose([bound for bound in bounds if not np.isnan(bound)] or [np.nan])
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, (int, float)) else np.nan
+
+
+def _held(one: Trace, rows: Array) -> Array:
+    """Hold the last value until the end."""
+    if len(rows):
+        rows = np.vstack([rows, [max(one.time[-1], rows[-1, 0]), rows[-1, 1]]])
+    return line(rows, np.array([], dtype=np.intp))
+
+
+def line(rows: Array, breaks: Indices) -> Array:
+    """Break a line before some of its rows, and thin it out: of a long one stays, of each stretch,
+    where each column is least and greatest.
+    """
+    rows = np.where(np.isfinite(rows), rows, np.nan)
+    rows = np.insert(rows, breaks, np.nan, axis=0)
+    count, width = rows.shape
+    if count <= 2 * width * BUCKETS:
+        return rows
+    holes = np.isnan(rows).any(axis=1)
+    gaps = np.flatnonzero(holes[1:] & ~holes[:-1]) + 1
+    # So many would leave nothing but dots.
+    keep = [np.array([0, count - 1]), gaps[: len(gaps) * (len(gaps) <= BUCKETS // 10)]]
+    size = -(-count // BUCKETS)
+    starts = np.arange(0, count, size)
+    for column in rows.T:
+        for sign in (1.0, -1.0):
+            # argmin is the first of equals: a hole counts as greatest.
+            padded = np.full(len(starts) * size, np.inf)
+            padded[:count] = np.where(np.isnan(column), np.inf, sign * column)
+            keep.append(starts + padded.reshape(-1, size).argmin(axis=1))
+    kept: Array = rows[np.unique(np.concatenate(keep))]
+    return kept if len(gaps) <= BUCKETS // 10 else kept[~np.isnan(kept).any(axis=1)]

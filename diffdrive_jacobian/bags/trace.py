@@ -1,0 +1,169 @@
+"""A run as numbers over time.
+
+Times are seconds since the first odometry, by its own stamps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from action_msgs.msg import GoalStatus
+from numpy.typing import NDArray
+
+from diffdrive_jacobian.bags.reading import BagError, Run, Series
+from diffdrive_jacobian.kinematics.se2 import wrap_angle
+from diffdrive_jacobian.nodes.parameters import GoToGoalParameters
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+_NEVER = int(np.iinfo(np.int64).max)
+TELEPORT = 0.1
+"""A shorter step of the odometry is taken for a motion, however sudden (m)."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Trace:
+    """What a run means, one value for each odometry message; arrays of shape (n,)."""
+
+    run: Run
+    time: Array
+    """Since the first of them (s)."""
+    breaks: Indices
+    """Where the odometry begins anew: no way leads there from the one before."""
+    goal: Indices
+    """Which of `run.goals` is driven to; -1: none."""
+    distance: Array
+    """To that goal (m); NaN: none."""
+    heading_error: Array
+    """From the heading to the direction of that goal (rad); NaN: none, or it is reached."""
+
+
+def trace(run: Run) -> Trace:
+    """Follow a run.
+
+    A goal counts from when it was recorded until the next one, unless it was refused, canceled or
+    aborted (`goal_status`). Of several waypoints the next one counts from the first odometry within
+    xy_goal_tolerance of go_to_goal (0.02 m if that was not recorded), as the node has it; if none is,
+    though the node says that it succeeded or nothing is known of it, from the closest approach.
+    A reached goal keeps its distance until the odometry begins anew, but has no direction.
+
+    Raises:
+        BagError: There is no odometry.
+    """
+    odometry = run.odometry
+    if not len(odometry):
+        raise BagError(
+            f'{run.path} has no odometry: no message on a topic odom of nav_msgs/msg/Odometry'
+        )
+    breaks = _breaks(run)
+    goal, reached = _progress(run, breaks)
+    x, y, theta = odometry.values[:, :3].T
+    targets = np.full((len(odometry), 2), np.nan)
+    targets[goal >= 0] = run.goals.values[goal[goal >= 0], :2]
+    dx, dy = targets[:, 0] - x, targets[:, 1] - y
+    return Trace(
+        run=run,
+        time=seconds(run, odometry),
+        breaks=breaks,
+        goal=goal,
+        distance=np.hypot(dx, dy),
+        heading_error=np.where(reached, np.nan, wrap_angle(np.arctan2(dy, dx) - theta)),
+    )
+
+
+def seconds(run: Run, series: Series) -> Array:
+    """Place messages on the time axis, shape (n,) (s).
+
+    Those without a stamp of their own count from when they were recorded, less the delay of the
+    odometry then: the recorder's clock may be another one than the robot's.
+    """
+    odometry = run.odometry
+    delay = np.interp(series.received, odometry.received, odometry.received - odometry.stamps)
+    stamps = np.where(
+        series.stamps == series.received,
+        series.received - np.rint(delay).astype(np.int64),
+        series.stamps,
+    )
+    return np.asarray((stamps - odometry.stamps[0]) / 1e9, dtype=np.float64)
+
+
+def _breaks(run: Run) -> Indices:
+    """Find where the odometry begins anew: after a start_pose, back in time, or by a teleport."""
+    stamps, values = run.odometry.stamps, run.odometry.values
+    dt, step = np.diff(stamps) / 1e9, np.hypot(*np.diff(values[:, :2], axis=0).T)
+    moving = (dt > 0.0) & (step > 0.0)
+    usual = np.median(step[moving] / dt[moving]) if moving.any() else 0.0
+    speed = np.abs(values[:, 3])
+    fastest = np.maximum(np.fmax(speed[:-1], speed[1:]), usual)
+    anew = (dt < 0.0) | (step > np.fmax(TELEPORT, 3.0 * fastest * dt))
+    for stamp, pose in zip(run.start_pose.stamps, run.start_pose.values, strict=True):
+        first = int(np.searchsorted(stamps, stamp))
+        if first < len(stamps) and stamps[first] == stamp:
+            # Of the same instant, but from before.
+            first += not np.allclose(values[first, :2], pose[:2], rtol=0.0, atol=1e-9)
+        if 0 < first < len(stamps):
+            anew[first - 1] = True
+    return np.flatnonzero(anew) + 1
+
+
+def _progress(run: Run, breaks: Indices) -> tuple[Indices, NDArray[np.bool_]]:
+    """Say of each odometry which goal it is on the way to, -1 for none, and whether that is reached."""
+    seen, places = run.odometry.received, run.odometry.values[:, :2]
+    goal, reached = np.full(len(seen), -1), np.zeros(len(seen), dtype=bool)
+    known = len(run.goal_status) > 0 or bool(run.of_node('go_to_goal'))
+    routes = _routes(run)
+    for index, route in enumerate(routes):
+        begun = run.goals.received[route.start]
+        until = run.goals.received[routes[index + 1].start] if index + 1 < len(routes) else _NEVER
+        states, instants = _statuses(run, begun, until)
+        here, end = np.searchsorted(seen, [begun, until]).tolist()
+        stop = end
+        if len(states) and states[-1] in (GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED):
+            stop = min(stop, int(np.searchsorted(seen, instants[-1], side='right')))
+        succeeded = instants[states == GoalStatus.STATUS_SUCCEEDED]
+        for target in route:
+            goal[here:stop] = target
+            distance = np.hypot(*(places[here:stop] - run.goals.values[target, :2]).T)
+            within = np.flatnonzero(distance <= tolerance(run) + 1e-12)
+            if len(within):
+                here += int(within[0])
+            elif target == route[-1] and len(succeeded):
+                here = max(here, int(np.searchsorted(seen, succeeded[-1])))
+            elif target != route[-1] and len(distance) and (len(succeeded) or not known):
+                here += int(np.argmin(distance))
+            else:
+                break
+        else:
+            stop = min([stop, *breaks[breaks > here]])
+            goal[stop:end], reached[here:stop] = -1, True
+    return goal, reached
+
+
+def _routes(run: Run) -> list[range]:
+    """Find which goals came in one message; those that the node refused are left out."""
+    goals = run.goals
+    together = (np.diff(goals.received) == 0) & (np.diff(goals.stamps) == 0)
+    edges = [0, *(np.flatnonzero(~together) + 1).tolist(), len(goals)]
+    routes = [range(*pair) for pair in pairwise(edges) if len(range(*pair))]
+    accepted = []
+    for index, route in enumerate(routes):
+        until = goals.received[route.stop] if index + 1 < len(routes) else _NEVER
+        states, _ = _statuses(run, goals.received[route.start], until)
+        if not len(states) or states[0] != GoalStatus.STATUS_ABORTED:
+            accepted.append(route)
+    return accepted
+
+
+def _statuses(run: Run, begin: int, end: int) -> tuple[Array, NDArray[np.int64]]:
+    """Give what was told from `begin` until before `end` (ns), and when."""
+    first, last = np.searchsorted(run.goal_status.received, [begin, end])
+    return run.goal_status.values[first:last, 0], run.goal_status.received[first:last]
+
+
+def tolerance(run: Run) -> float:
+    """Give the distance from a goal that counts as arrived (m)."""
+    default = GoToGoalParameters().xy_goal_tolerance
+    return float(run.of_node('go_to_goal').get('xy_goal_tolerance', default))

@@ -1,0 +1,227 @@
+"""Whether a robot still moves as it did: a recorded run, driven again, beside its odometry.
+
+What was commanded is driven again through `simulation.Robot`, as in the node `virtual_robot`, and each
+odometry message is held against where that robot is at the message's stamp. `cmd_vel_out` tells each
+command as it was applied, limits and timeout included, with the instant it took effect, so that nothing
+else need be known. Without it the commands are taken by the time of their recording, through the limits
+and the timeout of the parameters.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffdrive_jacobian.bags.reading import BagError, Run, Series
+from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
+from diffdrive_jacobian.kinematics.se2 import wrap_angle
+from diffdrive_jacobian.nodes.parameters import VirtualRobotParameters
+from diffdrive_jacobian.ros.parameters import from_ros
+from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot, RobotModel
+
+ROBOT = 'virtual_robot'
+EXACT, BY_RECORDING_TIME = 1e-9, 0.02
+"""Differences that are allowed if nothing else is said, by how well the commands are known (m, rad)."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Verification:
+    """How far odometry and the robot driven again are apart, at each of n odometry messages."""
+
+    source: str
+    """The topic from which the commands were taken."""
+    start: str
+    """Where the robot driven again began: `start_pose` or `odometry`."""
+    seconds: NDArray[np.float64]
+    """Stamps of the odometry messages, since the first one of the run, shape (n,) (s)."""
+    distances: NDArray[np.float64]
+    """Differences of the position, shape (n,) (m)."""
+    headings: NDArray[np.float64]
+    """Differences of the heading, not negative, shape (n,) (rad)."""
+
+    @property
+    def allowed(self) -> float:
+        """The difference that is allowed if nothing else is said (m, rad)."""
+        return EXACT if self.source == 'cmd_vel_out' else BY_RECORDING_TIME
+
+    def holds(self, tolerance: float, yaw_tolerance: float) -> bool:
+        """Say whether no difference is larger than allowed (m, rad)."""
+        return bool(np.all(self.distances <= tolerance) and np.all(self.headings <= yaw_tolerance))
+
+
+@dataclass(frozen=True, slots=True)
+class _Anchor:
+    """The robot after an event, and when that was recorded (ns)."""
+
+    robot: Robot
+    received: int
+
+
+def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verification:
+    """Drive a run again.
+
+    Args:
+        run: What was recorded.
+        parameters: Of the robot, by their ROS names; else those that were recorded with the run. They
+            matter only where `cmd_vel_out` was not recorded.
+
+    Raises:
+        BagError: There is no odometry, or nothing that tells what was commanded.
+        ParameterError: The parameters are not those of the robot.
+    """
+    if not len(run.odometry):
+        raise BagError(f'{run.path} has no odometry: record the topic odom')
+    if len(run.cmd_vel_out):
+        source, start, anchors = 'cmd_vel_out', *_applied(run)
+    else:
+        source, start, anchors = _commanded(run, parameters)
+    stamps, values = run.odometry.stamps, run.odometry.values
+    seconds, poses = [], []
+    measured = []
+    epochs = _epochs(run.odometry)
+    for index, epoch in enumerate(epochs):
+        robot = _nearest(anchors[epoch] if epoch < len(anchors) else [], run.odometry, index)
+        if robot is not None:
+            seconds.append((stamps[index] - stamps[0]) / NANOSECONDS)
+            poses.append(robot.pose)
+            measured.append(values[index, :3])
+    if not poses:
+        raise BagError(f'{run.path} has no odometry after the first command')
+    difference = np.array(measured) - np.array(poses)
+    return Verification(
+        source=source,
+        start=start,
+        seconds=np.array(seconds),
+        distances=np.hypot(difference[:, 0], difference[:, 1]),
+        headings=np.abs(wrap_angle(difference[:, 2])),
+    )
+
+
+def _epochs(series: Series) -> list[int]:
+    """Count for each message how often time went back before it."""
+    back = np.diff(series.stamps) < 0
+    return [0, *np.cumsum(back).astype(int).tolist()]
+
+
+def _nearest(anchors: list[_Anchor], odometry: Series, index: int) -> Robot | None:
+    """Give the robot at the stamp of an odometry message; None if it begins later.
+
+    A command that took effect before that stamp, but was recorded no sooner than the message, may have
+    come late, so that the robot did not know of it yet; or it was the recorder that got it later. What
+    was published first is not known then, and the nearer one counts.
+    """
+    stamp, received = int(odometry.stamps[index]), int(odometry.received[index])
+    last = bisect_right(anchors, stamp, key=lambda anchor: anchor.robot.stamp) - 1
+    if last < 0:
+        return None
+    robot = anchors[last].robot.at(stamp)
+    known = last
+    while known > 0 and anchors[known].received >= received:
+        known -= 1
+    if known == last:
+        return robot
+    candidates = [robot, *(anchors[one].robot.at(stamp) for one in range(known, last))]
+
+    def apart(candidate: Robot) -> float:
+        dx, dy, turn = (odometry.values[index, :3] - candidate.pose).tolist()
+        return math.hypot(dx, dy) + abs(float(wrap_angle(turn)))
+
+    return min(candidates, key=apart)
+
+
+def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
+    """Follow `cmd_vel_out` and `start_pose`, an epoch of time after the other."""
+    first = _beginning(run)
+    starts = run.start_pose
+    whole = len(starts) > 0 and int(starts.stamps[0]) >= first.stamp - _period(run)
+    # Else the first one is latched, from before the recording.
+    skipped = 0 if whole else 1
+    events: list[tuple[int, int, bool, NDArray[np.float64]]] = []
+    for is_start, series, begin in ((True, starts, skipped), (False, run.cmd_vel_out, 0)):
+        rows = zip(series.received.tolist(), series.stamps.tolist(), series.values, strict=True)
+        events += [(received, stamp, is_start, row) for received, stamp, row in list(rows)[begin:]]
+    events.sort(key=lambda event: event[0])
+    epochs: list[list[_Anchor]] = [[] if whole else [_Anchor(first, int(run.odometry.received[0]))]]
+    for received, stamp, is_start, row in events:
+        latest = epochs[-1][-1].robot if epochs[-1] else None
+        if is_start and (latest is None or stamp < latest.stamp):
+            if latest is not None:
+                epochs.append([])
+            robot = Robot(model=RobotModel(), stamp=stamp, pose=row)
+        elif latest is None or stamp < latest.stamp:
+            # From before the recording, or from before time went back.
+            continue
+        elif is_start:
+            robot = latest.placed(row, latest.covariance, stamp)
+        else:
+            robot = latest.commanded((float(row[0]), float(row[1])), stamp)
+        epochs[-1].append(_Anchor(robot, received))
+    return ('start_pose' if whole else 'odometry'), epochs
+
+
+def _beginning(run: Run) -> Robot:
+    """Give the robot as the first odometry message tells it, its twist included."""
+    x, y, theta, v, omega = run.odometry.values[0].tolist()
+    robot = Robot(model=RobotModel(), stamp=int(run.odometry.stamps[0]), pose=np.array([x, y, theta]))
+    return robot.commanded((v, omega), robot.stamp)
+
+
+def _period(run: Run) -> int:
+    """Give the odometry's period, and half as much again for a timer that was late (ns)."""
+    gaps = np.diff(run.odometry.stamps)
+    return int(np.median(gaps) * 1.5) if len(gaps) else 0
+
+
+def _commanded(run: Run, given: Mapping[str, Any] | None) -> tuple[str, str, list[list[_Anchor]]]:
+    """Follow `cmd_vel`, or `joint_command` of a robot that is driven by its wheels."""
+    values = dict(given if given is not None else run.of_node(ROBOT))
+    parameters = from_ros(VirtualRobotParameters, values)
+    source, series = 'cmd_vel', run.cmd_vel
+    if parameters.command_interface == 'wheels':
+        source, series = 'joint_command', run.wheel_commands
+    if not len(series):
+        raise BagError(f'{run.path} tells of no commands: record cmd_vel_out, or {source}')
+    events: list[tuple[int, Any]] = list(zip(series.received.tolist(), series.values, strict=True))
+    events += [
+        (received, changes)
+        for received, node, changes in run.parameter_events
+        if node.split('/')[-1] == ROBOT
+    ]
+    events.sort(key=lambda event: event[0])
+    before = max(int(np.searchsorted(run.odometry.stamps, int(series.received[0]))) - 1, 0)
+    x, y, theta = run.odometry.values[before, :3]
+    robot = Robot(
+        model=parameters.model(),
+        stamp=int(run.odometry.stamps[before]),
+        pose=np.array([x, y, theta]),
+    )
+    anchors = [_Anchor(robot, int(run.odometry.received[before]))]
+    for received, event in events:
+        if received < robot.stamp:
+            continue
+        if isinstance(event, dict):
+            values.update(event)
+            parameters = from_ros(VirtualRobotParameters, values)
+            robot = robot.remodelled(
+                parameters.model(), received, wheels_commanded=source == 'joint_command'
+            )
+        else:
+            robot = robot.commanded(_twist(parameters, source, event), received)
+        anchors.append(_Anchor(robot, received))
+    return source, 'odometry', [anchors]
+
+
+def _twist(
+    parameters: VirtualRobotParameters, source: str, values: NDArray[np.float64]
+) -> tuple[float, float]:
+    first, second = (float(value) for value in values)
+    if source == 'cmd_vel':
+        return first, second
+    v, omega = wheel_to_body(first, second, parameters.wheel_radius, parameters.wheel_separation)
+    return float(v), float(omega)

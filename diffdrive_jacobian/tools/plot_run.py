@@ -1,0 +1,236 @@
+"""Draw recorded runs, and export their numbers."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffdrive_jacobian.bags.figure import FORMATS, create, draw, names
+from diffdrive_jacobian.bags.reading import BagError, Run, Series, read_run
+from diffdrive_jacobian.bags.trace import Trace, seconds, trace
+from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.tools import _cli
+
+PROGRAM = 'plot_run'
+TOPICS = (
+    'odom',
+    'cmd_vel',
+    'cmd_vel_out',
+    'start_pose',
+    'goal_pose',
+    'goals',
+    'goal_status',
+    'joint_command',
+    'joint_states',
+    'parameter_events',
+)
+"""What can be told by --topic to have another name in the bag."""
+COLUMNS = (
+    *('time_s', 'x_m', 'y_m', 'theta_rad', 'v_mps', 'omega_radps'),
+    *('distance_m', 'heading_error_rad', 'v_command_mps', 'omega_command_radps'),
+    *('omega_right_radps', 'omega_left_radps'),
+)
+"""Of a CSV file."""
+
+
+class UsageError(Exception):
+    """The files that were named cannot be meant."""
+
+
+def table(run: Run) -> NDArray[np.float64]:
+    """Give a run as numbers, one row for each odometry message, `COLUMNS`; NaN: not known.
+
+    Time counts from the first odometry. The command is the last one until then, as it was applied
+    (`cmd_vel_out`) or else as it was sent (`cmd_vel`); the wheel speeds of `joint_states` are
+    interpolated linearly between its messages.
+
+    Raises:
+        BagError: There is no odometry.
+    """
+    one = trace(run)
+    commands = run.cmd_vel_out if len(run.cmd_vel_out) else run.cmd_vel
+    return np.column_stack(
+        [
+            one.time,
+            run.odometry.values,
+            one.distance,
+            one.heading_error,
+            _held(one, commands),
+            _interpolated(one, run.wheels),
+        ]
+    )
+
+
+def _held(one: Trace, series: Series) -> NDArray[np.float64]:
+    """Give the last value until each odometry, NaN before the first, shape (n, 2)."""
+    at, known = _clocks(one, series)
+    last = np.searchsorted(known, at, side='right')
+    return np.vstack([np.full((1, 2), np.nan), series.values])[last]
+
+
+def _interpolated(one: Trace, series: Series) -> NDArray[np.float64]:
+    """Give the value at each odometry, NaN before the first and after the last, shape (n, 2)."""
+    at, known = _clocks(one, series)
+    if not len(series):
+        return np.full((len(at), 2), np.nan)
+    columns = [np.interp(at, known, values, np.nan, np.nan) for values in series.values.T]
+    return np.column_stack(columns)
+
+
+def _clocks(one: Trace, series: Series) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Give two times that can be compared and do not go back: of the odometry and of a series (s)."""
+    times = one.time, seconds(one.run, series)
+    if all((np.diff(time) >= 0.0).all() for time in times):
+        return times
+    begin = one.run.odometry.received[0]
+    return (one.run.odometry.received - begin) / 1e9, (series.received - begin) / 1e9
+
+
+def write_csv(run: Run, path: Path) -> None:
+    """Write a run into a new CSV file with a header line; what is not known stays empty.
+
+    Raises:
+        BagError: The run has no odometry.
+        FileExistsError: The file exists; it stays as it is.
+        OSError: It cannot be written; nothing is left of it.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator='\n')
+    writer.writerow(COLUMNS)
+    for row in table(run).tolist():
+        writer.writerow(['' if value != value else repr(value) for value in row])
+    create(path, text.getvalue().encode())
+
+
+def main(arguments: Sequence[str], signals: Signals) -> int:
+    """Run the tool; gives the exit code."""
+    options = _parser().parse_args(arguments)
+    bags = [Path(bag) for bag in options.bags]
+    try:
+        if len({bag.resolve() for bag in bags}) < len(bags):
+            raise UsageError(f'each bag can be given once, got {" ".join(map(str, bags))}')
+        picture = _picture(options.output, bags)
+        tables = [] if options.csv is None else _tables(options.csv, bags)
+        runs: list[Run] = []
+        for bag in bags:
+            runs.append(read_run(bag, dict(options.topics)))
+            # Before the others are read, which takes a while.
+            trace(runs[-1])
+            if signals.count:
+                return _interrupted()
+        return _write(runs, picture, tables, signals)
+    except (BagError, UsageError) as error:
+        return _cli.complain(PROGRAM, error)
+    except ModuleNotFoundError as error:
+        if (error.name or '').split('.')[0] != 'matplotlib':
+            raise
+        return _cli.complain(
+            PROGRAM, "matplotlib is not installed: pip install 'diffdrive_jacobian[plot]'"
+        )
+
+
+def _write(runs: Sequence[Run], picture: Path, tables: Sequence[Path], signals: Signals) -> int:
+    """Write what was asked for, the picture first; gives the exit code."""
+    path = picture
+    try:
+        draw(runs, picture)
+        print(picture)
+        for run, path in zip(runs, tables, strict=bool(tables)):
+            if signals.count:
+                return _interrupted()
+            path.parent.mkdir(exist_ok=True)
+            write_csv(run, path)
+            print(path)
+    except OSError as error:
+        print(f'{PROGRAM}: error: {path} cannot be written: {error.strerror or error}', file=sys.stderr)
+        return _cli.FAILED
+    return _cli.DONE
+
+
+def _interrupted() -> int:
+    print(f'{PROGRAM}: interrupted', file=sys.stderr)
+    return _cli.INTERRUPTED
+
+
+def _picture(output: str | None, bags: Sequence[Path]) -> Path:
+    """Say which file is to be drawn: without a name, it lies beside the first bag.
+
+    Raises:
+        UsageError: It cannot be.
+    """
+    name = '_and_'.join(bag.resolve().name for bag in bags)
+    path = bags[0].resolve().parent / f'{name}.png' if output is None else Path(output)
+    if path.suffix.lower().removeprefix('.') not in FORMATS:
+        raise UsageError(f'the picture must end in .{", .".join(FORMATS)}, got {output!r}')
+    return _new(path)
+
+
+def _tables(output: str, bags: Sequence[Path]) -> list[Path]:
+    """Say into which files the numbers go, one for each run.
+
+    Raises:
+        UsageError: They cannot be.
+    """
+    path = Path(output)
+    if path.is_dir() or output.endswith('/') or path.suffix.lower() != '.csv':
+        if path.exists() and not path.is_dir():
+            raise UsageError(f'{path} exists already; a file for the numbers ends in .csv')
+        labels = (name.replace('/', '_') for name in names(bags))
+        return [_new(path / f'{label}.csv') for label in labels]
+    if len(bags) > 1:
+        raise UsageError(f'the numbers of {len(bags)} runs need a directory, got {output!r}')
+    return [_new(path)]
+
+
+def _new(path: Path) -> Path:
+    if path.exists() or path.is_symlink():
+        raise UsageError(f'{path} exists already; it is not overwritten')
+    return path
+
+
+def _topic(text: str) -> tuple[str, str]:
+    name, separator, topic = text.partition('=')
+    if name not in TOPICS or not separator or not topic:
+        raise argparse.ArgumentTypeError(
+            f'must be NAME=TOPIC with NAME one of {", ".join(TOPICS)}, got {text!r}'
+        )
+    return name, topic if topic.startswith('/') else f'/{topic}'
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM,
+        description='Draw runs that record_run or ros2 bag record has written: the path with its goals, '
+        'and over time the distance, the heading error, the speeds and their limits; several over each '
+        'other. No file is ever overwritten. Exit code 0: drawn; 1: it cannot be written; 2: wrong '
+        'arguments, or no such run; 130: interrupted.',
+    )
+    parser.add_argument('bags', metavar='BAG', nargs='+', help='the directory of a bag')
+    parser.add_argument(
+        '-o',
+        '--output',
+        metavar='FILE',
+        help=f'the picture, .{", .".join(FORMATS)}; else BAG.png beside the bag',
+    )
+    parser.add_argument(
+        '--csv',
+        metavar='FILE_OR_DIR',
+        help='write the numbers, too: FILE.csv, or in the directory BAG.csv for each bag',
+    )
+    parser.add_argument(
+        '--topic',
+        dest='topics',
+        metavar='NAME=TOPIC',
+        action='append',
+        type=_topic,
+        default=[],
+        help='a topic that has another name in the bag, as odom=/robot1/odometry; may be repeated',
+    )
+    return parser

@@ -1,0 +1,37 @@
+"""Runs recorded in lockstep, for the tests of bags."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+
+from diffdrive_jacobian.bags import read_run
+from diffdrive_jacobian.bags.recorder import Recorder, Selection
+from diffdrive_jacobian.bags.recording import Recording
+
+
+class LockstepRecording:
+    """Records what is said in a world from its making on."""
+
+    def __init__(self, world, path, storage='mcap', **selection):
+        self.world = world
+        self.recording = Recording(path, storage)
+        self.recorder = world.add(Recorder(Selection(**selection), self.recording.journal))
+
+    def look(self):
+        """Find what is new; what was published before is lost, unless it is latched."""
+        self.recorder.look()
+        self.world.settle()
+
+    def finish(self):
+        """Make the bag; gives it read."""
+        self.summary = self.recording.finish()
+        return read_run(self.recording.bag)
+
+
+@contextmanager
+def recorded(world, path, **kwargs):
+    """Record what the nodes of a world do within the block; the run is the `run` of what it gives."""
+    made = LockstepRecording(world, path, **kwargs)
+    made.look()
+    yield made
+    made.run = made.finish()

@@ -1,0 +1,589 @@
+"""The tool plot_run: the picture shows the run's numbers, the CSV holds them, mistakes are told."""
+
+from __future__ import annotations
+
+import csv
+import math
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ros_messages import goal, goals, joint_command, twist, twist_stamped
+from test_reading import REAL, SECOND, changed, odom, start, status, write_bag
+
+from diffdrive_jacobian.bags import figure as _figure
+from diffdrive_jacobian.bags import lines as _lines
+from diffdrive_jacobian.bags import trace as _trace
+from diffdrive_jacobian.bags.figure import LABELS, figure, names
+from diffdrive_jacobian.bags.lines import limits, line
+from diffdrive_jacobian.bags.reading import BagError, read_run
+from diffdrive_jacobian.bags.trace import trace
+from diffdrive_jacobian.kinematics.se2 import integrate, wrap_angle
+from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.tools.plot_run import COLUMNS, main
+
+RATE = 50
+PARAMETERS = {
+    '/virtual_robot': {
+        'linear.x.max_velocity': 0.22,
+        'linear.x.min_velocity': -0.1,
+        'angular.z.max_velocity': math.nan,
+        'angular.z.min_velocity': math.nan,
+        'max_wheel_velocity': 6.67,
+    },
+    '/go_to_goal': {'xy_goal_tolerance': 0.05, 'angular.z.max_velocity': 1.0},
+    '/wheel_bridge': {'max_wheel_velocity': 9.0},
+}
+"""Nodes that limit each other's speeds."""
+
+
+def drive(count=200, v=0.5, omega=0.5, begin=10.0, delay=0.0):
+    """Drive an arc; what the robot says is recorded with a delay (s)."""
+    pose = np.zeros(3)
+    for index in range(count):
+        at = begin + index / RATE
+        yield at + delay, '/odom', odom(*pose, v, omega, seconds=at)
+        yield at + delay, '/joint_states', joint_command(index, -index, round(at * SECOND))
+        pose = integrate(pose, (v, omega), 1 / RATE)
+
+
+def sample(extra=(), **how):
+    return sorted([*drive(**how), *extra], key=lambda one: one[0])
+
+
+@pytest.fixture
+def bag(tmp_path):
+    """A run with a goal, commands and limits."""
+    extra = [
+        (10.5, '/goal_pose', goal(1.0, 0.5)),
+        (10.5, '/cmd_vel', twist(0.5, 0.5)),
+        (12.0, '/cmd_vel', twist(0.25, 1.5)),
+        (12.0, '/joint_command', joint_command(1, 2)),
+    ]
+    return write_bag(tmp_path / 'bag', sample(extra), parameters=PARAMETERS)
+
+
+def run_of(tmp_path, extra=(), *, parameters=None, **how):
+    return read_run(write_bag(tmp_path / 'run', sample(extra, **how), parameters=parameters))
+
+
+def plot(*arguments):
+    return main([str(one) for one in arguments], Signals())
+
+
+def refuses(capsys, code, *words):
+    """Hold that it said in one line what is wrong, and nothing else."""
+    out, err = capsys.readouterr()
+    assert out == ''
+    last = err.splitlines()[-1]
+    assert last.startswith('plot_run: error: ')
+    assert all(word in last for word in words), last
+    assert 'Traceback' not in err
+    assert code in (1, 2)
+    return err
+
+
+def by_label(made):
+    return {one.get_ylabel(): one for one in made.axes if one.get_ylabel()}
+
+
+def drawn(axes, color=_figure.COLORS[0]):
+    """Give the points of the lines of a colour, without their holes."""
+    rows = [np.column_stack(one.get_data()) for one in axes.lines if one.get_color() == color]
+    rows = np.vstack([one for one in rows if len(one) > 1])
+    return rows[~np.isnan(rows).any(axis=1)]
+
+
+# --- Files
+
+
+@pytest.mark.parametrize(
+    ('ending', 'magic'),
+    [('png', b'\x89PNG\r\n'), ('svg', b'<?xml'), ('pdf', b'%PDF-'), ('PNG', b'\x89PNG')],
+)
+def test_the_picture_is_of_the_format_of_its_ending(bag, tmp_path, capsys, ending, magic):
+    picture = tmp_path / f'picture.{ending}'
+    assert plot(bag, '-o', picture) == 0
+    assert picture.read_bytes().startswith(magic)
+    assert capsys.readouterr() == (f'{picture}\n', '')
+
+
+def test_the_picture_lies_beside_the_bag(bag, tmp_path, monkeypatch):
+    monkeypatch.chdir(bag)
+    assert plot('.') == 0
+    assert (tmp_path / 'bag.png').stat().st_size > 10_000
+
+
+def test_two_runs_lie_in_one_picture(bag, tmp_path):
+    other = write_bag(tmp_path / 'other', sample(v=0.2))
+    assert plot(bag, other) == 0
+    assert (tmp_path / 'bag_and_other.png').exists()
+
+
+def test_no_display_is_needed(bag, tmp_path, monkeypatch):
+    monkeypatch.delenv('DISPLAY', raising=False)
+    monkeypatch.setenv('MPLBACKEND', 'tkagg')
+    assert plot(bag, '-o', tmp_path / 'a.png') == 0
+    assert 'matplotlib.pyplot' not in sys.modules
+
+
+@pytest.mark.parametrize('name', ['_hidden', 'cost $5', '$x^$', 'läuft 走行', 'a' * 200])
+def test_a_bag_may_have_any_name(bag, tmp_path, capsys, name):
+    assert plot(bag.rename(tmp_path / name), '-o', tmp_path / 'a.png') == 0
+    assert capsys.readouterr().err == ''
+
+
+def test_the_users_style_does_not_matter(bag):
+    import matplotlib
+
+    with matplotlib.rc_context({'figure.figsize': (1, 1), 'text.usetex': True, 'axes.grid': False}):
+        made = figure([read_run(bag)])
+        assert matplotlib.rcParams['text.usetex'] is True
+    assert made.get_size_inches().tolist() == [11.0, 7.0]
+
+
+# --- What is in the picture
+
+
+def test_the_axes_show_the_run_with_units(bag):
+    run = read_run(bag)
+    made = figure([run])
+    plane, axes = made.axes[0], by_label(made)
+    assert plane.get_aspect() == 1.0
+    assert (plane.get_xlabel(), plane.get_ylabel()) == ('x [m]', 'y [m]')
+    assert set(axes) == {'y [m]', *LABELS.values()}
+    assert {one.get_xlabel() for one in axes.values()} == {'x [m]', 'time [s]', ''}
+    assert drawn(plane)[: len(run.odometry)] == pytest.approx(run.odometry.values[:, :2], abs=0.0)
+    time = np.arange(200) / RATE
+    for quantity, column in (('v', 3), ('omega', 4)):
+        values = np.column_stack([time, run.odometry.values[:, column]])
+        assert drawn(axes[LABELS[quantity]]) == pytest.approx(values, abs=1e-9)
+    wheels = drawn(axes[LABELS['right']])
+    assert wheels == pytest.approx(np.column_stack([time, run.wheels.values[:, 0]]), abs=1e-9)
+    x, y, theta = run.odometry.values[25:, :3].T
+    distance = drawn(axes[LABELS['distance']])
+    assert distance[:, 1] == pytest.approx(np.hypot(1.0 - x, 0.5 - y), abs=1e-12)
+    error = wrap_angle(np.arctan2(0.5 - y, 1.0 - x) - theta)
+    reached = np.flatnonzero(np.hypot(1.0 - x, 0.5 - y) <= 0.05)
+    until = reached[0] if len(reached) else len(x)
+    shown = drawn(axes[LABELS['heading_error']])
+    assert shown[:, 1] == pytest.approx(error[:until], abs=1e-12)
+
+
+def test_everything_drawn_lies_inside_the_picture(bag):
+    run = read_run(bag)
+    made = figure([run, replace(run, path=Path('second'))])
+    made.savefig('/dev/null', format='png')
+    width, height = made.get_size_inches() * made.dpi
+    for axes in made.axes:
+        box = axes.get_tightbbox()
+        assert box.x0 >= 0.0
+        assert box.y0 >= 0.0
+        assert box.x1 <= width
+        assert box.y1 <= height
+
+
+def test_runs_differ_by_colour_and_by_style(bag):
+    run = read_run(bag)
+    made = figure([replace(run, path=Path(name)) for name in 'abcde'])
+    plane = made.axes[0]
+    labelled = [one for one in plane.lines if not one.get_label().startswith('_')]
+    assert [one.get_label()[:2] for one in labelled] == ['a:', 'b:', 'c:', 'd:', 'e:']
+    assert len({one.get_color() for one in labelled}) == 5
+    dashes = {str(one._dash_pattern) for one in labelled}
+    assert len(dashes) == 5
+    # One for each run, zero, and two limits for each.
+    assert len(by_label(made)[LABELS['v']].lines) == 5 + 5 + 2 * 5
+
+
+def test_only_a_single_run_shows_its_commands(bag):
+    run = read_run(bag)
+
+    def lines(made):
+        axes = by_label(made)[LABELS['v']]
+        return [one for one in axes.lines if one.get_color() == _figure.COMMAND]
+
+    (commanded,) = lines(figure([run]))
+    assert commanded.get_drawstyle() == 'steps-post'
+    values = [[0.5, 0.5], [2.0, 0.25], [199 / RATE, 0.25]]
+    assert np.column_stack(commanded.get_data()) == pytest.approx(np.array(values), abs=1e-9)
+    assert lines(figure([run, replace(run, path=Path('b'))])) == []
+
+
+def test_without_goals_and_wheels_their_axes_are_left_out(tmp_path):
+    sent = [one for one in sample() if one[1] == '/odom']
+    made = figure([read_run(write_bag(tmp_path / 'bag', sent))])
+    assert set(by_label(made)) == {'y [m]', LABELS['v'], LABELS['omega']}
+
+
+@pytest.mark.parametrize('count', [1, 2])
+def test_a_robot_that_stands_is_drawn(tmp_path, count):
+    made = figure([run_of(tmp_path, count=count, v=0.0, omega=0.0)])
+    low, high = made.axes[0].get_xlim()
+    assert 0.4 < high - low < 5.0
+
+
+# --- Limits
+
+
+def test_limits_are_the_narrowest_of_the_nodes(bag):
+    found = {name: bounds[:, 0, 1].tolist() for name, bounds in limits(trace(read_run(bag))).items()}
+    assert found == {
+        'v': [-0.1, 0.22],
+        'omega': [-1.0, 1.0],
+        'right': [-6.67, 6.67],
+        'left': [-6.67, 6.67],
+    }
+
+
+def test_limits_that_are_not_known_are_not_drawn(tmp_path):
+    run = run_of(tmp_path, parameters={'/virtual_robot': {'max_wheel_velocity': math.nan}})
+    assert all(np.isnan(bounds[..., 1]).all() for bounds in limits(trace(run)).values())
+    assert len(by_label(figure([run]))[LABELS['v']].lines) == 1 + 1 + 1 + 2
+
+
+def test_a_limit_holds_from_when_it_was_set(tmp_path):
+    change = (11.0, '/parameter_events', changed('/virtual_robot', 'max_wheel_velocity', 3.0))
+    run = run_of(tmp_path, [change], parameters=PARAMETERS)
+    upper = limits(trace(run))['right'][1]
+    assert upper == pytest.approx(np.array([[0.0, 6.67], [1.0, 3.0], [199 / RATE, 3.0]]), abs=1e-9)
+
+
+# --- Which goal counts
+
+
+def goals_of(run):
+    """Give `(time, goal)` whenever the goal changes."""
+    one = trace(run)
+    changes = [0, *(np.flatnonzero(np.diff(one.goal)) + 1).tolist()]
+    return [(round(float(one.time[index]), 6), int(one.goal[index])) for index in changes]
+
+
+STRAIGHT = {'omega': 0.0, 'v': 0.5}
+"""At time t at x = t / 2."""
+
+
+def test_a_goal_counts_from_when_it_came_until_the_next(tmp_path):
+    extra = [(11.0, '/goal_pose', goal(5, 0)), (12.0, '/goal_pose', goal(5, 1))]
+    run = run_of(tmp_path, extra, **STRAIGHT)
+    assert goals_of(run) == [(0.0, -1), (1.0, 0), (2.0, 1)]
+    assert np.isnan(trace(run).distance[:50]).all()
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'tolerance'),
+    [(None, 0.02), ({'/go_to_goal': {'xy_goal_tolerance': 0.1}}, 0.1)],
+)
+def test_the_next_waypoint_counts_from_within_the_tolerance(tmp_path, parameters, tolerance):
+    way = (10.0, '/goals', goals(goal(0.5, 0), goal(1.0, 0), goal(1.5, 0)))
+    run = run_of(tmp_path, [way], parameters=parameters, **STRAIGHT)
+    times = [round((x - tolerance) / 0.5, 6) for x in (0.5, 1.0, 1.5)]
+    assert goals_of(run) == [(0.0, 0), (times[0], 1), (times[1], 2)]
+    one = trace(run)
+    reached = np.flatnonzero(np.isnan(one.heading_error))
+    assert one.time[reached[0]] == pytest.approx(times[2])
+    assert not np.isnan(one.distance).any()
+
+
+def test_a_waypoint_that_was_missed_is_passed_at_the_closest_approach(tmp_path):
+    way = (10.0, '/goals', goals(goal(0.5, 0.3), goal(1.0, 0)))
+    assert goals_of(run_of(tmp_path, [way], **STRAIGHT)) == [(0.0, 0), (1.0, 1)]
+
+
+def test_a_waypoint_that_the_node_did_not_reach_stays(tmp_path):
+    way = (10.0, '/goals', goals(goal(0.5, 0.3), goal(1.0, 0)))
+    run = run_of(tmp_path, [way, (10.0, '/goal_status', status(2))], **STRAIGHT)
+    assert goals_of(run) == [(0.0, 0)]
+
+
+@pytest.mark.parametrize('value', [5, 6])
+def test_a_canceled_goal_counts_no_more(tmp_path, value):
+    extra = [
+        (11.0, '/goal_pose', goal(5, 0)),
+        (11.0, '/goal_status', status(2)),
+        (11.99, '/goal_status', status(value)),
+    ]
+    assert goals_of(run_of(tmp_path, extra, **STRAIGHT)) == [(0.0, -1), (1.0, 0), (2.0, -1)]
+
+
+def test_a_refused_goal_never_counts(tmp_path):
+    extra = [
+        (10.0, '/goal_pose', goal(5, 0)),
+        (10.01, '/goal_status', status(2)),
+        (11.0, '/goal_pose', goal(7, 0)),
+        (11.01, '/goal_status', status(6)),
+        (11.02, '/goal_status', status(2)),
+    ]
+    assert goals_of(run_of(tmp_path, extra, **STRAIGHT)) == [(0.0, 0)]
+
+
+def test_a_goal_that_was_replaced_is_followed_by_the_next(tmp_path):
+    extra = [
+        (10.0, '/goal_pose', goal(5, 0)),
+        (10.0, '/goal_status', status(1)),
+        (11.0, '/goal_pose', goal(7, 0)),
+        (11.0, '/goal_status', status(5)),
+        (11.0, '/goal_status', status(1)),
+    ]
+    assert goals_of(run_of(tmp_path, extra, **STRAIGHT)) == [(0.0, 0), (1.0, 1)]
+
+
+# --- Time
+
+
+@pytest.mark.parametrize('delay', [0.0, 0.5, 1.7e9])
+def test_what_has_no_stamp_counts_by_the_recorders_clock(tmp_path, delay):
+    extra = [(12.0 + delay, '/cmd_vel', twist(0.1, 0.2)), (11.0 + delay, '/goal_pose', goal(1, 1))]
+    run = run_of(tmp_path, extra, delay=delay)
+    assert _trace.seconds(run, run.cmd_vel) == pytest.approx([2.0], abs=1e-6)
+    assert trace(run).time == pytest.approx(np.arange(200) / RATE, abs=1e-9)
+    assert np.flatnonzero(trace(run).goal == 0)[0] in (50, 51)
+
+
+def test_no_line_leads_to_where_the_odometry_begins_anew(tmp_path):
+    sent = [
+        *drive(100),
+        (12.0, '/start_pose', start(0, 0, 0, seconds=12.0)),
+        *drive(100, begin=12.0),
+        *(
+            (14.0 + index / RATE, '/odom', odom(5, 5, 0, seconds=14.0 + index / RATE))
+            for index in range(9)
+        ),
+        (14.2, '/odom', odom(5, 5, 0, seconds=1.0)),
+    ]
+    run = read_run(write_bag(tmp_path / 'bag', sent))
+    assert trace(run).breaks.tolist() == [100, 200, 209]
+    (path,) = (one for one in figure([run]).axes[0].lines if not one.get_label().startswith('_'))
+    assert np.flatnonzero(np.isnan(path.get_xdata())).tolist() == [100, 201, 211]
+    assert path.get_label().startswith('bag: ')
+
+
+def test_odometry_of_the_instant_of_a_new_beginning_may_be_from_before(tmp_path):
+    sent = [*drive(50, **STRAIGHT), (11.0, '/odom', odom(0.5, 0, 0, seconds=11.0))]
+    sent += [
+        (11.0, '/start_pose', start(0.52, 0, 0, seconds=11.0)),
+        (11.02, '/odom', odom(0.52, 0, 0, seconds=11.02)),
+    ]
+    assert trace(read_run(write_bag(tmp_path / 'bag', sent))).breaks.tolist() == [51]
+
+
+def test_many_runs_are_drawn(bag, tmp_path):
+    run = read_run(bag)
+    _figure.draw([replace(run, path=Path(f'run_{index}')) for index in range(40)], tmp_path / 'a.png')
+    assert (tmp_path / 'a.png').exists()
+
+
+def test_a_teleport_that_nobody_announced_breaks_the_line(tmp_path):
+    sent = [*drive(50, **STRAIGHT), *drive(50, begin=11.0, **STRAIGHT)]
+    assert trace(read_run(write_bag(tmp_path / 'bag', sent))).breaks.tolist() == [50]
+
+
+def test_a_gap_in_the_recording_is_no_teleport(tmp_path):
+    sent = [one for one in drive(200, **STRAIGHT) if not 10.5 < one[0] < 12.5]
+    assert trace(read_run(write_bag(tmp_path / 'bag', sent))).breaks.tolist() == []
+
+
+# --- Long runs
+
+
+def test_a_long_line_keeps_its_extremes_and_its_ends():
+    rng = np.random.default_rng(1)
+    rows = np.column_stack([np.arange(1_000_000.0), rng.normal(size=1_000_000)])
+    rows[777_777, 1], rows[33, 1] = 50.0, -50.0
+    kept = line(rows, np.array([500_000]))
+    assert len(kept) < 4 * _lines.BUCKETS + 4
+    assert {33.0, 777_777.0, 0.0, 999_999.0} <= set(kept[:, 0])
+    assert np.isnan(kept[:, 1]).sum() == 1
+    assert (np.diff(kept[~np.isnan(kept[:, 0]), 0]) > 0).all()
+
+
+def test_a_short_line_stays_as_it_is():
+    rows = np.column_stack([np.arange(1000.0), np.arange(1000.0)])
+    assert line(rows, np.array([], dtype=int)).tolist() == rows.tolist()
+
+
+# --- CSV
+
+
+def read_csv(path):
+    with open(path, newline='', encoding='utf-8') as file:
+        header, *rows = csv.reader(file)
+    return header, np.array([[float(value or 'nan') for value in row] for row in rows])
+
+
+def test_csv_holds_the_numbers_of_the_run(bag, tmp_path):
+    assert plot(bag, '-o', tmp_path / 'a.png', '--csv', tmp_path / 'a.csv') == 0
+    header, rows = read_csv(tmp_path / 'a.csv')
+    run = read_run(bag)
+    one = trace(run)
+    assert header == list(COLUMNS)
+    columns = dict(zip(header, rows.T, strict=True))
+    assert rows[:, 0].tolist() == one.time.tolist()
+    assert rows[:, 1:6].tolist() == run.odometry.values.tolist()
+    np.testing.assert_array_equal(columns['distance_m'], one.distance)
+    np.testing.assert_array_equal(columns['heading_error_rad'], one.heading_error)
+    assert columns['omega_right_radps'].tolist() == run.wheels.values[:, 0].tolist()
+    assert columns['omega_left_radps'].tolist() == run.wheels.values[:, 1].tolist()
+    held = [math.nan] * 25 + [0.5] * 75 + [0.25] * 100
+    np.testing.assert_array_equal(columns['v_command_mps'], held)
+
+
+def test_csv_prefers_the_commands_that_were_applied(tmp_path):
+    extra = [(10.0, '/cmd_vel', twist(9, 9)), (10.5, '/cmd_vel_out', twist_stamped(1, 2, 10 * SECOND))]
+    bag = write_bag(tmp_path / 'bag', sample(extra))
+    assert plot(bag, '--csv', tmp_path / 'a.csv') == 0
+    _, rows = read_csv(tmp_path / 'a.csv')
+    assert (rows[:, 8:10] == [1.0, 2.0]).all()
+
+
+@pytest.mark.parametrize('there', [True, False])
+def test_several_runs_get_a_file_each(bag, tmp_path, there):
+    (tmp_path / 'x').mkdir()
+    other = write_bag(tmp_path / 'x/bag', sample(v=0.2))
+    if there:
+        (tmp_path / 'numbers').mkdir()
+    assert plot(bag, other, '-o', tmp_path / 'a.png', '--csv', tmp_path / 'numbers') == 0
+    found = sorted((tmp_path / 'numbers').iterdir())
+    assert [one.name for one in found] == [f'{tmp_path.name}_bag.csv', 'x_bag.csv']
+    assert sorted(read_csv(one)[1][0, 4] for one in found) == [0.2, 0.5]
+
+
+def test_names_are_as_long_as_it_takes():
+    assert names([Path('/a/run')]) == ['run']
+    assert names([Path('/a/run'), Path('/b/walk')]) == ['run', 'walk']
+    assert names([Path('/a/x/run'), Path('/b/x/run')]) == ['a/x/run', 'b/x/run']
+
+
+# --- Mistakes
+
+
+@pytest.mark.parametrize('what', ['nothing', 'an empty folder', 'a file', 'damaged', 'without odometry'])
+def test_what_cannot_be_drawn_is_told(tmp_path, capsys, what):
+    bag = tmp_path / 'bag'
+    if what == 'an empty folder':
+        bag.mkdir()
+    elif what == 'a file':
+        bag.write_text('Dear')
+    elif what == 'damaged':
+        write_bag(bag, sample())
+        (bag / 'metadata.yaml').write_text('x')
+    elif what == 'without odometry':
+        write_bag(bag, [(1.0, '/cmd_vel', twist(0, 0))])
+    assert plot(bag) == 2
+    refuses(capsys, 2, str(bag), {'without odometry': 'no odometry'}.get(what, 'bag'))
+    assert not (tmp_path / 'bag.png').exists()
+
+
+@pytest.mark.parametrize('output', ['a.jpg', 'a', 'a.', 'a.png.gz', ''])
+def test_an_unknown_ending_is_told(bag, capsys, output):
+    assert plot(bag, '-o', output) == 2
+    refuses(capsys, 2, '.png, .svg, .pdf', repr(output))
+
+
+@pytest.mark.parametrize('option', ['-o', '--csv'])
+def test_nothing_is_ever_overwritten(bag, tmp_path, capsys, option):
+    file = tmp_path / ('a.png' if option == '-o' else 'a.csv')
+    file.write_text('precious')
+    assert plot(bag, option, file) == 2
+    refuses(capsys, 2, f'{file} exists already')
+    assert file.read_text() == 'precious'
+    assert sorted(one.name for one in tmp_path.iterdir()) == sorted(['bag', file.name])
+
+
+def test_a_file_that_appears_meanwhile_is_not_overwritten(tmp_path):
+    with pytest.raises(FileExistsError):
+        _figure.create(Path('/dev/null'), b'x')
+
+
+@pytest.mark.parametrize('option', ['-o', '--csv'])
+def test_where_nobody_may_write_is_told(bag, tmp_path, capsys, option):
+    # For root, too, there is no such place.
+    place = Path('/proc/no') / ('a.png' if option == '-o' else 'a.csv')
+    arguments = [option, place] if option == '-o' else ['-o', tmp_path / 'a.png', option, place]
+    assert plot(bag, *arguments) == 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith(f'plot_run: error: {place} cannot be written: ')
+
+
+def test_a_file_that_cannot_be_finished_is_taken_away(bag, tmp_path, capsys, monkeypatch):
+    def full(self, data):
+        raise OSError(28, 'No space left on device')
+
+    class Full:
+        def __init__(self, path, mode):
+            Path(path).touch()
+
+        __enter__ = lambda self: self  # noqa: E731
+        __exit__ = lambda self, *_: None  # noqa: E731
+        write = full
+
+    monkeypatch.setattr(_figure, 'open', Full, raising=False)
+    assert plot(bag, '-o', tmp_path / 'a.png') == 1
+    refuses(capsys, 1, 'a.png cannot be written: No space left on device')
+    assert not (tmp_path / 'a.png').exists()
+
+
+def test_without_matplotlib_it_says_how_to_get_it(bag, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'matplotlib', None)
+    monkeypatch.setitem(sys.modules, 'matplotlib.figure', None)
+    assert plot(bag) == 2
+    refuses(capsys, 2, "pip install 'diffdrive_jacobian[plot]'")
+    assert not (tmp_path / 'bag.png').exists()
+
+
+@pytest.mark.parametrize('topic', ['odom', 'odom=', '=/x', 'speed=/x', ''])
+def test_a_topic_must_be_known(bag, capsys, topic):
+    with pytest.raises(SystemExit, match='2'):
+        plot(bag, '--topic', topic)
+    refuses(capsys, 2, 'NAME=TOPIC')
+
+
+def test_a_topic_may_have_another_name(tmp_path, capsys):
+    sent = [(at, f'/{robot}{topic}', one) for robot in 'ab' for at, topic, one in sample()]
+    bag = write_bag(tmp_path / 'bag', sent)
+    assert plot(bag) == 2
+    refuses(capsys, 2, 'several topics', '/a/')
+    named = [f'--topic={name}=b/{name}' for name in ('odom', 'joint_states')]
+    assert plot(bag, *named) == 0
+
+
+def test_the_numbers_of_several_runs_need_a_directory(bag, tmp_path, capsys):
+    other = write_bag(tmp_path / 'other', sample())
+    assert plot(bag, other, '--csv', tmp_path / 'a.csv') == 2
+    refuses(capsys, 2, 'need a directory')
+
+
+def test_a_bag_cannot_be_given_twice(bag, capsys):
+    assert plot(bag, f'{bag}/') == 2
+    refuses(capsys, 2, 'once')
+
+
+def test_a_signal_ends_it_before_anything_is_written(bag, tmp_path, capsys):
+    signals = Signals()
+    signals.count = 1
+    assert main([str(bag)], signals) == 130
+    assert capsys.readouterr().err == 'plot_run: interrupted\n'
+    assert not (tmp_path / 'bag.png').exists()
+
+
+def test_draw_checks_by_itself(bag, tmp_path):
+    run = read_run(bag)
+    with pytest.raises(ValueError, match=r'must end in \.png, \.svg, \.pdf'):
+        _figure.draw([run], tmp_path / 'a.gif')
+    with pytest.raises(FileExistsError):
+        _figure.draw([run], bag.rename(tmp_path / 'bag.png'))
+    empty = read_run(write_bag(tmp_path / 'empty', []))
+    with pytest.raises(BagError, match='no odometry'):
+        _figure.draw([run, empty], tmp_path / 'a.png')
+
+
+@pytest.mark.skipif(not REAL.exists(), reason='the recorded bag is not here')
+def test_a_bag_of_another_robot_is_drawn(tmp_path):
+    bag = shutil.copytree(REAL, tmp_path / 'bag')
+    assert plot(bag, '--csv', tmp_path / 'a.csv') == 0
+    _, rows = read_csv(tmp_path / 'a.csv')
+    assert rows[:, 4].max() == pytest.approx(0.15)
+    assert len(trace(read_run(bag)).breaks) == 0

@@ -1,0 +1,278 @@
+"""The tool recover_run on bags without metadata, in parts, and on journals."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import sqlite3
+from itertools import product
+from pathlib import Path
+
+import pytest
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+
+from diffdrive_jacobian.bags.definitions import definition
+from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
+from diffdrive_jacobian.bags.recording import journal_of
+from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.tools.recover_run import main
+
+TOPICS = {'/odom': 'nav_msgs/msg/Odometry', '/cmd_vel': 'geometry_msgs/msg/Twist'}
+FOREIGN = Path(__file__).parent / 'bags' / 'turtlebot3_fake_sqlite'
+START = 1_795_213_077_456_505_918
+LATCHED = Qos(
+    QosHistory.KEEP_LAST,
+    7,
+    QosReliability.RELIABLE,
+    QosDurability.TRANSIENT_LOCAL,
+    QosTime(0, 100_000_000),
+    QosTime(9223372036, 854775807),
+    QosLiveliness.AUTOMATIC,
+    QosTime(9223372036, 854775807),
+    False,
+)
+PLUGINS = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
+CUSTOM = {'parameters of /robot': '{"wheel_radius": 0.033}', 'é': 'ü\n'}
+
+# --- Bags, also for other tests
+
+
+def make_messages(count, most):
+    """Make topic, time and bytes: alike each time, random in their length and content."""
+    chance = random.Random(f'{count} {most}')
+    return [
+        (
+            chance.choice(list(TOPICS)),
+            START + 1_000_000 * index,
+            b'\0\1\0\0' + chance.randbytes(chance.randrange(most // 2, most)),
+        )
+        for index in range(count)
+    ]
+
+
+def write_bag(path, storage, messages, mode=CompressionMode.NONE, told=None):
+    """Write a bag by rosbags; `told` hears how many messages are in it."""
+    writer = Writer(path, version=9, storage_plugin=PLUGINS[storage])
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    for key, value in CUSTOM.items():
+        writer.set_custom_data(key, value)
+    with writer:
+        connections = {}
+        for topic, name in TOPICS.items():
+            found = definition(name)
+            connections[topic] = writer.add_connection(
+                topic,
+                name,
+                msgdef=found.text,
+                rihs01=found.type_hash,
+                offered_qos_profiles=[LATCHED],
+            )
+        for count, (topic, stamp, data) in enumerate(messages, 1):
+            writer.write(connections[topic], stamp, data)
+            if told:
+                told(count)
+
+
+def write_journal(bag, messages, storage='mcap'):
+    """Write what record_run leaves when it is killed."""
+    writer = JournalWriter(journal_of(bag))
+    writer.add(Text('storage', storage))
+    ids = {}
+    for topic, name in TOPICS.items():
+        found = definition(name)
+        ids[topic] = len(ids)
+        writer.add(
+            Channel(
+                id=ids[topic],
+                topic=topic,
+                type_name=name,
+                definition=found.text,
+                type_hash=found.type_hash,
+            )
+        )
+    for topic, stamp, data in messages:
+        writer.add(Message(ids[topic], stamp, data))
+    writer.flush()
+    writer.close()
+    return writer.path
+
+
+def read_bag(path):
+    """Give topic, time and bytes of each message."""
+    with Reader(path) as reader:
+        return [(one.topic, stamp, bytes(data)) for one, stamp, data in reader.messages()]
+
+
+def names_of(path):
+    """Give all that a bag tells of its topics and of itself."""
+    with Reader(path) as reader:
+        topics = {
+            (one.topic, one.msgtype, one.msgdef.data, one.digest, *one.ext.offered_qos_profiles)
+            for one in reader.connections
+        }
+        return topics, dict(reader.storage.metadata.custom or {})
+
+
+def contents(folder):
+    """Give every file with its bytes and its time of change."""
+    return {
+        path.name: (path.read_bytes(), path.stat().st_mtime_ns)
+        for path in sorted(Path(folder).iterdir())
+        if path.is_file()
+    }
+
+
+def recover(capsys, *arguments):
+    """Run the tool; gives exit code, stdout, stderr."""
+    capsys.readouterr()
+    try:
+        code = main([str(one) for one in arguments], Signals())
+    except SystemExit as end:
+        code = end.code
+    return code, *capsys.readouterr()
+
+
+@pytest.fixture
+def messages():
+    return make_messages(50, 300)
+
+
+# --- Without metadata
+
+
+@pytest.mark.parametrize(
+    ('storage', 'mode'),
+    # All that rosbags writes.
+    [one for one in product(PLUGINS, CompressionMode) if one != ('sqlite3', CompressionMode.STORAGE)],
+)
+def test_a_bag_without_metadata(tmp_path, capsys, messages, storage, mode):
+    path = tmp_path / 'run'
+    write_bag(path, storage, messages, mode)
+    expected = names_of(path) if mode in (CompressionMode.NONE, CompressionMode.STORAGE) else None
+    (path / 'metadata.yaml').unlink()
+    before = contents(path)
+    code, out, err = recover(capsys, path)
+    assert (code, err) == (0, '')
+    recovered = tmp_path / 'run_recovered'
+    assert out.splitlines()[0].startswith(f'{recovered} is complete: 50 messages in 0.0 s')
+    assert read_bag(recovered) == messages
+    assert expected in (None, names_of(recovered))
+    assert contents(path) == before
+
+
+@pytest.mark.parametrize(
+    'damage', ['', 'a: [', 'rosbag2_bagfile_information: 3', '- 1', '\0', 'x: !!y z']
+)
+def test_damaged_metadata(tmp_path, capsys, messages, damage):
+    write_bag(tmp_path / 'run', 'mcap', messages)
+    (tmp_path / 'run' / 'metadata.yaml').write_text(damage)
+    assert recover(capsys, tmp_path / 'run')[0] == 0
+    assert read_bag(tmp_path / 'run_recovered') == messages
+
+
+@pytest.mark.parametrize('storage', PLUGINS)
+def test_the_other_format_and_place(tmp_path, capsys, messages, storage):
+    write_bag(tmp_path / 'run', storage, messages)
+    (tmp_path / 'run' / 'metadata.yaml').unlink()
+    (other,) = set(PLUGINS) - {storage}
+    assert recover(capsys, tmp_path / 'run', '-o', tmp_path / 'new', '-s', other)[0] == 0
+    assert read_bag(tmp_path / 'new') == messages
+    assert (tmp_path / 'new' / ('new.mcap' if other == 'mcap' else 'new.db3')).exists()
+
+
+def test_a_bag_of_ros2_bag_record(tmp_path, capsys):
+    """Without metadata, and then cut off in the middle."""
+    true = read_bag(FOREIGN)
+    bag = tmp_path / 'run'
+    bag.mkdir()
+    file = bag / 'tb3_sqlite_0.db3'
+    file.write_bytes((FOREIGN / file.name).read_bytes())
+    assert recover(capsys, bag, '-o', tmp_path / 'whole')[0] == 0
+    assert read_bag(tmp_path / 'whole') == true
+    assert names_of(tmp_path / 'whole') == names_of(FOREIGN)
+    os.truncate(file, 777_777)
+    code, out, _ = recover(capsys, bag, '-s', 'mcap')
+    assert code == 0
+    assert 'lost: tb3_sqlite_0.db3: it breaks off: 365007 bytes are missing' in out
+    found = read_bag(tmp_path / 'run_recovered')
+    assert found == true[: len(found)]
+    assert len(found) > 900
+
+
+@pytest.mark.parametrize('storage', PLUGINS)
+def test_a_bag_in_parts(tmp_path, capsys, storage):
+    """As `ros2 bag record --max-bag-size` writes it; the last part has been cut off."""
+    messages = make_messages(120, 300)
+    bag = tmp_path / 'run'
+    bag.mkdir()
+    for part in range(12):
+        write_bag(tmp_path / 'part', storage, messages[10 * part : 10 * part + 10])
+        file = next(one for one in (tmp_path / 'part').iterdir() if one.suffix != '.yaml')
+        data = file.read_bytes()
+        (bag / f'run_{part}{file.suffix}').write_bytes(data if part < 11 else data[: len(data) // 2])
+        shutil.rmtree(tmp_path / 'part')
+    code, out, _ = recover(capsys, bag)
+    assert code == 0
+    assert f'lost: run_11.{"mcap" if storage == "mcap" else "db3"}' in out
+    found = read_bag(tmp_path / 'run_recovered')
+    assert found[:110] == messages[:110]
+    assert all(one in messages[110:] for one in found[110:])
+
+
+def test_a_part_that_is_missing(tmp_path, capsys, messages):
+    write_bag(tmp_path / 'run', 'mcap', messages)
+    metadata = tmp_path / 'run' / 'metadata.yaml'
+    text = metadata.read_text().replace('message_count: 50', 'message_count: 70')
+    metadata.write_text(text.replace('  - run.mcap', '  - run.mcap\n  - run_1.mcap'))
+    code, out, _ = recover(capsys, tmp_path / 'run')
+    assert code == 0
+    assert 'lost: run_1.mcap is missing' in out
+    assert 'lost: metadata.yaml tells of 70 messages, 50 were found' in out
+
+
+def test_a_write_ahead_log(tmp_path, capsys, messages):
+    write_bag(tmp_path / 'run', 'sqlite3', messages)
+    file = tmp_path / 'run' / 'run.db3'
+    (tmp_path / 'run' / 'metadata.yaml').unlink()
+    broken = tmp_path / 'broken'
+    broken.mkdir()
+    database = sqlite3.connect(file)
+    database.execute('PRAGMA journal_mode=WAL')
+    more = (START + 10**9, b'\0\1\0\0more of it')
+    database.execute('INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, ?)', more)
+    database.commit()
+    for path in (tmp_path / 'run').iterdir():
+        shutil.copyfile(path, broken / path.name)
+    database.close()
+    before = contents(broken)
+    assert recover(capsys, broken)[0] == 0
+    assert read_bag(tmp_path / 'broken_recovered') == [*messages, ('/odom', *more)]
+    assert contents(broken) == before
+
+
+# --- The journal of record_run
+
+
+@pytest.mark.parametrize('given', ['run', 'run.journal'])
+@pytest.mark.parametrize('storage', PLUGINS)
+def test_a_journal(tmp_path, capsys, messages, storage, given):
+    journal = write_journal(tmp_path / 'run', messages, storage)
+    with journal.open('ab') as file:
+        file.write(b'M12')
+    before = contents(tmp_path)
+    code, out, err = recover(capsys, tmp_path / given)
+    assert (code, err) == (0, '')
+    assert 'lost: run.journal breaks off: its last 3 bytes hold no record' in out
+    assert read_bag(tmp_path / 'run') == messages
+    assert (tmp_path / 'run' / ('run.mcap' if storage == 'mcap' else 'run.db3')).exists()
+    assert contents(tmp_path) == before
+
+
+def test_an_empty_journal(tmp_path, capsys):
+    write_journal(tmp_path / 'run', [])
+    code, out, err = recover(capsys, tmp_path / 'run')
+    assert (code, out) == (1, '')
+    assert err == f'recover_run: {tmp_path}/run.journal holds no message that can be saved\n'
+    assert os.listdir(tmp_path) == ['run.journal']

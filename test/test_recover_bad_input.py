@@ -1,0 +1,104 @@
+"""recover_run on bad input: a clear line, an exit status that is not 0, and nothing lost."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+
+import pytest
+from test_recover import PLUGINS, contents, make_messages, read_bag, recover, write_bag
+
+from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.tools.recover_run import main
+
+
+@pytest.fixture
+def messages():
+    return make_messages(50, 300)
+
+
+def assert_refused(capsys, folder, arguments, code, *words):
+    before = {path.name: contents(path) for path in folder.iterdir() if path.is_dir()}
+    before[''] = contents(folder)
+    found, out, err = recover(capsys, *arguments)
+    assert (found, out) == (code, '')
+    assert len(err.splitlines()) == 1
+    for word in ('recover_run: ', *words):
+        assert word in err
+    after = {path.name: contents(path) for path in folder.iterdir() if path.is_dir()}
+    after[''] = contents(folder)
+    assert after == before
+
+
+def test_what_is_no_bag(tmp_path, capsys):
+    (tmp_path / 'empty').mkdir()
+    (tmp_path / 'other').mkdir()
+    (tmp_path / 'other' / 'notes.txt').write_text('no bag')
+    (tmp_path / 'fake.journal').write_text('no journal')
+    for name, words in {
+        'nothing': ('there is no bag', 'nothing.journal'),
+        'empty': ('is an empty folder',),
+        'other': ('holds neither .mcap nor .db3 files',),
+        'other/notes.txt': ('is neither MCAP nor SQLite nor a journal',),
+        'fake.journal': ('is no journal',),
+    }.items():
+        assert_refused(capsys, tmp_path, [tmp_path / name], 2, *words)
+
+
+@pytest.mark.parametrize('storage', PLUGINS)
+def test_a_complete_bag(tmp_path, capsys, messages, storage):
+    write_bag(tmp_path / 'run', storage, messages)
+    assert_refused(capsys, tmp_path, [tmp_path / 'run'], 1, 'run is complete: nothing to recover')
+    file = next(one for one in (tmp_path / 'run').iterdir() if one.suffix != '.yaml')
+    assert_refused(capsys, tmp_path, [file], 1, 'is complete: nothing to recover')
+
+
+def test_output_that_exists(tmp_path, capsys, messages):
+    write_bag(tmp_path / 'run', 'mcap', messages)
+    (tmp_path / 'run' / 'metadata.yaml').unlink()
+    (tmp_path / 'file').write_text('dear')
+    (tmp_path / 'run_recovered').mkdir()
+    for options in ((), ('-o', tmp_path / 'file')):
+        assert_refused(capsys, tmp_path, [tmp_path / 'run', *options], 2, 'exists already')
+
+
+def test_output_that_cannot_be_written(tmp_path, capsys, messages):
+    write_bag(tmp_path / 'run', 'mcap', messages)
+    (tmp_path / 'run' / 'metadata.yaml').unlink()
+    (tmp_path / 'file').write_text('dear')
+    # Nobody may make a directory there, not even root.
+    for place in ('/sys/new', tmp_path / 'file' / 'new'):
+        assert_refused(capsys, tmp_path, [tmp_path / 'run', '-o', place], 2, 'no bag was made')
+
+
+def test_wrong_arguments(tmp_path, capsys):
+    for arguments in ((), ('run', '-s', 'ros1'), ('run', '--nonsense')):
+        code, out, err = recover(capsys, *arguments)
+        assert (code, out) == (2, '')
+        assert 'recover_run: error: ' in err
+
+
+def test_unknown_types(tmp_path, capsys, messages):
+    """The known ones are saved; the exit status tells that not all are."""
+    write_bag(tmp_path / 'run', 'sqlite3', messages)
+    (tmp_path / 'run' / 'metadata.yaml').unlink()
+    with sqlite3.connect(tmp_path / 'run' / 'run.db3') as database:
+        database.execute('DROP TABLE message_definitions')
+        database.execute("UPDATE topics SET type = 'my_msgs/msg/Mine' WHERE name = '/cmd_vel'")
+    database.close()
+    before = contents(tmp_path / 'run')
+    code, out, _ = recover(capsys, tmp_path / 'run')
+    assert code == 1
+    assert 'lost: /cmd_vel is left out: no installed package defines my_msgs/msg/Mine' in out
+    assert read_bag(tmp_path / 'run_recovered') == [one for one in messages if one[0] == '/odom']
+    assert contents(tmp_path / 'run') == before
+
+
+def test_a_signal_leaves_no_bag(tmp_path, capsys, messages):
+    write_bag(tmp_path / 'run', 'mcap', messages)
+    (tmp_path / 'run' / 'metadata.yaml').unlink()
+    signals = Signals()
+    signals.count = 1
+    assert main([str(tmp_path / 'run')], signals) == 130
+    assert capsys.readouterr().err == 'recover_run: interrupted: no bag was made\n'
+    assert os.listdir(tmp_path) == ['run']

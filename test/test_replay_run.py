@@ -1,0 +1,172 @@
+"""replay_run: a bag played to whom it may concern, and a run verified."""
+
+from __future__ import annotations
+
+import signal
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import Twist
+from lockstep_nodes import make
+from nav_msgs.msg import Goals
+from processes import open_world
+from recorded import recorded
+from ros_messages import goal, goals
+from rosgraph_msgs.msg import Clock
+
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.testing import Lockstep
+from diffdrive_jacobian.tools import replay_run
+
+LENGTH = 2.0
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    """A run of two seconds: a goal, its commands, the odometry."""
+    path = tmp_path_factory.mktemp('bags') / 'run'
+    with Lockstep() as world:
+        world.add(make(VirtualRobot, **{'linear__x__max_velocity': 0.5}))
+        world.add(make(GoToGoal))
+        with recorded(world, path) as made:
+            world.listen(Goals, 'goals')
+            world.node.create_publisher(Goals, 'goals', 10)
+            made.look()
+            world.publish('goals', goals(goal(1.0, 0.5)))
+            world.run_for(LENGTH)
+        assert len(made.run.goals) == 1
+    return path, made.run
+
+
+@pytest.fixture
+def world(tmp_path):
+    with open_world(tmp_path) as made:
+        yield made
+
+
+def twists(received):
+    return [[one.linear.x, one.angular.z] for one in received]
+
+
+def test_commands_come_as_recorded_and_only_they(world, bag):
+    path, run = bag
+    commands, told = world.harness.listen(Twist, 'cmd_vel'), world.harness.listen(Goals, 'goals')
+    child = world.start('replay_run', str(path), '-r', '4', '--wait-for-all-acked', '5000')
+    world.harness.until(lambda: not child.running, 'it is played')
+    assert child.exit() == 0
+    assert child.last_line == f'{len(run.cmd_vel)} messages played'
+    assert twists(commands) == run.cmd_vel.values.tolist()
+    assert told == []
+
+
+def test_goals_drive_a_new_robot_to_the_same_place(world, bag):
+    path, _ = bag
+    world.start('virtual_robot')
+    world.start('go_to_goal')
+    told, commands = world.harness.listen(Goals, 'goals'), world.harness.listen(Twist, 'cmd_vel')
+    world.until_published('odom', 'cmd_vel')
+    child = world.start('replay_run', str(path), '--goals')
+    world.harness.until(lambda: commands, 'the controller drives')
+    assert told[0].goals[0].pose.position.x == 1.0
+    assert child.exit() == 0
+
+
+def test_everything_remapped_with_a_clock_in_loops_until_interrupted(world, bag):
+    path, run = bag
+    harness = world.harness
+    commands, clock = harness.listen(Twist, 'again'), harness.listen(Clock, '/clock')
+    options = ('--all-topics', '-l', '-r', '8', '--clock', '100', '-m', '/cmd_vel:=/again')
+    child = world.start('replay_run', str(path), *options)
+    harness.until(lambda: len(commands) > 2 * len(run.cmd_vel), 'the second round')
+    child.signal(signal.SIGINT)
+    assert child.exit() == 130
+    assert twists(commands)[: len(run.cmd_vel)] == run.cmd_vel.values.tolist()
+    times = np.array([one.clock.sec + 1e-9 * one.clock.nanosec for one in clock])
+    begin = run.odometry.received[0] / 1e9
+    assert begin - 0.1 <= times.min() < times.max() <= begin + LENGTH + 0.5
+    assert 'nobody listens on /odom' in child.stderr
+
+
+def test_offset_leaves_the_beginning_out(world, bag):
+    path, run = bag
+    commands = world.harness.listen(Twist, 'cmd_vel')
+    child = world.start('replay_run', str(path), '--start-offset', '1.5', '-r', '5')
+    world.harness.until(lambda: not child.running, 'it is played')
+    late = run.cmd_vel.received >= run.odometry.received[0] + 1.4e9
+    assert 10 < len(commands) <= late.sum() + 1
+    assert twists(commands) == run.cmd_vel.values[-len(commands) :].tolist()
+
+
+def test_rival_is_named(world, bag):
+    path, _ = bag
+    world.harness.peer.create_publisher(Twist, 'cmd_vel', 10)
+    child = world.start('replay_run', str(path), '-r', '50')
+    world.harness.until(lambda: not child.running, 'it is played')
+    assert '/peer also publishes on /cmd_vel' in child.stderr
+
+
+# --- Verification
+
+
+def verify(capsys, *arguments):
+    """Run the tool; gives the exit code and what it printed."""
+    code = replay_run.main([*map(str, arguments), '--verify'], Signals())
+    return code, capsys.readouterr().out
+
+
+def test_verified_run_is_as_recorded(capsys, bag):
+    code, said = verify(capsys, bag[0])
+    assert code == 0
+    assert 'commands from cmd_vel_out' in said
+    assert 'allowed 1e-09 m' in said
+    assert said.splitlines()[-1] == 'the robot moves as recorded'
+
+
+def test_bag_of_others_is_verified_with_parameters_from_a_file(capsys, request, tmp_path):
+    foreign = request.path.parent / 'bags' / 'turtlebot3_fake_sqlite'
+    code, said = verify(capsys, foreign)
+    assert code == 0
+    assert 'commands from cmd_vel,' in said
+    file = tmp_path / 'slow.yaml'
+    file.write_text('virtual_robot:\n  ros__parameters:\n    linear: {x: {max_velocity: 0.05}}\n')
+    code, said = verify(capsys, foreign, '--params-file', file)
+    assert code == 1
+    assert 'position: beyond that in' in said
+    assert said.splitlines()[-1] == 'the robot moves NOT as recorded'
+    assert verify(capsys, foreign, '--tolerance', '1e-6')[0] == 1
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (['nowhere'], 'there is no bag nowhere'),
+        (['empty'], 'empty is an empty folder'),
+        (['empty', '--verify'], 'empty is an empty folder'),
+        (['file.txt', '--verify'], 'file.txt is not a bag'),
+        (['BAG', '-r', '-1'], 'must be positive'),
+        (['BAG', '--start-offset', '99'], '--start-offset must be less than the length of the bag'),
+        (['BAG', '--start-offset', '-1'], 'must not be negative'),
+        (['BAG', '--topics', '/nothing'], 'has no topic /nothing; it has /cmd_vel'),
+        (['BAG', '-m', 'nonsense'], 'must be OLD:=NEW'),
+        (
+            ['BAG', '--verify', '--params-file', 'file.txt'],
+            'file of ROS parameters, got file.txt',
+        ),
+        (['BAG', '--verify', '--tolerance', '0'], 'must be positive'),
+        (['BAG', '--goals', '--verify'], 'not allowed with'),
+    ],
+)
+def test_what_cannot_be_is_said(capsys, bag, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'empty').mkdir()
+    (tmp_path / 'file.txt').write_text('not a bag')
+    with pytest.raises(SystemExit) as caught:
+        raise SystemExit(
+            replay_run.main([str(bag[0]) if one == 'BAG' else one for one in arguments], Signals())
+        )
+    assert caught.value.code == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith('replay_run: error: ')
+    assert words in line

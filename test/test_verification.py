@@ -1,0 +1,244 @@
+"""Verification: a run driven again moves as it did, and what was altered is found, with its place."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
+from lockstep_nodes import make
+from rclpy.parameter import Parameter
+from recorded import recorded
+from ros_messages import goal, goals, twist, twist_stamped
+from std_srvs.srv import Trigger
+
+from diffdrive_jacobian.bags import BagError, read_run
+from diffdrive_jacobian.bags.verification import verify
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+
+EXACT = 1e-9
+FOREIGN = Path(__file__).parent / 'bags' / 'turtlebot3_fake_sqlite'
+
+
+def held(run, tolerance=EXACT, **kwargs):
+    """Verify, hold the run against a tolerance, and give what was found."""
+    verification = verify(run, **kwargs)
+    assert verification.holds(tolerance, tolerance), (
+        verification.distances.max(),
+        verification.headings.max(),
+    )
+    return verification
+
+
+def rows(series, keep):
+    return replace(
+        series, received=series.received[keep], stamps=series.stamps[keep], values=series.values[keep]
+    )
+
+
+@pytest.fixture
+def drive(lockstep, tmp_path):
+    """Record a drive to two waypoints."""
+
+    def drive(**parameters):
+        wheels = parameters.get('command_interface') == 'wheels'
+        lockstep.add(make(VirtualRobot, **parameters))
+        if wheels:
+            lockstep.add(make(WheelBridge))
+        lockstep.add(make(GoToGoal))
+        with recorded(lockstep, tmp_path / 'run') as made:
+            lockstep.publish('goals', goals(goal(0.5, 0.2), goal(-0.3, 0.4)))
+            lockstep.run_for(6.0)
+        return made.run
+
+    return drive
+
+
+@pytest.mark.parametrize(
+    'parameters',
+    [
+        {},
+        {'command_interface': 'wheels'},
+        {'linear__x__max_velocity': 0.1, 'angular__z__max_velocity': 0.5, 'max_wheel_velocity': 3.0},
+        {'publish_rate': 333.0, 'x': 4.0, 'y': -1.0, 'theta': 2.0},
+    ],
+    ids=['twist', 'wheels', 'limits', 'placed'],
+)
+def test_a_run_is_driven_again_exactly(drive, parameters):
+    run = drive(**parameters)
+    verification = held(run)
+    assert verification.source == 'cmd_vel_out'
+    assert len(verification.seconds) == len(run.odometry) > 250
+    assert np.ptp(run.odometry.values[:, 0]) > 0.2
+
+
+@pytest.mark.parametrize(
+    'parameters',
+    [{}, {'command_interface': 'wheels'}, {'linear__x__max_velocity': 0.1, 'max_wheel_velocity': 3.0}],
+    ids=['twist', 'wheels', 'limits'],
+)
+def test_without_cmd_vel_out_the_commands_are_taken_by_their_recording(drive, parameters):
+    run = drive(**parameters)
+    run = replace(run, cmd_vel_out=rows(run.cmd_vel_out, slice(0, 0)))
+    verification = held(run)
+    assert verification.source == ('joint_command' if 'command_interface' in parameters else 'cmd_vel')
+    assert verification.start == 'odometry'
+
+
+def test_placements_resets_timeouts_and_parameters_are_driven_again(lockstep, robot_at, tmp_path):
+    robot = robot_at(cmd_vel_timeout=0.3)
+    with recorded(lockstep, tmp_path / 'run') as made:
+        made.look()
+        lockstep.publish('cmd_vel', twist(0.5, 1.0))
+        lockstep.run_for(1.0)
+        placed = PoseWithCovarianceStamped()
+        placed.pose.pose = goal(3.0, 3.0, -2.0).pose
+        lockstep.publish('cmd_vel', twist(-0.5, 2.0))
+        lockstep.run_for(0.1)
+        lockstep.publish('initialpose', placed)
+        lockstep.run_for(0.5)
+        lockstep.publish('cmd_vel', twist(1.0, 0.1))
+        robot.set_parameters([Parameter('linear.x.max_velocity', value=0.2)])
+        lockstep.run_for(0.2)
+        lockstep.call(Trigger, 'reset_odometry')
+        lockstep.run_for(0.5)
+    run = made.run
+    assert len(run.start_pose) == 3
+    assert run.parameter_events[-1][2] == {'linear.x.max_velocity': 0.2}
+    held(run)
+
+
+def test_time_that_goes_back_is_followed(lockstep, robot_at, tmp_path):
+    robot_at()
+    with recorded(lockstep, tmp_path / 'run') as made:
+        lockstep.publish('cmd_vel', twist(0.5, 1.0))
+        lockstep.run_for(0.4)
+    run = made.run
+    shifted = replace(run.odometry, stamps=run.odometry.stamps - 10**9)
+    start = rows(run.start_pose, slice(-1, None))
+    begun = replace(
+        start,
+        stamps=shifted.stamps[:1],
+        values=shifted.values[:1, :3],
+        received=run.odometry.received[-1:],
+    )
+    received = begun.received + 1
+    moving = run.odometry.values[:1, 3:]
+
+    def again(twists):
+        commands = replace(run.cmd_vel_out, stamps=shifted.stamps[:1], values=twists, received=received)
+        return replace(
+            run,
+            odometry=_joined(run.odometry, replace(shifted, received=shifted.received + 10**9)),
+            start_pose=_joined(run.start_pose, begun),
+            cmd_vel_out=_joined(run.cmd_vel_out, commands),
+        )
+
+    assert np.any(np.diff(again(moving).odometry.stamps) < 0)
+    assert len(held(again(moving)).seconds) == 2 * len(run.odometry)
+    stood = verify(again(0.0 * moving))
+    assert stood.distances[: len(run.odometry)].max() < EXACT
+    assert stood.distances[-1] > 0.1
+
+
+def _joined(first, second):
+    return replace(
+        first,
+        **{
+            name: np.concatenate([getattr(first, name), getattr(second, name)])
+            for name in ('received', 'stamps', 'values')
+        },
+    )
+
+
+@pytest.mark.lockstep(start=100.0)
+def test_late_stamped_commands_are_explained(lockstep, robot_at, tmp_path):
+    robot_at(enable_stamped_cmd_vel=True)
+    with recorded(lockstep, tmp_path / 'run') as made:
+        for index in range(20):
+            lockstep.run_for(0.05)
+            late = lockstep.now - 30_000_000
+            lockstep.publish('cmd_vel', twist_stamped(0.5, (-1) ** index, late))
+    assert len(made.run.cmd_vel_out) == 20
+    held(made.run)
+
+
+def test_a_recording_that_begins_late_is_held_from_its_first_odometry(lockstep, robot_at, tmp_path):
+    robot_at()
+    lockstep.publish('cmd_vel', twist(0.3, -0.7))
+    lockstep.run_for(0.2)
+    with recorded(lockstep, tmp_path / 'run') as made:
+        lockstep.run_for(0.2)
+        lockstep.publish('cmd_vel', twist(0.1, 0.9))
+        lockstep.run_for(1.0)
+    verification = held(made.run)
+    assert verification.start == 'odometry'
+
+
+def test_what_was_altered_is_found_with_its_place(drive):
+    run = drive()
+    odometry = run.odometry
+    commands = run.cmd_vel_out
+    seconds = (commands.stamps - odometry.stamps[0]) / 1e9
+    gap = verify(replace(run, cmd_vel_out=rows(commands, (seconds < 1.0) | (seconds > 1.5))))
+    assert not gap.holds(EXACT, EXACT)
+    first = gap.seconds[np.flatnonzero(gap.distances > EXACT)[0]]
+    assert 1.0 <= first <= 1.1
+    scaled = odometry.values * [1.01, 1.01, 1.0, 1.0, 1.0]
+    assert not verify(replace(run, odometry=replace(odometry, values=scaled))).holds(EXACT, EXACT)
+    for column, differences in ((0, 'distances'), (1, 'distances'), (2, 'headings')):
+        altered = odometry.values.copy()
+        altered[123, column] += 1e-3
+        found = verify(replace(run, odometry=replace(odometry, values=altered)))
+        assert not found.holds(EXACT, EXACT)
+        assert found.seconds[getattr(found, differences).argmax()] == pytest.approx(
+            (odometry.stamps[123] - odometry.stamps[0]) / 1e9
+        )
+        assert getattr(found, differences).max() == pytest.approx(1e-3)
+
+
+def test_half_a_second_without_commands_is_found_by_recording_time_too(drive):
+    run = drive()
+    seconds = (run.cmd_vel.received - run.odometry.stamps[0]) / 1e9
+    gap = rows(run.cmd_vel, (seconds < 0.2) | (seconds > 0.7))
+    run = replace(run, cmd_vel_out=rows(run.cmd_vel_out, slice(0, 0)), cmd_vel=gap)
+    assert not verify(run).holds(0.02, 0.02)
+
+
+def test_a_bag_of_ros2_bag_record_is_held_against_our_robot():
+    run = read_run(FOREIGN)
+    verification = held(run, 0.02)
+    # That robot integrates by midpoints at 100 Hz; its commands' true instants are not known.
+    assert 1e-4 < verification.distances.max() < 2e-3
+    slower = verify(run, {'linear.x.max_velocity': 0.05})
+    assert not slower.holds(0.02, 0.02)
+
+
+def test_runs_that_cannot_be_verified_say_why(drive):
+    run = drive()
+    nothing = slice(0, 0)
+    with pytest.raises(BagError, match='no odometry'):
+        verify(replace(run, odometry=rows(run.odometry, nothing)))
+    silent = replace(run, cmd_vel_out=rows(run.cmd_vel_out, nothing), cmd_vel=rows(run.cmd_vel, nothing))
+    with pytest.raises(BagError, match='tells of no commands: record cmd_vel_out, or cmd_vel'):
+        verify(silent)
+
+
+def test_types_of_the_commands_are_both_read(lockstep, robot_at, tmp_path):
+    for index, (stamped, kind) in enumerate([(False, Twist), (True, TwistStamped)]):
+        robot_at(namespace=f'robot{index}', enable_stamped_cmd_vel=stamped)
+        topics = tuple(
+            f'robot{index}/{name}' for name in ('cmd_vel', 'odom', 'cmd_vel_out', 'start_pose')
+        )
+        made_at = tmp_path / f'run{index}'
+        message = twist_stamped(0.2, 0.3, lockstep.now) if stamped else twist(0.2, 0.3)
+        publisher = lockstep.node.create_publisher(kind, f'robot{index}/cmd_vel', 10)
+        with recorded(lockstep, made_at, topics=topics) as made:
+            publisher.publish(message)
+            lockstep.run_for(0.3)
+        assert made.run.cmd_vel.values.tolist() == [[0.2, 0.3]]
+        held(made.run)
