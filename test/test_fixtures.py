@@ -8,6 +8,9 @@ import sys
 
 import pytest
 
+from diffdrive_jacobian.bags import read_run
+from diffdrive_jacobian.bags.verification import verify
+
 SETTING = """
     import pytest
     from geometry_msgs.msg import Twist
@@ -137,3 +140,33 @@ def test_parallel_worlds_do_not_hear_each_other(run, pytester):
         environment.pop('ROS_AUTOMATIC_DISCOVERY_RANGE')
         processes.append(subprocess.Popen(command, cwd=pytester.path, env=environment))
     assert [process.wait(timeout=60) for process in processes] == [0, 0]
+
+
+def test_run_of_a_failed_test_is_kept_and_of_others_is_not(run, pytester):
+    result = run(
+        """
+    import pathlib
+
+    def test_fails(lockstep, robot_at, recorded_run):
+        robot_at()
+        twist = Twist()
+        twist.linear.x = 0.5
+        lockstep.publish('cmd_vel', twist)
+        lockstep.run_for(1.0)
+        assert False
+
+    def test_passes(lockstep, robot_at, recorded_run):
+        robot_at()
+        lockstep.run_for(1.0)
+    """,
+        '--basetemp=kept',
+    )
+    result.assert_outcomes(failed=1, passed=1)
+    (bag,) = pytester.path.glob('kept/*/run')
+    run_of_it = read_run(bag)
+    assert len(run_of_it.odometry) >= 50
+    assert verify(run_of_it).holds(1e-9, 1e-9)
+    text = result.stdout.str()
+    assert f'\n{bag}\n{bag}.png\n' in text
+    assert bag.with_suffix('.png').read_bytes().startswith(b'\x89PNG')
+    assert not list(pytester.path.glob('kept/*/run.journal'))

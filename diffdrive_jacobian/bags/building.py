@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
+import sqlite3
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,8 +64,8 @@ def build_bag(records: Callable[[], Iterable[Record]], target: Path, storage: st
 
 def _write(records: Iterable[Record], channels: dict[int, Channel], path: Path, storage: str) -> Summary:
     writer = Writer(path, version=9, storage_plugin=STORAGES[storage])
-    writer.open()
     try:
+        writer.open()
         connections = {
             channel.id: writer.add_connection(
                 channel.topic,
@@ -83,10 +86,14 @@ def _write(records: Iterable[Record], channels: dict[int, Channel], path: Path, 
                 topics[channels[record.channel].topic] += 1
                 start = record.stamp if start is None else min(start, record.stamp)
                 end = record.stamp if end is None else max(end, record.stamp)
-    except BaseException:
-        writer.abort()
+        writer.close()
+    except BaseException as error:
+        with suppress(Exception):
+            # What it cannot write now it cannot write then.
+            writer.abort()
+        if isinstance(error, sqlite3.Error):
+            raise OSError(errno.EIO, str(error)) from error
         raise
-    writer.close()
     return Summary(messages=sum(topics.values()), topics=topics, start=start, end=end)
 
 
