@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 from rosgraph_msgs.msg import Clock as ClockMessage
-from std_srvs.srv import Trigger
+from std_srvs.srv import Empty, Trigger
 from users_nodes import Blinker
 
 from diffdrive_jacobian.testing import Lockstep, LockstepError
@@ -123,8 +123,37 @@ def test_topics_and_services_that_are_not_there_are_named(lockstep):
         LockstepError, match=r'/cmd_vel is geometry_msgs/msg/Twist, not geometry_msgs/msg/V'
     ):
         lockstep.listen(Vector3, 'cmd_vel')
-    with pytest.raises(LockstepError, match='there is no service /nowhere of Trigger'):
+    lockstep.add(Blinker())
+    words = r'no service /nowhere of std_srvs/srv/Trigger; there are: /blinker/forget$'
+    with pytest.raises(LockstepError, match=words):
         lockstep.call(Trigger, 'nowhere')
+    with pytest.raises(LockstepError, match=r'/forget is std_srvs/srv/Trigger, not std_srvs/srv/Empty'):
+        lockstep.call(Empty, 'blinker/forget')
+
+
+def test_two_nodes_of_one_name_are_refused(lockstep, robot_at):
+    robot_at()
+    with pytest.raises(LockstepError, match='another node is called /virtual_robot: give one'):
+        robot_at(x=1.0)
+    robot_at(namespace='other')
+
+
+def test_robot_without_such_a_parameter_is_refused(robot_at):
+    with pytest.raises(TypeError, match=r"no parameter 'max_speed'; it has linear\.x\.max_velocity"):
+        robot_at(max_speed=3.0)
+
+
+def test_node_that_was_forgotten_is_told(lockstep):
+    forgotten = Blinker('forgotten')
+    assert '  made, but not added to the world: /forgotten' in lockstep.report().splitlines()
+    lockstep.add(forgotten)
+    assert 'forgotten' not in lockstep.report().replace('from /forgotten', '')
+
+
+def test_arguments_that_ros_would_pass_over_are_refused(lockstep):
+    lockstep.close()
+    with pytest.raises(LockstepError, match="args must begin with '--ros-args', got '-p'"):
+        Lockstep(['-p', 'side:=0.5'])
 
 
 def test_node_that_is_spun_by_somebody_else_is_named(lockstep):

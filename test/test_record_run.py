@@ -207,7 +207,7 @@ def test_topics_are_selected_and_time_is_limited(world, bag):
     [
         (['-o', 'taken'], 'cannot record to taken: taken exists already'),
         (['-o', 'nowhere/bag'], 'cannot record to nowhere/bag: no such file or directory'),
-        (['-o', 'begun'], 'cannot record to begun: file exists'),
+        (['-o', 'begun'], 'recover_run begun.journal makes the bag'),
         (['-e', '('], 'no regular expression'),
         (['-s', 'rosbag1'], 'invalid choice'),
         (['--max-duration', '-1'], 'must be positive'),

@@ -10,6 +10,7 @@ little-endian, and the payload. A record that was cut off or damaged ends the jo
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import struct
@@ -75,6 +76,8 @@ class JournalWriter:
         self.path = path
         # Its own buffer: that of `open` would raise once more for what could not be written.
         self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
+        # It ends with the process, however that ends.
+        fcntl.flock(self._file, fcntl.LOCK_EX)
         self._pending = bytearray(MAGIC)
         self._written = 0
 
@@ -116,6 +119,16 @@ class JournalWriter:
     def close(self) -> None:
         """Close the file; flush before."""
         self._file.close()
+
+
+def is_being_written(path: Path) -> bool:
+    """Whether the process that writes a journal still lives."""
+    with open(path, 'rb') as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
 
 
 def read_journal(path: Path) -> Generator[Record, None, int]:

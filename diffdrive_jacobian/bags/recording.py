@@ -43,7 +43,12 @@ class Recording:
         if bag.exists():
             raise FileExistsError(f'{bag} exists already')
         self.bag = bag
-        self.journal = JournalWriter(journal_of(bag))
+        journal = journal_of(bag)
+        if journal.exists():
+            raise FileExistsError(
+                f'{journal} exists already: recover_run {journal} makes the bag of what is in it'
+            )
+        self.journal = JournalWriter(journal)
         self._storage = storage
         self.begun = time.monotonic()
         self._flushed = self.begun

@@ -87,7 +87,16 @@ class Traffic:
         lines += [
             f'  {topic}: nothing; read by {", ".join(names)}' for topic, names in sorted(readers.items())
         ]
+        if strangers := _not_served(nodes):
+            lines.append(f'  made, but not added to the world: {", ".join(strangers)}')
         return '\n'.join([f'last messages, at {self._now() / NANOSECONDS:g} s:', *(lines or ['  none'])])
+
+
+def _not_served(nodes: list[Node]) -> list[str]:
+    """Name the nodes of the context that are not in the world: what they should do they do not."""
+    served = {node.get_fully_qualified_name() for node in nodes}
+    there = nodes[0].get_node_names_and_namespaces() if nodes else []
+    return sorted({f'{space.rstrip("/")}/{name}' for name, space in there} - served)
 
 
 def brief(message: Any) -> str:

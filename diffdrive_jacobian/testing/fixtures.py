@@ -19,7 +19,9 @@ from diffdrive_jacobian.bags import BagError, read_run
 from diffdrive_jacobian.bags.figure import draw
 from diffdrive_jacobian.bags.recorder import Recorder, Selection
 from diffdrive_jacobian.bags.recording import Recording
+from diffdrive_jacobian.nodes.parameters import VirtualRobotParameters
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.ros.parameters import specifications
 from diffdrive_jacobian.testing import Lockstep, LockstepError
 
 
@@ -62,10 +64,11 @@ def robot_at(lockstep: Lockstep) -> Callable[..., VirtualRobot]:
         x: float = 0.0, y: float = 0.0, theta: float = 0.0, *, namespace: str = '', **parameters: Any
     ) -> VirtualRobot:
         pose = {'x': float(x), 'y': float(y), 'theta': float(theta)}
-        overrides = [
-            Parameter(name.replace('__', '.'), value=value)
-            for name, value in {**pose, **parameters}.items()
-        ]
+        values = {name.replace('__', '.'): value for name, value in {**pose, **parameters}.items()}
+        known = specifications(VirtualRobotParameters)
+        if unknown := sorted(set(values) - set(known)):
+            raise TypeError(f'virtual_robot has no parameter {unknown[0]!r}; it has {", ".join(known)}')
+        overrides = [Parameter(name, value=value) for name, value in values.items()]
         return lockstep.add(VirtualRobot(namespace=namespace, parameter_overrides=overrides))
 
     return place

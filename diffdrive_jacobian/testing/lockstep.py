@@ -63,6 +63,8 @@ class Lockstep(SimulatedTime):
         """
         super().__init__(nanoseconds('start', start))
         nanoseconds('patience', patience)
+        if args and args[0] != '--ros-args':
+            raise LockstepError(f"args must begin with '--ros-args', got {args[0]!r}")
         if Lockstep._open is not None:
             raise LockstepError('another world is open in this process: close it first')
         if rclpy.ok():
@@ -137,6 +139,8 @@ class Lockstep(SimulatedTime):
             raise LockstepError('the node was destroyed before it was added') from error
         if node in self._executor.nodes:
             raise LockstepError(f'node {name} was added already')
+        if any(one.get_fully_qualified_name() == name for one in self._executor.nodes):
+            raise LockstepError(f'another node is called {name}: give one of them a namespace')
         if node.context is not self.node.context:
             raise LockstepError(
                 f'node {name} is in another context: make it without context=, after the world'
@@ -270,10 +274,17 @@ class Lockstep(SimulatedTime):
         """
         self._check_open()
         name = self.node.resolve_service_name(name)
+        services = dict(self.node.get_service_names_and_types())
+        wanted = _type_name(service_type, 'srv')
+        if wanted not in services.get(name, []):
+            others = ', '.join(one for one, kinds in services.items() if not _is_of_rclpy(kinds))
+            raise LockstepError(
+                f'there is no service {name} of {wanted}; there are: {others or "none"}'
+                if name not in services
+                else f'{name} is {services[name][0]}, not {wanted}'
+            )
         client = self.node.create_client(service_type, name)
         try:
-            if not client.service_is_ready():
-                raise LockstepError(f'there is no service {name} of {service_type.__name__}')
             future = client.call_async(request or service_type.Request())
             self.run_until(future.done, timeout, f'a response of {name}')
             return future.result()
@@ -297,5 +308,10 @@ class Lockstep(SimulatedTime):
             ) from error
 
 
-def _type_name(message_type: type) -> str:
-    return f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
+def _type_name(interface: Any, kind: str = 'msg') -> str:
+    return f'{interface.__module__.split(".")[0]}/{kind}/{interface.__name__}'
+
+
+def _is_of_rclpy(types: list[str]) -> bool:
+    """Whether it is a service that every node has."""
+    return types[0].startswith(('rcl_interfaces/', 'type_description_interfaces/'))

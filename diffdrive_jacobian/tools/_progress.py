@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
@@ -12,9 +13,10 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 class Drive:
     """The progress of a drive: a bar on a terminal, a line per second elsewhere."""
 
-    def __init__(self) -> None:
-        """Begin without a goal."""
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        """Begin without a goal; elsewhere the second is one of this clock (s)."""
         self._console = Console()
+        self._clock = time.monotonic if self._console.is_terminal else clock
         self._progress = Progress(
             TextColumn('{task.description}'),
             BarColumn(),
@@ -41,9 +43,10 @@ class Drive:
     def show(self, what: str, distance: float, wheels: tuple[float, float] | None = None) -> None:
         """Show how far it still is (m) and how fast the wheels turn, `(right, left)` (rad/s)."""
         period = 0.1 if self._console.is_terminal else 1.0
-        if time.monotonic() - self._shown < period:
+        now = self._clock()
+        if now - self._shown < period:
             return
-        self._shown = time.monotonic()
+        self._shown = now
         self._farthest = max(self._farthest, distance)
         state = f'{distance:7.3f} m to go'
         if wheels is not None:

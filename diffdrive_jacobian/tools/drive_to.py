@@ -174,7 +174,7 @@ def drive(
     observer = runner.add(lambda: Observer(goals, names, context))
     tend = _recorder(runner, recording)
     begun = runner.seconds()
-    with Drive() as progress:
+    with Drive(runner.seconds) as progress:
 
         def over() -> bool:
             tend()

@@ -3,68 +3,35 @@
 from __future__ import annotations
 
 import argparse
-import re
-import shutil
 import sqlite3
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import closing, suppress
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
-
-from rosbags.interfaces import QosTime
-from rosbags.rosbag2 import ReaderError
-from rosbags.rosbag2.metadata import parse_qos
-from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
+from typing import NamedTuple
 
 from diffdrive_jacobian.bags.building import STORAGES, Summary, build_bag
-from diffdrive_jacobian.bags.definitions import UnknownTypeError, definition
 from diffdrive_jacobian.bags.journal import (
-    MAGIC,
-    Channel,
     JournalError,
     Message,
     Record,
-    Text,
-    read_journal,
+    is_being_written,
 )
-from diffdrive_jacobian.bags.qos import NANOSECONDS
 from diffdrive_jacobian.bags.recording import JOURNAL, journal_of
-from diffdrive_jacobian.bags.salvage import (
-    MCAP_MAGIC,
-    SQLITE_MAGIC,
-    Topic,
-    read_mcap,
-    read_sqlite,
-)
+from diffdrive_jacobian.bags.remains import NotABagError, Remains
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools.record_run import describe
 
 if sys.version_info >= (3, 14):
-    from compression import zstd
+    pass
 else:
-    from backports import zstd
+    pass
 
 PROGRAM = 'recover_run'
 RECOVERED = '_recovered'
-KINDS = {'.mcap': 'mcap', '.db3': 'sqlite3', JOURNAL: 'journal'}
-READERS = {'mcap': read_mcap, 'sqlite3': read_sqlite}
-ZSTD, ZSTD_MAGIC = '.zstd', b'\x28\xb5\x2f\xfd'
-LAST_ENCAPSULATION = 0x0B
-"""Of CDR, in the second byte of a message; the first one is 0."""
-TOO_MUCH = (RecursionError, OverflowError)
-"""What nonsense in YAML may lead to, besides its own errors."""
-MAGICS = {MCAP_MAGIC: 'mcap', SQLITE_MAGIC: 'sqlite3', MAGIC: 'journal'}
-
-
-class NotABagError(Exception):
-    """What was given cannot be one."""
 
 
 class NothingToSaveError(Exception):
@@ -84,119 +51,6 @@ class Report(NamedTuple):
     """What could not be read, in words."""
     left_out: bool
     """Whether these are topics, too, that could be read and not be written."""
-
-
-class Remains:
-    """What is left of a bag, as records."""
-
-    def __init__(self, path: Path, workshop: Path) -> None:
-        """Look what is there.
-
-        Args:
-            path: A bag's directory, one of its files, or a journal.
-            workshop: An empty directory for what has to be unpacked.
-
-        Raises:
-            NotABagError: Nothing of a bag is there.
-            OSError: It cannot be read.
-        """
-        self.path = path
-        self.files = _files(path)
-        self.kind = _kind(self.files[0])
-        self.storage = 'mcap' if self.kind == 'journal' else self.kind
-        self.lost: list[str] = []
-        self.left_out: dict[str, str] = {}
-        folder = path if path.is_dir() else path.parent
-        self._metadata = _metadata(folder / 'metadata.yaml')
-        paths = self._metadata.get('relative_file_paths')
-        listed = {Path(str(name)).name for name in paths} if isinstance(paths, list) else set()
-        self._missing = listed - {file.name for file in self.files}
-        if path.is_file() and (self._missing or not listed):
-            self._metadata, self._missing = {}, set()
-        self.promised = self._metadata.get('message_count')
-        self._sources = [(file.name, _unpacked(file, workshop)) for file in self.files]
-
-    @property
-    def losses(self) -> list[str]:
-        """What could not be read or written, in words."""
-        left_out = [f'{topic} is left out: {why}' for topic, why in self.left_out.items()]
-        return [*self.lost, *left_out]
-
-    def records(self) -> Iterator[Record]:
-        """Give all that can be read, from the beginning, and note what cannot."""
-        self.lost = [f'{name} is missing' for name in sorted(self._missing)]
-        self.left_out, self._seen = {}, 0
-        if self.kind == 'journal':
-            if unread := (yield from self._of_journal()):
-                self.lost.append(f'{self.path.name} breaks off: its last {unread} bytes hold no record')
-            return
-        yield from _custom_data(self._metadata)
-        channels: dict[tuple[str, str], Channel] = {}
-        for name, source in self._sources:
-            yield from self._of_file(name, source, channels)
-        if isinstance(self.promised, int) and self.promised > self._seen:
-            self.lost.append(f'metadata.yaml tells of {self.promised} messages, {self._seen} were found')
-
-    def _of_journal(self) -> Generator[Record, None, int]:
-        records = read_journal(self.path)
-        while True:
-            try:
-                record = next(records)
-            except StopIteration as end:
-                return int(end.value)
-            if isinstance(record, Text) and record.key == 'storage' and record.value in STORAGES:
-                self.storage = record.value
-            yield record
-
-    def _of_file(
-        self, name: str, source: Path, channels: dict[tuple[str, str], Channel]
-    ) -> Iterator[Record]:
-        ids: dict[int, int | None] = {}
-        strange: Counter[str] = Counter()
-        with open(source, 'rb') as file:
-            reader = READERS[_kind(source)]
-            for one in reader(file, lambda what: self.lost.append(f'{name}: {what}')):
-                if isinstance(one, str):
-                    yield from _custom_data(_metadata(one))
-                    continue
-                if isinstance(one, Topic):
-                    new = (one.name, one.type_name) not in channels
-                    channel = self._channel(one, channels)
-                    ids[one.id] = None if channel is None else channel.id
-                    if channel is not None and new:
-                        yield channel
-                    continue
-                self._seen += 1
-                if one.channel not in ids:
-                    strange['belong to no known topic'] += 1
-                elif (to := ids[one.channel]) is not None:
-                    data = _payload(one.data)
-                    if data is None or not 0 <= one.stamp < 2**63:
-                        strange['are no CDR, or have no possible time'] += 1
-                    else:
-                        yield Message(to, one.stamp, data)
-        self.lost += [f'{name}: {count} messages {what}' for what, count in strange.items()]
-
-    def _channel(self, topic: Topic, channels: dict[tuple[str, str], Channel]) -> Channel | None:
-        """Give a topic's channel; None: it has to be left out."""
-        key = topic.name, topic.type_name
-        if key not in channels and topic.name not in self.left_out:
-            try:
-                if topic.encoding != 'cdr':
-                    raise UnknownTypeError(f'its messages are {topic.encoding!r}, only cdr can be saved')
-                text, type_hash = _described(topic)
-            except UnknownTypeError as error:
-                self.left_out[topic.name] = str(error)
-                return None
-            channels[key] = Channel(
-                id=len(channels),
-                topic=topic.name,
-                type_name=topic.type_name,
-                definition=text,
-                type_hash=type_hash,
-                qos=_qos(topic.qos),
-            )
-        return channels.get(key)
 
 
 def recover(what: Path, output: Path | None, storage: str | None, signals: Signals) -> Report:
@@ -222,6 +76,8 @@ def recover(what: Path, output: Path | None, storage: str | None, signals: Signa
         target = output or _beside(what, remains.kind)
         if target.exists():
             raise FileExistsError(f'{target} exists already')
+        if remains.kind == 'journal' and is_being_written(remains.files[0]):
+            raise NothingToSaveError(f'{what} is being recorded now: end record_run first')
 
         def records() -> Iterator[Record]:
             for record in remains.records():
@@ -239,138 +95,6 @@ def recover(what: Path, output: Path | None, storage: str | None, signals: Signa
             raise NothingToSaveError('\n'.join([f'{what} holds no message that can be saved', *losses]))
         summary = build_bag(lambda: islice(records(), kinds.total()), target, storage or remains.storage)
         return Report(target, summary, losses, left_out)
-
-
-def _files(path: Path) -> list[Path]:
-    """Give the files of a bag in their order."""
-    if path.is_file():
-        if not _kind(path):
-            raise NotABagError(f'{path} is neither MCAP nor SQLite nor a journal of record_run')
-        return [path]
-    if not path.is_dir():
-        raise NotABagError(f'there is no bag {path}, and no journal {journal_of(path)}')
-    present = set(path.iterdir())
-    # What was being compressed is there twice.
-    files = [one for one in present if one.is_file() and one.with_suffix('') not in present - {one}]
-    files = [one for one in files if _kind(one) in READERS]
-    if not files:
-        what = 'holds neither .mcap nor .db3 files' if present else 'is an empty folder'
-        raise NotABagError(f'{path} {what}: it is not a bag')
-    # Parts are numbered: 10 comes after 9.
-    return sorted(
-        files, key=lambda one: [int(n) if n.isdigit() else n for n in re.split('([0-9]+)', one.name)]
-    )
-
-
-def _kind(path: Path) -> str:
-    """Tell what a file is, by its first bytes, or, as these may be damaged, by its name."""
-    with open(path, 'rb') as file:
-        begin = file.read(len(SQLITE_MAGIC))
-    for magic, kind in MAGICS.items():
-        if begin.startswith(magic):
-            return kind
-    name = path.with_suffix('') if path.suffix == ZSTD else path
-    return KINDS.get(name.suffix, '')
-
-
-def _unpacked(file: Path, workshop: Path) -> Path:
-    """Give a file that can be read: itself, or a copy that is not compressed, or has its log in it."""
-    copy = Path(tempfile.mkdtemp(dir=workshop)) / file.name.removesuffix(ZSTD)
-    log = file.with_name(f'{file.name}-wal')
-    if file.suffix == ZSTD:
-        with (
-            open(copy, 'wb') as out,
-            zstd.open(file, 'rb') as packed,
-            suppress(EOFError, zstd.ZstdError),
-        ):
-            # As far as it goes; the reader sees that it breaks off.
-            while block := packed.read(1 << 16):
-                out.write(block)
-        return copy
-    if log.exists() and log.stat().st_size:
-        shutil.copyfile(file, copy)
-        shutil.copyfile(log, copy.with_name(log.name))
-        with suppress(sqlite3.Error), closing(sqlite3.connect(copy)) as database:
-            database.execute('PRAGMA wal_checkpoint(TRUNCATE)')
-        return copy
-    return file
-
-
-def _metadata(path: Path | str) -> dict[str, Any]:
-    """Read what metadata.yaml holds, or its text in a bag's file; {}: it is missing or damaged."""
-    try:
-        text = path if isinstance(path, str) else path.read_text(encoding='utf-8')
-        found = YAML(typ='safe').load(text)
-    except (FileNotFoundError, ValueError, YAMLError, *TOO_MUCH):
-        return {}
-    found = found.get('rosbag2_bagfile_information', found) if isinstance(found, dict) else {}
-    return found if isinstance(found, dict) else {}
-
-
-def _custom_data(metadata: dict[str, Any]) -> Iterator[Text]:
-    custom = metadata.get('custom_data')
-    for key, value in custom.items() if isinstance(custom, dict) else ():
-        # In damaged text there may be what no file can hold.
-        yield Text(*(str(one).encode('utf-8', 'replace').decode() for one in (key, value)))
-
-
-def _payload(data: bytes) -> bytes | None:
-    """Give a message as CDR; None: it is none."""
-    if data.startswith(ZSTD_MAGIC):
-        try:
-            data = zstd.decompress(data)
-        except zstd.ZstdError:
-            return None
-    return data if len(data) > 4 and data[0] == 0 and data[1] <= LAST_ENCAPSULATION else None
-
-
-def _described(topic: Topic) -> tuple[str, str]:
-    """Give the definition of a topic's type and its hash.
-
-    Raises:
-        UnknownTypeError: The file does not tell them, and no installed package does.
-    """
-    if topic.definition and topic.type_hash:
-        return topic.definition, topic.type_hash
-    try:
-        installed = definition(topic.type_name)
-        if topic.definition in ('', installed.text) and topic.type_hash in ('', installed.type_hash):
-            return installed.text, installed.type_hash
-        reason = f'{topic.type_name} is installed in another version than it was recorded'
-    except UnknownTypeError as error:
-        reason = str(error)
-    if not topic.definition:
-        raise UnknownTypeError(reason)
-    try:
-        store = get_typestore(Stores.EMPTY)
-        store.register(get_types_from_msg(topic.definition, topic.type_name))
-        return topic.definition, store.hash_rihs01(topic.type_name)
-    except (TypesysError, KeyError) as error:
-        raise UnknownTypeError(reason) from error
-
-
-def _qos(text: str) -> tuple[dict[str, Any], ...]:
-    """Read offered profiles as rosbag2 writes them; (): they cannot be read."""
-    try:
-        return tuple(
-            {
-                'history': one.history.value,
-                'depth': int(one.depth),
-                'reliability': one.reliability.value,
-                'durability': one.durability.value,
-                'deadline': _nanoseconds(one.deadline),
-                'lifespan': _nanoseconds(one.lifespan),
-                'liveliness': one.liveliness.value,
-                'liveliness_lease_duration': _nanoseconds(one.liveliness_lease_duration),
-            }
-            for one in parse_qos(text)
-        )
-    except (ReaderError, LookupError, TypeError, ValueError, AttributeError, *TOO_MUCH):
-        return ()
-
-
-def _nanoseconds(time: QosTime) -> int:
-    return NANOSECONDS * int(time.sec) + int(time.nsec)
 
 
 def _beside(what: Path, kind: str) -> Path:

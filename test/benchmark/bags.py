@@ -1,8 +1,8 @@
 """Recording and replaying: messages lost, CPU per message, and how late replayed messages come.
 
 A child publishes Odometry on six topics at 5,000 messages per second for 30 s, another records them.
-Then a bag of 500 messages per second is replayed to a reader; the lateness is told by the replayer itself,
-publish by publish. Run: `python test/benchmark/bags.py [--seconds S]`.
+Then a bag of 500 messages per second is replayed to a reader; the replayer itself tells how late it
+published each. Run: `python test/benchmark/bags.py [--seconds S]`.
 """
 
 from __future__ import annotations
