@@ -24,6 +24,7 @@ class LockstepRecording:
 
     def finish(self):
         """Make the bag; gives it read."""
+        self.world.remove(self.recorder)
         self.summary = self.recording.finish()
         return read_run(self.recording.bag)
 
