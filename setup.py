@@ -51,7 +51,7 @@ setup(
             f'ros-std-srvs=={MESSAGES}',
         ],
         'plot': ['matplotlib>=3.5'],
-        'test': ['hypothesis>=6', 'matplotlib>=3.5', 'pytest>=7', 'pyyaml>=5'],
+        'test': ['mcap>=1.2', 'hypothesis>=6', 'matplotlib>=3.5', 'pytest>=7', 'pyyaml>=5'],
     },
     zip_safe=False,
     entry_points={
