@@ -212,6 +212,7 @@ def test_topics_are_selected_and_time_is_limited(world, bag):
         (['-s', 'rosbag1'], 'invalid choice'),
         (['--max-duration', '-1'], 'must be positive'),
         (['-o', 'new', '--ros-args', '--bogus'], 'ROS arguments: '),
+        (['-o', 'new', 'bad//topic'], "no topic can be called 'bad//topic': "),
     ],
 )
 def test_what_cannot_be_is_said_and_nothing_is_lost(capsys, tmp_path, monkeypatch, arguments, words):
@@ -225,4 +226,4 @@ def test_what_cannot_be_is_said_and_nothing_is_lost(capsys, tmp_path, monkeypatc
     line = capsys.readouterr().err.splitlines()[-1]
     assert line.startswith('record_run: error: ')
     assert words in line
-    assert set(before) <= set(tmp_path.iterdir())
+    assert sorted(tmp_path.iterdir()) == before

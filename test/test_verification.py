@@ -223,6 +223,14 @@ def test_runs_that_cannot_be_verified_say_why(drive):
     nothing = slice(0, 0)
     with pytest.raises(BagError, match='no odometry'):
         verify(replace(run, odometry=rows(run.odometry, nothing)))
+    stopped = replace(run.odometry, received=0 * run.odometry.received)
+    with pytest.raises(BagError, match='clock of the recorder stood still'):
+        verify(replace(run, odometry=stopped))
+    shuffled = replace(
+        run.odometry, stamps=run.odometry.stamps - 10**9 * (np.arange(len(run.odometry)) % 2)
+    )
+    with pytest.raises(BagError, match='record without use_sim_time'):
+        verify(replace(run, odometry=shuffled))
     silent = replace(run, cmd_vel_out=rows(run.cmd_vel_out, nothing), cmd_vel=rows(run.cmd_vel, nothing))
     with pytest.raises(BagError, match='tells of no commands: record cmd_vel_out, or cmd_vel'):
         verify(silent)

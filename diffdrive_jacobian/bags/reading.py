@@ -147,8 +147,17 @@ def open_bag(path: Path) -> Iterator[Reader]:
 
 
 def custom_data(reader: Reader) -> dict[str, str]:
-    """Give what the recorder noted down."""
-    return dict(reader.storage.metadata.custom or {})
+    """Give what the recorder noted down.
+
+    Raises:
+        BagError: It is damaged.
+    """
+    custom = reader.storage.metadata.custom or {}
+    if not isinstance(custom, dict) or not all(isinstance(text, str) for text in custom.values()):
+        raise BagError(
+            f'{reader.path} is damaged: its custom_data must be texts by name, got {custom!r}'
+        )
+    return custom
 
 
 def messages(

@@ -11,12 +11,14 @@ from typing import Any
 
 from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.client import Client
+from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 
 from diffdrive_jacobian.bags.definitions import UnknownTypeError, definition
 from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
 from diffdrive_jacobian.bags.qos import to_fields, to_hear_all
+from diffdrive_jacobian.ros.parameters import ParameterError
 
 RUN_TOPICS = (
     'cmd_vel',
@@ -71,11 +73,14 @@ class Recorder(Node):  # type: ignore[misc]
                 received it; else with that of the node's clock when it is handled, as always with
                 simulated time. The EventsExecutor of Jazzy cannot tell the former.
             kwargs: As for `rclpy.node.Node`.
+
+        Raises:
+            ParameterError: A topic cannot be called so.
         """
         super().__init__('record_run', start_parameter_services=False, **kwargs)
         self._journal = journal
         self._everything = selection.everything
-        self._names = {self.resolve_topic_name(topic) for topic in selection.topics}
+        self._names = {self._resolved(topic) for topic in selection.topics}
         self._pattern = re.compile(selection.pattern) if selection.pattern else None
         self._channels: dict[str, Channel] = {}
         self._refused: set[str] = set()
@@ -102,8 +107,17 @@ class Recorder(Node):  # type: ignore[misc]
                 self._hear(topic, types, publishers)
             else:
                 self._note_profiles(self._channels[topic], publishers)
+                self._note_types(self._channels[topic], publishers)
             for publisher in publishers:
                 self._ask_for_parameters(publisher.node_namespace, publisher.node_name)
+
+    def _resolved(self, topic: str) -> str:
+        try:
+            return str(self.resolve_topic_name(topic))
+        except (RuntimeError, NameValidationException) as error:
+            self.destroy_node()
+            why = str(error).split(', at /')[0]
+            raise ParameterError(f'no topic can be called {topic!r}: {why}') from error
 
     def _wants(self, topic: str) -> bool:
         if topic in self._names:
@@ -151,6 +165,11 @@ class Recorder(Node):  # type: ignore[misc]
             channel = replace(channel, qos=channel.qos + new)
             self._channels[channel.topic] = channel
             self._journal.add(channel)
+
+    def _note_types(self, channel: Channel, publishers: list[Any]) -> None:
+        for other in {one.topic_type for one in publishers} - {channel.type_name}:
+            if (mismatch := f'{channel.topic} of {other}') not in self._refused:
+                self._refuse(mismatch, f'{channel.topic} is recorded as {channel.type_name}')
 
     def _on_stamped(self, channel: int, data: bytes, info: dict[str, int]) -> None:
         self._journal.add(Message(channel, info['received_timestamp'], data))

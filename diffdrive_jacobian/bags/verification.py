@@ -77,6 +77,11 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
     """
     if not len(run.odometry):
         raise BagError(f'{run.path} has no odometry: record the topic odom')
+    if len(run.odometry) > 1 and not np.ptp(run.odometry.received):
+        raise BagError(
+            f'{run.path} was recorded while the clock of the recorder stood still, so that the order of '
+            'its messages is lost (use_sim_time without /clock?)'
+        )
     if len(run.cmd_vel_out):
         source, start, anchors = 'cmd_vel_out', *_applied(run)
     else:
@@ -85,8 +90,14 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
     seconds, poses = [], []
     measured = []
     epochs = _epochs(run.odometry)
+    if epochs[-1] >= len(anchors):
+        raise BagError(
+            f'{run.path} cannot be followed: time goes back {epochs[-1]} times in the odometry, but the '
+            f'robot began anew {len(anchors) - 1} times. Where /clock goes back, '
+            'record without use_sim_time'
+        )
     for index, epoch in enumerate(epochs):
-        robot = _nearest(anchors[epoch] if epoch < len(anchors) else [], run.odometry, index)
+        robot = _nearest(anchors[epoch], run.odometry, index)
         if robot is not None:
             seconds.append((stamps[index] - stamps[0]) / NANOSECONDS)
             poses.append(robot.pose)

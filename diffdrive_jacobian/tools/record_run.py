@@ -40,9 +40,13 @@ def record(
     try:
         if not signals.count:
             _hear(recording, selection, ros, signals, max_duration)
-    finally:
-        summary = recording.finish()
-    return summary
+    except UserError:
+        recording.discard()
+        raise
+    except BaseException:
+        recording.finish()
+        raise
+    return recording.finish()
 
 
 def _hear(
