@@ -7,9 +7,7 @@ import math
 import os
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
-from diffdrive_jacobian.bags.recording import Recording
 from diffdrive_jacobian.nodes.parameters import GoToGoalParameters
 from diffdrive_jacobian.ros.messages import MAX_POSITION
 from diffdrive_jacobian.ros.parameters import ParameterError
@@ -111,18 +109,3 @@ def complain(program: str, message: object) -> int:
     """Report a user's mistake as argparse does; gives the exit code."""
     print(f'{program}: error: {message}', file=sys.stderr)
     return USER_ERROR
-
-
-def begin_recording(prefix: str, output: str | None, storage: str) -> Recording:
-    """Begin to record to what the user named, or to something named after the time.
-
-    Raises:
-        OSError: It exists already, or cannot be written; the message says which.
-    """
-    try:
-        if output is None:
-            return Recording.named_by_time(prefix, storage)
-        return Recording(Path(output), storage)
-    except OSError as error:
-        where = output or 'this directory'
-        raise OSError(f'cannot record to {where}: {(error.strerror or str(error)).lower()}') from error

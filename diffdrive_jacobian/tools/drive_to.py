@@ -40,6 +40,7 @@ from diffdrive_jacobian.ros.runner import Runner, UserError, closed_world, ros_c
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._progress import Drive
+from diffdrive_jacobian.tools._recording import begin_recording
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.testing.runner import LockstepRunner
@@ -249,7 +250,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     recording = None
     try:
         if not options.no_record:
-            recording = _cli.begin_recording('drive', options.output, 'mcap')
+            recording = begin_recording('drive', options.output, 'mcap')
     except OSError as error:
         return _cli.complain(PROGRAM, error)
     try:

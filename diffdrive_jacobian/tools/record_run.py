@@ -15,6 +15,7 @@ from diffdrive_jacobian.bags.recording import Recording
 from diffdrive_jacobian.ros.runner import UserError, ros_context, running
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools._recording import begin_recording
 
 PROGRAM = 'record_run'
 LOOK_PERIOD = 0.2
@@ -123,7 +124,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         pattern=options.regex or '',
     )
     try:
-        recording = _cli.begin_recording('run', options.output, options.storage)
+        recording = begin_recording('run', options.output, options.storage)
     except OSError as error:
         return _cli.complain(PROGRAM, error)
     bag = recording.bag
