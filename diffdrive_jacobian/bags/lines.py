@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from diffdrive_jacobian.bags.reading import Run, Series
-from diffdrive_jacobian.bags.trace import Array, Indices, Trace, seconds
+from diffdrive_jacobian.bags.trace import Array, Indices, Mask, Trace, seconds
 
 BUCKETS = 1500
 """A longer line shows the least and the greatest of so many stretches."""
@@ -105,7 +105,7 @@ def line(rows: Array, breaks: Indices) -> Array:
     count, width = rows.shape
     if count <= 2 * width * BUCKETS:
         return rows
-    holes = np.isnan(rows).any(axis=1)
+    holes: Mask = np.any(np.isnan(rows), axis=1)
     gaps = np.flatnonzero(holes[1:] & ~holes[:-1]) + 1
     # So many would leave nothing but dots.
     keep = [np.array([0, count - 1]), gaps[: len(gaps) * (len(gaps) <= BUCKETS // 10)]]

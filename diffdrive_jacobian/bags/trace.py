@@ -18,6 +18,7 @@ from diffdrive_jacobian.nodes.parameters import GoToGoalParameters
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
 
 _NEVER = int(np.iinfo(np.int64).max)
 TELEPORT = 0.1
