@@ -13,7 +13,7 @@ from action_msgs.msg import GoalStatus
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.reading import BagError, Run, Series
-from diffdrive_jacobian.kinematics.se2 import wrap_angle
+from diffdrive_jacobian.kinematics._elementary import wrapped
 from diffdrive_jacobian.nodes.parameters import GoToGoalParameters
 
 Array = NDArray[np.float64]
@@ -71,7 +71,7 @@ def trace(run: Run) -> Trace:
         breaks=breaks,
         goal=goal,
         distance=np.hypot(dx, dy),
-        heading_error=np.where(reached, np.nan, wrap_angle(np.arctan2(dy, dx) - theta)),
+        heading_error=np.where(reached, np.nan, wrapped(np.arctan2(dy, dx) - theta)),
     )
 
 

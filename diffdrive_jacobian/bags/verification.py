@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.reading import BagError, Run, Series
+from diffdrive_jacobian.kinematics._elementary import wrapped
 from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
-from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.nodes.parameters import VirtualRobotParameters
 from diffdrive_jacobian.ros.parameters import from_ros
 from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot, RobotModel
@@ -110,7 +110,7 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
         start=start,
         seconds=np.array(seconds),
         distances=np.hypot(difference[:, 0], difference[:, 1]),
-        headings=np.abs(wrap_angle(difference[:, 2])),
+        headings=np.abs(wrapped(difference[:, 2])),
     )
 
 
@@ -141,7 +141,7 @@ def _nearest(anchors: list[_Anchor], odometry: Series, index: int) -> Robot | No
 
     def apart(candidate: Robot) -> float:
         dx, dy, turn = (odometry.values[index, :3] - candidate.pose).tolist()
-        return math.hypot(dx, dy) + abs(float(wrap_angle(turn)))
+        return math.hypot(dx, dy) + abs(float(wrapped(turn)))
 
     return min(candidates, key=apart)
 

@@ -12,8 +12,15 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from diffdrive_jacobian.kinematics._elementary import arctan2, components, cos, hypot, operand
-from diffdrive_jacobian.kinematics.se2 import wrap_angle
+from diffdrive_jacobian.kinematics._elementary import (
+    agree,
+    arctan2,
+    components,
+    cos,
+    operand,
+    sin,
+    wrapped,
+)
 
 
 def go_to_goal(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any) -> tuple[Any, Any]:
@@ -34,15 +41,19 @@ def go_to_goal(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any) -> tuple[Any
         towards it is undefined, both are zero.
 
     Raises:
-        ValueError: The last axis of state or goal has a wrong length.
+        ValueError: The last axis of state or goal has a wrong length, shapes do not broadcast, or
+            something is not finite.
     """
     x, y, theta = components('state', state, 3)
     x_goal, y_goal = components('goal', goal, 2)
-    Kp, Kv = operand(Kp), operand(Kv)
+    Kp, Kv = operand('Kp', Kp), operand('Kv', Kv)
+    agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv)
     dx, dy = x_goal - x, y_goal - y
-    distance = hypot(dx, dy)
-    heading_error = wrap_angle(arctan2(dy, dx) - theta)
-    return Kv * distance * cos(heading_error), Kp * heading_error * (distance > 0.0)
+    c, s = cos(theta), sin(theta)
+    # d cos(e) and d sin(e): the way to the goal, seen from the robot. It needs no wrapping.
+    ahead, aside = c * dx + s * dy, c * dy - s * dx
+    heading_error = arctan2(aside, ahead)
+    return Kv * ahead, Kp * heading_error * ((dx != 0.0) | (dy != 0.0))
 
 
 def turn_in_place(theta: ArrayLike, heading: ArrayLike, Kp: Any) -> tuple[Any, Any]:
@@ -55,6 +66,11 @@ def turn_in_place(theta: ArrayLike, heading: ArrayLike, Kp: Any) -> tuple[Any, A
 
     Returns:
         `(v, omega)`, each of shape (...) (m/s, rad/s).
+
+    Raises:
+        ValueError: Shapes do not broadcast, or something is not finite.
     """
-    omega = operand(Kp) * wrap_angle(operand(heading) - operand(theta))
+    theta, heading, Kp = operand('theta', theta), operand('heading', heading), operand('Kp', Kp)
+    agree(theta=theta, heading=heading, Kp=Kp)
+    omega = Kp * wrapped(heading - theta)
     return 0.0 * omega, omega

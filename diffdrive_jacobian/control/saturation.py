@@ -12,44 +12,50 @@ from typing import Any
 
 import numpy as np
 
-from diffdrive_jacobian.kinematics._elementary import maximum, minimum, operand
+from diffdrive_jacobian.kinematics._checks import floats
+from diffdrive_jacobian.kinematics._elementary import agree, maximum, minimum, operand, where
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class VelocityLimits:
-    """Limits of a differential drive; infinity means none.
+    """Limits of a differential drive; infinity means none. Each is a number, or an array, for as many
+    robots, that broadcasts with the commands.
 
     Raises:
         ValueError: A limit is NaN or lies on the wrong side of zero: standing still must be allowed.
     """
 
-    min_v: float = -np.inf
+    min_v: Any = -np.inf
     """Fastest reverse speed, zero or negative (m/s)."""
-    max_v: float = np.inf
+    max_v: Any = np.inf
     """Fastest forward speed (m/s)."""
-    min_omega: float = -np.inf
+    min_omega: Any = -np.inf
     """Fastest clockwise yaw rate, zero or negative (rad/s)."""
-    max_omega: float = np.inf
+    max_omega: Any = np.inf
     """Fastest counter-clockwise yaw rate (rad/s)."""
-    max_wheel_speed: float = np.inf
+    max_wheel_speed: Any = np.inf
     """Fastest speed of either wheel, either way (rad/s)."""
 
     def __post_init__(self) -> None:
         """Check every limit."""
         for name in ('min_v', 'min_omega'):
-            if not (value := getattr(self, name)) <= 0.0:
+            if not np.all((value := getattr(self, name)) <= 0.0):
                 raise ValueError(f'{name} must be zero or negative, got {value}')
         for name in ('max_v', 'max_omega'):
-            if not (value := getattr(self, name)) >= 0.0:
+            if not np.all((value := getattr(self, name)) >= 0.0):
                 raise ValueError(f'{name} must be zero or positive, got {value}')
-        if not self.max_wheel_speed > 0.0:
+        if not np.all(self.max_wheel_speed > 0.0):
             raise ValueError(f'max_wheel_speed must be positive, got {self.max_wheel_speed}')
 
     @property
     def unlimited(self) -> bool:
         """Whether no limit is set."""
-        return self == _NONE
+        return all(type(limit) is float and abs(limit) == np.inf for limit in self.all())
+
+    def all(self) -> tuple[Any, ...]:
+        """Give the limits in their order."""
+        return self.min_v, self.max_v, self.min_omega, self.max_omega, self.max_wheel_speed
 
 
 def saturate(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tuple[Any, Any]:
@@ -69,37 +75,41 @@ def saturate(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tupl
         The limited `(v, omega)`, each of shape (...).
 
     Raises:
-        ValueError: The wheels have a limit, and r or L is not positive and finite.
+        ValueError: v or omega is not finite, or too large to be scaled; shapes do not broadcast; the
+            wheels have a limit, and r or L is not positive and finite.
     """
+    v, omega = operand('v', v), operand('omega', omega)
     if limits.unlimited:
         return v, omega
-    v, omega = operand(v), operand(omega)
-    v, v_excess = _allowed(v, limits.min_v, limits.max_v)
-    omega, omega_excess = _allowed(omega, limits.min_omega, limits.max_omega)
+    min_v, max_v, min_omega, max_omega, max_wheel_speed = map(_limit, limits.all())
+    agree(v=v, omega=omega, min_v=min_v, max_v=max_v, min_omega=min_omega, max_omega=max_omega)
+    v, v_excess = _allowed(v, min_v, max_v)
+    omega, omega_excess = _allowed(omega, min_omega, max_omega)
     excess = maximum(1.0, maximum(v_excess, omega_excess))
-    if limits.max_wheel_speed < np.inf:
+    if type(max_wheel_speed) is not float or max_wheel_speed < np.inf:
         omega_R, omega_L = body_to_wheel(v, omega, r, L)
+        agree(wheel_speeds=omega_R, max_wheel_speed=max_wheel_speed)
         fastest = maximum(abs(omega_R), abs(omega_L))
-        excess = maximum(excess, fastest / limits.max_wheel_speed)
+        excess = maximum(excess, fastest / max_wheel_speed)
+    if not np.all(excess < np.inf):
+        raise ValueError(f'v and omega must not overflow when they are scaled, got {v} and {omega}')
     # The quotient may round to one unit in the last place beyond the limit.
     return (
-        minimum(maximum(v / excess, limits.min_v), limits.max_v),
-        minimum(maximum(omega / excess, limits.min_omega), limits.max_omega),
+        minimum(maximum(v / excess, min_v), max_v),
+        minimum(maximum(omega / excess, min_omega), max_omega),
     )
 
 
-def _allowed(speed: Any, low: float, high: float) -> tuple[Any, Any]:
+def _limit(value: Any) -> Any:
+    return float(value) if isinstance(value, (float, int)) else floats('limit', value)
+
+
+def _allowed(speed: Any, low: Any, high: Any) -> tuple[Any, Any]:
     """Drop forbidden directions, and tell how many times too fast the rest is."""
-    if low == 0.0:
-        speed = maximum(speed, 0.0)
-    if high == 0.0:
-        speed = minimum(speed, 0.0)
-    excess: Any = 0.0
-    if low < 0.0:
-        excess = maximum(excess, speed / low)
-    if high > 0.0:
-        excess = maximum(excess, speed / high)
+    speed = where(low == 0.0, maximum(speed, 0.0), speed)
+    speed = where(high == 0.0, minimum(speed, 0.0), speed)
+    excess = maximum(
+        speed / where(low < 0.0, low, -np.inf),
+        speed / where(high > 0.0, high, np.inf),
+    )
     return speed, excess
-
-
-_NONE = VelocityLimits()

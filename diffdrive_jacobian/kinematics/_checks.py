@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 
 def positive(name: str, value: Any) -> None:
@@ -16,4 +18,109 @@ def positive(name: str, value: Any) -> None:
     # A plain float takes the first test alone: this runs for every message.
     inside = (value > 0.0) & (value < np.inf)
     if inside is not True and not np.all(inside):
-        raise ValueError(f'{name} must be positive and finite, got {value}')
+        raise ValueError(f'{name} must be positive and finite, got {_first(value, inside)}')
+
+
+def not_negative(name: str, value: Any) -> None:
+    """Require a number to be zero or positive, and finite.
+
+    Raises:
+        ValueError: An entry is negative, infinite or NaN.
+    """
+    inside = (value >= 0.0) & (value < np.inf)
+    if inside is not True and not np.all(inside):
+        raise ValueError(f'{name} must be zero or positive and finite, got {_first(value, inside)}')
+
+
+def offset(name: str, value: Any) -> None:
+    """Require a control point beside the axle.
+
+    Raises:
+        ValueError: An entry is zero, infinite or NaN.
+    """
+    inside = (value != 0.0) & (abs(value) < np.inf)
+    if inside is not True and not np.all(inside):
+        raise ValueError(
+            f'{name} must be finite and not 0, for the Jacobian of the axle centre itself has rank 1; '
+            f'got {_first(value, inside)}'
+        )
+
+
+def finite(name: str, value: Any) -> None:
+    """Require numbers.
+
+    Raises:
+        ValueError: An entry is infinite or NaN.
+    """
+    if type(value) is float:
+        if not math.isfinite(value):
+            raise ValueError(f'{name} must be finite, got {value}')
+        return
+    inside = np.isfinite(value)
+    if not inside.all():
+        raise ValueError(f'{name} must be finite, got {_first(value, inside)}')
+
+
+def floats(name: str, value: Any) -> NDArray[np.float64]:
+    """Make a float array of a value.
+
+    Raises:
+        ValueError: It holds something else than real numbers, or rows of several lengths.
+    """
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind not in 'biuf':
+            # A list of objects that are numbers is welcome, a complex number is not.
+            array = np.array(array.tolist(), dtype=np.float64)
+        return array.astype(np.float64, copy=False)
+    except (TypeError, ValueError) as error:
+        got = str(value)
+        got = got if len(got) <= 60 else f'{got[:57]}...'
+        raise ValueError(f'{name} must be an array of real numbers, got {got} ({error})') from error
+
+
+def array(name: str, value: Any, *trailing: int | None) -> NDArray[np.float64]:
+    """Make a finite float array with these last axes; None stands for any length but zero.
+
+    Raises:
+        ValueError: The shape is another one, or an entry is infinite, NaN or no number.
+    """
+    made = floats(name, value)
+    shape = made.shape[made.ndim - len(trailing) :] if made.ndim >= len(trailing) else None
+    if shape is None or any(
+        got == 0 if wanted is None else got != wanted
+        for got, wanted in zip(shape, trailing, strict=True)
+    ):
+        axes = ', '.join(['...', *('n'[wanted is not None :] or str(wanted) for wanted in trailing)])
+        raise ValueError(f'{name} must have shape ({axes}), got {made.shape}')
+    finite(name, made)
+    return made
+
+
+def leading(**shapes: tuple[int, ...]) -> tuple[int, ...]:
+    """Broadcast the leading axes of arguments.
+
+    Args:
+        shapes: For each argument the axes that are left when those of one robot are taken away.
+
+    Returns:
+        The axes of the whole batch.
+
+    Raises:
+        ValueError: They do not broadcast.
+    """
+    try:
+        return np.broadcast_shapes(*shapes.values())
+    except ValueError:
+        told = ', '.join(f'{name} {shape}' for name, shape in shapes.items())
+        raise ValueError(
+            f'{" and ".join(shapes)} must have leading axes that broadcast, got {told}'
+        ) from None
+
+
+def _first(value: Any, inside: Any) -> str:
+    """Tell the first entry that is not inside, and where it stands."""
+    if np.ndim(value) == 0:
+        return f'{value}'
+    index = tuple(int(i) for i in np.argwhere(~np.asarray(inside))[0])
+    return f'{np.asarray(value)[index]} at index {index if len(index) > 1 else index[0]}'

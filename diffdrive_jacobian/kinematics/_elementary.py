@@ -7,36 +7,77 @@ faster than NumPy's scalars would: that matters where it runs for every message.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from diffdrive_jacobian.kinematics._checks import finite, floats, leading
+
+TURN = 2.0 * math.pi
 
 
 def components(name: str, value: Any, size: int) -> list[Any]:
     """Split vectors along their last axis of `size` entries; a single vector gives floats.
 
     Raises:
-        ValueError: The last axis has another length, or there is none.
+        ValueError: The last axis has another length, or there is none, or an entry is infinite, NaN
+            or no number.
     """
     if type(value) is tuple and len(value) == size and type(value[0]) is type(value[-1]) is float:
-        return list(map(operand, value))
-    array: NDArray[np.float64] = np.asarray(value, dtype=np.float64)
-    if array.ndim == 0 or array.shape[-1] != size:
-        raise ValueError(f'{name} must have shape (..., {size}), got {array.shape}')
-    if array.ndim == 1:
-        entries: list[Any] = array.tolist()
-        return entries
-    return [array[..., index] for index in range(size)]
+        entries = list(map(float, value))
+    else:
+        array = floats(name, value)
+        if array.ndim == 0 or array.shape[-1] != size:
+            raise ValueError(f'{name} must have shape (..., {size}), got {array.shape}')
+        if array.ndim > 1:
+            finite(name, array)
+            return [array[..., index] for index in range(size)]
+        entries = array.tolist()
+    if not all(map(math.isfinite, entries)):
+        raise ValueError(f'{name} must be finite, got {entries}')
+    return entries
 
 
-def operand(value: Any) -> Any:
-    """Let numbers be floats, and everything else a float array."""
-    if type(value) is float:
-        return value
+def operand(name: str, value: Any, check: Callable[[str, Any], None] = finite) -> Any:
+    """Let numbers be floats, and everything else a float array.
+
+    Raises:
+        ValueError: A number does not pass the check, or something is no number.
+    """
     if isinstance(value, (float, int)):
-        return float(value)
-    return np.asarray(value, dtype=np.float64)
+        value = float(value)
+    else:
+        value = floats(name, value)
+        if value.ndim == 0:
+            value = float(value)
+    check(name, value)
+    return value
+
+
+def agree(**values: Any) -> None:
+    """Require arrays to broadcast; floats always do.
+
+    Raises:
+        ValueError: They do not; all are named.
+    """
+    shapes = {name: np.shape(value) for name, value in values.items() if type(value) is not float}
+    if len(shapes) > 1:
+        leading(**shapes)
+
+
+def wrapped(angle: Any) -> Any:
+    """Wrap angles to (-pi, pi], exactly with respect to the double nearest to 2 pi."""
+    if type(angle) is float:
+        if -math.pi < angle <= math.pi:
+            return angle
+        # math.fmod raises where NumPy gives NaN.
+        angle = math.fmod(angle, TURN) if math.isfinite(angle) else math.nan
+    elif not np.abs(angle).max(initial=0.0) < 2.0 * TURN:
+        # Nearer than that, the subtraction below is exact by itself, and faster.
+        angle = np.fmod(angle, TURN)
+    return angle - TURN * (angle > np.pi) + TURN * (angle <= -np.pi)
 
 
 def stack(*entries: Any) -> NDArray[np.float64]:
@@ -66,12 +107,6 @@ def arctan2(y: Any, x: Any) -> Any:
 def hypot(x: Any, y: Any) -> Any:
     """Length of the vector (x, y)."""
     return math.hypot(x, y) if type(x) is type(y) is float else np.hypot(x, y)
-
-
-def remainder(x: Any, divisor: float) -> Any:
-    """Exact remainder with the sign of x."""
-    # math.fmod raises where NumPy gives NaN.
-    return math.fmod(x, divisor) if type(x) is float and math.isfinite(x) else np.fmod(x, divisor)
 
 
 def maximum(x: Any, y: Any) -> Any:

@@ -6,8 +6,8 @@ separation `L` in m. **Wheels stand right, left everywhere.**
 
     w --J_w--> u --S(theta)--> q_dot
 
-Everything broadcasts over leading axes. A radius or separation that is not positive and finite
-raises ValueError.
+Everything broadcasts over leading axes. A radius or separation that is not positive and finite, an
+angle or speed that is not finite, and shapes that do not broadcast raise ValueError.
 
 Source: document A, equations (4)-(8); documents B and E; MATH.md, "Differential drive".
 """
@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import positive
-from diffdrive_jacobian.kinematics._elementary import operand
+from diffdrive_jacobian.kinematics._checks import array, floats, leading, offset, positive
+from diffdrive_jacobian.kinematics._elementary import agree, components, cos, operand, sin, stack
 
 
 def unicycle_jacobian(theta: ArrayLike) -> NDArray[np.float64]:
@@ -32,7 +32,7 @@ def unicycle_jacobian(theta: ArrayLike) -> NDArray[np.float64]:
     Returns:
         S, shape (..., 3, 2). Its rank is 2 and its singular values are 1, 1 for every heading.
     """
-    theta = np.asarray(theta, dtype=np.float64)
+    theta = _angles(theta)
     jacobian = np.zeros((*theta.shape, 3, 2))
     jacobian[..., 0, 0] = np.cos(theta)
     jacobian[..., 1, 0] = np.sin(theta)
@@ -96,8 +96,105 @@ def wheel_to_world_jacobian(theta: ArrayLike, r: ArrayLike, L: ArrayLike) -> NDA
     Raises:
         ValueError: r or L is not positive and finite.
     """
+    r, L = _geometry(r, L)
+    theta = _angles(theta, r=r, L=L)
     chain: NDArray[np.float64] = unicycle_jacobian(theta) @ wheel_to_body_jacobian(r, L)
     return chain
+
+
+def single_wheel_jacobian(theta: ArrayLike, r: ArrayLike) -> NDArray[np.float64]:
+    """Map the speed of one driven wheel and the yaw rate to the velocity in the world (B, "Unicycle").
+
+    Args:
+        theta: Headings, shape (...) (rad).
+        r: Wheel radius, shape (...) (m).
+
+    Returns:
+        `[[r cos, 0], [r sin, 0], [0, 1]]`, shape (..., 3, 2), over `[omega_wheel, theta_dot]` (rad/s).
+
+    Raises:
+        ValueError: r is not positive and finite.
+    """
+    r = floats('r', r)
+    positive('r', r)
+    theta = _angles(theta, r=r)
+    jacobian = np.zeros((*np.broadcast(theta, r).shape, 3, 2))
+    jacobian[..., 0, 0] = r * np.cos(theta)
+    jacobian[..., 1, 0] = r * np.sin(theta)
+    jacobian[..., 2, 1] = 1.0
+    return jacobian
+
+
+def wheel_to_position_jacobian(theta: ArrayLike, r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
+    """Map wheel speeds to the velocity of the axle centre alone: `[x_dot, y_dot] = S[:2] J_w w` (B).
+
+    **It has rank 1 for every heading, radius and separation**: the axle centre moves along the
+    heading only, whatever the wheels do. No controller of the position can be made by inverting it;
+    a point beside the axle can be controlled, see `offset_point_jacobian`.
+
+    Args:
+        theta: Headings, shape (...) (rad).
+        r: Wheel radius, shape (...) (m).
+        L: Wheel separation, shape (...) (m).
+
+    Returns:
+        The Jacobian, shape (..., 2, 2), over `[omega_R, omega_L]`. Its determinant is exactly 0.
+
+    Raises:
+        ValueError: r or L is not positive and finite.
+    """
+    return wheel_to_world_jacobian(theta, r, L)[..., :2, :]
+
+
+def offset_point(pose: ArrayLike, d: ArrayLike) -> NDArray[np.float64]:
+    """Give the point at distance d ahead of the axle centre: `[x + d cos, y + d sin]` (B).
+
+    Args:
+        pose: `[x, y, theta]`, shape (..., 3).
+        d: Distance of the point, negative for one behind the axle, shape (...) (m).
+
+    Returns:
+        The points in the world, shape (..., 2) (m).
+
+    Raises:
+        ValueError: Something is not finite, or shapes do not broadcast.
+    """
+    x, y, theta = components('pose', pose, 3)
+    d = operand('d', d)
+    agree(pose=x, d=d)
+    return stack(x + d * cos(theta), y + d * sin(theta))
+
+
+def offset_point_jacobian(
+    theta: ArrayLike, r: ArrayLike, L: ArrayLike, d: ArrayLike
+) -> NDArray[np.float64]:
+    """Map wheel speeds to the velocity of the offset point (B).
+
+    `J_d = R(theta) [[r/2, r/2], [d r/L, -d r/L]]`. Its determinant is `-d r^2 / L`: it inverts for
+    every heading, because d is not 0.
+
+    Args:
+        theta: Headings, shape (...) (rad).
+        r: Wheel radius, shape (...) (m).
+        L: Wheel separation, shape (...) (m).
+        d: Distance of the point ahead of the axle centre, not 0, shape (...) (m).
+
+    Returns:
+        The Jacobian, shape (..., 2, 2), over `[omega_R, omega_L]`.
+
+    Raises:
+        ValueError: r or L is not positive and finite, d is 0 or not finite.
+    """
+    r, L = _geometry(r, L)
+    d = array('d', d)
+    offset('d', d)
+    theta = _angles(theta, r=r, L=L, d=d)
+    c, s = np.cos(theta), np.sin(theta)
+    along, across = r / 2.0, d * r / L
+    jacobian = np.empty((*np.broadcast(theta, r, L, d).shape, 2, 2))
+    jacobian[..., 0, 0], jacobian[..., 0, 1] = c * along - s * across, c * along + s * across
+    jacobian[..., 1, 0], jacobian[..., 1, 1] = s * along + c * across, s * along - c * across
+    return jacobian
 
 
 def body_to_wheel(v: Any, omega: Any, r: Any, L: Any) -> tuple[Any, Any]:
@@ -115,7 +212,7 @@ def body_to_wheel(v: Any, omega: Any, r: Any, L: Any) -> tuple[Any, Any]:
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    v, omega, r, L = _operands(v, omega, r, L)
+    v, omega, r, L = _operands(r, L, v=v, omega=omega)
     half = omega * L / 2.0
     return (v + half) / r, (v - half) / r
 
@@ -135,7 +232,7 @@ def wheel_to_body(omega_R: Any, omega_L: Any, r: Any, L: Any) -> tuple[Any, Any]
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    omega_R, omega_L, r, L = _operands(omega_R, omega_L, r, L)
+    omega_R, omega_L, r, L = _operands(r, L, omega_R=omega_R, omega_L=omega_L)
     return r * (omega_R + omega_L) / 2.0, r * (omega_R - omega_L) / L
 
 
@@ -148,7 +245,7 @@ def no_lateral_slip_constraint(theta: ArrayLike) -> NDArray[np.float64]:
     Returns:
         The constraint, shape (..., 1, 3). Its null space is the range of S(theta).
     """
-    theta = np.asarray(theta, dtype=np.float64)
+    theta = _angles(theta)
     constraint = np.zeros((*theta.shape, 1, 3))
     constraint[..., 0, 0] = np.sin(theta)
     constraint[..., 0, 1] = -np.cos(theta)
@@ -174,8 +271,8 @@ def rolling_constraints(
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    theta = np.asarray(theta, dtype=np.float64)
     r, L = _geometry(r, L)
+    theta = _angles(theta, r=r, L=L)
     shape = np.broadcast(theta, r, L).shape
     over_pose, over_wheels = np.zeros((*shape, 3, 3)), np.zeros((*shape, 3, 2))
     over_pose[..., :1, :] = no_lateral_slip_constraint(theta)
@@ -187,15 +284,23 @@ def rolling_constraints(
     return over_pose, over_wheels
 
 
+def _angles(theta: ArrayLike, **lengths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Take headings that broadcast with the other arguments."""
+    made = array('theta', theta)
+    leading(theta=made.shape, **{name: length.shape for name, length in lengths.items()})
+    return made
+
+
 def _geometry(r: ArrayLike, L: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    r, L = np.asarray(r, dtype=np.float64), np.asarray(L, dtype=np.float64)
+    r, L = floats('r', r), floats('L', L)
     positive('r', r)
     positive('L', L)
+    leading(r=r.shape, L=L.shape)
     return r, L
 
 
-def _operands(first: Any, second: Any, r: Any, L: Any) -> tuple[Any, Any, Any, Any]:
-    first, second, r, L = operand(first), operand(second), operand(r), operand(L)
-    positive('r', r)
-    positive('L', L)
-    return first, second, r, L
+def _operands(r: Any, L: Any, **speeds: Any) -> tuple[Any, ...]:
+    made = {name: operand(name, value) for name, value in speeds.items()}
+    r, L = operand('r', r, positive), operand('L', L, positive)
+    agree(**made, r=r, L=L)
+    return *made.values(), r, L

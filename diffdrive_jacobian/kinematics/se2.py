@@ -4,7 +4,8 @@ Model: a pose `[x, y, theta]` (m, m, rad) is the placement of a frame B in a fra
 y left, theta counter-clockwise and wrapped to (-pi, pi]. A twist `[vx, vy, omega]` (m/s, m/s,
 rad/s) is a velocity in B.
 
-Everything broadcasts over leading axes: a pose has shape (..., 3). Wrong shapes raise ValueError.
+Everything broadcasts over leading axes: a pose has shape (..., 3). Wrong shapes, and values that are
+not finite, raise ValueError.
 
 Source: MATH.md, "Motion of a virtual robot"; document B for the homogeneous transform.
 """
@@ -17,15 +18,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._elementary import (
+    agree,
     components,
     cos,
     operand,
-    remainder,
     sin,
     stack,
+    wrapped,
 )
-
-TURN = 2.0 * np.pi
 
 
 def wrap_angle(angle: ArrayLike) -> Any:
@@ -39,9 +39,11 @@ def wrap_angle(angle: ArrayLike) -> Any:
 
     Returns:
         The wrapped angles, same shape (rad).
+
+    Raises:
+        ValueError: An angle is infinite or NaN.
     """
-    wrapped = remainder(operand(angle), TURN)
-    return wrapped - TURN * (wrapped > np.pi) + TURN * (wrapped <= -np.pi)
+    return wrapped(operand('angle', angle))
 
 
 def sinc(angle: Any) -> Any:
@@ -63,7 +65,7 @@ def exp(twist: ArrayLike) -> NDArray[np.float64]:
     vx, vy, turn = components('twist', twist, 3)
     chord = sinc(turn / 2.0)
     along, across = chord * cos(turn / 2.0), chord * sin(turn / 2.0)
-    return stack(along * vx - across * vy, across * vx + along * vy, wrap_angle(turn))
+    return stack(along * vx - across * vy, across * vx + along * vy, wrapped(turn))
 
 
 def log(pose: ArrayLike) -> NDArray[np.float64]:
@@ -76,7 +78,7 @@ def log(pose: ArrayLike) -> NDArray[np.float64]:
         The twist `[vx, vy, omega]`, shape (..., 3), with the turn of least magnitude.
     """
     x, y, theta = components('pose', pose, 3)
-    turn = wrap_angle(theta)
+    turn = wrapped(theta)
     along = cos(turn / 2.0) / sinc(turn / 2.0)
     return stack(along * x + turn / 2.0 * y, along * y - turn / 2.0 * x, turn)
 
@@ -93,15 +95,16 @@ def compose(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
     """
     x, y, theta = components('first', first, 3)
     dx, dy, turn = components('second', second, 3)
+    agree(first=x, second=dx)
     c, s = cos(theta), sin(theta)
-    return stack(x + c * dx - s * dy, y + s * dx + c * dy, wrap_angle(theta + turn))
+    return stack(x + c * dx - s * dy, y + s * dx + c * dy, wrapped(theta + turn))
 
 
 def inverse(pose: ArrayLike) -> NDArray[np.float64]:
     """Give the pose of W in B from the pose of B in W, shape (..., 3), theta wrapped."""
     x, y, theta = components('pose', pose, 3)
     c, s = cos(theta), sin(theta)
-    return stack(-c * x - s * y, s * x - c * y, wrap_angle(-theta))
+    return stack(-c * x - s * y, s * x - c * y, wrapped(-theta))
 
 
 def homogeneous(pose: ArrayLike) -> NDArray[np.float64]:
@@ -138,8 +141,9 @@ def integrate(pose: ArrayLike, twist: ArrayLike, dt: ArrayLike) -> NDArray[np.fl
     """
     x, y, theta = components('pose', pose, 3)
     v, omega = components('twist', twist, 2)
-    dt = operand(dt)
+    dt = operand('dt', dt)
+    agree(pose=x, twist=v, dt=dt)
     turn = omega * dt
     chord = v * dt * sinc(turn / 2.0)
     heading = theta + turn / 2.0
-    return stack(x + chord * cos(heading), y + chord * sin(heading), wrap_angle(theta + turn))
+    return stack(x + chord * cos(heading), y + chord * sin(heading), wrapped(theta + turn))

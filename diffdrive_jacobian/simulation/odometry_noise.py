@@ -68,7 +68,7 @@ def propagate_covariance(
     """
     _, _, theta = components('pose', pose, 3)
     v, omega = components('twist', twist, 2)
-    dt = operand(dt)
+    dt = operand('dt', dt)
     turn, way = omega * dt, v * dt
     c, s = cos(theta + turn), sin(theta + turn)
     # The displacement, seen from the end of the arc, then in the world.

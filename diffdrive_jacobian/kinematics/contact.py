@@ -1,0 +1,93 @@
+"""A wheel as a contact: where a point of its rim is, and how it moves.
+
+State: `q = [x, phi]`, the way of the wheel's centre (m) and the angle by which the wheel has turned
+(rad). The wheel, of radius r, stands upright on the ground at height 0, so its centre is at height r.
+
+A wheel that rolls does not slip: the point that touches the ground, at phi = pi, has no velocity. So
+the rolling condition is the null space of the contact's Jacobian there: `x_dot = r phi_dot`.
+
+Everything broadcasts over leading axes. A radius that is not positive and finite, other values that
+are not finite, and shapes that do not broadcast raise ValueError.
+
+Source: document C, "Kinematic structure of mobile robots"; MATH.md, "Differential drive".
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from diffdrive_jacobian.kinematics._checks import array, floats, leading, positive
+
+AT_GROUND = np.pi
+"""The angle phi of the point that touches the ground (rad)."""
+
+
+def wheel_contact_position(x: ArrayLike, phi: ArrayLike, r: ArrayLike) -> NDArray[np.float64]:
+    """Give the position of a point of the rim: `[x + r sin(phi), r + r cos(phi), 0]` (C).
+
+    Args:
+        x: Way of the centre, shape (...) (m).
+        phi: Angle of the point, 0 on top, shape (...) (rad).
+        r: Wheel radius, shape (...) (m).
+
+    Returns:
+        `[along, up, sideways]`, shape (..., 3) (m).
+
+    Raises:
+        ValueError: r is not positive and finite, or x or phi is not finite.
+    """
+    x, phi, r = _checked(x=x, phi=phi, r=r)
+    x, phi, r = np.broadcast_arrays(x, phi, r)
+    position: NDArray[np.float64] = np.stack(
+        [x + r * np.sin(phi), r + r * np.cos(phi), np.zeros_like(x)], axis=-1
+    )
+    return position
+
+
+def wheel_contact_jacobian(phi: ArrayLike, r: ArrayLike) -> NDArray[np.float64]:
+    """Map `[x_dot, phi_dot]` to the velocity of the point: `[[1, r cos], [0, -r sin], [0, 0]]` (C).
+
+    Args:
+        phi: Angle of the point, 0 on top, shape (...) (rad).
+        r: Wheel radius, shape (...) (m).
+
+    Returns:
+        The Jacobian, shape (..., 3, 2). At phi = pi its null space is the rolling condition.
+
+    Raises:
+        ValueError: r is not positive and finite, or phi is not finite.
+    """
+    phi, r = _checked(phi=phi, r=r)
+    jacobian = np.zeros((*np.broadcast(phi, r).shape, 3, 2))
+    jacobian[..., 0, 0] = 1.0
+    jacobian[..., 0, 1] = r * np.cos(phi)
+    jacobian[..., 1, 1] = -r * np.sin(phi)
+    return jacobian
+
+
+def rolling_direction(r: ArrayLike) -> NDArray[np.float64]:
+    """Give the velocity with which a wheel rolls: `[r, 1]` spans the null space at the ground (C).
+
+    Args:
+        r: Wheel radius, shape (...) (m).
+
+    Returns:
+        `[x_dot, phi_dot]` for one radian per second, shape (..., 2) (m/s, rad/s).
+
+    Raises:
+        ValueError: r is not positive and finite.
+    """
+    (r,) = _checked(r=r)
+    direction: NDArray[np.float64] = np.stack([r, np.ones_like(r)], axis=-1)
+    return direction
+
+
+def _checked(*, r: Any, **coordinates: Any) -> list[NDArray[np.float64]]:
+    made = {name: array(name, value) for name, value in coordinates.items()}
+    made['r'] = floats('r', r)
+    positive('r', made['r'])
+    leading(**{name: value.shape for name, value in made.items()})
+    return list(made.values())

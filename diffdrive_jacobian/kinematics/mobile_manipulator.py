@@ -1,0 +1,118 @@
+"""A planar arm on a differential drive: one Jacobian from the wheels and the joints to the tip.
+
+State: `q = [x, y, theta, q_1, ..., q_n]`, the pose of the base (m, m, rad) and the joint angles (rad).
+Input: `[omega_R, omega_L, q_1_dot, ..., q_n_dot]` (rad/s). Task: position (m) and heading (rad) of the
+tip in the world.
+
+Everything broadcasts over leading axes: q has shape (..., 3 + n). Wrong shapes and values that are not
+finite raise ValueError. There are more inputs than velocities of the task: see `inverse_velocity`.
+
+Source: document A, 3.2.4, "Mobile Manipulators"; MATH.md, "Manipulators and inverse velocity".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from diffdrive_jacobian.kinematics import se2
+from diffdrive_jacobian.kinematics._checks import array, leading, positive
+from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body, wheel_to_body_jacobian
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
+
+
+@dataclass(frozen=True, eq=False)
+class MobileManipulator:
+    """The base, and the arm that stands on it.
+
+    Raises:
+        ValueError: r or L is not positive and finite, or the mount is not `[m_x, m_y]`.
+    """
+
+    r: float
+    """Wheel radius (m)."""
+    L: float
+    """Wheel separation (m)."""
+    arm: PlanarArm
+    """Its x axis points forward."""
+    mount: Any = (0.0, 0.0)
+    """Where the arm's base is in the frame of the axle centre, `[m_x, m_y]` (m)."""
+
+    def __post_init__(self) -> None:
+        """Check every dimension."""
+        positive('r', float(self.r))
+        positive('L', float(self.L))
+        mount = array('mount', self.mount, 2)
+        if mount.ndim != 1:
+            raise ValueError(f'mount must have shape (2,), got {mount.shape}')
+        object.__setattr__(self, 'mount', mount)
+
+    def forward_kinematics(self, q: ArrayLike) -> NDArray[np.float64]:
+        """Give the pose of the tip in the world.
+
+        Args:
+            q: Configurations, shape (..., 3 + n).
+
+        Returns:
+            `[x, y, heading]`, shape (..., 3) (m, m, rad).
+        """
+        base, joints = self._split(q)
+        tip = self.arm.forward_kinematics(joints)
+        tip[..., :2] += self.mount
+        return se2.compose(base, tip)
+
+    def jacobian(self, q: ArrayLike, heading: bool = False) -> NDArray[np.float64]:
+        """Map the velocities of wheels and joints to that of the tip.
+
+        `[[I_2 | R'(theta) (m + p_arm)] S(theta) J_w | R(theta) J_arm]`: the wheels move the tip as a
+        part of the base, and the joints move it as the arm does, turned into the world.
+
+        Args:
+            q: Configurations, shape (..., 3 + n).
+            heading: Whether the heading of the tip is a part of the task.
+
+        Returns:
+            The Jacobian, shape (..., 2, 2 + n), or (..., 3, 2 + n) with the heading, over
+            `[omega_R, omega_L, q_1_dot, ...]`.
+        """
+        base, joints = self._split(q)
+        c, s = np.cos(base[..., 2]), np.sin(base[..., 2])
+        # In the frame of the base: v goes along x, and omega moves the tip across its lever arm.
+        lever = self.arm.forward_kinematics(joints)[..., :2] + self.mount
+        in_base = np.zeros((*joints.shape[:-1], 3, 2 + self.arm.joints))
+        in_base[..., 0, 0] = 1.0
+        in_base[..., 0, 1], in_base[..., 1, 1] = -lever[..., 1], lever[..., 0]
+        in_base[..., 2, 1] = 1.0
+        in_base[..., :2] = in_base[..., :2] @ wheel_to_body_jacobian(self.r, self.L)
+        in_base[..., 2:] = self.arm.jacobian(joints, heading=True)
+        jacobian = np.empty_like(in_base)
+        c, s = c[..., np.newaxis], s[..., np.newaxis]
+        jacobian[..., 0, :] = c * in_base[..., 0, :] - s * in_base[..., 1, :]
+        jacobian[..., 1, :] = s * in_base[..., 0, :] + c * in_base[..., 1, :]
+        jacobian[..., 2, :] = in_base[..., 2, :]
+        return jacobian if heading else jacobian[..., :2, :]
+
+    def integrate(self, q: ArrayLike, q_dot: ArrayLike, dt: ArrayLike) -> NDArray[np.float64]:
+        """Hold the velocities of wheels and joints for a time; the base drives an exact arc.
+
+        Args:
+            q: Configurations at the start, shape (..., 3 + n).
+            q_dot: `[omega_R, omega_L, q_1_dot, ...]`, shape (..., 2 + n) (rad/s).
+            dt: Time for which they are held, shape (...) (s).
+
+        Returns:
+            Configurations at the end, shape (..., 3 + n), theta wrapped.
+        """
+        base, joints = self._split(q)
+        speeds, dt = array('q_dot', q_dot, 2 + self.arm.joints), array('dt', dt)
+        leading(q=base.shape[:-1], q_dot=speeds.shape[:-1], dt=dt.shape)
+        v, omega = wheel_to_body(speeds[..., 0], speeds[..., 1], self.r, self.L)
+        driven = se2.integrate(base, np.stack([v, omega], axis=-1), dt)
+        return np.concatenate([driven, self.arm.integrate(joints, speeds[..., 2:], dt)], axis=-1)
+
+    def _split(self, q: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        made = array('q', q, 3 + self.arm.joints)
+        return made[..., :3], made[..., 3:]
