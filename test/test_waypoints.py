@@ -17,7 +17,7 @@ WITH_HEADING = Arrival(xy_tolerance=0.02, yaw_tolerance=0.01, use_heading=True)
 
 
 def law(pose, goal):
-    return go_to_goal(pose, goal, 3.0, 0.5)
+    return go_to_goal(pose, goal[:2], 3.0, 0.5)
 
 
 def refuses(pose, goal):
@@ -76,7 +76,7 @@ def test_the_law_is_asked_with_the_pose_and_the_position_driven_to():
     for index in range(3):
         here, command = Waypoints(POSES, index).follow(pose, echo, WITH_HEADING, GAIN)
         assert (here.index, here.turning) == (index, False)
-        assert command == (*pose, *POSES[index, :2])
+        assert command == (*pose, *POSES[index])
 
 
 @pytest.mark.parametrize('arrival', [POSITIONS_ONLY, WITH_HEADING])
@@ -86,7 +86,7 @@ def test_waypoints_already_reached_are_skipped_in_one_step(arrival):
     )
     here, command = Waypoints(near).follow(np.zeros(3), echo, arrival, GAIN)
     assert here.index == 3
-    assert command == (0.0, 0.0, 0.0, 1.0, 0.0)
+    assert command == (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
 
 
 def test_when_every_waypoint_is_reached_there_is_no_command():
@@ -131,10 +131,27 @@ def test_a_tolerance_of_zero_is_met_on_the_spot_and_a_tolerance_counts_to_its_ed
     assert goal.follow(np.array([np.nextafter(0.75, 0.0), 2.0, 0.0]), echo, edge, GAIN)[1] is not None
 
 
-def test_distance_is_to_the_waypoint_that_is_driven_to():
-    pose = np.array([-2.0, -3.0, 1.0])
-    for index, (x, y, _) in enumerate(POSES):
-        assert Waypoints(POSES, index).distance(pose) == pytest.approx(math.hypot(x + 2.0, y + 3.0))
+def test_arrival_is_judged_at_the_point_that_the_offset_names():
+    """Document B's law brings the point to the goal, the axle centre stays away from it."""
+    ahead = Arrival(xy_tolerance=0.01, offset=0.2)
+    goal = Waypoints(np.array([[1.0, 2.0, 0.0]]))
+    for theta in (0.0, 2.0, -3.0):
+        pose = np.array([1.0 - 0.2 * math.cos(theta), 2.0 - 0.2 * math.sin(theta), theta])
+        assert goal.follow(pose, refuses, ahead, GAIN)[1] is None
+        assert goal.follow(np.array([1.0, 2.0, theta]), echo, ahead, GAIN)[1] is not None
+
+
+@pytest.mark.parametrize(
+    ('name', 'bad'),
+    [
+        *((name, bad) for name in ('xy_tolerance', 'yaw_tolerance') for bad in (-1.0, np.nan, np.inf)),
+        ('offset', np.nan),
+        ('offset', [0.1, np.inf]),
+    ],
+)
+def test_what_cannot_be_arrived_at_is_named(name, bad):
+    with pytest.raises(ValueError, match=rf'^{name} must be '):
+        Arrival(**{name: bad})
 
 
 def test_following_changes_no_value_in_place():

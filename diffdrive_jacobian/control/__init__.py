@@ -1,7 +1,21 @@
-"""Control laws that turn a goal into a body twist: pure functions and values, no ROS."""
+"""Control laws that turn a goal into velocities: pure functions and values, no ROS."""
 
+from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.go_to_goal import go_to_goal, turn_in_place
+from diffdrive_jacobian.control.offset_point import offset_point
+from diffdrive_jacobian.control.pose import go_to_pose
+from diffdrive_jacobian.control.resolved_rate import resolved_rate
 from diffdrive_jacobian.control.saturation import VelocityLimits, saturate
-from diffdrive_jacobian.control.waypoints import Arrival, Waypoints
+from diffdrive_jacobian.control.waypoints import Waypoints
 
-__all__ = ['Arrival', 'VelocityLimits', 'Waypoints', 'go_to_goal', 'saturate', 'turn_in_place']
+__all__ = [
+    'Arrival',
+    'VelocityLimits',
+    'Waypoints',
+    'go_to_goal',
+    'go_to_pose',
+    'offset_point',
+    'resolved_rate',
+    'saturate',
+    'turn_in_place',
+]

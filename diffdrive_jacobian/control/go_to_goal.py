@@ -50,10 +50,10 @@ def go_to_goal(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any) -> tuple[Any
     agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv)
     dx, dy = x_goal - x, y_goal - y
     c, s = cos(theta), sin(theta)
-    # d cos(e) and d sin(e): the way to the goal, seen from the robot. It needs no wrapping.
-    ahead, aside = c * dx + s * dy, c * dy - s * dx
-    heading_error = arctan2(aside, ahead)
-    return Kv * ahead, Kp * heading_error * ((dx != 0.0) | (dy != 0.0))
+    # d cos(e) and d sin(e): the way to the goal, seen from the robot. It needs no wrapping. Without
+    # negative zeros the angle of (0, 0) is 0.
+    ahead, aside = c * dx + s * dy + 0.0, c * dy - s * dx + 0.0
+    return Kv * ahead, Kp * arctan2(aside, ahead)
 
 
 def turn_in_place(theta: ArrayLike, heading: ArrayLike, Kp: Any) -> tuple[Any, Any]:

@@ -57,6 +57,11 @@ class VelocityLimits:
         """Give the limits in their order."""
         return self.min_v, self.max_v, self.min_omega, self.max_omega, self.max_wheel_speed
 
+    @staticmethod
+    def names() -> tuple[str, ...]:
+        """Give the names of the limits in their order."""
+        return 'min_v', 'max_v', 'min_omega', 'max_omega', 'max_wheel_speed'
+
 
 def saturate(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tuple[Any, Any]:
     """Scale a twist by the largest factor, at most 1, that meets every limit; `v : omega` is kept.

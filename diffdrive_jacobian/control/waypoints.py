@@ -1,12 +1,7 @@
-"""Poses to reach in order, as a value: each step takes the robot's pose and gives the next command.
-
-Source: document A's law needs a tolerance (MATH.md, "Control laws"): at distance zero the heading
-to the goal is undefined.
-"""
+"""Poses to reach in order, as a value: each step takes the robot's pose and gives the next command."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,23 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.go_to_goal import turn_in_place
-from diffdrive_jacobian.kinematics.se2 import wrap_angle
 
 Law = Callable[[NDArray[np.float64], NDArray[np.float64]], tuple[Any, Any]]
-"""A control law: pose (3,) and goal position (2,) to `(v, omega)`."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Arrival:
-    """What counts as having arrived."""
-
-    xy_tolerance: float
-    """Largest distance to a waypoint that counts as there (m)."""
-    yaw_tolerance: float
-    """Largest heading error at the last waypoint, if its heading counts (rad)."""
-    use_heading: bool
-    """Whether the heading of the last waypoint counts."""
+"""A control law: pose (3,) and goal (3,) to `(v, omega)`; it may look at the goal's heading or not."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,11 +27,6 @@ class Waypoints:
     turning: bool = False
     """Whether the last position was reached and only its heading is left to take."""
 
-    def distance(self, pose: NDArray[np.float64]) -> float:
-        """Give the distance from a pose (3,) to the waypoint that is driven to (m)."""
-        x, y, _ = self.poses[self.index]
-        return math.hypot(x - pose[0], y - pose[1])
-
     def follow(
         self, pose: NDArray[np.float64], law: Law, arrival: Arrival, turning_gain: float
     ) -> tuple[Waypoints, tuple[Any, Any] | None]:
@@ -56,7 +34,7 @@ class Waypoints:
 
         Args:
             pose: Where the robot is, shape (3,).
-            law: The control law that drives to a position.
+            law: The control law that drives to a waypoint.
             arrival: What counts as having arrived.
             turning_gain: Gain of the turn in place (1/s).
 
@@ -65,7 +43,7 @@ class Waypoints:
             its place when everything is reached.
         """
         here = self
-        while not here.turning and here.distance(pose) <= arrival.xy_tolerance:
+        while not here.turning and here._there(pose, arrival):
             if here.index + 1 < len(here.poses):
                 here = replace(here, index=here.index + 1)
             elif arrival.use_heading:
@@ -74,7 +52,12 @@ class Waypoints:
                 return here, None
         goal = here.poses[here.index]
         if not here.turning:
-            return here, law(pose, goal[:2])
-        if abs(wrap_angle(goal[2] - pose[2])) <= arrival.yaw_tolerance:
+            return here, law(pose, goal)
+        if arrival.faces(pose[2], goal[2]):
             return here, None
         return here, turn_in_place(pose[2], goal[2], turning_gain)
+
+    def _there(self, pose: NDArray[np.float64], arrival: Arrival) -> bool:
+        x, y, _ = self.poses[self.index].tolist()
+        distance = arrival.distance(float(pose[0]), float(pose[1]), float(pose[2]), x, y)
+        return bool(distance <= arrival.xy_tolerance)

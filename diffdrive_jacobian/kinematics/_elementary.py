@@ -105,8 +105,9 @@ def arctan2(y: Any, x: Any) -> Any:
 
 
 def hypot(x: Any, y: Any) -> Any:
-    """Length of the vector (x, y)."""
-    return math.hypot(x, y) if type(x) is type(y) is float else np.hypot(x, y)
+    """Length of the vector (x, y), of up to 1e150."""
+    # NumPy's hypot takes four times as long.
+    return math.hypot(x, y) if type(x) is type(y) is float else np.sqrt(x * x + y * y)
 
 
 def maximum(x: Any, y: Any) -> Any:

@@ -1,11 +1,10 @@
-"""Drive a robot to goals by document A's law: odometry and goals in, body twists out."""
+"""Drive a robot to goals by one of three laws: odometry and goals in, body twists out."""
 
 from __future__ import annotations
 
 import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,14 @@ from nav_msgs.msg import Goals, Odometry
 from std_srvs.srv import Trigger
 from unique_identifier_msgs.msg import UUID
 
-from diffdrive_jacobian.control import Arrival, Waypoints, go_to_goal, saturate
+from diffdrive_jacobian.control import (
+    Arrival,
+    Waypoints,
+    go_to_goal,
+    go_to_pose,
+    offset_point,
+    saturate,
+)
 from diffdrive_jacobian.control.waypoints import Law
 from diffdrive_jacobian.nodes.parameters import GoToGoalParameters, nanoseconds
 from diffdrive_jacobian.ros import messages
@@ -24,7 +30,11 @@ from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 
 LAWS: dict[str, Callable[[GoToGoalParameters], Law]] = {
-    'go_to_goal': lambda parameters: partial(go_to_goal, Kp=parameters.kp, Kv=parameters.kv),
+    'go_to_goal': lambda gains: lambda pose, goal: go_to_goal(pose, goal[:2], gains.kp, gains.kv),
+    'offset_point': lambda gains: (
+        lambda pose, goal: offset_point(pose, goal[:2], gains.kv, gains.offset)
+    ),
+    'pose': lambda gains: lambda pose, goal: go_to_pose(pose, goal, gains.kp, gains.kv),
 }
 """Parameter `controller` to the law with its gains."""
 
@@ -236,17 +246,29 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._arrival = Arrival(
             xy_tolerance=parameters.xy_goal_tolerance,
             yaw_tolerance=parameters.yaw_goal_tolerance,
-            use_heading=parameters.use_goal_heading,
+            # A law that takes the heading on its way must not stop short of it.
+            use_heading=parameters.use_goal_heading or parameters.controller == 'pose',
+            offset=parameters.offset if parameters.controller == 'offset_point' else 0.0,
         )
         if self._limits.max_v == 0.0:
             self.get_logger().warning(
                 'linear.x.max_velocity is 0: the robot may not drive forward, goals stay out of reach'
             )
+        if self._limits.min_v == 0.0 and parameters.controller == 'pose':
+            self.get_logger().warning(
+                'linear.x.min_velocity is 0: the robot may not back up, which controller pose wants to '
+                'where the goal lies behind; it may come to rest before the goal'
+            )
         self._judge_gains()
 
     def _judge_gains(self) -> None:
         kp, kv = self.parameters.kp, self.parameters.kv
-        if kp <= kv:
+        if self.parameters.controller == 'pose' and kp <= 2.0 * kv:
+            self.get_logger().warning(
+                f'kp {kp:g} is not larger than twice kv {kv:g}: the robot is at the position before it '
+                'has the heading, and turns in place there; choose kp > 2 kv'
+            )
+        elif self.parameters.controller == 'go_to_goal' and kp <= kv:
             self.get_logger().warning(
                 f'kp {kp:g} is not larger than kv {kv:g}: the robot approaches faster than it turns '
                 'and spirals in; choose kp > kv'

@@ -13,6 +13,8 @@ from diffdrive_jacobian.ros.messages import MAX_POSITION, MAX_SPEED
 from diffdrive_jacobian.ros.parameters import NodeParameters, ParameterError, parameter
 from diffdrive_jacobian.simulation.robot import NANOSECONDS, RobotModel
 
+MIN_OFFSET = 1e-3
+"""The yaw rate of document B's law grows like the inverse of the offset (m)."""
 _STAMPED = 'cmd_vel is a TwistStamped instead of a Twist. Read-only.'
 
 
@@ -161,7 +163,14 @@ class GoToGoalParameters(LimitParameters):
     )
     kv: float = parameter(0.5, 'Gain on the distance [1/s].', bounds=(0.0, 100.0), above=0.0)
     controller: str = parameter(
-        'go_to_goal', "Control law: go_to_goal is document A's.", choices=('go_to_goal',)
+        'go_to_goal',
+        "Control law: go_to_goal (document A's), offset_point (document B's), or pose, with heading.",
+        choices=('go_to_goal', 'offset_point', 'pose'),
+    )
+    offset: float = parameter(
+        0.1,
+        'Of controller offset_point: how far ahead of the axle the point is that is driven; not 0 [m].',
+        bounds=(-100.0, 100.0),
     )
     xy_goal_tolerance: float = parameter(
         0.02, 'Distance to the goal that counts as arrived [m].', bounds=(1e-6, 100.0)
@@ -174,6 +183,14 @@ class GoToGoalParameters(LimitParameters):
         0.5, 'Odometry older than this stops the robot until it comes again [s]; 0: never.'
     )
     enable_stamped_cmd_vel: bool = parameter(False, _STAMPED, read_only=True)
+
+    def check(self) -> None:
+        """The point that is driven must stand off the axle."""
+        if abs(self.offset) < MIN_OFFSET:
+            raise ParameterError(
+                f"parameter 'offset' must be at least {MIN_OFFSET:g} m ahead of the axle or behind it, "
+                f'got {self.offset:g}: the Jacobian of the axle centre itself has rank 1'
+            )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

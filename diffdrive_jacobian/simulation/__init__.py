@@ -1,5 +1,7 @@
-"""The robot as a value that advances in time: kinematics and control, no ROS."""
+"""The robot as a value that advances in time, closed loops in batches, lines followed: no ROS."""
 
+from diffdrive_jacobian.simulation.closed_loop import closed_loops, trajectories
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
+from diffdrive_jacobian.simulation.tracking import track_line
 
-__all__ = ['Robot', 'RobotModel']
+__all__ = ['Robot', 'RobotModel', 'closed_loops', 'track_line', 'trajectories']

@@ -1,0 +1,80 @@
+"""A law that drives a unicycle to a position and a heading, smoothly, from wherever it stands.
+
+In polar coordinates about the goal, with rho the distance to it, alpha the bearing of the goal seen from
+the robot, and phi the same bearing seen from the goal's heading, the unicycle moves as
+
+    rho_dot = -v cos(alpha),  alpha_dot = v sin(alpha) / rho - omega,  phi_dot = v sin(alpha) / rho
+
+Document A's law knows rho and alpha only; here the heading that is left, phi, bends the way.
+
+State: pose `[x, y, theta]` (m, m, rad). Output: body twist `v, omega` (m/s, rad/s). Everything
+broadcasts over leading axes, the gains too.
+
+Source: M. Aicardi, G. Casalino, A. Bicchi, A. Balestrino, "Closed loop steering of unicycle-like
+vehicles via Lyapunov techniques", IEEE Robotics & Automation Magazine 2(1), 1995.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+from diffdrive_jacobian.kinematics._checks import positive
+from diffdrive_jacobian.kinematics._elementary import (
+    agree,
+    arctan2,
+    components,
+    cos,
+    operand,
+    sin,
+    wrapped,
+)
+from diffdrive_jacobian.kinematics.se2 import sinc
+
+
+def go_to_pose(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any, h: Any = None) -> tuple[Any, Any]:
+    """Drive to a position and a heading.
+
+    `v = Kv rho cos(alpha)`, as document A's law has it, and
+    `omega = Kp alpha + Kv cos(alpha) sin(alpha)/alpha (alpha + h phi)`. Held continuously,
+    `V = rho^2 + alpha^2 + h phi^2` never grows, and everything comes to rest on the goal. Near it,
+    heading and bearing settle like an oscillator of frequency `Kv sqrt(h)` damped by Kp, the distance
+    like exp(-Kv t): for the heading to be there first, Kp should be well above 2 Kv. If the goal lies
+    behind, the robot backs up.
+
+    Args:
+        state: Pose of the robot, shape (..., 3).
+        goal: Pose to take `[x, y, theta]`, shape (..., 3).
+        Kp: Gain on the bearing, positive, shape (...) (1/s).
+        Kv: Gain on the distance, positive, shape (...) (1/s).
+        h: Weight of the heading, positive, shape (...); None: `(Kp / (2 Kv))^2`, which damps critically.
+
+    Returns:
+        `(v, omega)`, each of shape (...) (m/s, rad/s). Exactly on the goal's position, where the bearing
+        is undefined, both are zero.
+
+    Raises:
+        ValueError: A gain is not positive, the last axis of state or goal has a wrong length, shapes do
+            not broadcast, or something is not finite.
+    """
+    x, y, theta = components('state', state, 3)
+    x_goal, y_goal, heading = components('goal', goal, 3)
+    Kp, Kv = operand('Kp', Kp, positive), operand('Kv', Kv, positive)
+    agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv)
+    if h is None:
+        root = Kp / (2.0 * Kv)
+        h = root * root
+    else:
+        h = operand('h', h, positive)
+        agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv, h=h)
+    dx, dy = x_goal - x, y_goal - y
+    c, s = cos(theta), sin(theta)
+    # Without negative zeros the angle of (0, 0) is 0.
+    ahead, aside = c * dx + s * dy + 0.0, c * dy - s * dx + 0.0
+    alpha = arctan2(aside, ahead)
+    phi = wrapped(alpha + theta - heading)
+    # cos(alpha) sin(alpha) / alpha, without a hole at zero.
+    bend = cos(alpha) * sinc(alpha)
+    away = (dx != 0.0) | (dy != 0.0)
+    return Kv * ahead, (Kp * alpha + Kv * bend * (alpha + h * phi)) * away
