@@ -37,7 +37,7 @@ class Trace:
     goal: Indices
     """Which of `run.goals` is driven to; -1: none."""
     distance: Array
-    """To that goal (m); NaN: none."""
+    """To that goal, of the point that the controller drives (m); NaN: none."""
     heading_error: Array
     """From the heading to the direction of that goal (rad); NaN: none, or it is reached."""
 
@@ -65,12 +65,13 @@ def trace(run: Run) -> Trace:
     targets = np.full((len(odometry), 2), np.nan)
     targets[goal >= 0] = run.goals.values[goal[goal >= 0], :2]
     dx, dy = targets[:, 0] - x, targets[:, 1] - y
+    to_goal = targets - _driven_points(run)
     return Trace(
         run=run,
         time=seconds(run, odometry),
         breaks=breaks,
         goal=goal,
-        distance=np.hypot(dx, dy),
+        distance=np.hypot(*to_goal.T),
         heading_error=np.where(reached, np.nan, wrapped(np.arctan2(dy, dx) - theta)),
     )
 
@@ -112,7 +113,7 @@ def _breaks(run: Run) -> Indices:
 
 def _progress(run: Run, breaks: Indices) -> tuple[Indices, NDArray[np.bool_]]:
     """Say of each odometry which goal it is on the way to, -1 for none, and whether that is reached."""
-    seen, places = run.odometry.received, run.odometry.values[:, :2]
+    seen, places = run.odometry.received, _driven_points(run)
     goal, reached = np.full(len(seen), -1), np.zeros(len(seen), dtype=bool)
     known = len(run.goal_status) > 0 or bool(run.of_node('go_to_goal'))
     routes = _routes(run)
@@ -156,6 +157,18 @@ def _routes(run: Run) -> list[range]:
         if not len(states) or states[0] != GoalStatus.STATUS_ABORTED:
             accepted.append(route)
     return accepted
+
+
+def _driven_points(run: Run) -> Array:
+    """Give the point that the controller drives to the goal, shape (n, 2): of document B's it lies
+    ahead of the axle centre.
+    """
+    poses = run.odometry.values[:, :3]
+    told = run.of_node('go_to_goal')
+    if told.get('controller') != 'offset_point':
+        return poses[:, :2]
+    d = float(told.get('offset', GoToGoalParameters().offset))
+    return poses[:, :2] + d * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
 
 
 def _statuses(run: Run, begin: int, end: int) -> tuple[Array, NDArray[np.int64]]:

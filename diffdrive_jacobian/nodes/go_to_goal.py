@@ -85,6 +85,11 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         """Which pose of the active goal is driven to; None without a goal."""
         return None if self._goal is None else self._goal.waypoints.index
 
+    @property
+    def arrival(self) -> Arrival:
+        """What counts as having arrived, by the parameters."""
+        return self._arrival
+
     # --- Goals
 
     def _on_goal_pose(self, message: PoseStamped) -> None:

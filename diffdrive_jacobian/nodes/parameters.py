@@ -13,6 +13,7 @@ from diffdrive_jacobian.ros.messages import MAX_POSITION, MAX_SPEED
 from diffdrive_jacobian.ros.parameters import NodeParameters, ParameterError, parameter
 from diffdrive_jacobian.simulation.robot import NANOSECONDS, RobotModel
 
+CONTROLLERS = ('go_to_goal', 'offset_point', 'pose')
 MIN_OFFSET = 1e-3
 """The yaw rate of document B's law grows like the inverse of the offset (m)."""
 _STAMPED = 'cmd_vel is a TwistStamped instead of a Twist. Read-only.'
@@ -165,7 +166,7 @@ class GoToGoalParameters(LimitParameters):
     controller: str = parameter(
         'go_to_goal',
         "Control law: go_to_goal (document A's), offset_point (document B's), or pose, with heading.",
-        choices=('go_to_goal', 'offset_point', 'pose'),
+        choices=CONTROLLERS,
     )
     offset: float = parameter(
         0.1,

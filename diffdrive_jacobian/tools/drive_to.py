@@ -9,10 +9,10 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from action_msgs.msg import GoalStatus
@@ -29,8 +29,9 @@ from diffdrive_jacobian.bags.figure import draw
 from diffdrive_jacobian.bags.reading import BagError, read_run
 from diffdrive_jacobian.bags.recorder import Recorder, Selection
 from diffdrive_jacobian.bags.recording import Recording
+from diffdrive_jacobian.control import Arrival
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
-from diffdrive_jacobian.nodes.parameters import nanoseconds
+from diffdrive_jacobian.nodes.parameters import CONTROLLERS, nanoseconds
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.ros import messages
@@ -58,11 +59,16 @@ class Observer(Node):  # type: ignore[misc]
     """Sends the goals and watches what becomes of them."""
 
     def __init__(
-        self, goals: NDArray[np.float64], wheel_names: tuple[str, str], context: Context
+        self,
+        goals: NDArray[np.float64],
+        arrival: Arrival,
+        wheel_names: tuple[str, str],
+        context: Context,
     ) -> None:
-        """Prepare to send goals `[x, y]`, shape (n, 2); `wheel_names` are left, right."""
+        """Prepare to send goals `[x, y, theta]`, shape (n, 3); `wheel_names` are left, right."""
         super().__init__('drive_to', context=context)
         self.goals = goals
+        self._arrival = arrival
         self._wheel_names = wheel_names
         self.index = 0
         """The goal that is driven to."""
@@ -82,11 +88,12 @@ class Observer(Node):  # type: ignore[misc]
 
     @property
     def distance(self) -> float:
-        """The distance to the goal that is driven to (m); infinite before the first odometry."""
+        """The distance to the goal that is driven to, of the point that is to arrive (m); infinite
+        before the first odometry.
+        """
         if self.pose is None:
             return math.inf
-        x, y = self.goals[self.index]
-        return math.hypot(x - self.pose[0], y - self.pose[1])
+        return float(self._arrival.distance(*self.pose, *self.goals[self.index, :2]))
 
     @property
     def ended(self) -> bool:
@@ -113,9 +120,9 @@ class Observer(Node):  # type: ignore[misc]
     def _send(self) -> None:
         self._sent = Goals()
         self._sent.header.stamp = self.get_clock().now().to_msg()
-        for x, y in self.goals.tolist():
+        for goal in self.goals:
             pose = PoseStamped()
-            pose.pose.position.x, pose.pose.position.y = x, y
+            messages.set_pose(pose.pose, goal)
             self._sent.goals.append(pose)
         self._publisher.publish(self._sent)
 
@@ -138,7 +145,7 @@ class Outcome:
     pose: NDArray[np.float64] | None
     """Where the robot stopped; None: it never reported."""
     distance: float
-    """Distance to the last goal (m)."""
+    """To the last goal, of the point that was to arrive (m)."""
     seconds: float
     """How long it took (s); in lockstep, of simulated time."""
 
@@ -149,17 +156,17 @@ def drive(
     signals: Signals,
     *,
     timeout: float,
-    tolerance: float | None,
+    parameters: Mapping[str, Any],
     recording: Recording | None = None,
 ) -> Outcome:
-    """Drive to goals `[x, y]`, shape (n, 2), in order, with all three nodes in this process.
+    """Drive to goals `[x, y, theta]`, shape (n, 3), in order, with all three nodes in this process.
 
     Args:
-        goals: The goals (m).
+        goals: The goals (m, m, rad).
         runner: What the nodes live in.
         signals: A signal ends the drive.
         timeout: How long it may take (s).
-        tolerance: Distance that counts as arrived (m); None: as the parameters say.
+        parameters: Of go_to_goal, by name; they go before those of the ROS arguments.
         recording: What is recorded to; None: nothing is.
 
     Raises:
@@ -169,10 +176,10 @@ def drive(
     wheels = Parameter('command_interface', value='wheels')
     robot = runner.add(lambda: VirtualRobot(context=context, parameter_overrides=[wheels]))
     runner.add(lambda: WheelBridge(context=context))
-    tolerances = [] if tolerance is None else [Parameter('xy_goal_tolerance', value=tolerance)]
-    controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=tolerances))
+    overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+    controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=overrides))
     names = robot.parameters.left_wheel_name, robot.parameters.right_wheel_name
-    observer = runner.add(lambda: Observer(goals, names, context))
+    observer = runner.add(lambda: Observer(goals, controller.arrival, names, context))
     tend = _recorder(runner, recording)
     begun = runner.seconds()
     with Drive(runner.seconds) as progress:
@@ -184,7 +191,7 @@ def drive(
                 if index is not None and index != observer.index:
                     observer.index = index
                     progress.next()
-                x, y = goals[observer.index]
+                x, y, _ = goals[observer.index]
                 what = f'goal {observer.index + 1}/{len(goals)} ({x:g}, {y:g})'
                 progress.show(what, observer.distance, observer.wheels)
             return bool(observer.ended or signals.count or runner.seconds() - begun > timeout)
@@ -244,7 +251,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         parser.error(f'coordinates come in pairs X Y, got {len(options.coordinates)} of them')
     if options.lockstep and options.open:
         parser.error('--lockstep cannot be open: others have another clock')
-    goals = np.reshape(options.coordinates, (-1, 2))
+    goals = _goals(np.reshape(options.coordinates, (-1, 2)), options.heading)
     ros = ['--ros-args', '--log-level', 'warn', '--', *_cli.with_params_file(ros, options)]
     stage = _lockstep(ros) if options.lockstep else _real_time(ros, open_to_all=options.open)
     recording = None
@@ -260,7 +267,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                 runner,
                 signals,
                 timeout=options.timeout,
-                tolerance=options.tolerance,
+                parameters=_parameters(options),
                 recording=recording,
             )
     except UserError as error:
@@ -271,6 +278,20 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     if recording is None:
         return code
     return _keep(recording, plot=not options.no_plot) or code
+
+
+def _goals(places: NDArray[np.float64], heading: float | None) -> NDArray[np.float64]:
+    """Give every place a heading: that of the way on, and at the last one what was asked for, or 0."""
+    dx, dy = np.diff(places, axis=0).T
+    return np.column_stack([places, [*np.arctan2(dy, dx), heading or 0.0]])
+
+
+def _parameters(options: argparse.Namespace) -> dict[str, Any]:
+    """Give the controller's parameters that have an option of their own."""
+    asked = {'xy_goal_tolerance': options.tolerance, 'controller': options.controller}
+    if options.heading is not None:
+        asked['use_goal_heading'] = True
+    return {name: value for name, value in asked.items() if value is not None}
 
 
 def _keep(recording: Recording, *, plot: bool) -> int:
@@ -359,6 +380,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         '--tolerance', type=_cli.tolerance, help='distance that counts as arrived (m); 0.02'
+    )
+    parser.add_argument(
+        '--heading', type=_cli.number, help='heading to take at the last goal (rad); else any will do'
+    )
+    parser.add_argument(
+        '--controller', choices=CONTROLLERS, help='law of the controller; go_to_goal, unless a file says'
     )
     _cli.add_params_file(parser)
     parser.add_argument(
