@@ -9,6 +9,9 @@ import signal
 import pytest
 from processes import open_world
 
+from diffdrive_jacobian.bags import read_run
+from diffdrive_jacobian.bags.trace import trace
+from diffdrive_jacobian.nodes.parameters import CONTROLLERS
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import drive_to
 
@@ -64,6 +67,31 @@ def test_takes_as_long_as_the_law_says(capsys):
     assert seconds == pytest.approx(steps * period, abs=0.1)
 
 
+@pytest.mark.parametrize('controller', CONTROLLERS)
+def test_every_controller_arrives_and_takes_the_heading_that_is_asked_for(tmp_path, capsys, controller):
+    arguments = ['0.5', '0.5', '0', '1', '--heading', '-2.5', '--controller', controller, '--no-plot']
+    assert drive_to.main([*arguments, '--lockstep', '-o', 'bag'], Signals()) == 0
+    x, y, theta = map(
+        float, re.search(r'x (\S+) m, y (\S+) m, heading (\S+) rad', last_line(capsys)).groups()
+    )
+    offset = 0.1 if controller == 'offset_point' else 0.0
+    assert math.hypot(x, y - 1.0) <= offset + 0.021
+    assert theta == pytest.approx(-2.5, abs=0.021)
+    run = read_run(tmp_path / 'bag')
+    seen = trace(run)
+    first, last = (seen.distance[seen.goal == index] for index in (0, 1))
+    # Of the point that is driven: it comes to each goal, and nothing is taken for the next one too soon.
+    assert first.min() <= 0.021
+    assert last.min() <= 0.021
+    assert first[0] == pytest.approx(math.hypot(0.5 - offset, 0.5), abs=1e-6)
+
+
+def test_without_a_heading_any_will_do(capsys):
+    assert drive_to.main(['0', '1', '--lockstep', '--no-record'], Signals()) == 0
+    theta = float(re.search(r'heading (\S+) rad', last_line(capsys)).group(1))
+    assert theta == pytest.approx(math.pi / 2.0, abs=0.2)
+
+
 def test_timeout_is_of_simulated_time(capsys):
     assert drive_to.main(['50', '0', '--lockstep', '--no-record', '--timeout', '3'], Signals()) == 1
     line = last_line(capsys)
@@ -75,6 +103,8 @@ def test_timeout_is_of_simulated_time(capsys):
     ('arguments', 'words'),
     [
         (['--open'], '--lockstep cannot be open'),
+        (['--controller', 'pid'], "'go_to_goal', 'offset_point', 'pose'"),
+        (['--heading', 'nan'], 'argument --heading: must be a finite number'),
         (['--ros-args', '-p', 'wheel_radius:=-1.0'], "parameter 'wheel_radius' must be in [0.001, 10]"),
         (['--ros-args', '--no-such-option'], 'ROS arguments: '),
     ],

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import math
 import re
 from dataclasses import fields
+from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from diffdrive_jacobian import kinematics
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.parameters import (
     GoToGoalParameters,
@@ -88,7 +93,7 @@ def test_topics_and_services(lockstep, name):
 
 
 def test_example_gives_the_numbers_in_its_comments():
-    code = next(block for block in blocks('python') if 'import numpy' in block)
+    code = next(block for block in blocks('python') if 'q_dot =' in block)
     names = {}
     exec(code, names)
     comments = [
@@ -144,3 +149,37 @@ def test_options_of_the_tools(tool):
     }
     assert told - {'--ros-args'} == options
     assert hasattr(entry_points, tool.PROGRAM)
+
+
+def examples():
+    """The table from the documents to the code: what each row's example says, and what it must give."""
+    for row in README.split('| document | function |', 1)[1].split('\n\n', 1)[0].splitlines()[2:]:
+        what, functions, _, example = (cell.strip() for cell in row.strip('|').split('|'))
+        yield pytest.param(functions, *re.findall(r'`([^`]+)`', example), id=what)
+
+
+@pytest.mark.parametrize(('functions', 'first', 'second'), list(examples()))
+def test_examples_of_the_documents_methods(functions, first, second):
+    names = {}
+    exec(next(block for block in blocks('python') if 'inverse_velocity' in block), names)
+    exec(first, names)
+    expression, expected = second.split('  # ')
+    np.testing.assert_allclose(eval(expression, names), eval(expected), rtol=0.0, atol=6e-4)
+    # What the second column names is there.
+    for function in re.findall(r'`([\w.]+)`', functions):
+        assert function.split('.')[-1] in library(), function
+
+
+@lru_cache
+def library():
+    """Every public name of the numpy half, methods included."""
+    names = set()
+    for module in (
+        *(importlib.import_module(f'diffdrive_jacobian.{layer}') for layer in ('control', 'simulation')),
+        *vars(kinematics).values(),
+    ):
+        for name, value in getattr(module, '__dict__', {}).items():
+            names.add(name)
+            if inspect.isclass(value):
+                names.update(vars(value))
+    return names

@@ -3,6 +3,7 @@
 from diffdrive_jacobian.kinematics import (
     contact,
     diff_drive,
+    inverse_kinematics,
     inverse_velocity,
     mobile_manipulator,
     planar_arm,
@@ -16,6 +17,7 @@ __all__ = [
     'PlanarArm',
     'contact',
     'diff_drive',
+    'inverse_kinematics',
     'inverse_velocity',
     'mobile_manipulator',
     'planar_arm',

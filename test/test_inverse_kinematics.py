@@ -1,0 +1,594 @@
+"""Numeric inverse kinematics: what is reached, what is not, and that each target has its own outcome."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from diffdrive_jacobian.kinematics.inverse_kinematics import METHODS, IKResult, pose_difference, solve
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
+
+TOLERANCE = 1e-6
+DOWNHILL = ('transpose', 'levenberg_marquardt')
+TWO, THREE, FIVE = (PlanarArm(lengths) for lengths in ([1.0, 0.7], [1.0, 0.7, 0.4], [0.5] * 5))
+LONG_FIRST = (PlanarArm([1.0, 0.7]), PlanarArm([1.0, 0.3, 0.2]))
+
+
+class Task:
+    """An arm's position or pose, and what was asked of it."""
+
+    def __init__(self, arm, heading=False):
+        self.arm, self.heading, self.asked, self.derived = arm, heading, [], []
+
+    def forward(self, q):
+        self.asked.append(len(q))
+        return self.arm.forward_kinematics(q)[:, : 3 if self.heading else 2]
+
+    def jacobian(self, q):
+        self.derived.extend(q[:, np.newaxis].copy())
+        return self.arm.jacobian(q, heading=self.heading)
+
+    def solve(self, target, q0, **options):
+        if self.heading:
+            options.setdefault('difference', pose_difference)
+        return solve(self.forward, self.jacobian, target, q0, **options)
+
+
+def configurations(arm, count, seed=0):
+    """Random ones, joints bent by 20 to 150 degrees: none next to a singularity."""
+    rng = np.random.default_rng(seed)
+    q = rng.choice([-1.0, 1.0], (count, 1)) * rng.uniform(0.35, 2.6, (count, arm.joints))
+    q[:, 0] = rng.uniform(-np.pi, np.pi, count)
+    return q
+
+
+def anywhere(arm, count, seed=1):
+    return np.random.default_rng(seed).uniform(-np.pi, np.pi, (count, arm.joints))
+
+
+def at(distance, angle):
+    return np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=-1)
+
+
+def unreachable(arm, where, count=60):
+    """Give targets, the reachable points nearest to them, and how far these are."""
+    rng = np.random.default_rng(3)
+    reach, angle = arm.lengths.sum(), rng.uniform(-np.pi, np.pi, count)
+    if where == 'too far':
+        distance, nearest = reach * rng.uniform(1.02, 2.0, count), reach
+    else:
+        nearest = 2.0 * arm.lengths.max() - reach
+        distance = nearest * rng.uniform(0.3, 0.9, count)
+    return at(distance, angle), at(nearest, angle), np.abs(distance - nearest)
+
+
+def assert_same(actual, expected):
+    assert np.array_equal(actual.converged, expected.converged)
+    assert np.array_equal(actual.iterations, expected.iterations)
+    np.testing.assert_allclose(actual.q, expected.q, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(actual.error, expected.error, rtol=0.0, atol=1e-9)
+
+
+# --- What is reached
+
+
+@pytest.mark.parametrize('method', METHODS)
+@pytest.mark.parametrize(
+    ('arm', 'heading'), [(TWO, False), (THREE, False), (THREE, True), (FIVE, False), (FIVE, True)]
+)
+def test_near_starts_converge_by_every_method(arm, heading, method):
+    task, q = Task(arm, heading), configurations(arm, 100)
+    q0 = q + np.random.default_rng(2).uniform(-0.2, 0.2, q.shape)
+    target = task.forward(q)
+    result = task.solve(target, q0, method=method, max_iterations=5000)
+    assert result.converged.all()
+    assert np.all(result.iterations >= 1)
+    assert np.all(result.error <= TOLERANCE)
+    reached = task.forward(result.q)
+    difference = pose_difference(target, reached) if heading else target - reached
+    np.testing.assert_allclose(np.linalg.norm(difference, axis=1), result.error, rtol=1e-6, atol=1e-14)
+
+
+@pytest.mark.parametrize('damping', [1e-300, 0.1, 1e6])
+@pytest.mark.parametrize('heading', [False, True])
+@pytest.mark.parametrize('arm', [THREE, FIVE], ids=['three', 'five'])
+def test_levenberg_marquardt_converges_from_anywhere(arm, heading, damping):
+    task = Task(arm, heading)
+    result = task.solve(task.forward(anywhere(arm, 200, 4)), anywhere(arm, 200, 5), damping=damping)
+    assert result.converged.all()
+    assert np.median(result.iterations) < 30
+    assert result.iterations.max() < 100
+
+
+@pytest.mark.parametrize(
+    ('method', 'tolerance'), [('newton', 1e-9), ('levenberg_marquardt', 1e-9), ('transpose', 1e-3)]
+)
+def test_a_target_at_the_rim_is_reached(method, tolerance):
+    # There the Jacobian is singular in the direction that is left to go.
+    result = Task(THREE).solve([2.1, 0.0], [0.3, -0.5, 0.4], method=method, tolerance=tolerance)
+    assert result.converged
+    np.testing.assert_allclose(result.q, 0.0, atol=3.0 * math.sqrt(tolerance))
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_at_the_target_there_is_nothing_to_do(method):
+    task, q0 = Task(THREE), configurations(THREE, 5)
+    result = task.solve(task.forward(q0), q0, method=method)
+    assert result.converged.all()
+    assert not result.iterations.any()
+    assert np.array_equal(result.q, q0)
+    assert not result.error.any()
+    assert task.derived == []
+
+
+# --- The steps of documents C and D
+
+
+def test_newton_is_document_c_with_its_lost_minus():
+    task, q = Task(TWO), np.array([0.4, 1.1])
+    goal, r = task.forward(np.array([[0.5, 0.9], q]))
+    inverse = np.linalg.inv(TWO.jacobian(q))
+    one = task.solve(goal, q, method='newton', max_iterations=1)
+    np.testing.assert_allclose(one.q, q + inverse @ (goal - r), rtol=1e-12)
+    assert one.iterations == 1
+    # Step by step the error is squared.
+    errors = [task.solve(goal, q, method='newton', max_iterations=k).error for k in (1, 2, 3)]
+    assert errors[1] < 2.0 * errors[0] ** 2
+    assert errors[2] < 2.0 * errors[1] ** 2 + 1e-15
+    # As it is printed, "r_goal r_i" with a sign lost, a plus would not even come nearer.
+    printed = q + inverse @ (goal + r)
+    assert np.linalg.norm(goal - task.forward(printed[None])[0]) > np.linalg.norm(goal - r) > one.error
+
+
+def test_newton_takes_the_least_step_of_a_redundant_arm():
+    q, goal = np.array([0.3, 0.8, -0.5]), np.array([1.5, 0.9])
+    step = np.linalg.pinv(THREE.jacobian(q)) @ (goal - THREE.forward_kinematics(q)[:2])
+    result = Task(THREE).solve(goal, q, method='newton', max_iterations=1)
+    np.testing.assert_allclose(result.q, q + step, rtol=1e-12)
+
+
+@pytest.mark.parametrize('damping', [1e-3, 0.1, 7.0])
+def test_levenberg_marquardt_is_document_d_with_its_lambda_not_squared(damping):
+    q, goal, m = np.array([0.3, 0.8, -0.5]), np.array([1.3, 1.0, 1.0]), np.array([1.0, 4.0, 0.25])
+    J, M = THREE.jacobian(q, heading=True), np.diag(m)
+    e = pose_difference(goal, THREE.forward_kinematics(q))
+    step = np.linalg.inv(J.T @ M @ J + damping * np.eye(3)) @ J.T @ M @ e
+    result = Task(THREE, heading=True).solve(goal, q, mask=m, damping=damping, max_iterations=1)
+    np.testing.assert_allclose(result.q, q + step, rtol=1e-10)
+
+
+def test_the_transpose_step_is_document_ds_with_alpha_by_line_search():
+    q, goal, m = np.array([0.3, 0.8]), np.array([1.0, 1.0]), np.array([1.0, 4.0])
+    J, M = TWO.jacobian(q), np.diag(m)
+    downhill = J.T @ M @ (goal - TWO.forward_kinematics(q)[:2])
+    best = downhill @ downhill / (downhill @ J.T @ M @ J @ downhill)
+    result = Task(TWO).solve(goal, q, mask=m, method='transpose', max_iterations=1)
+    np.testing.assert_allclose(result.q, q + 0.9 * best * downhill, rtol=1e-12)
+
+
+@pytest.mark.parametrize('method', DOWNHILL)
+def test_the_error_falls_with_every_step_that_is_taken(method):
+    taken_back = 0
+    targets = np.random.default_rng(6).uniform(-3.0, 3.0, (20, 2))
+    for target, q0 in zip(targets, anywhere(THREE, 20), strict=True):
+        task = Task(THREE)
+        # Nearly no damping at first, so that there are steps to take back.
+        result = task.solve(target, q0, method=method, damping=1e-12, max_iterations=25)
+        # It is derived where it stands; a step that is taken back counts, and is not derived.
+        errors = [np.linalg.norm(target - task.forward(q)) for q in task.derived]
+        assert np.all(np.diff(errors) < 0.0)
+        assert result.error <= errors[-1]
+        taken_back += result.iterations - len(errors)
+    assert taken_back > 5
+
+
+def test_newton_takes_steps_that_make_it_worse():
+    task = Task(TWO)
+    task.solve([2.0, 2.0], [0.3, 0.4], method='newton', max_iterations=30)
+    assert len(task.derived) >= 30
+    errors = [np.linalg.norm(np.array([2.0, 2.0]) - task.forward(q)) for q in task.derived]
+    assert np.any(np.diff(errors) > 0.1)
+
+
+def test_newton_may_get_worse_and_gives_the_best_it_saw():
+    task, target, q0 = Task(TWO), np.full((100, 2), 2.0), anywhere(TWO, 100)
+    errors = [
+        task.solve(target, q0, method='newton', max_iterations=steps).error for steps in range(1, 12)
+    ]
+    assert np.all(np.diff(errors, axis=0) <= 0.0)
+    last = task.solve(target, q0, method='newton', max_iterations=11)
+    np.testing.assert_allclose(np.linalg.norm(target - task.forward(last.q), axis=1), last.error)
+    assert not last.converged.any()
+
+
+# --- Headings, masks, units
+
+
+def test_pose_difference_wraps_the_heading_only():
+    target = [[5.0, -4.0, 3.0], [0.0, 0.0, -3.0], [1.0, 2.0, np.pi], [0.0, 0.0, 0.5]]
+    pose = [[1.0, 4.0, -3.0], [0.0, 0.0, 3.0], [1.0, 2.0, 0.0], [0.0, 0.0, 0.25]]
+    expected = [
+        [4.0, -8.0, 6.0 - 2.0 * np.pi],
+        [0.0, 0.0, 2.0 * np.pi - 6.0],
+        [0.0, 0.0, np.pi],
+        [0.0, 0.0, 0.25],
+    ]
+    np.testing.assert_allclose(pose_difference(target, pose), expected, atol=1e-15)
+    np.testing.assert_allclose(pose_difference(target[0], pose[0]), expected[0], atol=1e-15)
+    for bad, named in (([0.0, 0.0], 'shape'), ([0.0, 0.0, np.nan], 'finite'), (np.eye(3)[:2], 'axes')):
+        with pytest.raises(ValueError, match=f'pose must .*{named}'):
+            pose_difference(target, bad)
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_a_heading_takes_the_short_way_across_half_a_turn(method):
+    task, q = Task(THREE, heading=True), np.array([1.0, 1.0, 1.1])
+    q0 = q + np.array([0.02, 0.02, 0.06])
+    target, start = task.forward(np.stack([q, q0]))
+    assert target[2] > 3.0
+    assert start[2] < -3.0
+    wrapped = task.solve(target, q0, method=method, max_iterations=3000)
+    assert wrapped.converged
+    np.testing.assert_allclose(wrapped.q, q, atol=1e-4)
+    plain = task.solve(target, q0, method=method, max_iterations=3000, difference=np.subtract)
+    assert np.abs(plain.q - q).max() > 0.5
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_a_masked_entry_is_as_if_it_were_not_there(method):
+    pose, position = Task(THREE, heading=True), Task(THREE)
+    target, q0 = pose.forward(configurations(THREE, 40)), configurations(THREE, 40, 7)
+    target[:, 2] = 3.0
+    masked = pose.solve(target, q0, method=method, mask=[1, 1, 0], max_iterations=50)
+    assert_same(masked, position.solve(target[:, :2], q0, method=method, max_iterations=50))
+
+
+def test_weights_say_what_matters_where_not_all_can_be_had():
+    # Two joints for three entries.
+    task, q0, target = Task(TWO, heading=True), np.array([0.5, 0.5]), np.array([0.9, 0.9, 2.5])
+    off = []
+    for weight in (1e-4, 1.0, 1e4):
+        m = np.array([1.0, 1.0, weight])
+        for method in DOWNHILL:
+            result = task.solve(target, q0, mask=m, method=method, max_iterations=20_000)
+            e = pose_difference(target, TWO.forward_kinematics(result.q))
+            assert not result.converged
+            assert result.error == pytest.approx(math.sqrt(e @ np.diag(m) @ e))
+            downhill = TWO.jacobian(result.q, heading=True).T @ (m * e)
+            assert np.abs(downhill).max() < 1e-5 * result.error * max(1.0, math.sqrt(weight))
+        off.append([np.hypot(e[0], e[1]), abs(e[2])])
+    by_position, by_heading = np.transpose(off)
+    assert by_position[0] < 1e-3 < 0.1 < by_position[1] < by_position[2]
+    assert by_heading[0] > by_heading[1] > 0.1 > 1e-3 > by_heading[2]
+
+
+@pytest.mark.parametrize('method', METHODS)
+@pytest.mark.parametrize('unit', [1e-9, 1e-3, 1e3, 1e9])
+def test_the_unit_of_length_does_not_matter(unit, method):
+    q, q0 = configurations(THREE, 30), configurations(THREE, 30, 8)
+    target = Task(THREE).forward(q)
+    metres = Task(THREE).solve(target, q0, method=method, max_iterations=100)
+    other = Task(PlanarArm(unit * THREE.lengths)).solve(
+        unit * target,
+        q0,
+        method=method,
+        max_iterations=100,
+        tolerance=unit * TOLERANCE,
+        damping=0.1 * unit**2,
+    )
+    assert_same(other._replace(error=other.error / unit), metres)
+
+
+@pytest.mark.parametrize(('method', 'damping'), [('newton', 1.0), ('levenberg_marquardt', 1e-19)])
+def test_joints_may_have_other_units(method, damping):
+    # A slide in nm, and an arm on it that cannot help in this direction.
+    def forward(q):
+        return np.stack([1e-9 * q[:, 0] + 0.3 * np.cos(q[:, 1]), 0.3 * np.sin(q[:, 1])], axis=-1)
+
+    def jacobian(q):
+        slide = np.broadcast_to([1e-9, 0.0], (len(q), 2))
+        return np.stack([slide, 0.3 * np.stack([-np.sin(q[:, 1]), np.cos(q[:, 1])], axis=-1)], axis=-1)
+
+    result = solve(forward, jacobian, [0.8, 0.0], [0.0, 0.0], method=method, damping=damping)
+    assert result.converged
+    np.testing.assert_allclose(result.q, [0.5e9, 0.0], rtol=1e-5)
+
+
+# --- What is not reached
+
+
+@pytest.mark.parametrize('method', DOWNHILL)
+@pytest.mark.parametrize('where', ['too far', 'in the hole'])
+@pytest.mark.parametrize('arm', LONG_FIRST, ids=['two', 'three'])
+def test_the_nearest_reachable_point_is_found(arm, where, method):
+    task = Task(arm)
+    target, nearest, distance = unreachable(arm, where)
+    result = task.solve(target, anywhere(arm, len(target)), method=method, max_iterations=2000)
+    assert not result.converged.any()
+    np.testing.assert_allclose(result.error, distance, atol=1e-9)
+    np.testing.assert_allclose(task.forward(result.q), nearest, atol=1e-4)
+    # It is known when it is found.
+    assert result.iterations.max() < 2000
+
+
+@pytest.mark.parametrize('where', ['too far', 'in the hole'])
+def test_newton_ends_on_what_it_cannot_reach(where):
+    task = Task(TWO)
+    target, _, distance = unreachable(TWO, where)
+    q0 = anywhere(TWO, len(target))
+    result = task.solve(target, q0, method='newton', max_iterations=100)
+    assert not result.converged.any()
+    assert np.all(result.iterations <= 100)
+    assert np.all(result.error >= distance - 1e-12)
+    assert np.all(result.error <= np.linalg.norm(target - task.forward(q0), axis=1))
+
+
+@pytest.mark.parametrize('method', METHODS)
+@pytest.mark.parametrize('angle', [0.0, 0.3, 2.5])
+@pytest.mark.parametrize('distance', [0.5, 1.2, 2.5])
+def test_a_stretched_arm_sees_no_way_along_its_own_line(distance, angle, method):
+    # No joint moves the tip that way: a singular start, of which the caller is told.
+    q0 = np.array([angle, 0.0])
+    result = Task(TWO).solve(at(distance, angle), q0, method=method)
+    assert not result.converged
+    assert result.iterations == 0
+    assert np.array_equal(result.q, q0)
+    assert result.error == pytest.approx(abs(1.7 - distance))
+
+
+def test_steps_run_out():
+    result = Task(THREE).solve([1.0, 0.5], [0.1, 0.2, 0.3], method='transpose', max_iterations=3)
+    assert not result.converged
+    assert result.iterations == 3
+    assert result.error > TOLERANCE
+
+
+# --- Batches
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_a_batch_is_one_after_the_other(method):
+    task, target = Task(THREE), np.random.default_rng(9).uniform(-2.0, 2.0, (40, 2))
+    q0 = configurations(THREE, 40)
+    # Rounding, which differs, grows on the ways of newton and of transpose.
+    steps = {'newton': 5, 'transpose': 15, 'levenberg_marquardt': 100}
+    options = {'method': method, 'max_iterations': steps[method]}
+    together = task.solve(target, q0, **options)
+    apart = [task.solve(t, q, **options) for t, q in zip(target, q0, strict=True)]
+    assert_same(together, IKResult(*map(np.array, zip(*apart, strict=True))))
+
+
+def test_leading_axes_broadcast():
+    task, q0 = Task(THREE), configurations(THREE, 5)
+    target = task.forward(configurations(THREE, 4, 10))
+    table = task.solve(target[:, None], q0)
+    assert table.q.shape == (4, 5, 3)
+    assert table.converged.shape == table.iterations.shape == table.error.shape == (4, 5)
+    for row, t in enumerate(target):
+        assert_same(IKResult(*(field[row] for field in table)), task.solve(t, q0))
+    assert_same(task.solve(target[0], q0), task.solve(np.tile(target[:1], (5, 1)), q0))
+    assert_same(task.solve(target, q0[0]), task.solve(target, np.tile(q0[:1], (4, 1))))
+
+
+def test_a_single_target_gives_scalars_and_arguments_stay_as_they_are():
+    target, q0 = np.array([1.0, 1.0]), np.array([0.1, 0.2, 0.3])
+    result = Task(THREE).solve(target, q0)
+    assert result.q.shape == (3,)
+    assert [np.ndim(field) for field in result[1:]] == [0, 0, 0]
+    assert result.converged.dtype == np.bool_
+    assert result.iterations.dtype == np.int64
+    assert target.tolist() == [1.0, 1.0]
+    assert q0.tolist() == [0.1, 0.2, 0.3]
+    at_once = Task(THREE).solve(target, q0, max_iterations=np.int32(1), tolerance=10)
+    assert at_once.converged
+    assert not np.shares_memory(at_once.q, q0)
+
+
+def test_no_target_is_no_work():
+    task = Task(THREE)
+    result = task.solve(np.zeros((0, 4, 2)), np.zeros(3))
+    assert [field.shape for field in result] == [(0, 4, 3), (0, 4), (0, 4), (0, 4)]
+    assert task.asked == task.derived == []
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_what_is_done_costs_nothing(method):
+    task = Task(TWO)
+    target = task.forward(configurations(TWO, 200))
+    target[::10] *= 9.0
+    task.asked.clear()
+    result = task.solve(target, configurations(TWO, 200, 11), method=method)
+    assert len(set(result.iterations.tolist())) > 5
+    # One call for the starts, then one for the step of each that is still open.
+    assert task.asked[0] == 200
+    assert task.asked == sorted(task.asked, reverse=True)
+    assert sum(task.asked) == 200 + result.iterations.sum()
+    # A step that is taken back needs no Jacobian, nor does the last one.
+    assert len(task.derived) < sum(task.asked)
+
+
+# --- Functions that fail
+
+
+@pytest.mark.parametrize('method', METHODS)
+@pytest.mark.parametrize('bad', [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize('which', ['forward', 'jacobian', 'difference'])
+def test_what_is_not_finite_ends_its_own_target_only(which, bad, method):
+    task = Task(TWO)
+
+    def spoiled(name, pose, value):
+        """Left of the base this function fails, if only in its last row or column."""
+        assert np.isfinite(pose).all()
+        if name == which:
+            value[pose[:, 0] < 0.0, ..., -1] = bad
+        elif name == 'jacobian':
+            assert np.all(pose[:, 0] >= 0.0)  # nobody needs it elsewhere
+        return value
+
+    def forward(q):
+        return spoiled('forward', task.forward(q), task.forward(q))
+
+    def jacobian(q):
+        return spoiled('jacobian', task.forward(q), task.jacobian(q))
+
+    def difference(target, pose):
+        return spoiled('difference', pose, target - pose)
+
+    target, q0 = task.forward(configurations(TWO, 150)), anywhere(TWO, 150)
+    options = {'method': method, 'max_iterations': 60}
+    result = solve(forward, jacobian, target, q0, difference=difference, **options)
+    start = task.forward(q0)
+    lost = start[:, 0] < 0.0
+    assert np.array_equal(result.q[lost], q0[lost])
+    assert not result.iterations[lost].any()
+    # Where only the derivative fails, the error is known.
+    assert np.array_equal(np.isfinite(result.error), ~lost | (which == 'jacobian'))
+    off = np.linalg.norm(target - task.forward(result.q), axis=1)
+    np.testing.assert_allclose(result.error[~lost], off[~lost], atol=1e-14)
+    assert np.all(off <= np.linalg.norm(target - start, axis=1))
+    # Some come to where it fails, and those that do not see nothing of it.
+    assert np.any(~lost & ~result.converged & (result.iterations < 60))
+    assert np.count_nonzero(result.converged) > 10
+    whole = task.solve(target, q0, **options)
+    for field, other in zip(result, whole, strict=True):
+        assert np.array_equal(field[result.converged], other[result.converged])
+
+
+def test_of_nothing_no_difference_is_asked():
+    def nothing(q):
+        return np.full_like(q, np.nan)
+
+    result = solve(nothing, TWO.jacobian, [1.0, 1.0], [0.0, 1.0], difference=pytest.fail)
+    assert not result.converged
+    assert np.isnan(result.error)
+    assert result.q.tolist() == [0.0, 1.0]
+
+
+@pytest.mark.parametrize('method', METHODS)
+@pytest.mark.parametrize('scale', [1e-320, 1e-200, 1e-100, 1e100, 1e150, 1e200, 1e307])
+def test_numbers_without_measure_neither_raise_nor_warn(scale, method):
+    arm = Task(TWO)
+    for lift, steep in ((scale, 1.0), (1.0, scale), (scale, scale)):
+        result = solve(
+            lambda q, lift=lift: lift * arm.forward(q),
+            lambda q, steep=steep: steep * arm.jacobian(q),
+            lift * np.array([[0.4, 0.6], [-0.9, 0.3], [1.9, 0.3]]),
+            configurations(TWO, 3),
+            method=method,
+            max_iterations=40,
+            tolerance=min(1e-6, 1e-6 * lift) or 5e-324,
+        )
+        assert np.isfinite(result.q).all()
+
+
+def test_functions_may_warn_write_and_use_their_memory_again():
+    task, q, q0 = Task(THREE), configurations(THREE, 30), configurations(THREE, 30, 12)
+    memory = {name: np.empty(3000) for name in ('forward', 'jacobian', 'difference')}
+
+    def stored(name, value):
+        kept = memory[name][: value.size].reshape(value.shape)
+        kept[...] = value
+        return kept
+
+    def forward(q):
+        pose = stored('forward', task.forward(q))
+        np.log(0.0 * q, out=q)
+        return pose
+
+    def jacobian(q):
+        J = stored('jacobian', task.jacobian(q))
+        q[:] = np.nan
+        return J
+
+    def difference(target, pose):
+        return stored('difference', target - pose)
+
+    target = task.forward(q)
+    with np.errstate(all='raise'):
+        result = solve(forward, jacobian, target, q0, difference=difference)
+    assert_same(result, task.solve(target, q0))
+    assert result.converged.all()
+
+
+def test_what_a_function_raises_comes_through():
+    def broken(_):
+        raise ZeroDivisionError('mine')
+
+    with pytest.raises(ZeroDivisionError, match='mine'):
+        solve(broken, TWO.jacobian, [1.0, 1.0], [0.0, 1.0])
+
+
+# --- Bad input
+
+
+@pytest.mark.parametrize(
+    ('changes', 'message'),
+    [
+        ({'target': 1.0}, r'^target must have shape \(\.\.\., n\), got \(\)'),
+        ({'target': np.zeros((3, 0))}, r'^target must have shape \(\.\.\., n\), got \(3, 0\)'),
+        ({'target': [np.nan, 0.0]}, '^target must be finite, got nan at index 0'),
+        ({'target': 'home'}, '^target must be an array of real numbers, got home'),
+        ({'q0': 1.0}, r'^q0 must have shape \(\.\.\., n\), got \(\)'),
+        ({'q0': [0.0, -np.inf]}, '^q0 must be finite, got -inf at index 1'),
+        ({'q0': [[0.0, 1.0], [0.0]]}, '^q0 must be an array of real numbers'),
+        (
+            {'target': np.zeros((4, 2)), 'q0': np.zeros((3, 2))},
+            r'^target and q0 must have leading axes that broadcast, got target \(4,\), q0 \(3,\)',
+        ),
+        (
+            {'method': 'gauss'},
+            "^method must be one of newton, transpose, levenberg_marquardt, got 'gauss'",
+        ),
+        ({'method': None}, '^method must be one of newton, transpose, levenberg_marquardt, got None'),
+        ({'mask': [1.0]}, r'^mask must have shape \(2,\), as target has m = 2, got \(1,\)'),
+        ({'mask': 1.0}, r'^mask must have shape \(2,\)'),
+        ({'mask': np.ones((1, 2))}, r'^mask must have shape \(2,\)'),
+        ({'mask': [0, 0]}, r'^mask must have an entry that is not zero, got \[0.0, 0.0\]'),
+        ({'mask': [1.0, -1.0]}, r'^mask must be zero or positive and finite, got -1.0 at index 1'),
+        ({'mask': [1.0, np.nan]}, '^mask must be zero or positive and finite, got nan at index 1'),
+        ({'mask': [1.0, np.inf]}, '^mask must be zero or positive and finite, got inf at index 1'),
+        ({'tolerance': 0.0}, '^tolerance must be positive and finite, got 0.0'),
+        ({'tolerance': -1e-6}, '^tolerance must be positive and finite, got -1e-06'),
+        ({'tolerance': np.nan}, '^tolerance must be finite, got nan'),
+        ({'tolerance': [1e-6, 1e-6]}, r'^tolerance must be a single number, got shape \(2,\)'),
+        ({'damping': 0.0}, '^damping must be positive and finite, got 0.0'),
+        ({'damping': np.inf}, '^damping must be finite, got inf'),
+        ({'damping': 'much'}, '^damping must be an array of real numbers, got much'),
+        ({'max_iterations': 0}, '^max_iterations must be an integer of at least 1, got 0'),
+        ({'max_iterations': -3}, '^max_iterations must be an integer of at least 1, got -3'),
+        ({'max_iterations': 10.0}, '^max_iterations must be an integer of at least 1, got 10.0'),
+        ({'max_iterations': True}, '^max_iterations must be an integer of at least 1, got True'),
+        ({'max_iterations': None}, '^max_iterations must be an integer of at least 1, got None'),
+        (
+            {'forward': TWO.forward_kinematics},
+            r'^forward must return shape \(1, 2\) for q of shape \(1, 2\), got \(1, 3\)',
+        ),
+        ({'forward': lambda q: q[0]}, r'^forward must return shape \(1, 2\) .* got \(2,\)'),
+        ({'forward': lambda q: None}, r'^forward must return shape \(1, 2\) .* got \(\)'),
+        ({'forward': lambda q: q * 1j}, '^what forward returns must be an array of real numbers'),
+        (
+            {'jacobian': THREE.jacobian, 'q0': [0.1, 0.2]},
+            '^q must have shape',
+        ),
+        (
+            {'jacobian': lambda q: TWO.jacobian(q, heading=True)},
+            r'^jacobian must return shape \(1, 2, 2\) for q of shape \(1, 2\), got \(1, 3, 2\)',
+        ),
+        ({'jacobian': lambda q: np.eye(2)}, r'^jacobian must return shape \(1, 2, 2\) .* got \(2, 2\)'),
+        (
+            {'difference': lambda target, pose: target[0] - pose[0]},
+            r'^difference must return shape \(1, 2\) for q of shape \(1, 2\), got \(2,\)',
+        ),
+    ],
+)
+def test_bad_input_is_named(changes, message):
+    arguments = {
+        'forward': lambda q: TWO.forward_kinematics(q)[..., :2],
+        'jacobian': TWO.jacobian,
+        'target': [0.5, 0.5],
+        'q0': [0.1, 0.2],
+    }
+    with pytest.raises(ValueError, match=message):
+        solve(**{**arguments, **changes})
