@@ -56,7 +56,7 @@ def go_to_goal(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any) -> tuple[Any
     return Kv * ahead, Kp * arctan2(aside, ahead)
 
 
-def turn_in_place(theta: ArrayLike, heading: ArrayLike, Kp: Any) -> tuple[Any, Any]:
+def turn_in_place(theta: Any, heading: Any, Kp: Any) -> tuple[Any, Any]:
     """Turn to a heading the short way round: `v = 0`, `omega = Kp wrap(heading - theta)`.
 
     Args:

@@ -262,11 +262,10 @@ class _Fleet:
         done = 0
         for begin in range(0, count, BLOCK):
             rows = np.arange(begin, min(begin + BLOCK, count))
-            for finished in _Block(self.some(rows), rows).drive(keep):
-                rows, values = finished
+            for finished, values in _Block(self.some(rows), rows).drive(keep):
                 for field, value in zip(found, values, strict=True):
-                    field[rows] = value
-                done += len(rows)
+                    field[finished] = value
+                done += len(finished)
                 if progress is not None:
                     progress(done)
         made = [field.reshape(*self.shape, *field.shape[1:]) for field in found]
@@ -278,15 +277,15 @@ class _Block:
 
     def __init__(self, fleet: _Fleet, rows: NDArray[np.intp]) -> None:
         self.fleet, self.rows, count = fleet, rows, len(rows)
-        self.pose = fleet.starts
-        self.open = np.ones(count, dtype=np.bool_)
-        self.turning = np.zeros(count, dtype=np.bool_)
+        self.pose: Array = fleet.starts
+        self.open: Mask = np.ones(count, dtype=np.bool_)
+        self.turning: Mask = np.zeros(count, dtype=np.bool_)
         # Summed up: |v|, v^2, omega^2; the farthest way beyond the goal.
-        self.sums = np.zeros((3, count))
-        self.beyond = np.zeros(count)
+        self.sums: Array = np.zeros((3, count))
+        self.beyond: Array = np.zeros(count)
         way = fleet.goals[:, :2] - fleet.starts[:, :2]
         length = np.hypot(*way.T)
-        self.along = np.array((way / np.where(length > 0.0, length, 1.0)[:, np.newaxis]).T)
+        self.along: Array = np.array((way / np.where(length > 0.0, length, 1.0)[:, np.newaxis]).T)
 
     def drive(self, keep: Keep | None) -> Iterator[tuple[NDArray[np.intp], Outcomes]]:
         """Drive them to their ends; gives who is done, and what became of them."""
