@@ -526,8 +526,8 @@ def test_what_a_function_raises_comes_through():
 @pytest.mark.parametrize(
     ('changes', 'message'),
     [
-        ({'target': 1.0}, r'^target must have shape \(\.\.\., n\), got \(\)'),
-        ({'target': np.zeros((3, 0))}, r'^target must have shape \(\.\.\., n\), got \(3, 0\)'),
+        ({'target': 1.0}, r'^target must have shape \(\.\.\., m\), got \(\)'),
+        ({'target': np.zeros((3, 0))}, r'^target must have shape \(\.\.\., m\), got \(3, 0\)'),
         ({'target': [np.nan, 0.0]}, '^target must be finite, got nan at index 0'),
         ({'target': 'home'}, '^target must be an array of real numbers, got home'),
         ({'q0': 1.0}, r'^q0 must have shape \(\.\.\., n\), got \(\)'),
@@ -551,10 +551,10 @@ def test_what_a_function_raises_comes_through():
         ({'mask': [1.0, np.inf]}, '^mask must be zero or positive and finite, got inf at index 1'),
         ({'tolerance': 0.0}, '^tolerance must be positive and finite, got 0.0'),
         ({'tolerance': -1e-6}, '^tolerance must be positive and finite, got -1e-06'),
-        ({'tolerance': np.nan}, '^tolerance must be finite, got nan'),
+        ({'tolerance': np.nan}, '^tolerance must be positive and finite, got nan'),
         ({'tolerance': [1e-6, 1e-6]}, r'^tolerance must be a single number, got shape \(2,\)'),
         ({'damping': 0.0}, '^damping must be positive and finite, got 0.0'),
-        ({'damping': np.inf}, '^damping must be finite, got inf'),
+        ({'damping': np.inf}, '^damping must be positive and finite, got inf'),
         ({'damping': 'much'}, '^damping must be an array of real numbers, got much'),
         ({'max_iterations': 0}, '^max_iterations must be an integer of at least 1, got 0'),
         ({'max_iterations': -3}, '^max_iterations must be an integer of at least 1, got -3'),
@@ -566,7 +566,10 @@ def test_what_a_function_raises_comes_through():
             r'^forward must return shape \(1, 2\) for q of shape \(1, 2\), got \(1, 3\)',
         ),
         ({'forward': lambda q: q[0]}, r'^forward must return shape \(1, 2\) .* got \(2,\)'),
-        ({'forward': lambda q: None}, r'^forward must return shape \(1, 2\) .* got \(\)'),
+        (
+            {'forward': lambda q: None},
+            r'^what forward returns must be an array of real numbers, got None',
+        ),
         ({'forward': lambda q: q * 1j}, '^what forward returns must be an array of real numbers'),
         (
             {'jacobian': THREE.jacobian, 'q0': [0.1, 0.2]},

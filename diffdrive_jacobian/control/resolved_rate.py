@@ -49,7 +49,7 @@ def resolved_rate(
     Returns:
         Joint velocities, shape (..., n).
     """
-    J = array('J', J, None, None)
+    J = array('J', J, 'm', 'n')
     m, n = J.shape[-2:]
     x, x_desired = array('x', x, m), array('x_desired', x_desired, m)
     x_dot_desired, K = array('x_dot_desired', x_dot_desired, m), floats('gain', gain)
@@ -93,7 +93,7 @@ class StraightLine:
 
     def __post_init__(self) -> None:
         """Check everything."""
-        start = array('start', self.start, None)
+        start = array('start', self.start, 'm')
         end, speed = array('end', self.end, start.shape[-1]), floats('speed', self.speed)
         positive('speed', speed)
         leading(start=start.shape[:-1], end=end.shape[:-1], speed=speed.shape)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -69,18 +71,34 @@ def floats(name: str, value: Any) -> NDArray[np.float64]:
     """
     try:
         array = np.asarray(value)
-        if array.dtype.kind not in 'biuf':
-            # A list of objects that are numbers is welcome, a complex number is not.
-            array = np.array(array.tolist(), dtype=np.float64)
+        # Objects may be numbers, too, such as fractions.
+        known = array.dtype.kind in 'biuf'
+        if not known and not (
+            array.dtype.kind == 'O' and all(isinstance(entry, Real) for entry in array.flat)
+        ):
+            raise TypeError('neither text, complex numbers nor None are')
         return array.astype(np.float64, copy=False)
-    except (TypeError, ValueError) as error:
+    except (OverflowError, TypeError, ValueError) as error:
         got = str(value)
         got = got if len(got) <= 60 else f'{got[:57]}...'
         raise ValueError(f'{name} must be an array of real numbers, got {got} ({error})') from error
 
 
-def array(name: str, value: Any, *trailing: int | None) -> NDArray[np.float64]:
-    """Make a finite float array with these last axes; None stands for any length but zero.
+def number(name: str, value: Any, check: Callable[[str, Any], None]) -> float:
+    """Make a float of a single number that passes a check.
+
+    Raises:
+        ValueError: It does not, or it is something else.
+    """
+    made = floats(name, value)
+    if made.ndim:
+        raise ValueError(f'{name} must be a single number, got shape {made.shape}')
+    check(name, float(made))
+    return float(made)
+
+
+def array(name: str, value: Any, *trailing: int | str) -> NDArray[np.float64]:
+    """Make a finite float array with these last axes; a letter stands for any length but zero.
 
     Raises:
         ValueError: The shape is another one, or an entry is infinite, NaN or no number.
@@ -88,10 +106,10 @@ def array(name: str, value: Any, *trailing: int | None) -> NDArray[np.float64]:
     made = floats(name, value)
     shape = made.shape[made.ndim - len(trailing) :] if made.ndim >= len(trailing) else None
     if shape is None or any(
-        got == 0 if wanted is None else got != wanted
+        got == 0 if isinstance(wanted, str) else got != wanted
         for got, wanted in zip(shape, trailing, strict=True)
     ):
-        axes = ', '.join(['...', *('n'[wanted is not None :] or str(wanted) for wanted in trailing)])
+        axes = ', '.join(['...', *map(str, trailing)])
         raise ValueError(f'{name} must have shape ({axes}), got {made.shape}')
     finite(name, made)
     return made

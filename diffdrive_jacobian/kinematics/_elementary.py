@@ -25,8 +25,8 @@ def components(name: str, value: Any, size: int) -> list[Any]:
         ValueError: The last axis has another length, or there is none, or an entry is infinite, NaN
             or no number.
     """
-    if type(value) is tuple and len(value) == size and type(value[0]) is type(value[-1]) is float:
-        entries = list(map(float, value))
+    if type(value) is tuple and len(value) == size and set(map(type, value)) == {float}:
+        entries = list(value)
     else:
         array = floats(name, value)
         if array.ndim == 0 or array.shape[-1] != size:
@@ -46,9 +46,7 @@ def operand(name: str, value: Any, check: Callable[[str, Any], None] = finite) -
     Raises:
         ValueError: A number does not pass the check, or something is no number.
     """
-    if isinstance(value, (float, int)):
-        value = float(value)
-    else:
+    if type(value) is not float:
         value = floats(name, value)
         if value.ndim == 0:
             value = float(value)
@@ -74,8 +72,8 @@ def wrapped(angle: Any) -> Any:
             return angle
         # math.fmod raises where NumPy gives NaN.
         angle = math.fmod(angle, TURN) if math.isfinite(angle) else math.nan
-    elif not np.abs(angle).max(initial=0.0) < 2.0 * TURN:
-        # Nearer than that, the subtraction below is exact by itself, and faster.
+    elif not np.abs(angle).max(initial=0.0) < 1.5 * TURN:
+        # Nearer than that, one subtraction below is enough, exact and faster.
         angle = np.fmod(angle, TURN)
     return angle - TURN * (angle > np.pi) + TURN * (angle <= -np.pi)
 

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import array, floats, leading, not_negative, positive
+from diffdrive_jacobian.kinematics._checks import array, floats, leading, not_negative, number, positive
 from diffdrive_jacobian.kinematics._elementary import wrapped
 from diffdrive_jacobian.kinematics.inverse_velocity import damped_least_squares
 
@@ -114,7 +114,7 @@ def solve(
     Raises:
         ValueError: An argument has a wrong shape or value, or a function returns a wrong shape.
     """
-    target, q0 = array('target', target, None), array('q0', q0, None)
+    target, q0 = array('target', target, 'm'), array('q0', q0, 'n')
     (m,), (n,) = target.shape[-1:], q0.shape[-1:]
     batch = leading(target=target.shape[:-1], q0=q0.shape[:-1])
     if method not in METHODS:
@@ -131,8 +131,8 @@ def solve(
         roots=np.sqrt(weights[weights > 0.0]),
         targets=np.broadcast_to(target, (*batch, m)).reshape(-1, m),
         method=method,
-        tolerance=_number('tolerance', tolerance),
-        damping=_number('damping', damping),
+        tolerance=number('tolerance', tolerance, positive),
+        damping=number('damping', damping, positive),
     )
     # Of the user's functions, too: what they return is looked at.
     with np.errstate(all='ignore'):
@@ -276,14 +276,6 @@ def _returned(name: str, value: Any, shape: tuple[int, ...], q: Floats) -> Float
     if made.shape != shape:
         raise ValueError(f'{name} must return shape {shape} for q of shape {q.shape}, got {made.shape}')
     return made
-
-
-def _number(name: str, value: Any) -> float:
-    made = array(name, value)
-    if made.ndim:
-        raise ValueError(f'{name} must be a single number, got shape {made.shape}')
-    positive(name, made)
-    return float(made)
 
 
 def _weights(mask: ArrayLike | None, m: int) -> Floats:

@@ -13,12 +13,12 @@ below `CUTOFF max(m, n)` times the largest one.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import array, floats, leading, not_negative, positive
+from diffdrive_jacobian.kinematics._adjugate import adjugate, refuse_singular
+from diffdrive_jacobian.kinematics._checks import array, floats, leading, not_negative, number, positive
 
 CUTOFF = 1e-15
 _EPSILON = float(np.finfo(np.float64).eps)
@@ -29,10 +29,11 @@ Array = NDArray[np.float64]
 
 
 def adjugate_inverse(J: ArrayLike) -> Array:
-    """Invert by the adjugate: `J^-1 = adj(J) / det(J)` (A, 3.2.1).
+    """Invert by the adjugate: `J^-1 = [[d, -b], [-c, a]] / det(J)` (A, 3.2.1).
 
     Args:
-        J: Jacobians, shape (..., 2, 2) or (..., 3, 3).
+        J: Jacobians `[[a, b], [c, d]]`, shape (..., 2, 2). (With larger ones the adjugate loses digits
+            that `numpy.linalg.inv` keeps.)
 
     Returns:
         The inverses, same shape.
@@ -40,32 +41,13 @@ def adjugate_inverse(J: ArrayLike) -> Array:
     Raises:
         LinAlgError: A Jacobian is singular to working precision: what an inverse would hold is
             rounding error. The message gives its determinant.
-        ValueError: J is not square, or of another size.
+        ValueError: J has another shape.
     """
-    J = array('J', J, None, None)
-    if J.shape[-2:] not in ((2, 2), (3, 3)):
-        raise ValueError(f'J must have shape (..., 2, 2) or (..., 3, 3), got {J.shape}')
-    adjugate = np.empty_like(J)
-    if J.shape[-1] == 2:
-        adjugate[..., 0, 0], adjugate[..., 1, 1] = J[..., 1, 1], J[..., 0, 0]
-        adjugate[..., 0, 1], adjugate[..., 1, 0] = -J[..., 0, 1], -J[..., 1, 0]
-        determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-    else:
-        first, second, third = (J[..., row, :] for row in range(3))
-        adjugate[..., 0] = np.cross(second, third)
-        adjugate[..., 1] = np.cross(third, first)
-        adjugate[..., 2] = np.cross(first, second)
-        determinant = _dot(first, adjugate[..., 0])
-    size = np.sqrt(_dot(J, J).sum(axis=-1) * _dot(adjugate, adjugate).sum(axis=-1))
-    # The condition number is at least size / |det| (in the norm of Frobenius).
-    singular = np.abs(determinant) <= 4.0 * _EPSILON * size
-    if singular.any():
-        where = tuple(int(index) for index in np.argwhere(singular)[0])
-        at = f' (at index {where if len(where) > 1 else where[0]})' if where else ''
-        raise np.linalg.LinAlgError(
-            f'J must not be singular, got a determinant of {determinant[where]:.3g}{at}'
-        )
-    inverse: Array = adjugate / determinant[..., np.newaxis, np.newaxis]
+    J = array('J', J, 2, 2)
+    determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+    # The condition number is |J|^2 / |det| (in the norm of Frobenius).
+    refuse_singular(determinant, np.abs(determinant) <= 4.0 * _EPSILON * _dot(J, J).sum(axis=-1))
+    inverse: Array = adjugate(J) / determinant[..., np.newaxis, np.newaxis]
     return inverse
 
 
@@ -80,7 +62,7 @@ def pseudoinverse(J: ArrayLike) -> Array:
     Returns:
         The pseudo-inverses, shape (..., n, m).
     """
-    J = array('J', J, None, None)
+    J = array('J', J, 'm', 'n')
     left, values, right = np.linalg.svd(J, full_matrices=False)
     gains = _gains(values, np.zeros_like(values), J.shape[-2:])
     inverse: Array = np.swapaxes(right, -1, -2) * gains[..., np.newaxis, :] @ np.swapaxes(left, -1, -2)
@@ -97,22 +79,14 @@ def manipulability(J: ArrayLike) -> Array:
         w, shape (...): the product of the singular values, 0 where J is singular; also where it has
         more rows than columns, for then some velocity cannot be produced.
     """
-    J = array('J', J, None, None)
+    J = array('J', J, 'm', 'n')
     rows, columns = J.shape[-2:]
     if rows > columns:
         return np.zeros(J.shape[:-2])
-    if rows > 2 or not _moderate(J):
-        measure: Array = np.linalg.svd(J, compute_uv=False).prod(axis=-1)
-        return measure
-    if rows == 1:
-        return np.sqrt(_dot(J, J)[..., 0])
-    # Cauchy and Binet: the root of the sum of all squared minors, which loses no digits.
-    squares: Any = 0.0
-    for i in range(columns):
-        for j in range(i):
-            minor = J[..., 0, i] * J[..., 1, j] - J[..., 0, j] * J[..., 1, i]
-            squares = squares + minor * minor
-    return np.asarray(np.sqrt(squares))
+    if rows == columns == 2 and _moderate(np.abs(J)):
+        return np.asarray(np.abs(J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]))
+    measure: Array = np.linalg.svd(J, compute_uv=False).prod(axis=-1)
+    return measure
 
 
 def damping(manipulability: ArrayLike, threshold: ArrayLike, maximum: ArrayLike) -> Array:
@@ -132,7 +106,8 @@ def damping(manipulability: ArrayLike, threshold: ArrayLike, maximum: ArrayLike)
     positive('threshold', w_0)
     not_negative('maximum', most)
     leading(manipulability=w.shape, threshold=w_0.shape, maximum=most.shape)
-    return np.asarray(most * np.maximum(1.0 - w / w_0, 0.0))
+    w, w_0 = np.broadcast_arrays(w, w_0)
+    return np.asarray(most * (1.0 - np.divide(w, w_0, out=np.ones(w.shape), where=w < w_0)))
 
 
 def damped_least_squares(J: ArrayLike, x_dot: ArrayLike, damping: ArrayLike) -> Array:
@@ -153,7 +128,7 @@ def damped_least_squares(J: ArrayLike, x_dot: ArrayLike, damping: ArrayLike) -> 
     factor = floats('damping', damping)
     not_negative('damping', factor)
     leading(J=J.shape[:-2], x_dot=x_dot.shape[:-1], damping=factor.shape)
-    if J.shape[-2] == 2 and _moderate(J):
+    if J.shape[-2] == 2 and _moderate(_dot(J, J).sum(axis=-1)):
         return _two_rows(J, x_dot, factor)
     left, values, right = np.linalg.svd(J, full_matrices=False)
     along = (x_dot[..., np.newaxis, :] @ left)[..., 0, :]
@@ -171,8 +146,8 @@ def null_space_projector(J: ArrayLike) -> Array:
     Returns:
         N, shape (..., n, n): symmetric, `N N = N`, its rank n less that of J.
     """
-    J = array('J', J, None, None)
-    return _projector(J, CUTOFF * max(J.shape[-2:]) * _norm(J))[1]
+    J = array('J', J, 'm', 'n')
+    return _projector(J, CUTOFF * max(J.shape[-2:]) * _largest(J))[1]
 
 
 def manipulability_gradient(jacobian: Callable[[Array], ArrayLike], q: ArrayLike) -> Array:
@@ -189,7 +164,7 @@ def manipulability_gradient(jacobian: Callable[[Array], ArrayLike], q: ArrayLike
     Returns:
         The gradients, shape (..., n).
     """
-    q = array('q', q, None)
+    q = array('q', q, 'n')
     steps = _STEP * np.eye(q.shape[-1])
     around = q[..., np.newaxis, :]
     ahead, behind = (manipulability(jacobian(around + sign * steps)) for sign in (1.0, -1.0))
@@ -210,8 +185,8 @@ def joint_limit_cost(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> Array:
 
     Args:
         q: Joint angles, shape (..., n) (rad).
-        lower: Lower limits, shape (..., n) (rad).
-        upper: Upper limits, above the lower ones, shape (..., n) (rad).
+        lower: Lower limits, shape (..., n), or one for all joints (rad).
+        upper: Upper limits, above the lower ones, shape (..., n), or one for all joints (rad).
 
     Returns:
         The cost, shape (...): 0 in the middle, 1/8 with every joint at a limit.
@@ -228,8 +203,8 @@ def joint_limit_gradient(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> Ar
 
     Args:
         q: Joint angles, shape (..., n) (rad).
-        lower: Lower limits, shape (..., n) (rad).
-        upper: Upper limits, above the lower ones, shape (..., n) (rad).
+        lower: Lower limits, shape (..., n), or one for all joints (rad).
+        upper: Upper limits, above the lower ones, shape (..., n), or one for all joints (rad).
 
     Returns:
         The gradients, shape (..., n) (1/rad).
@@ -274,14 +249,20 @@ def prioritized(tasks: Sequence[tuple[ArrayLike, ArrayLike]], *, cutoff: float =
         Joint velocities, shape (..., n).
 
     Raises:
-        ValueError: There is no task, or their numbers of joints differ.
+        ValueError: There is no task, something is no pair, or the numbers of joints differ.
     """
-    if not tasks:
+    cutoff = number('cutoff', cutoff, positive)
+    if cutoff >= 1.0:
+        raise ValueError(f'cutoff must be below 1, got {cutoff}')
+    try:
+        pairs = [(J, x_dot) for J, x_dot in tasks]
+    except (TypeError, ValueError):
+        raise ValueError(f'tasks must be pairs (J, x_dot), got {tasks!r:.60}') from None
+    if not pairs:
         raise ValueError('tasks must hold at least one (J, x_dot), got none')
-    positive('cutoff', float(cutoff))
     read = [
         _task(J, x_dot, f'J of task {index}', f'x_dot of task {index}')
-        for index, (J, x_dot) in enumerate(tasks)
+        for index, (J, x_dot) in enumerate(pairs)
     ]
     joints = [J.shape[-1] for J, _ in read]
     if len(set(joints)) > 1:
@@ -295,7 +276,7 @@ def prioritized(tasks: Sequence[tuple[ArrayLike, ArrayLike]], *, cutoff: float =
         np.broadcast_to(np.eye(joints[0]), (*batch,) + (joints[0],) * 2),
     )
     for J, x_dot in read:
-        inverse, left_over = _projector(J @ free, cutoff * _norm(J))
+        inverse, left_over = _projector(J @ free, cutoff * _largest(J))
         missing = x_dot - (J @ q_dot[..., np.newaxis])[..., 0]
         q_dot = q_dot + (free @ (inverse @ missing[..., np.newaxis]))[..., 0]
         free = free @ left_over
@@ -307,19 +288,20 @@ def _dot(one: Array, other: Array) -> Array:
     return product
 
 
-def _norm(J: Array) -> Array:
-    return np.asarray(np.linalg.norm(J, axis=(-2, -1)))
+def _largest(J: Array) -> Array:
+    """Give the largest singular value, shape (...)."""
+    return np.asarray(np.linalg.norm(J, ord=2, axis=(-2, -1)))
 
 
-def _moderate(J: Array) -> bool:
-    """Whether squares of the entries neither overflow nor vanish altogether."""
-    return bool(1e-75 < np.abs(J).max(initial=1e-70) < 1e75)
+def _moderate(values: Array) -> bool:
+    """Whether products of such values neither overflow nor vanish; not so of values that are 0."""
+    return bool(((values > 1e-100) & (values < 1e100)).all())
 
 
 def _task(
     J: ArrayLike, x_dot: ArrayLike, name_J: str = 'J', name_x_dot: str = 'x_dot'
 ) -> tuple[Array, Array]:
-    J = array(name_J, J, None, None)
+    J = array(name_J, J, 'm', 'n')
     x_dot = array(name_x_dot, x_dot, J.shape[-2])
     leading(**{name_J: J.shape[:-2], name_x_dot: x_dot.shape[:-1]})
     return J, x_dot
@@ -368,8 +350,11 @@ def _projector(J: Array, least: Array) -> tuple[Array, Array]:
 
 def _from_the_middle(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array]:
     """Give the way of each joint from the middle of its range, relative to that range, and the range."""
-    q = array('q', q, None)
+    q = array('q', q, 'n')
     lower, upper = (array(name, value) for name, value in (('lower', lower), ('upper', upper)))
+    for name, value in (('lower', lower), ('upper', upper)):
+        if value.shape[-1:] not in ((), q.shape[-1:]):
+            raise ValueError(f'{name} must have shape () or (..., {q.shape[-1]}), got {value.shape}')
     leading(q=q.shape, lower=lower.shape, upper=upper.shape)
     span = upper - lower
     if not (span > 0.0).all():

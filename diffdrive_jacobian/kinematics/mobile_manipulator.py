@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics import se2
-from diffdrive_jacobian.kinematics._checks import array, leading, positive
+from diffdrive_jacobian.kinematics._checks import array, leading, number, positive
 from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body, wheel_to_body_jacobian
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 
@@ -43,11 +43,14 @@ class MobileManipulator:
 
     def __post_init__(self) -> None:
         """Check every dimension."""
-        positive('r', float(self.r))
-        positive('L', float(self.L))
-        mount = array('mount', self.mount, 2)
+        for name in ('r', 'L'):
+            object.__setattr__(self, name, number(name, getattr(self, name), positive))
+        if not isinstance(self.arm, PlanarArm):
+            raise ValueError(f'arm must be a PlanarArm, got {self.arm!r:.60}')
+        mount = array('mount', self.mount, 2).copy()
         if mount.ndim != 1:
             raise ValueError(f'mount must have shape (2,), got {mount.shape}')
+        mount.flags.writeable = False
         object.__setattr__(self, 'mount', mount)
 
     def forward_kinematics(self, q: ArrayLike) -> NDArray[np.float64]:

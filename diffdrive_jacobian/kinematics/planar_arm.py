@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from diffdrive_jacobian.kinematics._adjugate import adjugate, refuse_singular
 from diffdrive_jacobian.kinematics._checks import array, leading, positive
 from diffdrive_jacobian.kinematics._elementary import wrapped
-from diffdrive_jacobian.kinematics.inverse_velocity import adjugate_inverse
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class PlanarArm:
 
     def __init__(self, lengths: ArrayLike) -> None:
         """Take the lengths of the links, shape (n,), n >= 1 (m)."""
-        made = array('lengths', lengths, None).copy()
+        made = array('lengths', lengths, 'n').copy()
         if made.ndim != 1:
             raise ValueError(f'lengths must have shape (n,), got {made.shape}')
         positive('lengths', made)
@@ -151,10 +151,12 @@ class PlanarArm:
         self._need_two('inverse_velocity')
         q, x_dot = self._angles(q), array('x_dot', x_dot, 2)
         leading(q=q.shape[:-1], x_dot=x_dot.shape[:-1])
-        velocity: NDArray[np.float64] = (adjugate_inverse(self.jacobian(q)) @ x_dot[..., np.newaxis])[
-            ..., 0
-        ]
-        return velocity
+        determinant = self.determinant(q)
+        # Known better than from the entries of J; what is left is the rounding of q_2 itself.
+        blur = 4.0 * np.finfo(np.float64).eps * np.maximum(1.0, np.abs(q[..., 1]))
+        refuse_singular(determinant, np.abs(determinant) <= blur * self.lengths.prod())
+        turned: NDArray[np.float64] = (adjugate(self.jacobian(q)) @ x_dot[..., np.newaxis])[..., 0]
+        return turned / determinant[..., np.newaxis]
 
     def joint_torques(self, q: ArrayLike, wrench: ArrayLike) -> NDArray[np.float64]:
         """Give the torques that hold a wrench at the tip: `tau = J^T W` (D, 5).
@@ -167,7 +169,7 @@ class PlanarArm:
         Returns:
             Torques, shape (..., n) (N m).
         """
-        q, wrench = self._angles(q), array('wrench', wrench, None)
+        q, wrench = self._angles(q), array('wrench', wrench, 'm')
         if wrench.shape[-1] not in (2, 3):
             raise ValueError(f'wrench must have shape (..., 2) or (..., 3), got {wrench.shape}')
         leading(q=q.shape[:-1], wrench=wrench.shape[:-1])

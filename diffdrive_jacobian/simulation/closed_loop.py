@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.go_to_goal import turn_in_place
 from diffdrive_jacobian.control.saturation import VelocityLimits, saturate
-from diffdrive_jacobian.kinematics._checks import array, floats, leading, positive
+from diffdrive_jacobian.kinematics._checks import array, floats, leading, number, positive
 from diffdrive_jacobian.kinematics.se2 import integrate
 
 Array = NDArray[np.float64]
@@ -184,12 +184,12 @@ class _Fleet:
     ) -> _Fleet:
         """Check the arguments and flatten the batch."""
         arrival = Arrival() if arrival is None else arrival
-        starts, goals = array('starts', starts, 3), array('goals', goals, None)
+        starts, goals = array('starts', starts, 3), array('goals', goals, 'm')
         if goals.shape[-1] not in (2, 3) or (arrival.use_heading and goals.shape[-1] != 3):
             wanted = '(..., 3)' if arrival.use_heading else '(..., 2) or (..., 3)'
             raise ValueError(f'goals must have shape {wanted}, got {goals.shape}')
-        positive('rate', float(rate))
-        positive('duration', float(duration))
+        rate = number('rate', rate, positive)
+        duration = number('duration', duration, positive)
         columns = {f'gain {index}': array(f'gain {index}', gain) for index, gain in enumerate(gains)}
         columns['turning_gain'] = array('turning_gain', turning_gain)
         columns['offset'] = floats('offset', arrival.offset)
@@ -213,7 +213,7 @@ class _Fleet:
             starts=np.broadcast_to(starts, (*shape, 3)).reshape(-1, 3),
             goals=np.broadcast_to(goals, (*shape, goals.shape[-1])).reshape(-1, goals.shape[-1]),
             gains=tuple(flat[f'gain {index}'] for index in range(len(gains))),
-            rate=float(rate),
+            rate=rate,
             steps=math.ceil(duration * rate - 1e-9),
             arrival=replace(arrival, offset=flat['offset']),
             turning_gain=flat['turning_gain'],

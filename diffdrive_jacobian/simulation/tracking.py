@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.control.resolved_rate import StraightLine, resolved_rate
-from diffdrive_jacobian.kinematics._checks import not_negative, positive
+from diffdrive_jacobian.kinematics._checks import not_negative, number, positive
 from diffdrive_jacobian.kinematics.inverse_velocity import damping as damping_factor
 from diffdrive_jacobian.kinematics.inverse_velocity import manipulability
 
@@ -82,9 +82,10 @@ def track_line(
         ValueError: Rate, threshold or speed is not positive, another number negative, the gain not below
             the rate, or a shape is wrong.
     """
-    positive('rate', float(rate))
-    not_negative('settling', float(settling))
-    if not 0.0 <= gain < rate:
+    rate = number('rate', rate, positive)
+    settling = number('settling', settling, not_negative)
+    gain = number('gain', gain, not_negative)
+    if gain >= rate:
         raise ValueError(f'gain must be at least 0 and below the rate {rate:g}, got {gain:g}')
     steps = math.ceil(rate * (float(np.max(line.duration)) + settling) - 1e-9)
     q = np.asarray(q0, dtype=np.float64)

@@ -1,0 +1,26 @@
+"""The adjugate of 2x2 matrices, and the refusal of singular ones."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def adjugate(J: Array) -> Array:
+    """Give `[[d, -b], [-c, a]]` of `[[a, b], [c, d]]`, shape (..., 2, 2)."""
+    made = np.empty_like(J)
+    made[..., 0, 0], made[..., 1, 1] = J[..., 1, 1], J[..., 0, 0]
+    made[..., 0, 1], made[..., 1, 0] = -J[..., 0, 1], -J[..., 1, 0]
+    return made
+
+
+def refuse_singular(determinant: Array, singular: NDArray[np.bool_]) -> None:
+    """Raise LinAlgError with the determinant of the first Jacobian that is singular, if there is one."""
+    if np.any(singular):
+        where = tuple(int(index) for index in np.argwhere(singular)[0])
+        at = f' (at index {where if len(where) > 1 else where[0]})' if where else ''
+        raise np.linalg.LinAlgError(
+            f'J must not be singular, got a determinant of {determinant[where]:.3g}{at}'
+        )

@@ -1,0 +1,343 @@
+"""Inverse velocity: the adjugate, the pseudo-inverse, damping, the null space."""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from diffdrive_jacobian.kinematics import diff_drive
+from diffdrive_jacobian.kinematics import inverse_velocity as iv
+
+EPS = np.finfo(float).eps
+SVD = 300.0 * EPS  # LAPACK stops when what is left beside the singular values is below some 90 eps.
+deterministic = settings(deadline=None, derandomize=True)
+shapes = pytest.mark.parametrize(
+    ('m', 'n'),
+    [*((1, n) for n in (1, 2, 5)), *((m, n) for m in (2, 3, 4) for n in (1, 2, 3, 4, 7))],
+)
+
+
+def norm(vectors):
+    return np.linalg.norm(vectors, axis=-1)
+
+
+def size(matrices):
+    return np.linalg.norm(matrices, axis=(-2, -1))
+
+
+def transposed(matrices):
+    return np.swapaxes(matrices, -1, -2)
+
+
+def times(matrices, vectors):
+    return (matrices @ vectors[..., np.newaxis])[..., 0]
+
+
+def decomposed(m, n, count=2000, seed=1):
+    """Give J = U diag(s) V^T of all scales, s from 1 down to 1e-16 and exact zeros."""
+    rng = np.random.default_rng(seed)
+    U, _, V_T = np.linalg.svd(rng.normal(size=(count, m, n)), full_matrices=False)
+    s = 10.0 ** rng.uniform(-16.0, 0.0, (count, min(m, n)))
+    s[count // 2 :] **= 0.1  # well conditioned
+    s[rng.random(s.shape) < 0.2] = 0.0
+    s *= 10.0 ** rng.uniform(-6.0, 6.0, (count, 1))
+    return U * s[:, np.newaxis] @ V_T, U, s, transposed(V_T)
+
+
+def rank(m, n, s):
+    """Give the rank by the library's cutoff, and whether rounding could not change it."""
+    relative = s / np.maximum(s.max(axis=-1, keepdims=True), 1e-300) / (iv.CUTOFF * max(m, n))
+    return (relative > 1.0).sum(axis=-1), ((relative < 0.5) | (relative > 2.0)).all(axis=-1)
+
+
+# --- The adjugate
+
+
+@deterministic
+@given(arrays(int, (2, 2), elements=st.integers(-9, 9)))
+def test_the_adjugate_inverts_what_is_not_singular_and_names_the_determinant_of_what_is(J):
+    if round(np.linalg.det(J)) == 0:
+        with pytest.raises(np.linalg.LinAlgError, match=r'^J must not be .* a determinant of -?0$'):
+            iv.adjugate_inverse(J)
+    else:
+        inverse, tolerance = iv.adjugate_inverse(J), 20.0 * EPS * np.linalg.cond(J)
+        for other in (np.linalg.inv(J), np.linalg.solve(J, np.eye(len(J)))):
+            np.testing.assert_allclose(inverse, other, rtol=0.0, atol=tolerance * np.abs(other).max())
+
+
+def test_the_adjugate_inverts_what_is_nearly_singular():
+    least = 1e-14
+    J, _, s, _ = decomposed(2, 2)
+    J = J[s.min(axis=-1) > least * s.max(axis=-1)]
+    assert len(J) > 100
+    P = np.linalg.inv(J)
+    assert np.all(size(iv.adjugate_inverse(J) - P) <= SVD / least * size(P))
+
+
+def test_the_adjugate_never_gives_what_is_rounding_error_only():
+    J, _, s, _ = decomposed(2, 2, count=1000)
+    J[::5] = J[::5, :1] * J[::5, :, :1]  # rank 1
+    s[::5, 1:] = 0.0
+    inverses = np.zeros_like(J)
+    for matrix, inverse in zip(J, inverses, strict=True):
+        with contextlib.suppress(np.linalg.LinAlgError):
+            inverse[:] = iv.adjugate_inverse(matrix)
+    given, relative = inverses.any(axis=(1, 2)), s.min(axis=-1) / np.maximum(s.max(axis=-1), 1e-300)
+    assert np.all(relative[given] > 1e-16)
+    which = given & (relative > 1e-12)
+    right = np.linalg.inv(J[which])
+    assert np.all(size(inverses[which] - right) <= 0.01 * size(right))
+
+
+def test_the_axle_centre_is_refused_and_so_is_one_of_a_batch_with_its_index():
+    theta, r, L = np.random.default_rng(3).uniform(0.01, 3.0, (3, 500))
+    for J in [*diff_drive.wheel_to_position_jacobian(theta, r, L), np.zeros((2, 2))]:
+        with pytest.raises(np.linalg.LinAlgError, match=r'a determinant of 0$'):
+            iv.adjugate_inverse(J)
+    J = np.broadcast_to(np.diag([1.0, 2.0]), (4, 5, 2, 2)).copy()
+    J[2, 1, 0, 0] = J[3, 3, 0, 0] = 0.0
+    for batch, index in [(J, r'\(2, 1\)'), (J[2], '1'), (J[2:, 1], '0')]:
+        with pytest.raises(np.linalg.LinAlgError, match=rf'a determinant of 0 \(at index {index}\)$'):
+            iv.adjugate_inverse(batch)
+
+
+# --- The pseudo-inverse and the null space
+
+
+@shapes
+def test_the_penrose_conditions_hold(m, n):
+    J, *_ = decomposed(m, n)
+    P = iv.pseudoinverse(J)
+    rounding = SVD * np.maximum(size(J) * size(P), 1.0)
+    assert np.all(size(J @ P @ J - J) <= rounding * size(J))
+    assert np.all(size(P @ J @ P - P) <= rounding * size(P))
+    assert np.all(size(J @ P - transposed(J @ P)) <= rounding)
+    assert np.all(size(P @ J - transposed(P @ J)) <= rounding)
+
+
+@shapes
+def test_the_pseudo_inverse_inverts_singular_values_and_leaves_zeros(m, n):
+    J, U, s, V = decomposed(m, n)
+    largest = s.max(axis=-1, keepdims=True)
+    kept = s > 1e-8 * largest
+    clear = (kept | (s <= 3e-16 * largest)).all(axis=-1)
+    assert clear.mean() > 0.4
+    P = V * np.where(kept, 1.0 / np.where(kept, s, 1.0), 0.0)[:, np.newaxis] @ transposed(U)
+    error = size(iv.pseudoinverse(J) - P)
+    assert np.all((error <= SVD * size(J) * size(P) ** 2)[clear])
+
+
+@shapes
+def test_the_projector_is_one_and_moves_no_task(m, n):
+    J, _, s, _ = decomposed(m, n)
+    N = iv.null_space_projector(J)
+    assert np.all(size(J @ N) <= (4.0 * max(m, n) * iv.CUTOFF + 20.0 * EPS) * size(J))
+    np.testing.assert_allclose(N @ N, N, rtol=0.0, atol=30.0 * EPS)
+    np.testing.assert_allclose(N, transposed(N), rtol=0.0, atol=10.0 * EPS)
+    ranks, clear = rank(m, n, s)
+    np.testing.assert_allclose(np.trace(N, axis1=-2, axis2=-1)[clear], (n - ranks)[clear], atol=1e-13)
+
+
+def test_the_projector_and_the_pseudo_inverse_count_the_same_values_as_zero():
+    J = np.zeros((1000, 4, 4))
+    J[:, range(4), range(4)] = 1.0
+    J[:, 3, 3] = np.logspace(-16.0, -13.0, 1000)
+    np.testing.assert_allclose(
+        iv.null_space_projector(J), np.eye(4) - iv.pseudoinverse(J) @ J, atol=1e-13
+    )
+
+
+@shapes
+def test_without_damping_it_is_the_pseudo_inverse_and_redundancy_adds_the_null_space(m, n):
+    J, _, s, _ = decomposed(m, n)
+    ranks, clear = rank(m, n, s)
+    J, full = J[clear], (ranks == m)[clear]
+    rng = np.random.default_rng(4)
+    x_dot, wish = rng.normal(size=(len(J), m)), rng.normal(size=(len(J), n))
+    P, N = iv.pseudoinverse(J), iv.null_space_projector(J)
+    least, rounding = times(P, x_dot), SVD * (1.0 + size(J) * size(P))
+    error = norm(iv.damped_least_squares(J, x_dot, 0.0) - least)
+    assert np.all(error <= rounding * size(P) * norm(x_dot))
+    error = norm(times(J, iv.damped_least_squares(J, x_dot, 0.0)) - x_dot)
+    assert np.all((error <= rounding * norm(x_dot))[full])
+    rounding *= size(P) * norm(x_dot) + norm(wish)
+    assert np.all(norm(iv.redundant(J, x_dot, wish) - least - times(N, wish)) <= rounding)
+    assert np.all(norm(iv.redundant(J, times(J, wish), wish) - wish) <= rounding)
+
+
+# --- Damped least squares
+
+
+@shapes
+def test_with_damping_it_is_the_dense_solution_and_that_of_each_singular_value(m, n):
+    J, U, s, V = decomposed(m, n)
+    rng = np.random.default_rng(6)
+    x_dot, damping = (
+        rng.normal(size=(len(J), m)),
+        size(J) * 10.0 ** rng.uniform(-8.0, 1.0, len(J)) + 1e-9,
+    )
+    q_dot = iv.damped_least_squares(J, x_dot, damping)
+    gains = s / (s**2 + damping[:, np.newaxis] ** 2)
+    exact = times(V * gains[:, np.newaxis] @ transposed(U), x_dot)
+    assert np.all(norm(q_dot - exact) <= SVD * size(J) * norm(x_dot) / damping**2)
+    square = J @ transposed(J) + (damping**2)[:, np.newaxis, np.newaxis] * np.eye(m)
+    dense = times(transposed(J), times(np.linalg.inv(square), x_dot))
+    error = norm(q_dot - dense) * damping**2 / norm(x_dot)
+    assert np.all((error <= 1e-9 * size(J))[damping > 1e-3 * size(J)])
+
+
+@shapes
+def test_no_joint_is_faster_than_the_damping_allows(m, n):
+    J, *_ = decomposed(m, n, count=1000)
+    J[::10] = 0.0
+    J[1::10] = J[1::10, :1]  # equal rows
+    J[2::10] = J[2::10, :, :1]  # equal columns
+    x_dot = np.random.default_rng(7).normal(size=(len(J), m))
+    damping = np.logspace(-12.0, 3.0, 31)[:, np.newaxis]
+    for factor in (1e-6, 1.0, 1e6):
+        q_dot = iv.damped_least_squares(factor * J, x_dot, damping)
+        assert np.all(norm(q_dot) <= norm(x_dot) / (2.0 * damping) * (1.0 + 1e-12))
+    for value in (0.1, 1e-20):
+        fastest = iv.damped_least_squares(np.diag([value, *[1.0] * 6])[:m, :n], np.eye(m)[0], value)
+        assert norm(fastest) == pytest.approx(1.0 / (2.0 * value), rel=1e-14)
+
+
+@deterministic
+@given(st.floats(0.0, 10.0), st.floats(1e-3, 10.0), st.floats(0.0, 10.0))
+def test_damping_sets_in_below_the_threshold_and_grows_to_the_maximum(w, threshold, maximum):
+    factor = iv.damping(w, threshold, maximum)
+    squared = maximum**2 * (1.0 - w / threshold) ** 2 if w < threshold else 0.0
+    assert factor**2 == pytest.approx(squared, rel=1e-9, abs=1e-290)
+    assert 0.0 <= factor <= maximum == iv.damping(0.0, threshold, maximum)
+    assert np.all(np.diff(iv.damping(np.linspace(0.0, 2.0 * threshold, 9), threshold, maximum)) <= 0.0)
+
+
+@pytest.mark.parametrize('scale', [1e-170, 1e-100, 1e-30, 1e30, 1e100])
+def test_other_units_give_the_same_motion_and_other_robots_change_nothing(scale):
+    J, x_dot = np.array([[1.0, 2.0, 0.5], [-0.3, 1.0, 2.0]]), np.array([0.2, -0.7])
+    both, damping = np.array([J, scale * J]), [0.1, 0.1 * scale]
+    expected = iv.damped_least_squares(J, x_dot, 0.1)
+    one, other = iv.damped_least_squares(both, x_dot, damping)
+    for q_dot in (one, other * scale, iv.damped_least_squares(both[1], x_dot, damping[1]) * scale):
+        np.testing.assert_allclose(q_dot, expected, rtol=1e-12)
+    w = iv.manipulability(J)
+    np.testing.assert_allclose(iv.manipulability(both), [w, scale * w * scale], rtol=1e-12)
+    assert iv.manipulability(both[1]) == pytest.approx(scale * w * scale, rel=1e-12)
+
+
+@shapes
+def test_manipulability_is_the_volume_of_the_velocities_and_does_not_depend_on_axes(m, n):
+    rng = np.random.default_rng(8)
+    J = rng.normal(size=(500, m, n))
+    w, gram = iv.manipulability(J), np.linalg.det(J @ transposed(J)) * (m <= n)
+    np.testing.assert_allclose(w, np.sqrt(np.maximum(gram, 0.0)), rtol=1e-7, atol=1e-7)
+    U, V = (np.linalg.qr(rng.normal(size=(side, side)))[0] for side in (m, n))
+    np.testing.assert_allclose(iv.manipulability(U @ J @ V), w, rtol=1e-9, atol=1e-13)
+    np.testing.assert_allclose(iv.manipulability(-3.0 * J), 3.0**m * w, rtol=1e-9)
+    J[:, -1] = J[:, 0] if m > 1 else 0.0
+    np.testing.assert_allclose(iv.manipulability(J), 0.0, atol=1e-13)
+
+
+# --- Shapes and bad input
+
+J, X_DOT, Q = np.ones((2, 3)), np.ones(2), np.zeros(3)
+VALID = {
+    iv.adjugate_inverse: {'J': np.array([[1.0, 2.0], [0.5, 3.0]])},
+    iv.pseudoinverse: {'J': J},
+    iv.manipulability: {'J': J},
+    iv.damping: {'manipulability': 0.1, 'threshold': 0.2, 'maximum': 0.3},
+    iv.damped_least_squares: {'J': J, 'x_dot': X_DOT, 'damping': 0.1},
+    iv.null_space_projector: {'J': J},
+    iv.manipulability_gradient: {'jacobian': lambda q: np.cos(q)[..., np.newaxis, :], 'q': Q},
+    iv.joint_limit_cost: {'q': Q, 'lower': Q - 1.0, 'upper': Q + 1.0},
+    iv.joint_limit_gradient: {'q': Q, 'lower': Q - 1.0, 'upper': Q + 1.0},
+    iv.redundant: {'J': J, 'x_dot': X_DOT, 'q_dot_0': Q},
+    iv.prioritized: {'tasks': [(J, X_DOT)], 'cutoff': 1e-9},
+}
+RAGGED = [[1.0], [1.0, 2.0]]
+NO_ARRAYS = ('jacobian', 'tasks', 'cutoff')
+ARGUMENTS = [(function, name) for function, arguments in VALID.items() for name in arguments]
+
+
+def test_every_public_function_is_given_bad_input_here():
+    functions = {f for _, f in inspect.getmembers(iv, inspect.isfunction) if f.__module__ == iv.__name__}
+    assert {f for f in functions if not f.__name__.startswith('_')} == set(VALID)
+
+
+@pytest.mark.parametrize(('function', 'name'), [of for of in ARGUMENTS if of[1] not in NO_ARRAYS[:2]])
+def test_what_is_no_finite_real_number_is_named(function, name):
+    shape = np.shape(VALID[function][name])
+    for number in (np.nan, np.inf, -np.inf, 1j):
+        with pytest.raises(ValueError, match=rf'^{name} must .*got'):
+            function(**VALID[function] | {name: np.full(shape, number)[()]})
+    for bad in ('north', RAGGED, None, {}):
+        with pytest.raises(ValueError, match=rf'^{name} must .*got'):
+            function(**VALID[function] | {name: bad})
+
+
+def test_text_that_looks_like_numbers_is_no_number():
+    for text in ('1.0', ['1', '2'], b'1.0'):
+        with pytest.raises(ValueError, match=r'^manipulability must be'):
+            iv.damping(text, 1.0, 1.0)
+
+
+@pytest.mark.parametrize(('function', 'name'), [of for of in ARGUMENTS if of[1] not in NO_ARRAYS])
+def test_every_function_broadcasts_over_leading_axes_and_names_those_that_do_not(function, name):
+    fixed = {key: value for key, value in VALID[function].items() if key in NO_ARRAYS}
+    shapes = {key: np.shape(value) for key, value in VALID[function].items() if key not in NO_ARRAYS}
+    rng, alone = np.random.default_rng(13), len(shapes) == 1
+    lead = {key: (4, 5) if alone else (4, 1) if key == name else (5,) for key in shapes}
+    batch = {key: VALID[function][key] + 0.01 * rng.random(lead[key] + shapes[key]) for key in shapes}
+    at_once = function(**batch, **fixed)
+    whole = {key: np.broadcast_to(batch[key], (4, 5, *shapes[key])) for key in shapes}
+    for index in np.ndindex(4, 5):
+        one = function(**{key: value[index] for key, value in whole.items()}, **fixed)
+        np.testing.assert_allclose(at_once[index], one, rtol=1e-9, atol=1e-12)
+    wrong = {key: np.stack([VALID[function][key]] * (2 if key == name else 3)) for key in shapes}
+    if not alone:
+        with pytest.raises(ValueError, match=rf'\b{name}\b.* must .*got'):
+            function(**wrong)
+
+
+TWO, THREE = (np.eye(2), np.ones(2)), (np.eye(3), np.ones(3))
+BAD = [
+    (iv.adjugate_inverse, {'J': np.ones((2, 3))}, r'^J must have shape .*2, 2.* got \(2, 3\)'),
+    (iv.adjugate_inverse, {'J': np.eye(3)}, r'^J must have shape .*2, 2.* got \(3, 3\)'),
+    (iv.pseudoinverse, {'J': np.ones(3)}, r'^J must have shape \(\.\.\., m, n\), got \(3,\)'),
+    (iv.pseudoinverse, {'J': np.ones((0, 3))}, r'^J must have shape .* got \(0, 3\)'),
+    (iv.redundant, {'x_dot': [1.0]}, r'^x_dot must have shape .*2.* got \(1,\)'),
+    (iv.redundant, {'q_dot_0': [1.0, 2.0]}, r'^q_dot_0 must have shape .*3.* got \(2,\)'),
+    (iv.damped_least_squares, {'x_dot': np.ones(3)}, r'^x_dot must have shape .*2.* got \(3,\)'),
+    (iv.damped_least_squares, {'damping': -0.1}, r'^damping must be zero or positive.* got -0\.1'),
+    (iv.damping, {'manipulability': -1e-9}, r'^manipulability must be zero or .* got -1e-09'),
+    (iv.damping, {'threshold': 0.0}, r'^threshold must be positive .* got 0'),
+    (iv.damping, {'maximum': -1.0}, r'^maximum must be zero or positive .* got -1'),
+    (iv.joint_limit_cost, {'upper': Q - 1.0}, r'^upper must be above lower'),
+    (iv.joint_limit_gradient, {'upper': Q - 2.0}, r'^upper must be above lower'),
+    (iv.joint_limit_gradient, {'q': [0.0]}, r'^(q|lower|upper)\b.* must .*got'),
+    (iv.manipulability_gradient, {'jacobian': lambda q: np.eye(2)}, r'^jacobian must give'),
+    (iv.manipulability_gradient, {'q': 0.0}, r'^q must have shape'),
+    (iv.prioritized, {'tasks': []}, r'^tasks must hold at least one'),
+    (iv.prioritized, {'tasks': [TWO, THREE]}, r'^tasks must all be about the same joints.*2, 3'),
+    (iv.prioritized, {'tasks': [(J, [1.0, np.nan])]}, r'^x_dot of task 0 must be finite'),
+    (iv.prioritized, {'tasks': [TWO, (RAGGED, [1.0])]}, r'^J of task 1 must be an array'),
+    (iv.prioritized, {'tasks': [(J, [1.0])]}, r'^x_dot of task 0 must have shape'),
+    (iv.prioritized, {'tasks': [TWO[:1]]}, r'\btask'),
+    (iv.prioritized, {'tasks': [np.eye(3)]}, r'\btask'),
+    (iv.prioritized, {'tasks': 7}, r'\btask'),
+    (iv.prioritized, {'cutoff': 0.0}, r'^cutoff must be positive'),
+]
+
+
+@pytest.mark.parametrize(
+    ('function', 'bad', 'message'), BAD, ids=[f'{f.__name__} {next(iter(bad))}' for f, bad, _ in BAD]
+)
+def test_an_error_names_the_argument_what_was_got_and_what_is_allowed(function, bad, message):
+    with pytest.raises(ValueError, match=message):
+        function(**VALID[function] | bad)

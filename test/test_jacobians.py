@@ -1,0 +1,207 @@
+"""Every Jacobian and gradient of the library against central differences of the motion it describes."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+
+import numpy as np
+import pytest
+
+from diffdrive_jacobian import kinematics
+from diffdrive_jacobian.kinematics import MobileManipulator, PlanarArm, contact, diff_drive, se2
+from diffdrive_jacobian.kinematics import inverse_velocity as iv
+
+COUNT = 1000
+STEP = 1e-5
+MOUNTS = [(0.0, 0.0), (0.12, -0.07)]
+
+
+def differences(function, at=None, step=STEP):
+    """Differentiate a function of (..., n) that gives (..., m); its third entry is an angle."""
+    at = np.zeros((COUNT, 2)) if at is None else at
+    steps, around = step * np.eye(at.shape[-1]), at[..., np.newaxis, :]
+    change = function(around + steps) - function(around - steps)
+    change[..., 2:] = se2.wrap_angle(change[..., 2:])
+    return np.swapaxes(change, -1, -2) / (2.0 * step)
+
+
+class Robots:
+    """Random differential drives, and where a motion of their wheels takes them."""
+
+    def __init__(self, rng):
+        self.pose = rng.uniform([-3.0, -3.0, -np.pi], [3.0, 3.0, np.pi], (COUNT, 3))
+        self.theta = self.pose[:, 2]
+        self.r, self.L = 10.0 ** rng.uniform([-2.0, -1.5], [0.0, 0.5], (COUNT, 2)).T
+        self.d = rng.choice([-1.0, 1.0], COUNT) * 10.0 ** rng.uniform(-2.0, 0.0, COUNT)
+
+    def steered(self, way, turn):
+        return se2.integrate(self.pose[:, np.newaxis], np.stack([way, turn], axis=-1), 1.0)
+
+    def rolled(self, angles):
+        """Turn the wheels by angles, right and left: each rim goes its way."""
+        right, left = np.moveaxis(self.r[:, np.newaxis, np.newaxis] * angles, -1, 0)
+        return self.steered((right + left) / 2.0, (right - left) / self.L[:, np.newaxis])
+
+    def twist(self, angles):
+        moved = se2.compose(se2.inverse(self.pose)[:, np.newaxis], self.rolled(angles))
+        return se2.log(moved)[..., ::2]
+
+
+def unicycle(rng):
+    robots = Robots(rng)
+    numeric = differences(lambda u: robots.steered(u[..., 0], u[..., 1]))
+    return diff_drive.unicycle_jacobian(robots.theta), numeric
+
+
+def wheel_to_body(rng):
+    robots = Robots(rng)
+    return diff_drive.wheel_to_body_jacobian(robots.r, robots.L), differences(robots.twist)
+
+
+def body_to_wheel(rng):
+    robots = Robots(rng)
+    numeric = np.linalg.inv(differences(robots.twist))
+    return diff_drive.body_to_wheel_jacobian(robots.r, robots.L), numeric
+
+
+def wheel_to_world(rng):
+    robots = Robots(rng)
+    jacobian = diff_drive.wheel_to_world_jacobian(robots.theta, robots.r, robots.L)
+    return jacobian, differences(robots.rolled)
+
+
+def wheel_to_position(rng):
+    robots = Robots(rng)
+    jacobian = diff_drive.wheel_to_position_jacobian(robots.theta, robots.r, robots.L)
+    return jacobian, differences(lambda angles: robots.rolled(angles)[..., :2])
+
+
+def single_wheel(rng):
+    robots = Robots(rng)
+    numeric = differences(lambda u: robots.steered(robots.r[:, np.newaxis] * u[..., 0], u[..., 1]))
+    return diff_drive.single_wheel_jacobian(robots.theta, robots.r), numeric
+
+
+def offset_point(rng):
+    robots = Robots(rng)
+    jacobian = diff_drive.offset_point_jacobian(robots.theta, robots.r, robots.L, robots.d)
+    point = differences(lambda w: diff_drive.offset_point(robots.rolled(w), robots.d[:, np.newaxis]))
+    return jacobian, point
+
+
+def wheel_contact(rng):
+    r, q = 10.0 ** rng.uniform(-2.0, 0.0, COUNT), rng.uniform(-4.0, 4.0, (COUNT, 2))
+
+    def point(q):
+        return contact.wheel_contact_position(q[..., 0], q[..., 1], r[:, np.newaxis])
+
+    return contact.wheel_contact_jacobian(q[:, 1], r), differences(point, q)
+
+
+def planar_arm(rng, links, heading):
+    arm, q = PlanarArm(rng.uniform(0.1, 1.0, links)), rng.uniform(-4.0, 4.0, (COUNT, links))
+    numeric = differences(lambda q: arm.forward_kinematics(q)[..., : 3 if heading else 2], q)
+    return arm.jacobian(q, heading=heading), numeric
+
+
+def mobile_manipulator(rng, links, heading, mount):
+    arm = PlanarArm(rng.uniform(0.1, 1.0, links))
+    robot = MobileManipulator(r=0.05, L=0.3, arm=arm, mount=mount)
+    q = rng.uniform(-4.0, 4.0, (COUNT, 3 + links))
+
+    def tip(q_dot):
+        there = robot.integrate(q[:, np.newaxis], q_dot, 1.0)
+        return robot.forward_kinematics(there)[..., : 3 if heading else 2]
+
+    return robot.jacobian(q, heading=heading), differences(tip, np.zeros((COUNT, 2 + links)))
+
+
+def manipulability(rng, links, heading):
+    arm, q = PlanarArm(rng.uniform(0.3, 1.0, links)), rng.uniform(-4.0, 4.0, (COUNT, links))
+    if links == 2:  # The measure has an edge where the arm is singular.
+        q[:, 1] = rng.choice([-1.0, 1.0], COUNT) * rng.uniform(0.1, 3.0, COUNT)
+
+    def jacobian(q):
+        return arm.jacobian(q, heading=heading)
+
+    def measure(q):
+        J = jacobian(q)
+        return np.sqrt(np.linalg.det(J @ np.swapaxes(J, -1, -2)))[..., np.newaxis]
+
+    numeric = differences(measure, q)
+    return iv.manipulability_gradient(jacobian, q)[:, np.newaxis], numeric
+
+
+def joint_limit(rng):
+    q, lower = rng.uniform(-4.0, 4.0, (2, COUNT, 5))
+    upper = lower + rng.uniform(0.1, 6.0, (COUNT, 5))
+    limits = lower[:, np.newaxis], upper[:, np.newaxis]
+    numeric = differences(lambda q: iv.joint_limit_cost(q, *limits)[..., np.newaxis], q)
+    return iv.joint_limit_gradient(q, lower, upper)[:, np.newaxis], numeric
+
+
+CASES = [
+    ('diff_drive.unicycle_jacobian', unicycle, {}),
+    ('diff_drive.wheel_to_body_jacobian', wheel_to_body, {}),
+    ('diff_drive.body_to_wheel_jacobian', body_to_wheel, {}),
+    ('diff_drive.wheel_to_world_jacobian', wheel_to_world, {}),
+    ('diff_drive.wheel_to_position_jacobian', wheel_to_position, {}),
+    ('diff_drive.single_wheel_jacobian', single_wheel, {}),
+    ('diff_drive.offset_point_jacobian', offset_point, {}),
+    ('contact.wheel_contact_jacobian', wheel_contact, {}),
+    *(
+        ('planar_arm.PlanarArm.jacobian', planar_arm, {'links': links, 'heading': heading})
+        for links in (1, 2, 3, 7)
+        for heading in (False, True)
+    ),
+    *(
+        (
+            'mobile_manipulator.MobileManipulator.jacobian',
+            mobile_manipulator,
+            {'links': links, 'heading': heading, 'mount': mount},
+        )
+        for links in (1, 2, 4)
+        for heading in (False, True)
+        for mount in MOUNTS
+    ),
+    ('inverse_velocity.manipulability_gradient', manipulability, {'links': 2, 'heading': False}),
+    ('inverse_velocity.manipulability_gradient', manipulability, {'links': 3, 'heading': False}),
+    ('inverse_velocity.manipulability_gradient', manipulability, {'links': 4, 'heading': True}),
+    ('inverse_velocity.joint_limit_gradient', joint_limit, {}),
+]
+
+
+def label(name, options):
+    return ' '.join([name, *(f'{option}={chosen}' for option, chosen in options.items())])
+
+
+@pytest.mark.parametrize(
+    ('case', 'options'),
+    [pytest.param(case, options, id=label(name, options)) for name, case, options in CASES],
+)
+def test_it_is_the_derivative_of_the_motion(case, options):
+    jacobian, numeric = case(np.random.default_rng(1), **options)
+    assert jacobian.shape == numeric.shape == (COUNT, *numeric.shape[1:])
+    error = np.linalg.norm(jacobian - numeric, axis=(-2, -1)) / np.linalg.norm(jacobian, axis=(-2, -1))
+    assert error.max() < 1e-6
+
+
+def derivatives_of_the_library():
+    """Find every public function and method that is named as a derivative."""
+    for info in pkgutil.walk_packages(kinematics.__path__, f'{kinematics.__name__}.'):
+        members = vars(importlib.import_module(info.name))
+        own = {name: m for name, m in members.items() if getattr(m, '__module__', None) == info.name}
+        for name, member in list(own.items()):
+            if inspect.isclass(member):
+                own.update({f'{name}.{method}': m for method, m in vars(member).items()})
+        for name, member in own.items():
+            public = not any(part.startswith('_') for part in name.split('.'))
+            if public and ('jacobian' in name.lower() or 'gradient' in name.lower()):
+                assert inspect.isroutine(member), name
+                yield f'{info.name.removeprefix(kinematics.__name__)}.{name}'[1:]
+
+
+def test_no_jacobian_and_no_gradient_is_missing_here():
+    assert set(derivatives_of_the_library()) == {name for name, _, _ in CASES}

@@ -1,0 +1,345 @@
+"""Planar arms, alone and on a differential drive, and a wheel as a contact."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from diffdrive_jacobian.kinematics import MobileManipulator, PlanarArm, contact, se2
+from diffdrive_jacobian.kinematics import diff_drive as dd
+from diffdrive_jacobian.kinematics import inverse_velocity as iv
+
+R, L = 0.033, 0.16  # document A's robot
+BATCH = (4, 5)
+links = pytest.mark.parametrize('n', [1, 2, 3, 7])
+two_links = pytest.mark.parametrize('lengths', [(1.0, 1.0), (0.3, 0.2), (2.0**0.5, 1.0), (0.01, 5.0)])
+
+
+def close(actual, expected, tolerance=1e-12):
+    np.testing.assert_allclose(actual, expected, rtol=0.0, atol=tolerance)
+
+
+def same_pose(actual, expected):
+    close(actual[..., :2], expected[..., :2])
+    close(se2.wrap_angle(actual[..., 2] - expected[..., 2]), 0.0)
+
+
+def norm(vectors):
+    return np.linalg.norm(vectors, axis=-1)
+
+
+def times(matrices, vectors):
+    return (matrices @ vectors[..., np.newaxis])[..., 0]
+
+
+def an_arm(n, seed=1):
+    """Give an arm, a batch of joint angles, some beyond a turn, and joint velocities."""
+    rng = np.random.default_rng(seed)
+    return (
+        PlanarArm(rng.uniform(0.1, 1.0, n)),
+        rng.uniform(-9, 9, (*BATCH, n)),
+        rng.normal(size=(*BATCH, n)),
+    )
+
+
+def a_robot(n, seed=2):
+    arm, joints, rates = an_arm(n, seed)
+    rng = np.random.default_rng(seed)
+    robot = MobileManipulator(R, L, arm, mount=rng.uniform(-0.3, 0.3, 2))
+    q = np.concatenate([rng.uniform(-3.0, 3.0, (*BATCH, 3)), joints], axis=-1)
+    return robot, q, np.concatenate([rng.uniform(-9.0, 9.0, (*BATCH, 2)), rates], axis=-1)
+
+
+# --- The arm
+
+
+@links
+def test_the_tip_is_the_sum_of_complex_numbers_and_a_chain_of_rigid_motions(n):
+    arm, q, _ = an_arm(n)
+    tips = arm.lengths * np.exp(1j * np.cumsum(q, axis=-1))
+    pose, chain, positions = arm.forward_kinematics(q), np.zeros((*BATCH, 3)), [np.zeros((*BATCH, 2))]
+    close(pose[..., 0] + 1j * pose[..., 1], tips.sum(axis=-1))
+    for angle, length in zip(np.moveaxis(q, -1, 0), arm.lengths, strict=True):
+        turned = se2.compose(chain, np.stack([0.0 * angle, 0.0 * angle, angle], axis=-1))
+        chain = se2.compose(turned, [length, 0.0, 0.0])
+        positions.append(chain[..., :2])
+    same_pose(pose, chain)
+    assert arm.joints == n
+    close(arm.joint_positions(q), np.stack(positions, axis=-2))
+
+
+def test_the_heading_is_wrapped_in_a_batch_as_it_is_alone():
+    q = np.linspace(-20.0, 20.0, 1001)
+    for turns in (q, q[np.abs(q) < 2.0 * np.pi], q[np.abs(q) < 4.0 * np.pi]):
+        heading = PlanarArm([1.0]).forward_kinematics(turns[:, np.newaxis])[:, 2]
+        close(heading, [np.angle(np.exp(1j * turn)) for turn in turns])
+        assert np.array_equal(heading, [se2.wrap_angle(float(turn)) for turn in turns])
+
+
+@links
+def test_the_jacobian_turns_the_tip_about_each_joint(n):
+    arm, q, _ = an_arm(n)
+    positions = arm.joint_positions(q)
+    levers = positions[..., -1:, :] - positions[..., :-1, :]
+    J = arm.jacobian(q, heading=True)
+    close(J, np.stack([-levers[..., 1], levers[..., 0], np.ones_like(q)], axis=-2))
+    assert np.array_equal(J[..., :2, :], arm.jacobian(q))
+
+
+@links
+def test_torques_do_the_work_of_the_wrench(n):
+    arm, q, q_dot = an_arm(n)
+    for size, heading in [(2, False), (3, True)]:
+        wrench = np.random.default_rng(3).normal(size=(*BATCH, size))
+        work = (wrench * times(arm.jacobian(q, heading), q_dot)).sum(axis=-1)
+        close((arm.joint_torques(q, wrench) * q_dot).sum(axis=-1), work)
+
+
+@two_links
+def test_two_links_by_the_adjugate_move_the_tip_as_told_and_are_singular_by_the_sine(lengths):
+    arm, rng = PlanarArm(lengths), np.random.default_rng(4)
+    q = rng.uniform([-4.0, 0.1], [4.0, 3.0], (*BATCH, 2))
+    x_dot = rng.normal(size=(*BATCH, 2))
+    q_dot = arm.inverse_velocity(q, x_dot)
+    close(times(arm.jacobian(q), q_dot), x_dot, 1e-9)
+    close(arm.determinant(q), lengths[0] * lengths[1] * np.sin(q[..., 1]))
+    close(arm.determinant(q), np.linalg.det(arm.jacobian(q)))
+    close(iv.manipulability(arm.jacobian(q)), np.abs(arm.determinant(q)))
+    singular = arm.singular_configurations(q[..., 0])
+    close(singular[..., 0, :], np.stack([q[..., 0], np.zeros(BATCH)], axis=-1), 0.0)
+    close(singular[..., 1, :], np.stack([q[..., 0], np.full(BATCH, np.pi)], axis=-1), 0.0)
+    close(arm.determinant(singular), 0.0)
+    reach = norm(arm.forward_kinematics(singular)[..., :2])
+    close(reach, np.broadcast_to(np.abs([sum(lengths), lengths[0] - lengths[1]]), reach.shape))
+
+
+@two_links
+def test_stretched_and_folded_arms_are_refused(lengths):
+    arm = PlanarArm(lengths)
+    for q in arm.singular_configurations(np.linspace(-3.1, 3.1, 100)).reshape(-1, 2):
+        with pytest.raises(np.linalg.LinAlgError, match=r'^J must not be .* got a determinant of'):
+            iv.adjugate_inverse(arm.jacobian(q))
+        with pytest.raises(np.linalg.LinAlgError, match=r'got a determinant of'):
+            arm.inverse_velocity(q, [1.0, 0.0])
+
+
+@two_links
+def test_stretched_and_folded_arms_are_refused_after_many_turns_and_folded_the_other_way(lengths):
+    arm = PlanarArm(lengths)
+    for q_1 in [*np.linspace(-3.1, 3.1, 100), *np.linspace(10.0, 1000.0, 100)]:
+        for q_2 in (0.0, np.pi, -np.pi):
+            with pytest.raises(np.linalg.LinAlgError):
+                arm.inverse_velocity([q_1, q_2], [1.0, 0.0])
+
+
+def test_manipulability_of_a_nearly_stretched_arm_keeps_its_digits():
+    arm, rng = PlanarArm([0.7, 0.4]), np.random.default_rng(5)
+    q = np.column_stack([rng.uniform(-4.0, 4.0, 1000), 10.0 ** rng.uniform(-9.0, 0.0, 1000)])
+    w = iv.manipulability(arm.jacobian(q))
+    np.testing.assert_allclose(w, 0.7 * 0.4 * np.sin(q[:, 1]), rtol=1e-12, atol=1e-15)
+
+
+def test_an_arm_keeps_its_lengths():
+    given = np.array([0.3, 0.2])
+    arm = PlanarArm(given)
+    given[0] = 9.0
+    assert arm.lengths.tolist() == [0.3, 0.2]
+    with pytest.raises(ValueError, match='read-only'):
+        arm.lengths[0] = 9.0
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        arm.lengths = given
+
+
+def test_joints_go_on_turning_and_one_step_is_many():
+    arm, q, q_dot = an_arm(3)
+    here = q
+    for _ in range(100):
+        here = arm.integrate(here, q_dot, 0.1)
+    close(arm.integrate(q, q_dot, 10.0), here)
+    close(here, q + 10.0 * q_dot)
+    close(arm.integrate(q, q_dot, np.arange(5.0))[:, 3], (q + 3.0 * q_dot)[:, 3])
+
+
+# --- What the null space is for
+
+
+LOWER, UPPER = np.array([-1.0, -2.0, -0.5]), np.array([2.0, 1.0, 2.5])
+
+
+@pytest.mark.parametrize('aim', ['away from singularities', 'away from limits'])
+def test_null_space_motion_does_its_secondary_task_and_leaves_the_tip(aim):
+    arm, dt = PlanarArm([0.5, 0.4, 0.3]), 0.01
+
+    def better(q):
+        if aim == 'away from limits':
+            return -iv.joint_limit_cost(q, LOWER, UPPER)
+        return iv.manipulability(arm.jacobian(q))
+
+    def wish(q):
+        if aim == 'away from limits':
+            return -iv.joint_limit_gradient(q, LOWER, UPPER)
+        return iv.manipulability_gradient(arm.jacobian, q)
+
+    def tip_moved(q, q_dot, dt):
+        here, there = (arm.forward_kinematics(at)[:, :2] for at in (q, arm.integrate(q, q_dot, dt)))
+        return norm(there - here)
+
+    q = start = np.random.default_rng(6).uniform([-1.0, 0.2, 0.2], [1.0, 1.0, 1.0], (50, 3))
+    for _ in range(300):
+        q_dot = iv.redundant(arm.jacobian(q), np.zeros(2), wish(q))
+        assert np.all(tip_moved(q, q_dot, dt) <= 2.0 * norm(dt * q_dot) ** 2 + 1e-15)
+        after = arm.integrate(q, q_dot, dt)
+        assert np.all(better(after) >= better(q) - 1e-9)
+        q = after
+    assert np.mean(better(q) - better(start)) > 1e-3
+
+
+def test_the_cost_of_joint_limits_is_zero_in_the_middle_and_an_eighth_at_the_limits():
+    ends = [LOWER, UPPER, np.where([True, False, True], LOWER, UPPER)]
+    close(iv.joint_limit_cost(ends, LOWER, UPPER), 0.125)
+    close(iv.joint_limit_cost((LOWER + UPPER) / 2.0, LOWER, UPPER), 0.0)
+    assert np.all(iv.joint_limit_gradient(ends[:2], LOWER, UPPER) * [[-1.0], [1.0]] > 0.0)
+
+
+# --- The arm on its base
+
+
+@links
+def test_the_tip_of_a_mobile_manipulator_is_base_and_mount_and_arm(n):
+    robot, q, _ = a_robot(n)
+    mount = np.array([*robot.mount, 0.0])
+    tip = se2.compose(se2.compose(q[..., :3], mount), robot.arm.forward_kinematics(q[..., 3:]))
+    same_pose(robot.forward_kinematics(q), tip)
+    assert MobileManipulator(R, L, robot.arm).mount.tolist() == [0.0, 0.0]
+
+
+@links
+def test_its_jacobian_is_the_base_with_its_lever_arm_beside_the_arm(n):
+    robot, q, _ = a_robot(n)
+    J = robot.jacobian(q, heading=True)
+    assert np.array_equal(robot.jacobian(q), J[..., :2, :])
+    for index in np.ndindex(BATCH):
+        theta, joints = q[index][2], q[index][3:]
+        turn = se2.homogeneous([0.0, 0.0, theta])
+        lever = robot.mount + robot.arm.forward_kinematics(joints)[:2]
+        derivative = se2.homogeneous([0.0, 0.0, theta + np.pi / 2.0])[:2, :2]  # R'(theta)
+        through = np.column_stack([np.eye(3)[:, :2], [*derivative @ lever, 1.0]])
+        base = through @ dd.unicycle_jacobian(theta) @ dd.wheel_to_body_jacobian(R, L)
+        close(J[index], np.column_stack([base, turn @ robot.arm.jacobian(joints, heading=True)]))
+
+
+def test_one_link_straight_ahead_is_the_offset_point():
+    theta = np.linspace(-3.0, 3.0, 20)
+    robot = MobileManipulator(R, L, PlanarArm([0.2]))
+    q = np.column_stack([theta, theta, theta, 0.0 * theta])
+    close(robot.jacobian(q)[..., :2], dd.offset_point_jacobian(theta, R, L, 0.2), 1e-15)
+    close(robot.forward_kinematics(q)[:, :2], dd.offset_point(q[:, :3], 0.2), 1e-15)
+
+
+@links
+def test_one_step_is_many_and_the_base_drives_as_if_alone(n):
+    robot, q, q_dot = a_robot(n)
+    here = q
+    for _ in range(50):
+        here = robot.integrate(here, q_dot, 0.02)
+    there = robot.integrate(q, q_dot, 1.0)
+    same_pose(here, there)
+    close(here[..., 3:], there[..., 3:])
+    v, omega = dd.wheel_to_body(q_dot[..., 0], q_dot[..., 1], R, L)
+    same_pose(there, se2.integrate(q[..., :3], np.stack([v, omega], axis=-1), 1.0))
+    close(there[..., 3:], q[..., 3:] + q_dot[..., 2:])
+
+
+@pytest.mark.parametrize('heading', [False, True])
+def test_it_is_redundant_and_null_space_motion_leaves_the_tip(heading):
+    robot, q, wish = a_robot(3)
+    J = robot.jacobian(q, heading)
+    x_dot = np.random.default_rng(7).normal(size=J.shape[:-1])
+    assert np.all(np.linalg.matrix_rank(J) == J.shape[-2])
+    close(times(J, iv.redundant(J, x_dot, wish)), x_dot, 1e-9)
+    still, dt = iv.redundant(J, np.zeros(J.shape[-2]), wish), 1e-4
+    assert np.all(norm(still) > 1e-3)
+    change = robot.forward_kinematics(robot.integrate(q, still, dt)) - robot.forward_kinematics(q)
+    change = np.append(change[..., :2], se2.wrap_angle(change[..., 2:]) * heading, axis=-1)
+    assert np.all(norm(change) <= 2.0 * norm(dt * still) ** 2)
+
+
+def test_a_mobile_manipulator_keeps_its_mount():
+    given = np.array([0.1, 0.0])
+    robot = MobileManipulator(R, L, PlanarArm([0.2]), mount=given)
+    given[0] = 9.0
+    assert robot.mount.tolist() == [0.1, 0.0]
+    with pytest.raises(ValueError, match='read-only'):
+        robot.mount[0] = 9.0
+
+
+# --- The wheel as a contact
+
+
+def test_the_point_at_the_ground_stands_still_where_the_wheel_rolls():
+    r = np.array([[0.01], [R], [2.0]])
+    rolling = contact.rolling_direction(r)
+    J = contact.wheel_contact_jacobian(contact.AT_GROUND, r)
+    assert J.shape == (3, 1, 3, 2)
+    close(times(J, rolling), 0.0, 1e-15)
+    close(contact.wheel_contact_position(0.7, contact.AT_GROUND, r), [[[0.7, 0.0, 0.0]]] * 3, 1e-15)
+    phi = np.linspace(-3.0, 3.0, 7)
+    assert norm(times(contact.wheel_contact_jacobian(phi, r), rolling)).min() > 1e-4
+    from_hub = contact.wheel_contact_position(0.7, phi, r) - np.stack(
+        [0.7 + 0.0 * r, r, 0.0 * r], axis=-1
+    )
+    close(norm(from_hub), np.broadcast_to(r, (3, 7)))
+    top = contact.wheel_contact_jacobian(0.0, r) @ np.array([0.0, 1.0])
+    close(top[..., 0], r)  # forward, for phi turns as the wheel rolls
+
+
+# --- Bad input
+
+NAN, HUGE, NOT_LENGTHS = np.nan, 10**400, (0.0, -1.0, np.inf, 'a')
+ARM, LONG, ONES = PlanarArm([0.3, 0.2]), PlanarArm([1.0] * 3), {n: np.ones((2, n)) for n in (2, 4)}
+ROBOT = MobileManipulator(R, L, ARM)
+BAD = [
+    ('lengths must', PlanarArm, [[], 1.0, [[1.0]], [1.0, 0.0], [-1.0], [NAN], [1j], 'long', None]),
+    ('q must', ARM.forward_kinematics, [[0.0] * 3, 0.0, [0.0, NAN], [['a', 'b']]]),
+    ('q must', ARM.joint_positions, [[0.0], [np.inf, 0.0], [[0.0], [0.0, 1.0]]]),
+    ('q must', ARM.jacobian, [[0.0], [1j, 0.0], None]),
+    ('q must', ARM.determinant, [[0.0] * 3, [0.0, NAN]]),
+    ('q_1 must', ARM.singular_configurations, [NAN, 'a', 1j]),
+    ('determinant is for an arm of 2 links, .* 3$', LONG.determinant, [[0.0] * 3]),
+    ('singular_configurations is for an arm of 2 links, .* 3$', LONG.singular_configurations, [0.0]),
+    ('inverse_velocity is for .* 2 links', lambda x: LONG.inverse_velocity([0.0] * 3, x), [[0, 1]]),
+    ('x_dot must', lambda x: ARM.inverse_velocity([0.0, 1.0], x), [[1.0] * 3, [NAN, 0.0], 'ab']),
+    ('q and x_dot must .* broadcast', lambda q: ARM.inverse_velocity(q, ONES[2]), [np.ones((3, 2))]),
+    ('wrench must', lambda w: ARM.joint_torques([0.0] * 2, w), [1.0, [1.0], [0.0] * 4, [NAN, 0.0]]),
+    ('q and wrench must .* broadcast', lambda q: ARM.joint_torques(q, ONES[2]), [np.ones((3, 2))]),
+    ('q_dot must', lambda q_dot: ARM.integrate([0.0] * 2, q_dot, 1.0), [[0.0], [NAN, 0.0]]),
+    ('dt must', lambda dt: ARM.integrate([0.0] * 2, [0.0] * 2, dt), [NAN, 'a', 1j]),
+    ('q and .*dt must .* broadcast', lambda dt: ARM.integrate([0.0] * 2, ONES[2], dt), [np.ones(3)]),
+    ('r must', lambda r: MobileManipulator(r, L, ARM), [*NOT_LENGTHS, NAN, None, 1j, [R, R], '0.1']),
+    ('L must', lambda L: MobileManipulator(R, L, ARM), [*NOT_LENGTHS, NAN, None, 1j, [L, L], '0.1']),
+    ('mount must', lambda m: MobileManipulator(R, L, ARM, m), [1.0, [1.0], [[0, 0]], [NAN, 0.0], 'a']),
+    ('q must', ROBOT.forward_kinematics, [[0.0] * 4, [NAN] * 5, 'a']),
+    ('q must', ROBOT.jacobian, [[0.0] * 6, 0.0, [1j] * 5]),
+    ('q_dot must', lambda q_dot: ROBOT.integrate([0.0] * 5, q_dot, 1.0), [[0.0] * 5, [NAN] * 4]),
+    ('q and .* must .* broadcast', lambda q: ROBOT.integrate(q, ONES[4], 1.0), [np.ones((3, 5))]),
+    ('r must', contact.rolling_direction, [*NOT_LENGTHS, [1.0, 0.0], 1j]),
+    ('r must', lambda r: contact.wheel_contact_jacobian(0.0, r), NOT_LENGTHS),
+    ('phi must', lambda phi: contact.wheel_contact_jacobian(phi, R), [NAN, 'a', 1j]),
+    ('phi and r must .* broadcast', lambda r: contact.wheel_contact_jacobian([0.0] * 2, r), [[1.0] * 3]),
+    ('x must', lambda x: contact.wheel_contact_position(x, 0.0, R), [NAN, 'a', 1j]),
+    ('d must .* rank 1', lambda d: dd.offset_point_jacobian(0.0, R, L, d), [0, -0.0, [1.0, 0.0]]),
+    ('d must', lambda d: dd.offset_point_jacobian(0.0, R, L, d), [NAN, np.inf, 1j, 'a']),
+    ('d must', lambda d: dd.offset_point([0.0] * 3, d), [NAN, 1j, 'a', HUGE]),
+    ('pose must', lambda pose: dd.offset_point(pose, 0.1), [[0.0] * 2, [NAN] * 3, (0.0, None, 1.0)]),
+    ('r must', lambda r: dd.single_wheel_jacobian(0.0, r), NOT_LENGTHS),
+    ('theta must', lambda theta: dd.wheel_to_position_jacobian(theta, R, L), [NAN, 'a', HUGE]),
+]
+ROWS = [pytest.param(*row[:2], bad, id=f'{row[0]} {str(bad)[:15]}') for row in BAD for bad in row[2]]
+
+
+@pytest.mark.parametrize(('message', 'call', 'bad'), ROWS)
+def test_an_error_names_the_argument_what_was_got_and_what_is_allowed(message, call, bad):
+    with pytest.raises(ValueError, match=f'^{message}'):
+        call(bad)
