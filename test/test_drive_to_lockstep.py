@@ -15,6 +15,7 @@ from diffdrive_jacobian.nodes.parameters import CONTROLLERS
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import drive_to
 
+QUICK = ('--ros-args', '-p', 'kp:=12.0', '-p', 'kv:=3.0')
 CRAWL = (
     '50',
     '0',
@@ -42,7 +43,7 @@ def last_line(capsys):
 def test_arrives_and_says_the_same_each_time(capsys, goals):
     said = set()
     for record in (['--no-plot'], ['--no-record']):
-        assert drive_to.main([*map(str, goals), '--lockstep', *record], Signals()) == 0
+        assert drive_to.main([*map(str, goals), '--lockstep', *record, *QUICK], Signals()) == 0
         said.add(last_line(capsys))
     (line,) = said
     numbers = re.fullmatch(
@@ -70,7 +71,7 @@ def test_takes_as_long_as_the_law_says(capsys):
 @pytest.mark.parametrize('controller', CONTROLLERS)
 def test_every_controller_arrives_and_takes_the_heading_that_is_asked_for(tmp_path, capsys, controller):
     arguments = ['0.5', '0.5', '0', '1', '--heading', '-2.5', '--controller', controller, '--no-plot']
-    assert drive_to.main([*arguments, '--lockstep', '-o', 'bag'], Signals()) == 0
+    assert drive_to.main([*arguments, '--lockstep', '-o', 'bag', *QUICK], Signals()) == 0
     x, y, theta = map(
         float, re.search(r'x (\S+) m, y (\S+) m, heading (\S+) rad', last_line(capsys)).groups()
     )
