@@ -15,6 +15,7 @@ COMMANDS = [
     'recover_run',
     'replay_run',
     'plot_run',
+    'sweep_gains',
 ]
 MESSAGES = '5.3.6'
 CORE_MESSAGES = '2.0.3'
@@ -34,7 +35,7 @@ setup(
         (f'share/{PACKAGE}/config', sorted(glob('config/*.yaml'))),
     ],
     python_requires='>=3.10',
-    install_requires=['numpy>=1.21', 'rich>=12', 'rosbags>=0.11.9,<0.12', 'ruamel.yaml>=0.17'],
+    install_requires=['numpy>=1.24', 'rich>=12', 'rosbags>=0.11.9,<0.12', 'ruamel.yaml>=0.17'],
     # rclpy is not required here: a ROS installation brings its own, under another name than PyPI's.
     extras_require={
         'jazzy': [

@@ -89,7 +89,7 @@ def draw(runs: Sequence[Run], path: Path) -> None:
     if path.exists():
         raise FileExistsError(f'{path} exists already')
     drawn = io.BytesIO()
-    with warnings.catch_warnings(), _style():
+    with warnings.catch_warnings(), styled():
         # A letter of a bag's name that the font does not have.
         warnings.filterwarnings('ignore', message='Glyph')
         # So many runs that there is no room left for their names.
@@ -144,7 +144,7 @@ def figure(runs: Sequence[Run]) -> Figure:
     columns = 1 if len(quantities) == 2 else 2
     rows = len(quantities) // columns
     labels = names([run.path for run in runs])
-    with _style():
+    with styled():
         made = Figure(figsize=SIZE, layout='constrained')
         grid = made.add_gridspec(
             rows + 1,
@@ -165,7 +165,7 @@ def figure(runs: Sequence[Run]) -> Figure:
     return made
 
 
-def _style() -> Any:
+def styled() -> Any:
     """Draw in our style, whatever the user has configured; a context manager."""
     import matplotlib
 

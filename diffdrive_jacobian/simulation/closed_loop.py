@@ -268,8 +268,8 @@ class _Fleet:
                 done += len(finished)
                 if progress is not None:
                     progress(done)
-        made = [field.reshape(*self.shape, *field.shape[1:]) for field in found]
-        return Outcomes(*made)  # type: ignore[arg-type]
+        made = [field.reshape((*self.shape, *field.shape[1:])) for field in found]
+        return Outcomes._make(made)
 
 
 class _Block:

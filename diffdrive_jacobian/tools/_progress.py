@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 
 class Drive:
@@ -99,4 +99,41 @@ class Playing:
             self._shown = time.monotonic()
             what = 'paused (Enter)' if paused else 'playing'
             self._progress.update(self._task, completed=seconds, description=what)
+            self._progress.refresh()
+
+
+class Batch:
+    """How many of a batch are done: a bar on a terminal, nothing elsewhere."""
+
+    def __init__(self, what: str, count: int) -> None:
+        """Begin a batch of so many."""
+        self._console = Console()
+        self._progress = Progress(
+            TextColumn('{task.description}'),
+            BarColumn(),
+            TextColumn('{task.completed} of {task.total}'),
+            TimeElapsedColumn(),
+            console=self._console,
+            auto_refresh=False,
+            transient=True,
+        )
+        self._task = self._progress.add_task(what, total=count)
+        self._shown = -math.inf
+
+    def __enter__(self) -> Batch:
+        """Show the bar, where there is a terminal."""
+        if self._console.is_terminal:
+            self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Take the bar away."""
+        if self._console.is_terminal:
+            self._progress.stop()
+
+    def show(self, done: int) -> None:
+        """Show how many are done."""
+        if self._console.is_terminal and time.monotonic() - self._shown >= 0.1:
+            self._shown = time.monotonic()
+            self._progress.update(self._task, completed=done)
             self._progress.refresh()

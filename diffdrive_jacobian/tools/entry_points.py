@@ -75,3 +75,8 @@ def recover_run() -> int:
 def plot_run() -> int:
     """Run the tool plot_run."""
     return _run('plot_run', 'main')
+
+
+def sweep_gains() -> int:
+    """Run the tool sweep_gains."""
+    return _run('sweep_gains', 'main')

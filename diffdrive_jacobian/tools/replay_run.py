@@ -8,20 +8,18 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rclpy.duration import Duration
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 
 from diffdrive_jacobian.bags.reading import BagError, open_bag, read_run
 from diffdrive_jacobian.bags.replayer import COMMANDED, TOLD, Playback, Replayer
-from diffdrive_jacobian.bags.verification import ROBOT, Verification, verify
+from diffdrive_jacobian.bags.verification import Verification, verify
 from diffdrive_jacobian.ros.parameters import ParameterError
 from diffdrive_jacobian.ros.runner import Runner, UserError, ros_context, running
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools._params_file import robot_parameters
 from diffdrive_jacobian.tools._progress import Playing
 
 PROGRAM = 'replay_run'
@@ -126,42 +124,13 @@ def report(verification: Verification, tolerance: float, yaw_tolerance: float) -
 
 
 def _verify(bag: Path, options: argparse.Namespace) -> int:
-    parameters = None if options.params_file is None else _robot_parameters(options.params_file)
+    parameters = None if options.params_file is None else robot_parameters(options.params_file)
     verification = verify(read_run(bag), parameters)
     allowed = verification.allowed
     tolerance = allowed if options.tolerance is None else options.tolerance
     yaw_tolerance = allowed if options.yaw_tolerance is None else options.yaw_tolerance
     print(report(verification, tolerance, yaw_tolerance))
     return _cli.DONE if verification.holds(tolerance, yaw_tolerance) else _cli.FAILED
-
-
-def _robot_parameters(path: str) -> dict[str, Any]:
-    """Read the robot's parameters from a file of ROS parameters.
-
-    Raises:
-        UserError: The file is none of that kind.
-    """
-    try:
-        content = YAML(typ='safe').load(Path(path))
-        values: dict[str, Any] = {}
-        for key, section in content.items():
-            if key.rstrip('/').split('/')[-1] in (ROBOT, '**'):
-                values.update(_flat(section['ros__parameters'], ''))
-    except (OSError, UnicodeError, YAMLError, AttributeError, KeyError, TypeError) as error:
-        raise UserError(
-            f'--params-file must be a file of ROS parameters, got {path}: {error}'
-        ) from error
-    return values
-
-
-def _flat(section: dict[str, Any], prefix: str) -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in section.items():
-        if isinstance(value, dict):
-            flat.update(_flat(value, f'{prefix}{key}.'))
-        else:
-            flat[f'{prefix}{key}'] = value
-    return flat
 
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
