@@ -120,8 +120,9 @@ def _draw_map(made: Figure, panel: Axes, swept: Sweep, measure: str) -> None:
     from matplotlib.colors import LogNorm, Normalize
     from matplotlib.ticker import FuncFormatter, LogLocator
 
-    values = np.ma.masked_where(~swept.complete, swept.mean(measure))
-    found = values.compressed()
+    # What is NaN stays empty.
+    values = np.where(swept.complete, swept.mean(measure), np.nan)
+    found = values[swept.complete]
     low, high = _range(found, from_zero=measure == 'overshoot')
     many = low > 0.0 and high / low > MANY_TIMES
     norm: Any = LogNorm(low, high) if many else Normalize(low, high)
@@ -138,7 +139,8 @@ def _draw_map(made: Figure, panel: Axes, swept: Sweep, measure: str) -> None:
     panel.grid(False)
     panel.spines[:].set_visible(True)
     scale = made.colorbar(mesh, ax=panel, pad=0.02, aspect=28)
-    scale.outline.set_linewidth(0.8)
+    outline: Any = scale.outline
+    outline.set_linewidth(0.8)
     if many:
         scale.ax.yaxis.set_major_locator(LogLocator(subs=TICKS))
         scale.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))

@@ -148,8 +148,7 @@ class Setup:
     def gains(self, name: str) -> Array:
         """Give the gains `kp` or `kv`, evenly spaced, as decimals that people write (1/s)."""
         first, last = self.kp if name == 'kp' else self.kv
-        values: Array = np.linspace(first, last, self.grid).round(9)
-        return values
+        return np.asarray(np.linspace(first, last, self.grid).round(9), dtype=np.float64)
 
     def poses(self) -> Array:
         """Give the starts, shape (starts, 3): evenly around the goal, which lies at the origin.
@@ -190,7 +189,7 @@ class Sweep(NamedTuple):
     @property
     def complete(self) -> NDArray[np.bool_]:
         """Where all starts arrived, shape (n, n): kv, kp."""
-        return self.outcomes.arrived.all(axis=-1)
+        return np.asarray(self.outcomes.arrived.all(axis=-1))
 
     def mean(self, measure: str) -> Array:
         """Give the mean over the starts that arrived, shape (n, n): kv, kp; NaN: none has."""
