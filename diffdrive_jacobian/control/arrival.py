@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from diffdrive_jacobian.kinematics._checks import finite, floats, not_negative
-from diffdrive_jacobian.kinematics._elementary import cos, hypot, sin, wrapped
+from diffdrive_jacobian.kinematics._checks import not_negative, number
+from diffdrive_jacobian.kinematics._elementary import cos, hypot, operand, sin, wrapped
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -32,9 +32,9 @@ class Arrival:
 
     def __post_init__(self) -> None:
         """Check every value."""
-        not_negative('xy_tolerance', self.xy_tolerance)
-        not_negative('yaw_tolerance', self.yaw_tolerance)
-        finite('offset', floats('offset', self.offset))
+        for name in ('xy_tolerance', 'yaw_tolerance'):
+            object.__setattr__(self, name, number(name, getattr(self, name), not_negative))
+        object.__setattr__(self, 'offset', operand('offset', self.offset))
 
     def distance(self, x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any) -> Any:
         """Give the distance to a goal (m) of the point that is to arrive; arguments broadcast."""

@@ -25,7 +25,8 @@ def offset_point(state: ArrayLike, goal: ArrayLike, k: Any, d: Any) -> tuple[Any
     With wheel speeds the law is `w = J_d^-1 k (goal - p_d)`; here as the body twist `u = J_w w`:
     `v = k a`, `omega = k b / d`, where `[a, b]` is the way from the point to the goal, seen from the
     robot. The distance of the point decays as exp(-k t), whatever the heading. The point comes to rest
-    on the goal, the axle centre |d| away from it.
+    on the goal, the axle centre |d| away from it. Sampled at a rate, that holds while
+    `k distance < 2 |d| rate`: far from the goal, a short offset makes the robot turn too far.
 
     Args:
         state: Pose of the robot, shape (..., 3).

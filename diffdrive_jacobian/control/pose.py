@@ -26,11 +26,15 @@ from diffdrive_jacobian.kinematics._elementary import (
     arctan2,
     components,
     cos,
+    minimum,
     operand,
     sin,
     wrapped,
 )
 from diffdrive_jacobian.kinematics.se2 import sinc
+
+FASTER = 2.0
+"""How many times as fast as the distance the heading settles, if nothing else is asked for."""
 
 
 def go_to_pose(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any, h: Any = None) -> tuple[Any, Any]:
@@ -40,15 +44,17 @@ def go_to_pose(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any, h: Any = Non
     `omega = Kp alpha + Kv cos(alpha) sin(alpha)/alpha (alpha + h phi)`. Held continuously,
     `V = rho^2 + alpha^2 + h phi^2` never grows, and everything comes to rest on the goal. Near it,
     heading and bearing settle like an oscillator of frequency `Kv sqrt(h)` damped by Kp, the distance
-    like exp(-Kv t): for the heading to be there first, Kp should be well above 2 Kv. If the goal lies
-    behind, the robot backs up.
+    like exp(-Kv t): for the heading to be there first, Kp should be above 2 Kv. A weight that is larger
+    than it needs to be makes long ways round. If the goal lies behind, the robot backs up; where it may
+    not, it turns first. Sampled, Kp should be below a quarter of the rate.
 
     Args:
         state: Pose of the robot, shape (..., 3).
         goal: Pose to take `[x, y, theta]`, shape (..., 3).
         Kp: Gain on the bearing, positive, shape (...) (1/s).
         Kv: Gain on the distance, positive, shape (...) (1/s).
-        h: Weight of the heading, positive, shape (...); None: `(Kp / (2 Kv))^2`, which damps critically.
+        h: Weight of the heading, positive, shape (...). None: `(Kp / (2 Kv))^2`, which damps critically,
+            or from `Kp = 4 Kv` on `2 Kp / Kv - 4`, with which the heading settles like exp(-2 Kv t).
 
     Returns:
         `(v, omega)`, each of shape (...) (m/s, rad/s). Exactly on the goal's position, where the bearing
@@ -63,11 +69,13 @@ def go_to_pose(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any, h: Any = Non
     Kp, Kv = operand('Kp', Kp, positive), operand('Kv', Kv, positive)
     agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv)
     if h is None:
-        root = Kp / (2.0 * Kv)
-        h = root * root
+        least = minimum(Kp, 2.0 * FASTER * Kv)
+        # The tangent goes on where the parabola would rise steeply; either way h Kv cannot overflow.
+        weight = least / (4.0 * Kv) * least + FASTER * (Kp - least)
     else:
         h = operand('h', h, positive)
         agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv, h=h)
+        weight = h * Kv
     dx, dy = x_goal - x, y_goal - y
     c, s = cos(theta), sin(theta)
     # Without negative zeros the angle of (0, 0) is 0.
@@ -77,4 +85,4 @@ def go_to_pose(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any, h: Any = Non
     # cos(alpha) sin(alpha) / alpha, without a hole at zero.
     bend = cos(alpha) * sinc(alpha)
     away = (dx != 0.0) | (dy != 0.0)
-    return Kv * ahead, (Kp * alpha + Kv * bend * (alpha + h * phi)) * away
+    return Kv * ahead, (Kp * alpha + bend * (Kv * alpha + weight * phi)) * away

@@ -72,7 +72,7 @@ def resolved_rate(
     if q_dot_0 is None:
         return damped_least_squares(J, x_dot, damping)
     wish = array('q_dot_0', q_dot_0, n)
-    leading(J=J.shape[:-2], q_dot_0=wish.shape[:-1])
+    leading(J=J.shape[:-2], x_dot=x_dot.shape[:-1], q_dot_0=wish.shape[:-1])
     return wish + damped_least_squares(J, x_dot - (J @ wish[..., np.newaxis])[..., 0], damping)
 
 

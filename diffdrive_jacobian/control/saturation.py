@@ -39,14 +39,17 @@ class VelocityLimits:
 
     def __post_init__(self) -> None:
         """Check every limit."""
-        for name in ('min_v', 'min_omega'):
-            if not np.all((value := getattr(self, name)) <= 0.0):
-                raise ValueError(f'{name} must be zero or negative, got {value}')
-        for name in ('max_v', 'max_omega'):
-            if not np.all((value := getattr(self, name)) >= 0.0):
-                raise ValueError(f'{name} must be zero or positive, got {value}')
-        if not np.all(self.max_wheel_speed > 0.0):
-            raise ValueError(f'max_wheel_speed must be positive, got {self.max_wheel_speed}')
+        for name, limit in zip(self.names(), self.all(), strict=True):
+            value = limit if type(limit) is float else floats(name, limit)
+            if name == 'max_wheel_speed':
+                inside, allowed = value > 0.0, 'positive'
+            elif name.startswith('min'):
+                inside, allowed = value <= 0.0, 'zero or negative'
+            else:
+                inside, allowed = value >= 0.0, 'zero or positive'
+            if not np.all(inside):
+                raise ValueError(f'{name} must be {allowed}, got {limit}')
+            object.__setattr__(self, name, float(value) if np.ndim(value) == 0 else value)
 
     @property
     def unlimited(self) -> bool:
@@ -85,8 +88,9 @@ def saturate(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tupl
     """
     v, omega = operand('v', v), operand('omega', omega)
     if limits.unlimited:
+        agree(v=v, omega=omega)
         return v, omega
-    min_v, max_v, min_omega, max_omega, max_wheel_speed = map(_limit, limits.all())
+    min_v, max_v, min_omega, max_omega, max_wheel_speed = limits.all()
     agree(v=v, omega=omega, min_v=min_v, max_v=max_v, min_omega=min_omega, max_omega=max_omega)
     v, v_excess = _allowed(v, min_v, max_v)
     omega, omega_excess = _allowed(omega, min_omega, max_omega)
@@ -103,10 +107,6 @@ def saturate(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tupl
         minimum(maximum(v / excess, min_v), max_v),
         minimum(maximum(omega / excess, min_omega), max_omega),
     )
-
-
-def _limit(value: Any) -> Any:
-    return float(value) if isinstance(value, (float, int)) else floats('limit', value)
 
 
 def _allowed(speed: Any, low: Any, high: Any) -> tuple[Any, Any]:

@@ -43,6 +43,9 @@ class Waypoints:
             its place when everything is reached.
         """
         here = self
+        if here.turning and not arrival.use_heading:
+            # Asked for no longer: the position was reached.
+            return here, None
         while not here.turning and here._there(pose, arrival):
             if here.index + 1 < len(here.poses):
                 here = replace(here, index=here.index + 1)

@@ -259,10 +259,10 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self.get_logger().warning(
                 'linear.x.max_velocity is 0: the robot may not drive forward, goals stay out of reach'
             )
-        if self._limits.min_v == 0.0 and parameters.controller == 'pose':
+        if self._limits.min_v == 0.0 and parameters.controller == 'offset_point':
             self.get_logger().warning(
-                'linear.x.min_velocity is 0: the robot may not back up, which controller pose wants to '
-                'where the goal lies behind; it may come to rest before the goal'
+                'linear.x.min_velocity is 0: the robot may not back up, which controller offset_point '
+                'does where the goal lies behind; it may come to rest before the goal'
             )
         self._judge_gains()
 

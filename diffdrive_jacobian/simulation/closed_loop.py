@@ -33,7 +33,8 @@ omega)`. `go_to_goal`, `offset_point` and `go_to_pose` are such laws."""
 BLOCK = 8192
 """Robots that are advanced together: as many as fit into the processor's cache."""
 LOST = 1e6
-"""A robot that is farther from its goal has been driven away by its law (m)."""
+"""A robot that is so much farther from its goal than at the start was driven away by its law (m)."""
+MAX_STEPS = 1e12
 NO_LIMITS = VelocityLimits()
 
 
@@ -190,6 +191,12 @@ class _Fleet:
             raise ValueError(f'goals must have shape {wanted}, got {goals.shape}')
         rate = number('rate', rate, positive)
         duration = number('duration', duration, positive)
+        if not duration * rate < MAX_STEPS:
+            raise ValueError(
+                f'duration must be below {MAX_STEPS / rate:g} s at that rate, got {duration:g}'
+            )
+        if not isinstance(limits, VelocityLimits):
+            raise ValueError(f'limits must be VelocityLimits, got {limits!r:.60}')
         columns = {f'gain {index}': array(f'gain {index}', gain) for index, gain in enumerate(gains)}
         columns['turning_gain'] = array('turning_gain', turning_gain)
         columns['offset'] = floats('offset', arrival.offset)
@@ -286,6 +293,7 @@ class _Block:
         way = fleet.goals[:, :2] - fleet.starts[:, :2]
         length = np.hypot(*way.T)
         self.along: Array = np.array((way / np.where(length > 0.0, length, 1.0)[:, np.newaxis]).T)
+        self.too_far: Array = length + LOST
 
     def drive(self, keep: Keep | None) -> Iterator[tuple[NDArray[np.intp], Outcomes]]:
         """Drive them to their ends; gives who is done, and what became of them."""
@@ -298,12 +306,11 @@ class _Block:
             ended = bool(done.any())
             if ended:
                 yield self._outcomes(done, arrived, step)
-            going = self.open & ~done if ended else self.open
+            going = self.open = self.open & ~done if ended else self.open
             if not last and going.any():
                 v, omega = self._command()
             if keep is not None:
                 self._keep(keep, step, done, going, v, omega)
-            self.open = going
             if v is None:
                 return
             if ended and np.count_nonzero(going) < 0.75 * len(going):
@@ -315,14 +322,15 @@ class _Block:
         """Tell who has arrived, and whom the law has driven away."""
         fleet, arrival = self.fleet, self.fleet.arrival
         (x, y, theta), goal = self.pose.T, fleet.goals.T
-        distance = arrival.distance(x, y, theta, goal[0], goal[1])
+        with np.errstate(over='ignore'):
+            distance = arrival.distance(x, y, theta, goal[0], goal[1])
         dx, dy = x - goal[0], y - goal[1]
         np.maximum(self.beyond, self.along[0] * dx + self.along[1] * dy, out=self.beyond)
         there = distance <= arrival.xy_tolerance
         if arrival.use_heading:
             self.turning |= there
             there = self.turning & arrival.faces(theta, goal[2])
-        return there, distance > LOST
+        return there, distance > self.too_far
 
     def _command(self) -> tuple[Array, Array]:
         """Ask the law, and hold what it gives to the limits."""
@@ -335,9 +343,18 @@ class _Block:
             raise ValueError(
                 f'law must give (v, omega), each of shape () or {shape}, got {twist!r:.80}'
             ) from error
+        if not self.open.all():
+            # Who is done stays where it is, whatever its law makes of that.
+            v, omega = np.where(self.open, (v, omega), 0.0)
         if self.turning.any():
             turn = turn_in_place(self.pose[:, 2], fleet.goals[:, 2], fleet.turning_gain)
-            v, omega = np.where(self.turning, turn, (v, omega))
+            v, omega = np.where(self.turning & self.open, turn, (v, omega))
+        finite = np.isfinite(v) & np.isfinite(omega)
+        if not finite.all():
+            row = int(np.argmin(finite))
+            raise ValueError(
+                f'law must give finite (v, omega), got ({v[row]}, {omega[row]}) at pose {self.pose[row]}'
+            )
         if not fleet.limits.unlimited:
             v, omega = saturate(v, omega, fleet.limits, fleet.r, fleet.L)
         return v, omega
@@ -376,3 +393,4 @@ class _Block:
         self.pose, self.turning = np.array(self.pose[going].T).T, self.turning[going]
         self.sums, self.beyond = self.sums[:, going], self.beyond[going]
         self.along, self.open = self.along[:, going], self.open[going]
+        self.too_far = self.too_far[going]

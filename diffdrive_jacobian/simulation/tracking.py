@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.control.resolved_rate import StraightLine, resolved_rate
-from diffdrive_jacobian.kinematics._checks import not_negative, number, positive
+from diffdrive_jacobian.kinematics._checks import array, leading, not_negative, number, positive
 from diffdrive_jacobian.kinematics.inverse_velocity import damping as damping_factor
 from diffdrive_jacobian.kinematics.inverse_velocity import manipulability
 
@@ -81,14 +81,23 @@ def track_line(
     Raises:
         ValueError: Rate, threshold or speed is not positive, another number negative, the gain not below
             the rate, or a shape is wrong.
+
+    A tip that is far from the axle, on a mobile base, needs a higher rate: the wheels then swing it.
     """
     rate = number('rate', rate, positive)
     settling = number('settling', settling, not_negative)
     gain = number('gain', gain, not_negative)
     if gain >= rate:
         raise ValueError(f'gain must be at least 0 and below the rate {rate:g}, got {gain:g}')
-    steps = math.ceil(rate * (float(np.max(line.duration)) + settling) - 1e-9)
-    q = np.asarray(q0, dtype=np.float64)
+    steps = math.ceil(rate * (float(np.max(line.duration, initial=0.0)) + settling) - 1e-9)
+    most = number('maximum_damping', maximum_damping, not_negative)
+    if threshold is not None:
+        threshold = number('threshold', threshold, positive)
+    q = array('q0', q0, 'n')
+    if line.start.shape[-1] != 2:
+        raise ValueError(f'line must have 2 coordinates, got {line.start.shape[-1]}')
+    leading(q0=q.shape[:-1], line=line.duration.shape)
+    inputs = robot.jacobian(q).shape[-1]
     track: list[Array] = []
     velocities: list[Array] = []
     errors: list[Array] = []
@@ -102,7 +111,7 @@ def track_line(
         J = robot.jacobian(q)
         factor: ArrayLike = 0.0
         if threshold is not None:
-            factor = damping_factor(manipulability(J), threshold, maximum_damping)
+            factor = damping_factor(manipulability(J), threshold, most)
         wish = None if secondary is None else secondary(q)
         # What moves the target to its next sample, also in the period in which the line ends.
         moving = (line.position((step + 1) / rate) - wanted) * rate
@@ -115,6 +124,6 @@ def track_line(
     return Tracking(
         np.arange(steps + 1) / rate,
         np.array(track),
-        np.array(velocities).reshape(steps, *np.shape(velocities)[1:]),
+        np.array(velocities) if steps else np.empty((0, *shape[:-1], inputs)),
         np.array(errors),
     )

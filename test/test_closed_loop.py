@@ -1,0 +1,394 @@
+"""Closed loops in batches against one robot in a scalar loop, and what becomes of who gets lost."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from diffdrive_jacobian.control import (
+    Arrival,
+    VelocityLimits,
+    Waypoints,
+    go_to_goal,
+    go_to_pose,
+    offset_point,
+    saturate,
+)
+from diffdrive_jacobian.kinematics import se2
+from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
+from diffdrive_jacobian.simulation import Robot, RobotModel, closed_loop, closed_loops, trajectories
+
+R, L = 0.033, 0.16
+FREE = VelocityLimits()
+LIMITS = VelocityLimits(min_v=-0.5, max_v=0.7, min_omega=-4.0, max_omega=3.0, max_wheel_speed=24.0)
+LAWS = {
+    'go_to_goal': (lambda pose, to, Kp, Kv: go_to_goal(pose, to[..., :2], Kp, Kv), (6.0, 1.5)),
+    'offset_point': (lambda pose, to, k, d: offset_point(pose, to[..., :2], k, d), (1.5, -0.2)),
+    'pose': (go_to_pose, (6.0, 1.5)),
+}
+
+
+def random_batch(seed, *shape):
+    box = np.array([1.0, 1.0, np.pi])
+    return np.random.default_rng(seed).uniform(-box, box, (2, *shape, 3))
+
+
+def alone(law, start, to, gains, arrival, limits=FREE, *, rate=50.0, duration=6.0, r=R, separation=L):
+    """One robot in a scalar loop; gives every outcome, and its poses."""
+    way, pose, poses, command = Waypoints(np.array([to])), start, [start], None
+    time, path, effort, beyond, step = math.nan, 0.0, 0.0, 0.0, 0
+    along = (to - start)[:2] / (math.dist(to[:2], start[:2]) or 1.0)
+    while True:
+        beyond = max(beyond, float(along @ (pose - to)[:2]))
+        way, command = way.follow(pose, lambda at, goal: law(at, goal, *gains), arrival, 3.0)
+        if command is None:
+            time = step / rate
+        if command is None or step == round(duration * rate):
+            return (command is None, time, path, effort, beyond, pose), poses
+        v, omega = saturate(*command, limits, r, separation)
+        path += abs(v) / rate
+        effort += sum(wheel**2 for wheel in body_to_wheel(v, omega, r, separation)) / rate
+        pose, step = se2.integrate(pose, [v, omega], 1.0 / rate), step + 1
+        poses.append(pose)
+
+
+def assert_same(found, expected):
+    for name, one, other in zip(found._fields, found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize('use_heading', [False, True], ids=['position', 'heading'])
+@pytest.mark.parametrize('limits', [FREE, LIMITS], ids=['free', 'limited'])
+@pytest.mark.parametrize('name', LAWS)
+def test_a_batch_is_each_of_its_robots_in_a_scalar_loop(name, limits, use_heading):
+    law, gains = LAWS[name]
+    starts, targets = random_batch(1, 5)
+    targets[0] = starts[0]
+    arrival = Arrival(use_heading=use_heading, offset=gains[1] if name == 'offset_point' else 0.0)
+    gone = trajectories(law, starts, targets, *gains, duration=6.0, arrival=arrival, limits=limits)
+    assert_same(
+        closed_loops(law, starts, targets, *gains, duration=6.0, arrival=arrival, limits=limits),
+        gone.outcomes,
+    )
+    np.testing.assert_allclose(gone.times, np.arange(len(gone.poses)) / 50.0, rtol=1e-12)
+    for index, (start, to) in enumerate(zip(starts, targets, strict=True)):
+        expected, poses = alone(law, start, to, gains, arrival, limits)
+        assert_same(type(gone.outcomes)(*(field[index] for field in gone.outcomes)), expected)
+        np.testing.assert_allclose(gone.poses[: len(poses), index], poses, atol=1e-9)
+        # Who has arrived stands still.
+        assert np.all(gone.poses[len(poses) - 1 :, index] == gone.poses[-1, index])
+        assert not gone.twists[len(poses) - 1 :, index].any()
+    assert gone.outcomes.arrived.sum() >= 3
+
+
+def test_the_robot_of_the_nodes_drives_the_same_way():
+    (start, to), gains = random_batch(2), (6.0, 1.5)
+    gone = trajectories(go_to_pose, start[np.newaxis], to, *gains, limits=LIMITS)
+    model = RobotModel(limits=LIMITS)
+    robot = Robot(model=model, stamp=0, pose=start)
+    for pose in gone.poses[:, 0]:
+        np.testing.assert_allclose(robot.pose, pose, atol=1e-9)
+        stamp = robot.stamp
+        robot = robot.commanded(go_to_pose(robot.pose, to, *gains), stamp).at(stamp + 20_000_000)
+    assert len(gone.poses) > 50
+
+
+@pytest.mark.parametrize('drive', [closed_loops, lambda *a, **k: trajectories(*a, **k).outcomes])
+def test_a_single_robot_is_a_batch_without_axes(drive):
+    (start, to), gains = random_batch(3), (6.0, 1.5)
+    found = drive(go_to_pose, start, to, *gains)
+    assert [np.shape(field) for field in found] == [()] * 5 + [(3,)]
+    assert_same(found, alone(go_to_pose, start, to, gains, Arrival())[0])
+
+
+def test_outcomes_are_those_of_the_trajectories():
+    starts, targets = random_batch(4, 3, 2)
+    r, separation = np.array([[0.01], [0.03], [0.05]]), np.array([0.1, 0.2])
+    robots = {'limits': LIMITS, 'r': r, 'L': separation, 'duration': 4.0}
+    gone = trajectories(go_to_pose, starts, targets, 6.0, 1.5, **robots)
+    count = len(gone.times)
+    assert gone.poses.shape == (count, 3, 2, 3)
+    assert gone.twists.shape == (count - 1, 3, 2, 2)
+    v, omega = np.moveaxis(gone.twists, -1, 0)
+    wheels = np.array(body_to_wheel(v, omega, r, separation))
+    assert np.abs(wheels).max() <= 24.0 * (1.0 + 1e-12)
+    way, left = (one[..., :2] @ [1.0, 1j] for one in (targets - starts, targets - gone.poses))
+    beyond = np.maximum(-(left * way.conj()).real / np.abs(way), 0.0).max(axis=0)
+    there, arrived = np.abs(left) <= 0.02, (np.abs(left) <= 0.02).any(axis=0)
+    time = np.where(arrived, gone.times[there.argmax(axis=0)], np.nan)
+    path, effort = np.abs(v).sum(axis=0) / 50.0, (wheels**2).sum(axis=(0, 1)) / 50.0
+    assert_same(gone.outcomes, (arrived, time, path, effort, beyond, gone.poses[-1]))
+    moved = se2.integrate(gone.poses[:-1], gone.twists, 0.02)
+    np.testing.assert_allclose(moved[..., :2], gone.poses[1:, ..., :2], atol=1e-12)
+    assert 0 < gone.outcomes.arrived.sum() < 6
+
+
+def test_starts_gains_robots_limits_and_offsets_broadcast():
+    starts, targets = random_batch(5, 3, 1, 1, 1)
+    k, d = np.array([[[0.8]], [[2.0]]]), np.array([[0.1], [-0.3]])
+    r, separation, max_v = np.array([0.02, 0.05]), np.array([0.2, 0.1]), np.array([[0.3], [np.inf]])
+    min_omega = np.array([[[[-0.5]]], [[[-1.0]]], [[[-np.inf]]]])
+    limits = VelocityLimits(max_v=max_v, min_omega=min_omega, max_wheel_speed=9.0)
+    robots = {'arrival': Arrival(offset=d), 'limits': limits, 'r': r, 'L': separation, 'duration': 6.0}
+    found = closed_loops(offset_point, starts, targets[..., :2], k, d, **robots)
+    assert found.time.shape == (3, 2, 2, 2)
+    for i, j, m, n in np.ndindex(3, 2, 2, 2):
+        one, _ = alone(
+            lambda at, to, *gains: offset_point(at, to[:2], *gains),
+            *(starts[i, 0, 0, 0], targets[i, 0, 0, 0], (k[j, 0, 0], d[m, 0])),
+            Arrival(offset=float(d[m, 0])),
+            VelocityLimits(max_v=max_v[m, 0], min_omega=min_omega[i, 0, 0, 0], max_wheel_speed=9.0),
+            r=r[n],
+            separation=separation[n],
+        )
+        assert_same(type(found)(*(field[i, j, m, n] for field in found)), one)
+    assert len(np.unique(found.effort)) > 20
+
+
+@pytest.mark.parametrize('block', [1, 3])
+def test_neither_order_nor_block_size_matters(monkeypatch, block):
+    starts, targets = random_batch(6, 8)
+    Kp, arrival = np.linspace(6.0, 12.0, 8), Arrival(use_heading=True)
+
+    def drive(order, drive=closed_loops):
+        rows = starts[order], targets[order], Kp[order], 2.0
+        return drive(go_to_pose, *rows, limits=LIMITS, arrival=arrival, duration=4.0)
+
+    expected = drive(np.arange(8))
+    monkeypatch.setattr(closed_loop, 'BLOCK', block)
+    order = np.random.default_rng(7).permutation(8)
+    assert_same(drive(order), [field[order] for field in expected])
+    assert_same(drive(order, trajectories).outcomes, [field[order] for field in expected])
+
+
+def test_each_robot_turns_in_place_with_its_own_gain():
+    gains, arrival = np.array([1.0, 10.0]), Arrival(use_heading=True)
+    found = closed_loops(
+        go_to_pose, np.zeros((2, 3)), [0.0, 0.0, 1.0], 3.0, 0.5, arrival=arrival, turning_gain=gains
+    )
+    steps = np.ceil(np.log(0.02) / np.log(1.0 - gains / 50.0))
+    np.testing.assert_allclose(found.time, steps / 50.0)
+    assert not found.path_length.any()
+
+
+# --- Who does not arrive, and who is there
+
+
+def test_who_never_arrives_has_no_time_and_is_where_the_time_ran_out():
+    targets = [[0.5, 0.0], [9.0, 0.0], [-1.0, 0.0]]
+    found = closed_loops(lambda pose, to: (0.1, 0.0), np.zeros((3, 3)), targets, duration=10.0)
+    assert found.arrived.tolist() == [True, False, False]
+    np.testing.assert_allclose(found.time, [4.8, np.nan, np.nan])
+    np.testing.assert_allclose(found.pose[:, 0], [0.48, 1.0, 1.0])
+    assert not found.pose[:, 1:].any()
+    np.testing.assert_allclose(found.path_length, [0.48, 1.0, 1.0])
+    np.testing.assert_allclose(found.effort, 2.0 * (0.1 / R) ** 2 * np.array([4.8, 10.0, 10.0]))
+
+
+@pytest.mark.parametrize(('duration', 'arrives'), [(0.96, False), (0.98, True), (1.0, True)])
+def test_the_last_sample_counts(duration, arrives):
+    way = (np.zeros((1, 3)), [1.0, 0.0])
+    arrival = Arrival(xy_tolerance=0.03)
+    found = closed_loops(lambda pose, to: (1, 0), *way, duration=duration, arrival=arrival)
+    assert found.arrived.tolist() == [arrives]
+
+
+def test_overshoot_is_measured_beyond_the_goal_along_the_line_from_the_start():
+    # A gain of 1.5 rates: each sample leaves minus half of the way.
+    c, s = math.cos(2.0), math.sin(2.0)
+    way = ([[1.0, 2.0, 2.0]], [1.0 + 3.0 * c, 2.0 + 3.0 * s])
+    found = closed_loops(go_to_goal, *way, 1e-9, 15.0, rate=10.0)
+    assert found.overshoot == pytest.approx([1.5])
+    assert found.path_length == pytest.approx([9.0], rel=0.02)
+
+
+@pytest.mark.parametrize(('wild', 'count'), [(101.0, 1), (300.0, 1), (300.0, 5), (1e4, 40)])
+@pytest.mark.parametrize('law', [offset_point, go_to_goal])
+def test_a_law_that_diverges_has_not_arrived_and_leaves_its_company_alone(law, wild, count):
+    """A gain beyond twice the rate."""
+    starts, targets = random_batch(8, count)
+    lost, gains = np.arange(count) == count // 2, np.full(count, 0.3)
+
+    def drive(function=closed_loops):
+        others = [gains, 0.3] if law is offset_point else [3.0, gains]
+        return function(law, starts, targets[:, :2], *others, duration=10.0)
+
+    tame = drive()
+    gains[lost] = wild
+    for found in (drive(), drive(trajectories).outcomes):
+        assert not found.arrived[lost]
+        assert np.isnan(found.time[lost])
+        assert np.isfinite(found.pose).all()
+        assert_same(type(found)(*(field[~lost] for field in found)), [field[~lost] for field in tame])
+
+
+def test_turning_gains_far_beyond_the_rate_raise_nothing():
+    starts, targets = random_batch(9, 100)
+    Kp = 10.0 ** np.linspace(2.1, 8.0, 100)
+    found = closed_loops(go_to_goal, starts, targets[:, :2], Kp, 0.5, duration=10.0)
+    assert np.array_equal(np.isnan(found.time), ~found.arrived)
+    assert np.isfinite(found.pose).all()
+
+
+def test_who_is_there_has_no_use_for_the_law_any_more():
+    """Which may know no direction there."""
+
+    def straight(poses, goals):
+        way = (goals - poses[:, :2])[:, 0]
+        return np.where(np.abs(way) > 0.02, np.sign(way), np.nan), 0.0
+
+    starts = np.zeros((8, 3))
+    starts[1:, 0] = -np.arange(1.0, 8.0)
+    found = closed_loops(straight, starts, [0.0, 0.0])
+    assert found.arrived.all()
+    np.testing.assert_allclose(found.time, np.maximum(-starts[:, 0] - 0.02, 0.0), atol=0.021)
+    assert [field[0] for field in found[1:5]] == [0.0] * 4
+
+
+def test_who_starts_on_the_goal_is_there_at_once():
+    starts, _ = random_batch(12, 3)
+    for function in (closed_loops, lambda *a: trajectories(*a).outcomes):
+        found = function(go_to_pose, starts, starts, 3.0, 0.5)
+        assert_same(found, ([True] * 3, *np.zeros((4, 3)), starts))
+
+
+@pytest.mark.parametrize('shape', [(0,), (3, 0), (0, 2)])
+def test_an_empty_batch_is_an_empty_result(shape):
+    said = []
+    found = closed_loops(go_to_goal, np.zeros((*shape, 3)), [1.0, 0.0], 3.0, 0.5, progress=said.append)
+    assert [field.shape for field in found] == [shape] * 5 + [(*shape, 3)]
+    assert not any(said)
+    gone = trajectories(go_to_goal, np.zeros((*shape, 3)), [1.0, 0.0], 3.0, 0.5)
+    assert gone.times.tolist() == [0.0]
+    assert (gone.poses.shape, gone.twists.shape) == ((1, *shape, 3), (0, *shape, 2))
+
+
+def test_memory_does_not_grow_with_the_duration():
+    peaks = []
+    for duration in (1.0, 1.0, 10.0):  # the first one also pays for what is made once
+        tracemalloc.start()
+        closed_loops(lambda pose, to: (0.1, 1.0), np.zeros((1000, 3)), [9.0, 0.0], duration=duration)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[2] < 1.2 * peaks[1] < 1.2e6
+
+
+@pytest.mark.parametrize('block', [5, 8192])
+def test_progress_counts_up_to_the_batch(monkeypatch, block):
+    monkeypatch.setattr(closed_loop, 'BLOCK', block)
+    starts, targets = random_batch(10, 5, 3)
+    said = []
+    closed_loops(go_to_goal, starts, targets[..., :2], 3.0, 0.5, duration=8.0, progress=said.append)
+    assert all(sooner < later for sooner, later in itertools.pairwise([0, *said]))
+    assert said[-1] == 15
+
+
+# --- Laws of one's own
+
+
+def test_a_law_sees_rows_and_whatever_gains_it_was_given():
+    seen = set()
+
+    def law(poses, goals, one, many):
+        seen.add((poses.shape, goals.shape, np.shape(one), np.shape(many)))
+        return 0, np.float32(1.0)
+
+    closed_loops(law, np.zeros((2, 3, 3)), [1.0, 0.0], 4.0, np.ones((3,)), duration=1.0)
+    assert seen == {((6, 3), (6, 2), (), (6,))}
+
+
+NO_TWISTS = [
+    None,
+    1.0,
+    (1.0,),
+    (1.0, 2.0, 3.0),
+    'vw',
+    (1j, 0.0),
+    (np.zeros(3), 0.0),
+    (0.0, [[1.0], [2.0]]),
+]
+NOT_FINITE = [(math.nan, 0.0), (0.0, math.inf), (np.array([0.0, np.nan]), 0.0)]
+
+
+@pytest.mark.parametrize('limits', [FREE, LIMITS], ids=['free', 'limited'])
+@pytest.mark.parametrize('twist', NO_TWISTS + NOT_FINITE, ids=str)
+def test_a_law_that_gives_something_else_is_named(twist, limits):
+    with pytest.raises(ValueError, match=r'^law must .*got'):
+        closed_loops(lambda pose, to: twist, np.zeros((2, 3)), [1.0, 0.0], limits=limits)
+
+
+# --- Arrays of limits, bad input
+
+
+def test_limits_as_arrays_are_limits_one_by_one():
+    rng = np.random.default_rng(11)
+    v, omega = rng.choice([-1.0, 1.0], (2, 500)) * 10.0 ** rng.uniform(-3.0, 2.0, (2, 500))
+    drawn = 10.0 ** rng.uniform(-2.0, 1.0, (5, 500)) * [[-1.0], [1.0], [-1.0], [1.0], [10.0]]
+    drawn[:, ::7], drawn[:4, ::5] = [[-np.inf], [np.inf], [-np.inf], [np.inf], [np.inf]], 0.0
+    names = VelocityLimits.names()
+    limited = saturate(v, omega, VelocityLimits(**dict(zip(names, drawn, strict=True))), R, L)
+    ones = [
+        saturate(*twist, VelocityLimits(**dict(zip(names, map(float, row), strict=True))), R, L)
+        for *twist, row in zip(v, omega, drawn.T, strict=True)
+    ]
+    assert np.array_equal(np.transpose(limited), ones)
+
+
+@pytest.mark.parametrize('bad', [[0.5, -0.5], np.array([0.1, np.nan]), 'fast', None, 1j], ids=str)
+@pytest.mark.parametrize('name', VelocityLimits.names())
+def test_a_bad_limit_is_named(name, bad):
+    with pytest.raises(ValueError, match=rf'^{name} must be'):
+        VelocityLimits(**{name: bad})
+
+
+@pytest.mark.parametrize('names', [(), ('max_v',), ('max_wheel_speed',)], ids=str)
+def test_twists_and_limits_that_do_not_broadcast_are_named(names):
+    limits = VelocityLimits(**dict.fromkeys(names, np.ones(2)))
+    with pytest.raises(ValueError, match=r'must have leading axes that broadcast, got .*\(3,\).*\(2,\)'):
+        saturate(np.ones(3), 1.0 if names else np.ones(2), limits, R, L)
+
+
+@pytest.mark.parametrize('bad', [math.nan, math.inf, 'near', 1j], ids=str)
+@pytest.mark.parametrize('name', ['xy_tolerance', 'yaw_tolerance', 'offset'])
+def test_a_bad_arrival_is_named(name, bad):
+    with pytest.raises(ValueError, match=rf'^{name} must be'):
+        Arrival(**{name: bad})
+
+
+BAD = {
+    'starts': [np.zeros(2), 0.0, [0.0, 0.0, np.nan], 'here'],
+    'goals': [[1.0], [1.0] * 4, 1.0, [np.inf, 0.0], np.zeros((3, 2))],
+    'gain 1': [np.nan, np.ones(3), 'much'],
+    'rate': [0.0, -1.0, np.nan, np.inf, 'x', None],
+    'duration': [0.0, -1.0, np.nan, np.inf, 'x', None],
+    'turning_gain': [np.nan, np.ones(3), 'a'],
+    'r': [0.0, -1.0, [0.1, np.nan], np.ones(3)],
+    'L': [0.0, np.inf, [0.1, -0.1], np.ones(3)],
+    'max_v': [np.ones(3)],
+    'offset': [np.ones(3)],
+}
+
+
+@pytest.mark.parametrize('drive', [closed_loops, trajectories])
+@pytest.mark.parametrize(
+    ('name', 'bad'), [(name, bad) for name, row in BAD.items() for bad in row], ids=str
+)
+def test_what_cannot_be_is_named(drive, name, bad):
+    arguments = {'starts': np.zeros((2, 3)), 'goals': [1.0, 0.0], 'gain 1': 0.5}
+    if name in arguments:
+        arguments[name], options = bad, {}
+    elif name == 'max_v':
+        options = {'limits': VelocityLimits(max_v=bad)}
+    else:
+        options = {'arrival': Arrival(offset=bad)} if name == 'offset' else {name: bad}
+    with pytest.raises(ValueError, match=rf'\b{name}\b.* must .*got'):
+        drive(go_to_goal, arguments['starts'], arguments['goals'], 3.0, arguments['gain 1'], **options)
+
+
+def test_headings_that_count_must_be_given():
+    with pytest.raises(ValueError, match=r'^goals must have shape \(\.\.\., 3\), got \(2,\)$'):
+        closed_loops(go_to_goal, np.zeros(3), [1.0, 0.0], 3.0, 0.5, arrival=Arrival(use_heading=True))
