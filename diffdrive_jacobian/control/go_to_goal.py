@@ -52,7 +52,11 @@ def go_to_goal(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any) -> tuple[Any
     c, s = cos(theta), sin(theta)
     # d cos(e) and d sin(e): the way to the goal, seen from the robot. It needs no wrapping. Without
     # negative zeros the angle of (0, 0) is 0.
-    ahead, aside = c * dx + s * dy + 0.0, c * dy - s * dx + 0.0
+    return steer(c * dx + s * dy + 0.0, c * dy - s * dx + 0.0, Kp, Kv)
+
+
+def steer(ahead: Any, aside: Any, Kp: Any, Kv: Any) -> tuple[Any, Any]:
+    """Give the law for a goal that lies `[ahead, aside]` of the robot (m), unchecked."""
     return Kv * ahead, Kp * arctan2(aside, ahead)
 
 

@@ -47,4 +47,9 @@ def offset_point(state: ArrayLike, goal: ArrayLike, k: Any, d: Any) -> tuple[Any
     agree(state=x, goal=x_goal, k=k, d=d)
     dx, dy = x_goal - x, y_goal - y
     c, s = cos(theta), sin(theta)
-    return k * (c * dx + s * dy - d), k * (c * dy - s * dx) / d
+    return steer(c * dx + s * dy, c * dy - s * dx, k, d)
+
+
+def steer(ahead: Any, aside: Any, k: Any, d: Any) -> tuple[Any, Any]:
+    """Give the law for a goal that lies `[ahead, aside]` of the robot (m), unchecked."""
+    return k * (ahead - d), k * aside / d

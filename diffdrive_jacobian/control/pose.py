@@ -68,21 +68,29 @@ def go_to_pose(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any, h: Any = Non
     x_goal, y_goal, heading = components('goal', goal, 3)
     Kp, Kv = operand('Kp', Kp, positive), operand('Kv', Kv, positive)
     agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv)
+    if h is not None:
+        h = operand('h', h, positive)
+        agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv, h=h)
+    dx, dy = x_goal - x, y_goal - y
+    c, s = cos(theta), sin(theta)
+    # Without negative zeros the angle of (0, 0) is 0.
+    ahead, aside = c * dx + s * dy + 0.0, c * dy - s * dx + 0.0
+    return steer(ahead, aside, heading - theta, Kp, Kv, h)
+
+
+def steer(ahead: Any, aside: Any, turn: Any, Kp: Any, Kv: Any, h: Any = None) -> tuple[Any, Any]:
+    """Give the law for a goal that lies `[ahead, aside]` of the robot (m) and looks `turn` further to
+    the left (rad), unchecked.
+    """
     if h is None:
         least = minimum(Kp, 2.0 * FASTER * Kv)
         # The tangent goes on where the parabola would rise steeply; either way h Kv cannot overflow.
         weight = least / (4.0 * Kv) * least + FASTER * (Kp - least)
     else:
-        h = operand('h', h, positive)
-        agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv, h=h)
         weight = h * Kv
-    dx, dy = x_goal - x, y_goal - y
-    c, s = cos(theta), sin(theta)
-    # Without negative zeros the angle of (0, 0) is 0.
-    ahead, aside = c * dx + s * dy + 0.0, c * dy - s * dx + 0.0
     alpha = arctan2(aside, ahead)
-    phi = wrapped(alpha + theta - heading)
     # cos(alpha) sin(alpha) / alpha, without a hole at zero.
     bend = cos(alpha) * sinc(alpha)
-    away = (dx != 0.0) | (dy != 0.0)
-    return Kv * ahead, (Kp * alpha + bend * (Kv * alpha + weight * phi)) * away
+    away = (ahead != 0.0) | (aside != 0.0)
+    omega = Kp * alpha + bend * (Kv * alpha + weight * wrapped(alpha - turn))
+    return Kv * ahead, omega * away

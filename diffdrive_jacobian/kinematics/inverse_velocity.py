@@ -13,6 +13,7 @@ below `CUTOFF max(m, n)` times the largest one.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -85,6 +86,14 @@ def manipulability(J: ArrayLike) -> Array:
         return np.zeros(J.shape[:-2])
     if rows == columns == 2 and _moderate(np.abs(J)):
         return np.asarray(np.abs(J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]))
+    if rows == 2 and _moderate(_dot(J, J).sum(axis=-1)):
+        # Cauchy and Binet: the root of the sum of all squared minors, which loses no digits.
+        squares: Any = 0.0
+        for i in range(columns):
+            for j in range(i):
+                minor = J[..., 0, i] * J[..., 1, j] - J[..., 0, j] * J[..., 1, i]
+                squares = squares + minor * minor
+        return np.asarray(np.sqrt(squares))
     measure: Array = np.linalg.svd(J, compute_uv=False).prod(axis=-1)
     return measure
 
@@ -295,7 +304,7 @@ def _largest(J: Array) -> Array:
 
 def _moderate(values: Array) -> bool:
     """Whether products of such values neither overflow nor vanish; not so of values that are 0."""
-    return bool(((values > 1e-100) & (values < 1e100)).all())
+    return bool(((values > 1e-60) & (values < 1e60)).all())
 
 
 def _task(
@@ -318,23 +327,32 @@ def _gains(values: Array, damping: Array, shape: tuple[int, ...]) -> Array:
 
 def _two_rows(J: Array, x_dot: Array, damping: Array) -> Array:
     """Damped least squares of two rows, in closed form: a turn of the task's plane makes the rows
-    orthogonal, and so singular vectors (Jacobi, one-sided). Ten times as fast as LAPACK on batches.
+    orthogonal, and so singular vectors (Jacobi, one-sided). Many times as fast as LAPACK on batches.
     """
-    first, second = J[..., 0, :], J[..., 1, :]
+    # Column by column, for loops over the short last axis take longer.
+    columns: list[tuple[Any, Any]] = [(J[..., 0, k], J[..., 1, k]) for k in range(J.shape[-1])]
     one, other = x_dot[..., 0], x_dot[..., 1]
     for _ in range(2):  # the second turn mends the rounding of the first where J is nearly singular
-        angle = 0.5 * np.arctan2(2.0 * _dot(first, second), _dot(first, first) - _dot(second, second))
+        first, second, both = _products(columns)
+        angle = 0.5 * np.arctan2(2.0 * both, first - second)
         c, s = np.cos(angle), np.sin(angle)
         one, other = c * one + s * other, c * other - s * one
-        c, s = c[..., np.newaxis], s[..., np.newaxis]
-        first, second = c * first + s * second, c * second - s * first
-    values = np.sqrt(np.stack([_dot(first, first), _dot(second, second)], axis=-1))
-    gains = _gains(values, damping[..., np.newaxis], J.shape[-2:])
-    unit = np.where(values > 0.0, values, 1.0)
-    weights = gains / unit
-    q_dot: Array = (weights[..., 0] * one)[..., np.newaxis] * first
-    q_dot = q_dot + (weights[..., 1] * other)[..., np.newaxis] * second
-    return q_dot
+        columns = [(c * a + s * b, c * b - s * a) for a, b in columns]
+    first, second, _ = _products(columns)
+    values = np.stack([np.sqrt(first), np.sqrt(second)], axis=-1)
+    weights = _gains(values, damping[..., np.newaxis], J.shape[-2:])
+    weights /= np.where(values > 0.0, values, 1.0)
+    one, other = weights[..., 0] * one, weights[..., 1] * other
+    return np.stack([one * a + other * b for a, b in columns], axis=-1)
+
+
+def _products(columns: Sequence[tuple[Any, Any]]) -> tuple[Any, Any, Any]:
+    """Give the squares of two rows, and their product."""
+    return (
+        sum(a * a for a, _ in columns),
+        sum(b * b for _, b in columns),
+        sum(a * b for a, b in columns),
+    )
 
 
 def _projector(J: Array, least: Array) -> tuple[Array, Array]:

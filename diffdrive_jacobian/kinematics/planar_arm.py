@@ -13,6 +13,7 @@ MATH.md, "Manipulators and inverse velocity".
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -93,10 +94,14 @@ class PlanarArm:
         """
         angles = np.cumsum(self._angles(q), axis=-1)
         jacobian = np.ones((*angles.shape[:-1], 3 if heading else 2, self.joints))
-        # From the tip back to the base: what stands beyond a joint is what it turns.
-        along, across = self.lengths * np.cos(angles), -self.lengths * np.sin(angles)
-        jacobian[..., 0, :] = np.cumsum(across[..., ::-1], axis=-1)[..., ::-1]
-        jacobian[..., 1, :] = np.cumsum(along[..., ::-1], axis=-1)[..., ::-1]
+        # From the tip back to the base: what stands beyond a joint is what it turns. Joint by joint, for
+        # loops over the short last axis take longer.
+        along: Any = 0.0
+        across: Any = 0.0
+        for joint in reversed(range(self.joints)):
+            length, angle = self.lengths[joint], angles[..., joint]
+            along, across = along + length * np.cos(angle), across - length * np.sin(angle)
+            jacobian[..., 0, joint], jacobian[..., 1, joint] = across, along
         return jacobian
 
     def determinant(self, q: ArrayLike) -> NDArray[np.float64]:

@@ -30,7 +30,8 @@ from diffdrive_jacobian.ros.parameters import from_ros
 from diffdrive_jacobian.ros.runner import UserError
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.simulation import RobotModel, closed_loops
-from diffdrive_jacobian.simulation.closed_loop import LOST, Law, Outcomes
+from diffdrive_jacobian.simulation._batch import Law, Outcomes
+from diffdrive_jacobian.simulation._block import LOST
 from diffdrive_jacobian.tools import _cli, _sweep_figure
 from diffdrive_jacobian.tools._params_file import robot_parameters
 from diffdrive_jacobian.tools._progress import Batch
