@@ -7,7 +7,7 @@ component by itself and so bends the path.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,10 @@ class VelocityLimits:
     """Fastest counter-clockwise yaw rate (rad/s)."""
     max_wheel_speed: Any = np.inf
     """Fastest speed of either wheel, either way (rad/s)."""
+    unlimited: bool = field(init=False, repr=False, compare=False)
+    """Whether no limit is set."""
+    _bounds: tuple[Any, ...] = field(init=False, repr=False, compare=False)
+    """Of v, then of omega: what is forbidden below and above, and what scales below and above."""
 
     def __post_init__(self) -> None:
         """Check every limit."""
@@ -50,11 +54,19 @@ class VelocityLimits:
             if not np.all(inside):
                 raise ValueError(f'{name} must be {allowed}, got {limit}')
             object.__setattr__(self, name, float(value) if np.ndim(value) == 0 else value)
-
-    @property
-    def unlimited(self) -> bool:
-        """Whether no limit is set."""
-        return all(type(limit) is float and abs(limit) == np.inf for limit in self.all())
+        unlimited = all(type(limit) is float and abs(limit) == np.inf for limit in self.all())
+        object.__setattr__(self, 'unlimited', unlimited)
+        # Made once, for it is asked for with every message.
+        bounds = (
+            (
+                where(low == 0.0, 0.0, -np.inf),
+                where(high == 0.0, 0.0, np.inf),
+                where(low == 0.0, -np.inf, low),
+                where(high == 0.0, np.inf, high),
+            )
+            for low, high in ((self.min_v, self.max_v), (self.min_omega, self.max_omega))
+        )
+        object.__setattr__(self, '_bounds', tuple(bounds))
 
     def all(self) -> tuple[Any, ...]:
         """Give the limits in their order."""
@@ -90,31 +102,26 @@ def saturate(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tupl
     if limits.unlimited:
         agree(v=v, omega=omega)
         return v, omega
-    min_v, max_v, min_omega, max_omega, max_wheel_speed = limits.all()
-    agree(v=v, omega=omega, min_v=min_v, max_v=max_v, min_omega=min_omega, max_omega=max_omega)
-    v, v_excess = _allowed(v, min_v, max_v)
-    omega, omega_excess = _allowed(omega, min_omega, max_omega)
+    if not type(v) is type(omega) is type(limits.min_v) is float:
+        agree(v=v, omega=omega, **dict(zip(limits.names(), limits.all(), strict=True)))
+    v, v_excess = _allowed(v, *limits._bounds[0])
+    omega, omega_excess = _allowed(omega, *limits._bounds[1])
     excess = maximum(1.0, maximum(v_excess, omega_excess))
-    if type(max_wheel_speed) is not float or max_wheel_speed < np.inf:
+    if type(limits.max_wheel_speed) is not float or limits.max_wheel_speed < np.inf:
         omega_R, omega_L = body_to_wheel(v, omega, r, L)
-        agree(wheel_speeds=omega_R, max_wheel_speed=max_wheel_speed)
-        fastest = maximum(abs(omega_R), abs(omega_L))
-        excess = maximum(excess, fastest / max_wheel_speed)
-    if not np.all(excess < np.inf):
+        agree(wheel_speeds=omega_R, max_wheel_speed=limits.max_wheel_speed)
+        excess = maximum(excess, maximum(abs(omega_R), abs(omega_L)) / limits.max_wheel_speed)
+    finite = excess < np.inf
+    if finite is not True and not np.all(finite):
         raise ValueError(f'v and omega must not overflow when they are scaled, got {v} and {omega}')
     # The quotient may round to one unit in the last place beyond the limit.
     return (
-        minimum(maximum(v / excess, min_v), max_v),
-        minimum(maximum(omega / excess, min_omega), max_omega),
+        minimum(maximum(v / excess, limits.min_v), limits.max_v),
+        minimum(maximum(omega / excess, limits.min_omega), limits.max_omega),
     )
 
 
-def _allowed(speed: Any, low: Any, high: Any) -> tuple[Any, Any]:
+def _allowed(speed: Any, floor: Any, ceiling: Any, low: Any, high: Any) -> tuple[Any, Any]:
     """Drop forbidden directions, and tell how many times too fast the rest is."""
-    speed = where(low == 0.0, maximum(speed, 0.0), speed)
-    speed = where(high == 0.0, minimum(speed, 0.0), speed)
-    excess = maximum(
-        speed / where(low < 0.0, low, -np.inf),
-        speed / where(high > 0.0, high, np.inf),
-    )
-    return speed, excess
+    speed = minimum(maximum(speed, floor), ceiling)
+    return speed, maximum(speed / low, speed / high)

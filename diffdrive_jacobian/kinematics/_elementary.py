@@ -60,9 +60,8 @@ def agree(**values: Any) -> None:
     Raises:
         ValueError: They do not; all are named.
     """
-    shapes = {name: np.shape(value) for name, value in values.items() if type(value) is not float}
-    if len(shapes) > 1:
-        leading(**shapes)
+    if set(map(type, values.values())) != {float}:
+        leading(**{name: np.shape(value) for name, value in values.items()})
 
 
 def wrapped(angle: Any) -> Any:
