@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from diffdrive_jacobian.kinematics._checks import not_negative, number
 from diffdrive_jacobian.kinematics._elementary import cos, hypot, operand, sin, wrapped
 
@@ -34,7 +36,8 @@ class Arrival:
         """Check every value."""
         for name in ('xy_tolerance', 'yaw_tolerance'):
             object.__setattr__(self, name, number(name, getattr(self, name), not_negative))
-        object.__setattr__(self, 'offset', operand('offset', self.offset))
+        offset = operand('offset', self.offset)
+        object.__setattr__(self, 'offset', offset if type(offset) is float else np.array(offset))
 
     def distance(self, x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any) -> Any:
         """Give the distance to a goal (m) of the point that is to arrive; arguments broadcast."""

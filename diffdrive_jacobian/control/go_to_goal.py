@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.kinematics._elementary import (
     agree,
+    alike,
     arctan2,
     components,
     cos,
@@ -52,7 +53,8 @@ def go_to_goal(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any) -> tuple[Any
     c, s = cos(theta), sin(theta)
     # d cos(e) and d sin(e): the way to the goal, seen from the robot. It needs no wrapping. Without
     # negative zeros the angle of (0, 0) is 0.
-    return steer(c * dx + s * dy + 0.0, c * dy - s * dx + 0.0, Kp, Kv)
+    v, omega = steer(c * dx + s * dy + 0.0, c * dy - s * dx + 0.0, Kp, Kv)
+    return alike(v, omega)
 
 
 def steer(ahead: Any, aside: Any, Kp: Any, Kv: Any) -> tuple[Any, Any]:

@@ -16,7 +16,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.kinematics._checks import offset
-from diffdrive_jacobian.kinematics._elementary import agree, components, cos, operand, sin
+from diffdrive_jacobian.kinematics._elementary import agree, alike, components, cos, operand, sin
 
 
 def offset_point(state: ArrayLike, goal: ArrayLike, k: Any, d: Any) -> tuple[Any, Any]:
@@ -47,7 +47,8 @@ def offset_point(state: ArrayLike, goal: ArrayLike, k: Any, d: Any) -> tuple[Any
     agree(state=x, goal=x_goal, k=k, d=d)
     dx, dy = x_goal - x, y_goal - y
     c, s = cos(theta), sin(theta)
-    return steer(c * dx + s * dy, c * dy - s * dx, k, d)
+    v, omega = steer(c * dx + s * dy, c * dy - s * dx, k, d)
+    return alike(v, omega)
 
 
 def steer(ahead: Any, aside: Any, k: Any, d: Any) -> tuple[Any, Any]:

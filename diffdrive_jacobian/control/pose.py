@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 from diffdrive_jacobian.kinematics._checks import positive
 from diffdrive_jacobian.kinematics._elementary import (
     agree,
+    alike,
     arctan2,
     components,
     cos,
@@ -45,8 +46,9 @@ def go_to_pose(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any, h: Any = Non
     `V = rho^2 + alpha^2 + h phi^2` never grows, and everything comes to rest on the goal. Near it,
     heading and bearing settle like an oscillator of frequency `Kv sqrt(h)` damped by Kp, the distance
     like exp(-Kv t): for the heading to be there first, Kp should be above 2 Kv. A weight that is larger
-    than it needs to be makes long ways round. If the goal lies behind, the robot backs up; where it may
-    not, it turns first. Sampled, Kp should be below a quarter of the rate.
+    than it needs to be makes long ways round. Where the goal lies behind, the robot backs up while it
+    turns to it, then drives on forwards; where it may not back up, it turns first. Sampled, Kp should be
+    below a quarter of the rate.
 
     Args:
         state: Pose of the robot, shape (..., 3).
@@ -75,7 +77,8 @@ def go_to_pose(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any, h: Any = Non
     c, s = cos(theta), sin(theta)
     # Without negative zeros the angle of (0, 0) is 0.
     ahead, aside = c * dx + s * dy + 0.0, c * dy - s * dx + 0.0
-    return steer(ahead, aside, heading - theta, Kp, Kv, h)
+    v, omega = steer(ahead, aside, heading - theta, Kp, Kv, h)
+    return alike(v, omega)
 
 
 def steer(ahead: Any, aside: Any, turn: Any, Kp: Any, Kv: Any, h: Any = None) -> tuple[Any, Any]:

@@ -98,7 +98,7 @@ class StraightLine:
         positive('speed', speed)
         leading(start=start.shape[:-1], end=end.shape[:-1], speed=speed.shape)
         for name, value in (('start', start), ('end', end), ('speed', speed)):
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, np.array(value))
 
     @property
     def duration(self) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from diffdrive_jacobian.kinematics._checks import floats
-from diffdrive_jacobian.kinematics._elementary import agree, maximum, minimum, operand, where
+from diffdrive_jacobian.kinematics._elementary import agree, alike, maximum, minimum, operand, where
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 
 
@@ -38,13 +38,15 @@ class VelocityLimits:
     """Fastest speed of either wheel, either way (rad/s)."""
     unlimited: bool = field(init=False, repr=False, compare=False)
     """Whether no limit is set."""
+    alike: bool = field(init=False, repr=False, compare=False)
+    """Whether every limit is a number, the same for all robots."""
     _bounds: tuple[Any, ...] = field(init=False, repr=False, compare=False)
     """Of v, then of omega: what is forbidden below and above, and what scales below and above."""
 
     def __post_init__(self) -> None:
         """Check every limit."""
         for name, limit in zip(self.names(), self.all(), strict=True):
-            value = limit if type(limit) is float else floats(name, limit)
+            value = limit if type(limit) is float else np.array(floats(name, limit))
             if name == 'max_wheel_speed':
                 inside, allowed = value > 0.0, 'positive'
             elif name.startswith('min'):
@@ -56,6 +58,7 @@ class VelocityLimits:
             object.__setattr__(self, name, float(value) if np.ndim(value) == 0 else value)
         unlimited = all(type(limit) is float and abs(limit) == np.inf for limit in self.all())
         object.__setattr__(self, 'unlimited', unlimited)
+        object.__setattr__(self, 'alike', all(type(limit) is float for limit in self.all()))
         # Made once, for it is asked for with every message.
         bounds = (
             (
@@ -95,15 +98,23 @@ def saturate(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tupl
         The limited `(v, omega)`, each of shape (...).
 
     Raises:
-        ValueError: v or omega is not finite, or too large to be scaled; shapes do not broadcast; the
-            wheels have a limit, and r or L is not positive and finite.
+        ValueError: v or omega is not finite; shapes do not broadcast; the wheels have a limit, and r or
+            L is not positive and finite.
     """
     v, omega = operand('v', v), operand('omega', omega)
     if limits.unlimited:
         agree(v=v, omega=omega)
-        return v, omega
-    if not type(v) is type(omega) is type(limits.min_v) is float:
-        agree(v=v, omega=omega, **dict(zip(limits.names(), limits.all(), strict=True)))
+        v, omega = alike(v, omega)
+        return (v, omega) if type(v) is float else (np.array(v), np.array(omega))
+    if type(v) is type(omega) is float and limits.alike:
+        return _saturated(v, omega, limits, r, L)
+    agree(v=v, omega=omega, **dict(zip(limits.names(), limits.all(), strict=True)))
+    # What is infinitely too fast is slowed down to nothing.
+    with np.errstate(over='ignore'):
+        return _saturated(v, omega, limits, r, L)
+
+
+def _saturated(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tuple[Any, Any]:
     v, v_excess = _allowed(v, *limits._bounds[0])
     omega, omega_excess = _allowed(omega, *limits._bounds[1])
     excess = maximum(1.0, maximum(v_excess, omega_excess))
@@ -111,9 +122,6 @@ def saturate(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tupl
         omega_R, omega_L = body_to_wheel(v, omega, r, L)
         agree(wheel_speeds=omega_R, max_wheel_speed=limits.max_wheel_speed)
         excess = maximum(excess, maximum(abs(omega_R), abs(omega_L)) / limits.max_wheel_speed)
-    finite = excess < np.inf
-    if finite is not True and not np.all(finite):
-        raise ValueError(f'v and omega must not overflow when they are scaled, got {v} and {omega}')
     # The quotient may round to one unit in the last place beyond the limit.
     return (
         minimum(maximum(v / excess, limits.min_v), limits.max_v),

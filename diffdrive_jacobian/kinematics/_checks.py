@@ -130,9 +130,11 @@ def leading(**shapes: tuple[int, ...]) -> tuple[int, ...]:
     try:
         return np.broadcast_shapes(*shapes.values())
     except ValueError:
-        told = ', '.join(f'{name} {shape}' for name, shape in shapes.items())
+        # A single value goes with everything.
+        several = {name: shape for name, shape in shapes.items() if shape}
+        told = ', '.join(f'{name} {shape}' for name, shape in several.items())
         raise ValueError(
-            f'{" and ".join(shapes)} must have leading axes that broadcast, got {told}'
+            f'{" and ".join(several)} must have leading axes that broadcast, got {told}'
         ) from None
 
 

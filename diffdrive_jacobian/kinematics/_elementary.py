@@ -64,6 +64,13 @@ def agree(**values: Any) -> None:
         leading(**{name: np.shape(value) for name, value in values.items()})
 
 
+def alike(*values: Any) -> tuple[Any, ...]:
+    """Give floats as they are, and arrays in the shape to which they broadcast."""
+    if set(map(type, values)) == {float} or len({np.shape(value) for value in values}) == 1:
+        return values
+    return tuple(map(np.array, np.broadcast_arrays(*values)))
+
+
 def wrapped(angle: Any) -> Any:
     """Wrap angles to (-pi, pi], exactly with respect to the double nearest to 2 pi."""
     if type(angle) is float:

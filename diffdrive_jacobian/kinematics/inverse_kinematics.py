@@ -41,16 +41,19 @@ RELAXED = 0.9
 
 
 class IKResult(NamedTuple):
-    """What was found for each target; the leading axes are those of targets and starts."""
+    """What was found for each target; the leading axes are those of targets and starts.
+
+    Attributes:
+        q: The best joints seen, shape (..., n).
+        converged: Whether the error is within the tolerance, shape (...).
+        iterations: Steps that were tried, shape (...).
+        error: `sqrt(e^T M e)` at q, shape (...); not finite where forward(q0) is not.
+    """
 
     q: Floats
-    """The best joints seen, shape (..., n)."""
     converged: NDArray[np.bool_]
-    """Whether the error is within the tolerance, shape (...)."""
     iterations: NDArray[np.int64]
-    """Steps that were tried, shape (...)."""
     error: Floats
-    """`sqrt(e^T M e)` at q, shape (...); not finite where forward(q0) is not."""
 
 
 def pose_difference(target: ArrayLike, pose: ArrayLike) -> Floats:

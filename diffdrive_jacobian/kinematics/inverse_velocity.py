@@ -23,6 +23,8 @@ from diffdrive_jacobian.kinematics._checks import array, floats, leading, not_ne
 
 CUTOFF = 1e-15
 _EPSILON = float(np.finfo(np.float64).eps)
+_TINY = float(np.finfo(np.float64).tiny)
+"""What is smaller has no inverse that is a number."""
 _STEP = _EPSILON ** (1.0 / 3.0)
 """Of central differences: where rounding and truncation are alike."""
 
@@ -45,10 +47,19 @@ def adjugate_inverse(J: ArrayLike) -> Array:
         ValueError: J has another shape.
     """
     J = array('J', J, 2, 2)
-    determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+    # By powers of two, so that neither products overflow nor digits are lost.
+    _, exponent = np.frexp(np.abs(J).max(axis=(-2, -1)))
+    scaled = np.ldexp(J, -exponent[..., np.newaxis, np.newaxis])
+    determinant = scaled[..., 0, 0] * scaled[..., 1, 1] - scaled[..., 0, 1] * scaled[..., 1, 0]
     # The condition number is |J|^2 / |det| (in the norm of Frobenius).
-    refuse_singular(determinant, np.abs(determinant) <= 4.0 * _EPSILON * _dot(J, J).sum(axis=-1))
-    inverse: Array = adjugate(J) / determinant[..., np.newaxis, np.newaxis]
+    singular = np.abs(determinant) <= 4.0 * _EPSILON * _dot(scaled, scaled).sum(axis=-1)
+    regular = np.where(singular, 1.0, determinant)[..., np.newaxis, np.newaxis]
+    with np.errstate(over='ignore', under='ignore'):
+        inverse: Array = np.ldexp(adjugate(scaled) / regular, -exponent[..., np.newaxis, np.newaxis])
+        # Also where the inverse would be larger than any number.
+        refuse_singular(
+            np.ldexp(determinant, 2 * exponent), singular | ~np.isfinite(inverse).all(axis=(-2, -1))
+        )
     return inverse
 
 
@@ -84,18 +95,12 @@ def manipulability(J: ArrayLike) -> Array:
     rows, columns = J.shape[-2:]
     if rows > columns:
         return np.zeros(J.shape[:-2])
-    if rows == columns == 2 and _moderate(np.abs(J)):
-        return np.asarray(np.abs(J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]))
-    if rows == 2 and _moderate(_dot(J, J).sum(axis=-1)):
-        # Cauchy and Binet: the root of the sum of all squared minors, which loses no digits.
-        squares: Any = 0.0
-        for i in range(columns):
-            for j in range(i):
-                minor = J[..., 0, i] * J[..., 1, j] - J[..., 0, j] * J[..., 1, i]
-                squares = squares + minor * minor
-        return np.asarray(np.sqrt(squares))
-    measure: Array = np.linalg.svd(J, compute_uv=False).prod(axis=-1)
-    return measure
+
+    def by_svd(J: Array) -> Array:
+        with np.errstate(over='ignore', under='ignore'):
+            return np.asarray(np.linalg.svd(J, compute_uv=False).prod(axis=-1))
+
+    return by_svd(J) if rows != 2 else _each(_minors, by_svd, (J, 2))
 
 
 def damping(manipulability: ArrayLike, threshold: ArrayLike, maximum: ArrayLike) -> Array:
@@ -137,13 +142,9 @@ def damped_least_squares(J: ArrayLike, x_dot: ArrayLike, damping: ArrayLike) -> 
     factor = floats('damping', damping)
     not_negative('damping', factor)
     leading(J=J.shape[:-2], x_dot=x_dot.shape[:-1], damping=factor.shape)
-    if J.shape[-2] == 2 and _moderate(_dot(J, J).sum(axis=-1)):
-        return _two_rows(J, x_dot, factor)
-    left, values, right = np.linalg.svd(J, full_matrices=False)
-    along = (x_dot[..., np.newaxis, :] @ left)[..., 0, :]
-    gains = _gains(values, np.broadcast_to(factor[..., np.newaxis], (*factor.shape, 1)), J.shape[-2:])
-    q_dot: Array = ((gains * along)[..., np.newaxis, :] @ right)[..., 0, :]
-    return q_dot
+    if J.shape[-2] != 2:
+        return _by_svd(J, x_dot, factor)
+    return _each(_two_rows, _by_svd, (J, 2), (x_dot, 1), (factor, 0))
 
 
 def null_space_projector(J: ArrayLike) -> Array:
@@ -302,9 +303,59 @@ def _largest(J: Array) -> Array:
     return np.asarray(np.linalg.norm(J, ord=2, axis=(-2, -1)))
 
 
-def _moderate(values: Array) -> bool:
-    """Whether products of such values neither overflow nor vanish; not so of values that are 0."""
-    return bool(((values > 1e-60) & (values < 1e60)).all())
+def _each(
+    usual: Callable[..., Array],
+    careful: Callable[..., Array],
+    *arguments: tuple[Array, int],
+) -> Array:
+    """Treat each Jacobian the usual way, unless squares would overflow or vanish: then carefully. So
+    what becomes of one does not depend on its company.
+
+    Args:
+        usual: Of arguments with the same leading axes, or with some that broadcast.
+        careful: Likewise.
+        arguments: Each with the number of its last axes that belong to one robot; the first is J.
+    """
+    J, _ = arguments[0]
+    with np.errstate(over='ignore', under='ignore'):
+        squares = _dot(J, J).sum(axis=-1)
+    moderate = (squares > 1e-60) & (squares < 1e60)
+    if moderate.all():
+        return usual(*(one for one, _ in arguments))
+    batch = np.broadcast_shapes(*(one.shape[: one.ndim - own] for one, own in arguments))
+    own_shapes = [one.shape[one.ndim - own :] for one, own in arguments]
+    flat = [
+        np.broadcast_to(one, (*batch, *shape)).reshape(-1, *shape)
+        for (one, _), shape in zip(arguments, own_shapes, strict=True)
+    ]
+    which = np.broadcast_to(moderate, batch).reshape(-1)
+    parts = [(rows, way) for rows, way in ((which, usual), (~which, careful)) if rows.any()]
+    given = [(rows, way(*(one[rows] for one in flat))) for rows, way in parts]
+    whole = np.empty((len(which), *given[0][1].shape[1:]))
+    for rows, values in given:
+        whole[rows] = values
+    return whole.reshape((*batch, *whole.shape[1:]))
+
+
+def _minors(J: Array) -> Array:
+    """Give the manipulability of two rows: the root of the sum of all squared minors (Cauchy and Binet),
+    which loses no digits.
+    """
+    squares: Any = 0.0
+    for i in range(J.shape[-1]):
+        for j in range(i):
+            minor = J[..., 0, i] * J[..., 1, j] - J[..., 0, j] * J[..., 1, i]
+            squares = squares + minor * minor
+    return np.asarray(np.sqrt(squares))
+
+
+def _by_svd(J: Array, x_dot: Array, damping: Array) -> Array:
+    """Damped least squares by singular vectors and values."""
+    left, values, right = np.linalg.svd(J, full_matrices=False)
+    along = (x_dot[..., np.newaxis, :] @ left)[..., 0, :]
+    gains = _gains(values, damping[..., np.newaxis], J.shape[-2:])
+    q_dot: Array = ((gains * along)[..., np.newaxis, :] @ right)[..., 0, :]
+    return q_dot
 
 
 def _task(
@@ -319,9 +370,9 @@ def _task(
 def _gains(values: Array, damping: Array, shape: tuple[int, ...]) -> Array:
     """Give s / (s^2 + lambda^2); without damping 1/s, and 0 for what counts as zero."""
     least = CUTOFF * max(shape) * values.max(axis=-1, keepdims=True)
-    kept = (values > 0.0) & ((damping > 0.0) | (values > least))
+    kept = (values > _TINY) & ((damping > 0.0) | (values > least))
     safe = np.where(kept, values, 1.0)
-    with np.errstate(over='ignore'):
+    with np.errstate(over='ignore', under='ignore'):
         return np.where(kept, 1.0 / (safe + damping * (damping / safe)), 0.0)
 
 
@@ -358,7 +409,7 @@ def _products(columns: Sequence[tuple[Any, Any]]) -> tuple[Any, Any, Any]:
 def _projector(J: Array, least: Array) -> tuple[Array, Array]:
     """Give J^+ and I - J^+ J, with singular values up to `least` counted as zero."""
     left, values, right = np.linalg.svd(J, full_matrices=False)
-    kept = values > least[..., np.newaxis]
+    kept = values > np.maximum(least, _TINY)[..., np.newaxis]
     gains = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
     columns = np.swapaxes(right, -1, -2)
     inverse = columns * gains[..., np.newaxis, :] @ np.swapaxes(left, -1, -2)

@@ -264,6 +264,11 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
                 'linear.x.min_velocity is 0: the robot may not back up, which controller offset_point '
                 'does where the goal lies behind; it may come to rest before the goal'
             )
+        if 0.0 in (self._limits.min_omega, self._limits.max_omega):
+            self.get_logger().warning(
+                'angular.z.min_velocity or max_velocity is 0: the robot may turn one way only or not at '
+                'all, goals and headings may stay out of reach'
+            )
         self._judge_gains()
 
     def _judge_gains(self) -> None:

@@ -24,20 +24,23 @@ MAX_STEPS = 1e12
 
 
 class Outcomes(NamedTuple):
-    """What became of each robot; every field has the shape of the batch."""
+    """What became of each robot; every field has the shape of the batch.
+
+    Attributes:
+        arrived: Whether it arrived in time.
+        time: When it arrived; NaN: it did not (s).
+        path_length: Way of the axle centre, backwards too (m).
+        effort: Integral of the squares of both wheel speeds over time (rad^2/s).
+        overshoot: How far it went beyond the goal, along the line from start to goal (m).
+        pose: Where it was at the end, shape (..., 3).
+    """
 
     arrived: Mask
-    """Whether it arrived in time."""
     time: Array
-    """When it arrived; NaN: it did not (s)."""
     path_length: Array
-    """Way of the axle centre, backwards too (m)."""
     effort: Array
-    """Integral of the squares of both wheel speeds (rad^2/s)."""
     overshoot: Array
-    """How far it went beyond the goal, along the line from start to goal (m)."""
     pose: Array
-    """Where it was at the end, shape (..., 3)."""
 
 
 @dataclass(frozen=True, kw_only=True)

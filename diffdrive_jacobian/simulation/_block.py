@@ -29,12 +29,19 @@ ANEW = 32
 """After so many steps cosine and sine of the heading are computed anew."""
 SHRINK = 0.94
 """When less than this share of the robots still drives, the others are let go of."""
-STEERED: dict[Law, Callable[..., tuple[Any, Any]]] = {
-    go_to_goal: lambda ahead, aside, _, *gains: steer_to_goal(ahead, aside, *gains),
-    offset_point: lambda ahead, aside, _, *gains: steer_offset_point(ahead, aside, *gains),
-    go_to_pose: lambda ahead, aside, turn, *gains: steer_to_pose(ahead, aside, turn(), *gains),
-}
-"""Laws of this package, for a goal that is given as seen from the robot."""
+STEERED: tuple[tuple[Law, Callable[..., tuple[Any, Any]]], ...] = (
+    (go_to_goal, lambda ahead, aside, _, *gains: steer_to_goal(ahead, aside, *gains)),
+    (offset_point, lambda ahead, aside, _, *gains: steer_offset_point(ahead, aside, *gains)),
+    (go_to_pose, lambda ahead, aside, turn, *gains: steer_to_pose(ahead, aside, turn(), *gains)),
+)
+"""Laws of this package, and what they are for a goal that is given as seen from the robot."""
+
+
+def steered(law: Law) -> Callable[..., tuple[Any, Any]] | None:
+    """Give what a law of this package is for a goal as seen from the robot; None: not one of them."""
+    return next((core for known, core in STEERED if known is law), None)
+
+
 Keep = Callable[[int, Rows, Array, Any, Any], None]
 
 
@@ -44,6 +51,7 @@ class Block:
     def __init__(self, batch: Batch, rows: Rows) -> None:
         """Place the robots, which are these of the whole batch, at their starts."""
         self.batch, self.rows, count = batch, rows, len(rows)
+        self.steered = steered(batch.law)
         self.x, self.y, theta = batch.starts.T.copy()
         self.theta: Array = wrapped(theta)
         self.open: Mask = np.ones(count, dtype=np.bool_)
@@ -93,7 +101,7 @@ class Block:
             dx, dy = dx - offset * self.c, dy - offset * self.s
         with np.errstate(over='ignore'):
             squared = dx * dx + dy * dy
-        there = squared <= arrival.xy_tolerance**2
+        there = squared <= arrival.xy_tolerance * arrival.xy_tolerance
         if arrival.use_heading:
             self.turning |= there
             there = self.turning & arrival.faces(self.theta, goal[2])
@@ -102,14 +110,13 @@ class Block:
     def _command(self) -> tuple[Array, Array]:
         """Ask the law, and hold what it gives to the limits."""
         batch, shape = self.batch, (len(self.rows),)
-        steered = STEERED.get(batch.law)
-        if steered is None:
+        if self.steered is None:
             twist = batch.law(np.array([self.x, self.y, self.theta]).T, batch.goals, *batch.gains)
         else:
             # Without negative zeros the angle of (0, 0) is 0.
             ahead = self.c * self.dx + self.s * self.dy + 0.0
             aside = self.c * self.dy - self.s * self.dx + 0.0
-            twist = steered(ahead, aside, self._turn, *batch.gains)
+            twist = self.steered(ahead, aside, self._turn, *batch.gains)
         try:
             v, omega = (np.broadcast_to(floats('law', part), shape) for part in twist)
         except (TypeError, ValueError) as error:
@@ -125,7 +132,7 @@ class Block:
         finite = np.isfinite(v) & np.isfinite(omega)
         if not finite.all():
             row = int(np.argmin(finite))
-            pose = self.x[row], self.y[row], self.theta[row]
+            pose = [float(one[row]) for one in (self.x, self.y, self.theta)]
             raise ValueError(
                 f'law must give finite (v, omega), got ({v[row]}, {omega[row]}) at pose {pose}'
             )

@@ -20,22 +20,28 @@ from numpy.typing import ArrayLike
 from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.simulation._batch import Array, Batch, Law, Outcomes, Rows
-from diffdrive_jacobian.simulation._block import STEERED, Block, Keep
+from diffdrive_jacobian.simulation._block import Block, Keep, steered
 
 BLOCK = 8192
 """Robots that are advanced together: as many as fit into the processor's cache."""
+MAX_SAMPLES = 1e9
+"""As many are kept: 40 GB."""
 NO_LIMITS = VelocityLimits()
 
 
 class Trajectories(NamedTuple):
-    """Every sample of every robot, k + 1 of them; who has arrived stands still."""
+    """Every sample of every robot, k + 1 of them; who has arrived stands still.
+
+    Attributes:
+        times: Shape (k + 1,) (s).
+        poses: Shape (k + 1, ..., 3): time first, then the batch.
+        twists: `[v, omega]` held from each sample to the next, shape (k, ..., 2) (m/s, rad/s).
+        outcomes: What became of each robot, as `closed_loops` gives it.
+    """
 
     times: Array
-    """Shape (k + 1,) (s)."""
     poses: Array
-    """Shape (k + 1, ..., 3)."""
     twists: Array
-    """`[v, omega]` held from each sample to the next, shape (k, ..., 2) (m/s, rad/s)."""
     outcomes: Outcomes
 
 
@@ -62,8 +68,9 @@ def closed_loops(
         gains: Whatever else the law takes, each of shape (...).
         rate: How often the law is asked (Hz).
         duration: After how long a robot is given up (s).
-        arrival: What counts as having arrived; None: the defaults of `Arrival`. If the heading counts, a
-            robot that has reached its position turns in place.
+        arrival: What counts as having arrived, a `control.Arrival`; None: its defaults. If the heading
+            counts (`use_heading=True`, as with go_to_pose), a robot that has reached its position turns
+            in place. With the law offset_point give its offset, for the point arrives, not the axle.
         turning_gain: Gain of that turn, shape (...) (1/s).
         limits: What the drives can do.
         r: Wheel radius, shape (...) (m).
@@ -98,6 +105,11 @@ def trajectories(
     Arguments and errors are those of `closed_loops`.
     """
     batch = Batch.of(law, starts, goals, gains, rate, duration, arrival, turning_gain, limits, r, L)
+    if (batch.steps + 1) * batch.size > MAX_SAMPLES:
+        raise ValueError(
+            f'duration must be shorter, for at most {MAX_SAMPLES:g} samples are kept, got {duration:g} '
+            f'with {batch.size} robots'
+        )
     poses = np.empty((batch.steps + 1, batch.size, 3))
     twists = np.zeros((batch.steps, batch.size, 2))
     last = np.zeros(batch.size, dtype=np.intp)
@@ -121,7 +133,7 @@ def trajectories(
 
 def _drive(batch: Batch, keep: Keep | None, progress: Callable[[int], object] | None) -> Outcomes:
     """Drive a batch, block by block."""
-    if batch.law in STEERED:
+    if steered(batch.law) is not None:
         # It checks its arguments; on their way the robots ask only for what it gives.
         batch.law(batch.starts, batch.goals, *batch.gains)
     count = batch.size

@@ -18,6 +18,7 @@ from diffdrive_jacobian.kinematics.inverse_velocity import damping as damping_fa
 from diffdrive_jacobian.kinematics.inverse_velocity import manipulability
 
 Array = NDArray[np.float64]
+MAX_STEPS = 1e8
 
 
 class Manipulator(Protocol):
@@ -34,16 +35,19 @@ class Manipulator(Protocol):
 
 
 class Tracking(NamedTuple):
-    """How a line was followed, at k + 1 samples."""
+    """How a line was followed, at k + 1 samples.
+
+    Attributes:
+        times: Shape (k + 1,) (s).
+        q: Configurations, shape (k + 1, ..., n).
+        q_dot: Velocities held from each sample to the next, shape (k, ..., inputs) (rad/s).
+        error: Distance of the tip from where it should be, shape (k + 1, ...) (m).
+    """
 
     times: Array
-    """Shape (k + 1,) (s)."""
     q: Array
-    """Configurations, shape (k + 1, ..., n)."""
     q_dot: Array
-    """Velocities held from each sample to the next, shape (k, ..., inputs) (rad/s)."""
     error: Array
-    """Distance of the tip from where it should be, shape (k + 1, ...) (m)."""
 
 
 def track_line(
@@ -66,10 +70,11 @@ def track_line(
     Args:
         robot: The arm or the mobile manipulator.
         q0: Configurations at the start, shape (..., n).
-        line: Where the tip is to be; leading axes as those of q0.
+        line: Where the tip is to be, a `control.StraightLine`; leading axes as those of q0.
         rate: How often velocities are computed; each is held until the next (Hz).
         gain: K of the feedback (1/s); below the rate.
-        threshold: Manipulability below which damping sets in; None: never.
+        threshold: Manipulability below which damping sets in; None: never, and near a singularity the
+            joints race.
         maximum_damping: lambda of a singular Jacobian.
         secondary: Gives, for configurations, joint velocities that are wished for besides.
         settling: How long to go on when the line has ended (s).
@@ -89,11 +94,15 @@ def track_line(
     gain = number('gain', gain, not_negative)
     if gain >= rate:
         raise ValueError(f'gain must be at least 0 and below the rate {rate:g}, got {gain:g}')
+    if not rate * (float(np.max(line.duration, initial=0.0)) + settling) < MAX_STEPS:
+        raise ValueError(f'rate must make fewer than {MAX_STEPS:g} samples of the line, got {rate:g}')
     steps = math.ceil(rate * (float(np.max(line.duration, initial=0.0)) + settling) - 1e-9)
     most = number('maximum_damping', maximum_damping, not_negative)
     if threshold is not None:
         threshold = number('threshold', threshold, positive)
     q = array('q0', q0, 'n')
+    if not isinstance(line, StraightLine):
+        raise ValueError(f'line must be a control.StraightLine, got {line!r:.60}')
     if line.start.shape[-1] != 2:
         raise ValueError(f'line must have 2 coordinates, got {line.start.shape[-1]}')
     leading(q0=q.shape[:-1], line=line.duration.shape)

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -80,6 +81,8 @@ class Observer(Node):  # type: ignore[misc]
         """Speeds of the right and left wheel (rad/s)."""
         self.status = GoalStatus.STATUS_UNKNOWN
         self._sent: Goals | None = None
+        self.over = False
+        """Whether the drive is over: nothing is sent any more."""
         self._publisher = self.create_publisher(Goals, 'goals', 10)
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.create_subscription(GoalStatus, 'goal_status', self._on_status, latched)
@@ -114,7 +117,7 @@ class Observer(Node):  # type: ignore[misc]
         self.seen = messages.from_time(message.header.stamp)
         twist = message.twist.twist
         self.moving = (twist.linear.x, twist.angular.z) != (0.0, 0.0)
-        if self._sent is None:
+        if self._sent is None and not self.over:
             self._send()
 
     def _send(self) -> None:
@@ -146,6 +149,8 @@ class Outcome:
     """Where the robot stopped; None: it never reported."""
     distance: float
     """To the last goal, of the point that was to arrive (m)."""
+    offset: float
+    """How far that point is ahead of the axle (m)."""
     seconds: float
     """How long it took (s); in lockstep, of simulated time."""
 
@@ -198,14 +203,19 @@ def drive(
 
         runner.spin(over)
         seconds, status = runner.seconds() - begun, observer.status
+        observer.over = True
+        why = 'interrupted' if signals.count else 'out of time'
         if not observer.ended:
-            controller.stop('interrupted' if signals.count else 'out of time')
+            controller.stop(why)
         settled = robot.now() + nanoseconds(SETTLING)
         before = signals.count
         patience = runner.seconds() + STOP_PATIENCE + 1.0 / robot.parameters.publish_rate
 
         def settled_or_late() -> bool:
             tend()
+            if controller.waypoint is not None:
+                # The goals were still on their way to it.
+                controller.stop(why)
             still = observer.seen >= settled and not observer.moving
             return bool(still or runner.seconds() > patience or signals.count > before)
 
@@ -216,6 +226,7 @@ def drive(
         interrupted=signals.count > 0,
         pose=observer.pose,
         distance=observer.distance,
+        offset=controller.arrival.offset,
         seconds=seconds,
     )
 
@@ -260,6 +271,9 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             recording = begin_recording('drive', options.output, 'mcap')
     except OSError as error:
         return _cli.complain(PROGRAM, error)
+    if recording is not None and not options.no_plot and _picture(recording).exists():
+        recording.discard()
+        return _cli.complain(PROGRAM, f'{_picture(recording)} exists already; it is not overwritten')
     try:
         with stage as runner:
             outcome = drive(
@@ -294,13 +308,17 @@ def _parameters(options: argparse.Namespace) -> dict[str, Any]:
     return {name: value for name, value in asked.items() if value is not None}
 
 
+def _picture(recording: Recording) -> Path:
+    return recording.bag.with_name(recording.bag.name + '.png')
+
+
 def _keep(recording: Recording, *, plot: bool) -> int:
     """Make the bag and its picture, and say where they are; gives the exit code."""
     try:
         recording.finish()
         print(f'recorded: {recording.bag}')
         if plot:
-            picture = recording.bag.with_name(recording.bag.name + '.png')
+            picture = _picture(recording)
             draw([read_run(recording.bag)], picture)
             print(f'drawn: {picture}')
     except ModuleNotFoundError:
@@ -342,9 +360,10 @@ def _report(outcome: Outcome, timeout: float, time: str) -> int:
         where = 'the robot never reported where it is'
     else:
         x, y, theta = outcome.pose
+        of = f' with the point {outcome.offset:g} m ahead of its axle' if outcome.offset else ''
         where = (
             f'the robot stopped at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, '
-            f'{outcome.distance:.3f} m from the goal, after {outcome.seconds:.1f} s{time}'
+            f'{outcome.distance:.3f} m from the goal{of}, after {outcome.seconds:.1f} s{time}'
         )
     if outcome.status == GoalStatus.STATUS_SUCCEEDED:
         print(f'arrived: {where}')
