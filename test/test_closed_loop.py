@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import tracemalloc
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -176,6 +177,37 @@ def test_each_robot_turns_in_place_with_its_own_gain():
 
 
 # --- Who does not arrive, and who is there
+
+
+def test_a_law_may_be_any_callable():
+    @dataclass
+    class Law:
+        gain: float
+
+        def __call__(self, poses, goals):
+            return go_to_goal(poses, goals, self.gain, 0.5)
+
+    found = closed_loops(Law(3.0), [0.0] * 3, [1.0, 1.0])
+    assert found.time == closed_loops(go_to_goal, [0.0] * 3, [1.0, 1.0], 3.0, 0.5).time
+
+
+def test_laws_give_the_shape_of_the_batch_whichever_argument_has_it():
+    Kp = np.full((2, 1), 3.0)
+    for v, omega in (
+        go_to_goal(np.zeros((7, 3)), [1.0, 1.0], Kp, 0.5),
+        go_to_goal(np.zeros((7, 3)), [1.0, 1.0], 3.0, Kp),
+        go_to_pose(np.zeros((7, 3)), [1.0, 1.0, 0.0], Kp, 0.5),
+        offset_point(np.zeros((7, 3)), [1.0, 1.0], Kp, 0.1),
+    ):
+        assert v.shape == omega.shape == (2, 7)
+
+
+def test_values_keep_their_own_numbers():
+    mine = np.array([1.0, 2.0])
+    limits, arrival = VelocityLimits(max_v=mine), Arrival(offset=mine)
+    v, omega = saturate(mine, mine, VelocityLimits(), R, L)
+    mine[0] = -5.0
+    assert limits.max_v[0] == arrival.offset[0] == v[0] == omega[0] == 1.0
 
 
 def test_who_never_arrives_has_no_time_and_is_where_the_time_ran_out():

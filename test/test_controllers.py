@@ -216,6 +216,16 @@ def test_gains_are_warned_about_only_with_the_law_they_do_not_fit(
     assert warned(capfd) == expected
 
 
+@pytest.mark.parametrize('name', ['go_to_goal', 'offset_point', 'pose'])
+@pytest.mark.parametrize('limit', ['linear__x__max_velocity', 'angular__z__max_velocity'])
+def test_the_tiniest_limit_kills_no_node(lockstep, name, limit):
+    controller = Controller(lockstep, controller=name, kp=100.0, kv=50.0, **{limit: 5e-324})
+    controller.send(goal(5.0, 3.0))
+    v, omega = controller.at(0.0, 0.0)
+    assert math.isfinite(v)
+    assert math.isfinite(omega)
+
+
 @pytest.mark.parametrize(
     ('name', 'limit', 'expected'),
     [

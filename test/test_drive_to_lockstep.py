@@ -93,6 +93,23 @@ def test_without_a_heading_any_will_do(capsys):
     assert theta == pytest.approx(math.pi / 2.0, abs=0.2)
 
 
+def test_nothing_is_driven_once_the_drive_is_over(tmp_path, capsys):
+    """The time is up before the robot was heard of, and so before a goal was sent."""
+    assert drive_to.main(['1', '1', '--timeout', '1e-9', '--no-plot', '-o', 'bag'], Signals()) == 1
+    assert 'the robot stopped at x 0.000 m, y 0.000 m' in last_line(capsys)
+    run = read_run(tmp_path / 'bag')
+    assert len(run.goals) == 0
+    assert not run.cmd_vel_out.values.any()
+
+
+def test_picture_that_is_there_is_told_of_before_the_drive(tmp_path, capsys):
+    (tmp_path / 'bag.png').write_text('precious')
+    assert drive_to.main(['1', '1', '--lockstep', '-o', 'bag'], Signals()) == 2
+    assert 'bag.png exists already' in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ['bag.png']
+    assert (tmp_path / 'bag.png').read_text() == 'precious'
+
+
 def test_timeout_is_of_simulated_time(capsys):
     assert drive_to.main(['50', '0', '--lockstep', '--no-record', '--timeout', '3'], Signals()) == 1
     line = last_line(capsys)

@@ -95,6 +95,30 @@ def test_the_adjugate_never_gives_what_is_rounding_error_only():
     assert np.all(size(inverses[which] - right) <= 0.01 * size(right))
 
 
+@pytest.mark.parametrize('scale', [1e-300, 1e-161, 1e200, 1e307])
+def test_the_adjugate_inverts_whatever_the_units(scale):
+    J = np.array([[1.0, 1.0], [0.5, 2.0]])
+    np.testing.assert_allclose(iv.adjugate_inverse(J * scale) * scale, np.linalg.inv(J), rtol=1e-12)
+
+
+def test_an_inverse_that_no_number_can_hold_is_refused():
+    with pytest.raises(np.linalg.LinAlgError, match='must not be singular'):
+        iv.adjugate_inverse(np.eye(2) * 1e-310)
+    tiny = np.eye(2) * 1e-310
+    assert not iv.pseudoinverse(tiny).any()
+    assert np.isfinite(iv.damped_least_squares(tiny, [1e-310, 0.0], 1e-310)).all()
+
+
+@pytest.mark.parametrize('other', [0.0, 1e-170, 1e170])
+def test_what_becomes_of_a_jacobian_does_not_depend_on_its_company(other):
+    J = np.array([[0.1, 0.2, 0.3], [0.2, 0.4, 0.6 * (1.0 + 1e-12)]])
+    company = np.stack([J, np.full((2, 3), other)])
+    alone = iv.damped_least_squares(J, [1.0, 0.0], [0.0, 0.1])
+    together = iv.damped_least_squares(company[:, np.newaxis], [1.0, 0.0], [0.0, 0.1])
+    assert np.array_equal(together[0], alone)
+    assert iv.manipulability(company)[0] == iv.manipulability(J)
+
+
 def test_the_axle_centre_is_refused_and_so_is_one_of_a_batch_with_its_index():
     theta, r, L = np.random.default_rng(3).uniform(0.01, 3.0, (3, 500))
     for J in [*diff_drive.wheel_to_position_jacobian(theta, r, L), np.zeros((2, 2))]:

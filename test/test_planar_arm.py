@@ -316,7 +316,7 @@ BAD = [
     ('q and wrench must .* broadcast', lambda q: ARM.joint_torques(q, ONES[2]), [np.ones((3, 2))]),
     ('q_dot must', lambda q_dot: ARM.integrate([0.0] * 2, q_dot, 1.0), [[0.0], [NAN, 0.0]]),
     ('dt must', lambda dt: ARM.integrate([0.0] * 2, [0.0] * 2, dt), [NAN, 'a', 1j]),
-    ('q and .*dt must .* broadcast', lambda dt: ARM.integrate([0.0] * 2, ONES[2], dt), [np.ones(3)]),
+    ('q_dot and dt must .* broadcast', lambda dt: ARM.integrate([0.0] * 2, ONES[2], dt), [np.ones(3)]),
     ('r must', lambda r: MobileManipulator(r, L, ARM), [*NOT_LENGTHS, NAN, None, 1j, [R, R], '0.1']),
     ('L must', lambda L: MobileManipulator(R, L, ARM), [*NOT_LENGTHS, NAN, None, 1j, [L, L], '0.1']),
     ('mount must', lambda m: MobileManipulator(R, L, ARM, m), [1.0, [1.0], [[0, 0]], [NAN, 0.0], 'a']),

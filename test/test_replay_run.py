@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -67,7 +68,7 @@ def test_goals_drive_a_new_robot_to_the_same_place(world, bag):
     world.start('go_to_goal')
     told, commands = world.harness.listen(Goals, 'goals'), world.harness.listen(Twist, 'cmd_vel')
     world.until_published('odom', 'cmd_vel')
-    child = world.start('replay_run', str(path), '--goals')
+    child = world.start('replay_run', str(path), '--goals', '-w', '2')
     world.harness.until(lambda: commands, 'the controller drives')
     assert told[0].goals[0].pose.position.x == 1.0
     assert child.exit() == 0
@@ -92,11 +93,17 @@ def test_everything_remapped_with_a_clock_in_loops_until_interrupted(world, bag)
 def test_offset_leaves_the_beginning_out(world, bag):
     path, run = bag
     commands = world.harness.listen(Twist, 'cmd_vel')
-    child = world.start('replay_run', str(path), '--start-offset', '1.5', '-r', '5')
-    assert child.exit() == 0
-    count = int(child.last_line.split()[0])
-    assert 20 <= count <= 30
-    world.harness.until(lambda: len(commands) == count, 'all have come')
+    for _ in range(3):
+        child = world.start('replay_run', str(path), '--start-offset', '1.5', '-r', '5')
+        assert child.exit() == 0
+        count = int(child.last_line.split()[0])
+        assert 20 <= count <= 30
+        with suppress(AssertionError):
+            world.harness.until(lambda: len(commands) == count, 'all have come', 2.0)  # noqa: B023
+        if len(commands) == count:
+            break
+        # On a busy machine DDS may have matched us later than it told the tool.
+        commands.clear()
     assert twists(commands) == run.cmd_vel.values[-count:].tolist()
 
 
@@ -151,6 +158,7 @@ def test_bag_of_others_is_verified_with_parameters_from_a_file(capsys, request, 
         (['BAG', '--start-offset', '-1'], 'must not be negative'),
         (['BAG', '--topics', '/nothing'], 'has no topic /nothing; it has /cmd_vel'),
         (['BAG', '-m', 'nonsense'], 'must be OLD:=NEW'),
+        (['BAG', '-w', '0'], 'must be a whole number of at least 1'),
         (
             ['BAG', '--verify', '--params-file', 'file.txt'],
             'file of ROS parameters, got file.txt',

@@ -89,6 +89,13 @@ def test_waypoints_already_reached_are_skipped_in_one_step(arrival):
     assert command == (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
 
 
+def test_a_turn_that_is_not_asked_for_any_more_ends():
+    turning = Waypoints(POSES[:1], turning=True)
+    here = np.array([1.0, 0.0, 0.0])
+    assert turning.follow(here, refuses, WITH_HEADING, GAIN)[1] == turn_in_place(0.0, 2.0, GAIN)
+    assert turning.follow(here, refuses, POSITIONS_ONLY, GAIN)[1] is None
+
+
 def test_when_every_waypoint_is_reached_there_is_no_command():
     near = np.array([[0.01, 0.0, 1.0], [0.0, -0.01, 2.0]])
     here, command = Waypoints(near).follow(np.zeros(3), refuses, POSITIONS_ONLY, GAIN)

@@ -138,7 +138,12 @@ class Replayer(Node):  # type: ignore[misc]
     @property
     def unheard(self) -> list[str]:
         """The topics that nobody is matched to."""
-        return [one.topic_name for one in self._outlets.values() if not one.get_subscription_count()]
+        return self.heard_by_fewer(1)
+
+    def heard_by_fewer(self, readers: int) -> list[str]:
+        """Give the topics that have fewer readers."""
+        outlets = self._outlets.values()
+        return [one.topic_name for one in outlets if one.get_subscription_count() < readers]
 
     def rivals(self) -> dict[str, list[str]]:
         """Name the others that publish on the same topics."""

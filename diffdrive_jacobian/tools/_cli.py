@@ -72,6 +72,26 @@ def positive(text: str) -> float:
     return value
 
 
+def count(text: str) -> int:
+    """Read how many there are to be, at least one."""
+    if not (text.isascii() and text.isdigit()) or int(text) < 1:
+        raise argparse.ArgumentTypeError(f'must be a whole number of at least 1, got {text!r}')
+    return int(text)
+
+
+def add_wait_matching(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add the option that `ros2 topic pub` has for readers which are found late."""
+    parser.add_argument(
+        '-w',
+        '--wait-matching-subscriptions',
+        dest='readers',
+        metavar='N',
+        type=count,
+        default=1,
+        help=f'wait until {what} N readers (%(default)s); discovery may take three seconds for each',
+    )
+
+
 def tolerance(text: str) -> float:
     """Read a distance that go_to_goal takes as xy_goal_tolerance (m)."""
     value = number(text)

@@ -30,7 +30,12 @@ MATCH_QUIET = 0.5
 
 
 def replay(
-    bag: Path, playback: Playback, ros: Sequence[str], signals: Signals, acked: float | None
+    bag: Path,
+    playback: Playback,
+    ros: Sequence[str],
+    signals: Signals,
+    acked: float | None,
+    readers: int = 1,
 ) -> int:
     """Play a bag; gives the exit code.
 
@@ -41,6 +46,7 @@ def replay(
         signals: What was caught so far.
         acked: How long to wait at the end until all readers have everything (s; 0: for ever); None:
             not at all.
+        readers: How many each topic should have before anything is played.
 
     Raises:
         UserError: The ROS arguments cannot be.
@@ -52,7 +58,7 @@ def replay(
         running(context, closed_world=False) as runner,
     ):
         player = runner.add(lambda: Replayer(reader, playback, context=context))
-        _wait_for_subscribers(player, runner, signals)
+        _wait_for_subscribers(player, runner, signals, readers)
         for topic, others in player.rivals().items():
             player.get_logger().warning(f'{", ".join(others)} also publishes on {topic}')
         for topic in player.unheard:
@@ -76,14 +82,14 @@ def replay(
     return _cli.DONE if alive and player.done else _cli.FAILED
 
 
-def _wait_for_subscribers(player: Replayer, runner: Runner, signals: Signals) -> None:
+def _wait_for_subscribers(player: Replayer, runner: Runner, signals: Signals, readers: int) -> None:
     """Wait until those who listen are matched: what is sent before is lost to them."""
     begun = quiet = time.monotonic()
     heard = -1
 
     def matched() -> bool:
         nonlocal quiet, heard
-        now, unheard = time.monotonic(), len(player.unheard)
+        now, unheard = time.monotonic(), len(player.heard_by_fewer(readers))
         if unheard != heard:
             quiet, heard = now, unheard
         complete = unheard == 0 and now - quiet >= MATCH_QUIET
@@ -155,7 +161,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     try:
         if options.verify:
             return _verify(bag, options)
-        return replay(bag, playback, ros, signals, acked)
+        return replay(bag, playback, ros, signals, acked, options.readers)
     except (UserError, BagError, ParameterError) as error:
         return _cli.complain(PROGRAM, error)
 
@@ -213,6 +219,7 @@ def _parser() -> argparse.ArgumentParser:
         help="publish the bag's time on /clock (40)",
     )
     parser.add_argument('-p', '--start-paused', action='store_true', help='begin with a pause')
+    _cli.add_wait_matching(parser, 'each topic has')
     parser.add_argument(
         '--wait-for-all-acked',
         type=_not_negative,

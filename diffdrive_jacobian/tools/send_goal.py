@@ -43,8 +43,10 @@ ENDS = {
 class Sender(Node):  # type: ignore[misc]
     """Sends one goal and follows what becomes of it."""
 
-    def __init__(self, goal: NDArray[np.float64], frame: str, context: Context) -> None:
-        """Prepare to send a goal `[x, y, theta]`, shape (3,)."""
+    def __init__(
+        self, goal: NDArray[np.float64], frame: str, context: Context, readers: int = 1
+    ) -> None:
+        """Prepare to send a goal `[x, y, theta]`, shape (3,), to so many readers."""
         super().__init__('send_goal', context=context, start_parameter_services=False)
         self.goal = goal
         self.status = GoalStatus.STATUS_UNKNOWN
@@ -52,6 +54,7 @@ class Sender(Node):  # type: ignore[misc]
         self.seen = time.monotonic()
         """When odometry came last, or the watch for it began (s, monotonic)."""
         self._frame = frame
+        self._readers = readers
         self._message: PoseStamped | None = None
         self._publisher = self.create_publisher(PoseStamped, 'goal_pose', 10)
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -82,7 +85,11 @@ class Sender(Node):  # type: ignore[misc]
             if reader.qos_profile.durability != DurabilityPolicy.TRANSIENT_LOCAL
         ]
         tellers = self.get_publishers_info_by_topic(self.resolve_topic_name('goal_status'))
-        matched = self._publisher.get_subscription_count() >= len(readers)
+        found = self._publisher.get_subscription_count()
+        if readers and found < self._readers:
+            topic = self.resolve_topic_name('goal_pose')
+            return f'{topic} has {found} readers, not the {self._readers} that are to be waited for'
+        matched = found >= len(readers)
         if not (matched and _nodes(readers) & _nodes(tellers)):
             return (
                 f'nobody reads {self.resolve_topic_name("goal_pose")} and publishes '
@@ -249,7 +256,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             ros_context([PROGRAM, *ros]) as context,
             running(context, closed_world=False) as runner,
         ):
-            sender = runner.add(lambda: Sender(goal, options.frame, context))
+            sender = runner.add(lambda: Sender(goal, options.frame, context, options.readers))
             return follow(sender, runner, signals, options)
     except UserError as error:
         return _cli.complain(PROGRAM, error)
@@ -264,6 +271,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument('x', metavar='X', type=_cli.coordinate, help='goal (m)')
     parser.add_argument('y', metavar='Y', type=_cli.coordinate, help='goal (m)')
+    _cli.add_wait_matching(parser, 'goal_pose has')
     parser.add_argument(
         '--heading',
         type=_cli.number,
