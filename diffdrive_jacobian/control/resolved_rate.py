@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._checks import array, floats, leading, not_negative, positive
-from diffdrive_jacobian.kinematics.inverse_velocity import damped_least_squares
+from diffdrive_jacobian.kinematics.inverse_velocity import damped_least_squares, redundant
 
 
 def resolved_rate(
@@ -50,7 +50,7 @@ def resolved_rate(
         Joint velocities, shape (..., n).
     """
     J = array('J', J, 'm', 'n')
-    m, n = J.shape[-2:]
+    m = J.shape[-2]
     x, x_desired = array('x', x, m), array('x_desired', x_desired, m)
     x_dot_desired, K = array('x_dot_desired', x_dot_desired, m), floats('gain', gain)
     not_negative('gain', K)
@@ -71,9 +71,7 @@ def resolved_rate(
     x_dot = x_dot_desired + correction
     if q_dot_0 is None:
         return damped_least_squares(J, x_dot, damping)
-    wish = array('q_dot_0', q_dot_0, n)
-    leading(J=J.shape[:-2], x_dot=x_dot.shape[:-1], q_dot_0=wish.shape[:-1])
-    return wish + damped_least_squares(J, x_dot - (J @ wish[..., np.newaxis])[..., 0], damping)
+    return redundant(J, x_dot, q_dot_0, damping)
 
 
 @dataclass(frozen=True, eq=False)

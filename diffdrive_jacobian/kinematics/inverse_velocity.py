@@ -224,13 +224,14 @@ def joint_limit_gradient(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> Ar
     return gradient
 
 
-def redundant(J: ArrayLike, x_dot: ArrayLike, q_dot_0: ArrayLike) -> Array:
+def redundant(J: ArrayLike, x_dot: ArrayLike, q_dot_0: ArrayLike, damping: ArrayLike = 0.0) -> Array:
     """Do a task, and come near to other joint velocities: `J^+ x_dot + N q_dot_0` (A, C).
 
     Args:
         J: Jacobians, shape (..., m, n).
         x_dot: Velocities of the task, shape (..., m).
         q_dot_0: Joint velocities that are wished for besides, shape (..., n).
+        damping: lambda of damped least squares, in the place of J^+, shape (...).
 
     Returns:
         Joint velocities, shape (..., n): with `q_dot_0 = 0` the least ones.
@@ -240,7 +241,7 @@ def redundant(J: ArrayLike, x_dot: ArrayLike, q_dot_0: ArrayLike) -> Array:
     leading(J=J.shape[:-2], x_dot=x_dot.shape[:-1], q_dot_0=wish.shape[:-1])
     # J^+ (x_dot - J q_dot_0) + q_dot_0, which needs no projector.
     missing = x_dot - (J @ wish[..., np.newaxis])[..., 0]
-    return wish + damped_least_squares(J, missing, 0.0)
+    return wish + damped_least_squares(J, missing, damping)
 
 
 def prioritized(tasks: Sequence[tuple[ArrayLike, ArrayLike]], *, cutoff: float = 1e-9) -> Array:
