@@ -17,6 +17,8 @@ from rclpy.serialization import deserialize_message
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
+from diffdrive_jacobian.bags.bounded_reader import BoundedReader
+from diffdrive_jacobian.bags.limits import TooLargeError
 from diffdrive_jacobian.bags.recorder import PARAMETERS, message_class
 from diffdrive_jacobian.ros.messages import (
     MessageError,
@@ -25,6 +27,7 @@ from diffdrive_jacobian.ros.messages import (
     from_time,
     from_twist,
 )
+from diffdrive_jacobian.text import printable
 
 WHEELS = ('left_wheel_joint', 'right_wheel_joint')
 """Joints that are taken for wheels where no parameters tell their names: left, right."""
@@ -136,10 +139,10 @@ def open_bag(path: Path) -> Iterator[Reader]:
         what = 'an empty folder' if not any(path.iterdir()) else 'a folder without metadata.yaml'
         raise BagError(f'{path} is {what}, not a bag (recover_run makes one from what a crash has left)')
     try:
-        reader = Reader(path)
+        reader = BoundedReader(path)
         reader.open()
     except Exception as error:  # whatever the parsers of a damaged file raise
-        raise BagError(f'{path} is not a bag that can be read: {error!r}') from error
+        raise BagError(f'{path} is not a bag that can be read: {_described(error)}') from error
     try:
         yield reader
     finally:
@@ -174,8 +177,16 @@ def messages(
     try:
         for connection, received, data in reader.messages(connections):
             yield connection, received, bytes(data)
+    except TooLargeError as error:
+        raise BagError(f'{reader.path} cannot be read: {error}') from error
     except Exception as error:  # as above
-        raise BagError(f'{reader.path} is damaged: {error!r}') from error
+        raise BagError(f'{reader.path} is damaged: {_described(error)}') from error
+
+
+def _described(error: Exception) -> str:
+    """Return an error of a parser on one line; what it quotes of the bag is cut."""
+    text = str(error) if isinstance(error, TooLargeError) else repr(error)
+    return printable(text, 200)
 
 
 def _parameters(path: Path, key: str, text: str) -> dict[str, Any]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shutil
 import sqlite3
-import sys
 import tempfile
 from collections import Counter
 from collections.abc import Generator, Iterator
@@ -15,11 +14,10 @@ from typing import Any
 
 from rosbags.interfaces import QosTime
 from rosbags.rosbag2 import ReaderError
-from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 
+from diffdrive_jacobian.bags.bounded_reader import parse_bounded_qos
+from diffdrive_jacobian.bags.bounded_yaml import YAML_ERRORS, load_yaml
 from diffdrive_jacobian.bags.building import STORAGES
 from diffdrive_jacobian.bags.definitions import UnknownTypeError, definition
 from diffdrive_jacobian.bags.journal import (
@@ -29,6 +27,13 @@ from diffdrive_jacobian.bags.journal import (
     Record,
     Text,
     read_journal,
+)
+from diffdrive_jacobian.bags.limits import (
+    UNPACK_ERRORS,
+    Budget,
+    TooLargeError,
+    unpack_file,
+    unpack_message,
 )
 from diffdrive_jacobian.bags.qos import NANOSECONDS
 from diffdrive_jacobian.bags.recording import JOURNAL, journal_of
@@ -40,19 +45,11 @@ from diffdrive_jacobian.bags.salvage import (
     read_sqlite,
 )
 
-if sys.version_info >= (3, 14):
-    from compression import zstd
-else:
-    from backports import zstd
-
-
 KINDS = {'.mcap': 'mcap', '.db3': 'sqlite3', JOURNAL: 'journal'}
 READERS = {'mcap': read_mcap, 'sqlite3': read_sqlite}
 ZSTD, ZSTD_MAGIC = '.zstd', b'\x28\xb5\x2f\xfd'
 LAST_ENCAPSULATION = 0x0B
 """Of CDR, in the second byte of a message; the first one is 0."""
-TOO_MUCH = (RecursionError, OverflowError)
-"""What nonsense in YAML may lead to, besides its own errors."""
 MAGICS = {MCAP_MAGIC: 'mcap', SQLITE_MAGIC: 'sqlite3', MAGIC: 'journal'}
 
 
@@ -81,7 +78,7 @@ class Remains:
         self.lost: list[str] = []
         self.left_out: dict[str, str] = {}
         folder = path if path.is_dir() else path.parent
-        self._metadata = _metadata(folder / 'metadata.yaml')
+        self._metadata, self._problem = _metadata(folder / 'metadata.yaml')
         paths = self._metadata.get('relative_file_paths')
         listed = {Path(str(name)).name for name in paths} if isinstance(paths, list) else set()
         self._missing = listed - {file.name for file in self.files}
@@ -99,6 +96,7 @@ class Remains:
     def records(self) -> Iterator[Record]:
         """Give all that can be read, from the beginning, and note what cannot."""
         self.lost = [f'{name} is missing' for name in sorted(self._missing)]
+        self.lost += [f'metadata.yaml: {self._problem}'] if self._problem else []
         self.left_out, self._seen = {}, 0
         if self.kind == 'journal':
             if unread := (yield from self._of_journal()):
@@ -127,11 +125,14 @@ class Remains:
     ) -> Iterator[Record]:
         ids: dict[int, int | None] = {}
         strange: Counter[str] = Counter()
+        budget = Budget(source.stat().st_size)
         with open(source, 'rb') as file:
             reader = READERS[_kind(source)]
             for one in reader(file, lambda what: self.lost.append(f'{name}: {what}')):
                 if isinstance(one, str):
-                    yield from _custom_data(_metadata(one))
+                    metadata, problem = _metadata(one)
+                    self.lost += [f'{name}: {problem}'] if problem else []
+                    yield from _custom_data(metadata)
                     continue
                 if isinstance(one, Topic):
                     new = (one.name, one.type_name) not in channels
@@ -144,9 +145,9 @@ class Remains:
                 if one.channel not in ids:
                     strange['belong to no known topic'] += 1
                 elif (to := ids[one.channel]) is not None:
-                    data = _payload(one.data)
+                    data = _payload(one.data, budget)
                     if data is None or not 0 <= one.stamp < 2**63:
-                        strange['are no CDR, or have no possible time'] += 1
+                        strange['are not CDR, are too large, or have no possible time'] += 1
                     else:
                         yield Message(to, one.stamp, data)
         self.lost += [f'{name}: {count} messages {what}' for what, count in strange.items()]
@@ -210,33 +211,40 @@ def _unpacked(file: Path, workshop: Path) -> Path:
     copy = Path(tempfile.mkdtemp(dir=workshop)) / file.name.removesuffix(ZSTD)
     log = file.with_name(f'{file.name}-wal')
     if file.suffix == ZSTD:
-        with (
-            open(copy, 'wb') as out,
-            zstd.open(file, 'rb') as packed,
-            suppress(EOFError, zstd.ZstdError),
-        ):
+        try:
+            with open(copy, 'wb') as out:
+                unpack_file(file, out)
+        except TooLargeError as error:
+            raise NotABagError(str(error)) from error
+        except UNPACK_ERRORS:
             # As far as it goes; the reader sees that it breaks off.
-            while block := packed.read(1 << 16):
-                out.write(block)
+            pass
         return copy
     if log.exists() and log.stat().st_size:
+        size = file.stat().st_size + log.stat().st_size
         shutil.copyfile(file, copy)
         shutil.copyfile(log, copy.with_name(log.name))
         with suppress(sqlite3.Error), closing(sqlite3.connect(copy)) as database:
             database.execute('PRAGMA wal_checkpoint(TRUNCATE)')
-        return copy
+        # A log can name any page: pages without end would follow, none of them in either file.
+        return copy if copy.stat().st_size <= size else file
     return file
 
 
-def _metadata(path: Path | str) -> dict[str, Any]:
-    """Read what metadata.yaml holds, or its text in a bag's file; {}: it is missing or damaged."""
+def _metadata(source: Path | str) -> tuple[dict[str, Any], str]:
+    """Read what metadata.yaml holds, or its text in a bag's file.
+
+    Returns:
+        The content, empty if it is missing or damaged, and why it was not read if it is too large.
+    """
     try:
-        text = path if isinstance(path, str) else path.read_text(encoding='utf-8')
-        found = YAML(typ='safe').load(text)
-    except (FileNotFoundError, ValueError, YAMLError, *TOO_MUCH):
-        return {}
+        found = load_yaml(source)
+    except TooLargeError as error:
+        return {}, str(error)
+    except (FileNotFoundError, *YAML_ERRORS):
+        return {}, ''
     found = found.get('rosbag2_bagfile_information', found) if isinstance(found, dict) else {}
-    return found if isinstance(found, dict) else {}
+    return (found if isinstance(found, dict) else {}), ''
 
 
 def _custom_data(metadata: dict[str, Any]) -> Iterator[Text]:
@@ -246,12 +254,13 @@ def _custom_data(metadata: dict[str, Any]) -> Iterator[Text]:
         yield Text(*(str(one).encode('utf-8', 'replace').decode() for one in (key, value)))
 
 
-def _payload(data: bytes) -> bytes | None:
-    """Give a message as CDR; None: it is none."""
+def _payload(data: bytes, budget: Budget) -> bytes | None:
+    """Return a message as CDR, or None if it is not CDR or unpacks to more than is read."""
     if data.startswith(ZSTD_MAGIC):
         try:
-            data = zstd.decompress(data)
-        except zstd.ZstdError:
+            data = unpack_message(data)
+            budget.spend(len(data))
+        except UNPACK_ERRORS:
             return None
     return data if len(data) > 4 and data[0] == 0 and data[1] <= LAST_ENCAPSULATION else None
 
@@ -295,9 +304,9 @@ def _qos(text: str) -> tuple[dict[str, Any], ...]:
                 'liveliness': one.liveliness.value,
                 'liveliness_lease_duration': _nanoseconds(one.liveliness_lease_duration),
             }
-            for one in parse_qos(text)
+            for one in parse_bounded_qos(text)
         )
-    except (ReaderError, LookupError, TypeError, ValueError, AttributeError, *TOO_MUCH):
+    except (ReaderError, LookupError, TypeError, ValueError, AttributeError, *YAML_ERRORS):
         return ()
 
 

@@ -8,20 +8,20 @@ so rows come to light, too, that were written, but never committed.
 from __future__ import annotations
 
 import struct
-import sys
 import zlib
 from collections.abc import Callable, Iterator
 from io import BytesIO
 from typing import Any, BinaryIO, NamedTuple
 
-from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
-
 from diffdrive_jacobian.bags.journal import Message
-
-if sys.version_info >= (3, 14):
-    from compression import zstd
-else:
-    from backports import zstd
+from diffdrive_jacobian.bags.limits import (
+    MAX_RECORD,
+    UNPACK_ERRORS,
+    Budget,
+    check_record,
+    format_size,
+    unpack,
+)
 
 Schemas = dict[int, tuple[str, str]]
 """Numbers of types to their names and definitions."""
@@ -52,23 +52,30 @@ _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA = 0x02, 0x03, 0x04, 0x05
 _OPCODES = range(0x01, 0x10)
 _HEAD = struct.Struct('<BQ')
 _MESSAGE_HEAD = struct.Struct('<HIQQ')
-_DECOMPRESS: dict[str, Callable[[bytes], bytes]] = {  # Each gives as much as is there.
-    '': lambda data: data,
-    'lz4': lambda data: bytes(LZ4FrameDecompressor().decompress(data)),
-    'zstd': lambda data: zstd.ZstdDecompressor().decompress(data),
-}
+_ATTACHMENT = 0x09
 
 
 class _Cursor:
     """Reads the fields of an MCAP record; ValueError: the record is too short."""
 
     def __init__(self, data: bytes) -> None:
-        self.left = data
+        self._data = data
+        self._at = 0
+
+    @property
+    def left(self) -> bytes:
+        """What was not taken yet."""
+        return self._data[self._at :]
+
+    def __bool__(self) -> bool:
+        """Whether something is left."""
+        return self._at < len(self._data)
 
     def take(self, length: int) -> bytes:
-        if len(self.left) < length:
-            raise ValueError(f'{length} bytes expected, got {len(self.left)}')
-        taken, self.left = self.left[:length], self.left[length:]
+        end = self._at + length
+        if end > len(self._data):
+            raise ValueError(f'{length} bytes expected, got {len(self._data) - self._at}')
+        taken, self._at = self._data[self._at : end], end
         return taken
 
     def number(self, length: int) -> int:
@@ -79,7 +86,7 @@ class _Cursor:
 
     def texts(self) -> dict[str, str]:
         inner, found = _Cursor(self.take(self.number(4))), {}
-        while inner.left:
+        while inner:
             key = inner.text()
             found[key] = inner.text()
         return found
@@ -93,11 +100,12 @@ def read_mcap(file: BinaryIO, note: Note) -> Iterator[Found]:
         note(f'its {size} bytes do not begin as MCAP does')
         return
     schemas: Schemas = {}
+    budget = Budget(size)
     good, opcode = len(MCAP_MAGIC), 0
     try:
-        for opcode, payload, end in _walk(file, size):
+        for opcode, payload, end in _walk(file, size, note):
             if opcode == _CHUNK:
-                yield from _read_chunk(payload, end > size, schemas, note)
+                yield from _read_chunk(payload, end > size, schemas, budget, note)
             elif end <= size:
                 yield from _read_record(opcode, payload, schemas)
             if end <= size:
@@ -109,7 +117,7 @@ def read_mcap(file: BinaryIO, note: Note) -> Iterator[Found]:
         note(f'it breaks off: the last {size - good} of its {size} bytes hold no whole record')
 
 
-def _walk(file: BinaryIO, size: int) -> Iterator[tuple[int, bytes, int]]:
+def _walk(file: BinaryIO, size: int, note: Note) -> Iterator[tuple[int, bytes, int]]:
     """Give opcode, payload and end of each record; the end of one that was cut off is beyond `size`.
 
     A message is given when a record follows it, or the end: else its length may be wrong.
@@ -126,23 +134,32 @@ def _walk(file: BinaryIO, size: int) -> Iterator[tuple[int, bytes, int]]:
             break
         opcode, length = _HEAD.unpack(head)
         end += _HEAD.size + length
-        held = [(opcode, file.read(min(length, size)), end)]
+        if opcode == _ATTACHMENT or (length > MAX_RECORD and end <= size):
+            if opcode != _ATTACHMENT:
+                note(f'a record of {format_size(length)} is not read: it is too large')
+            file.seek(end)
+            continue
+        held = [(opcode, file.read(min(length, size, MAX_RECORD)), end)]
     yield from held
 
 
-def _read_chunk(payload: bytes, cut: bool, schemas: Schemas, note: Note) -> Iterator[Found]:
+def _read_chunk(
+    payload: bytes, cut: bool, schemas: Schemas, budget: Budget, note: Note
+) -> Iterator[Found]:
     cursor = _Cursor(payload)
     try:
         start, end, size, checksum = (cursor.number(length) for length in (8, 8, 8, 4))
         compression, length = cursor.text(), cursor.number(8)
-        data = _DECOMPRESS[compression](cursor.left[:length])
-    except (ValueError, KeyError, RuntimeError, EOFError, zstd.ZstdError) as error:
+        check_record(size, 'it')
+        budget.spend(size)
+        data = unpack(compression, cursor.left[:length], size)
+    except UNPACK_ERRORS as error:
         note(f'a chunk of {len(payload)} bytes cannot be unpacked: {error}')
         return
     if not cut and (len(data) != size or (checksum and zlib.crc32(data) != checksum)):
         note(f'a chunk of {size} bytes is damaged ({(end - start) / 1e9:.1f} s)')
         return
-    for opcode, record, ending in _walk(BytesIO(data), len(data)):
+    for opcode, record, ending in _walk(BytesIO(data), len(data), note):
         if ending <= len(data):
             yield from _read_record(opcode, record, schemas)
 
@@ -171,6 +188,9 @@ def _read_record(opcode: int, payload: bytes, schemas: Schemas) -> Iterator[Foun
 SQLITE_MAGIC = b'SQLite format 3\0'
 _LEAF = 0x0D
 _WIDTHS = (0, 1, 2, 3, 4, 6, 8, 8, 0, 0)  # of the serial types below 10
+_MAX_COLUMNS = 32
+_COPIES = 4
+"""How many times the size of a database its rows may be in all: pages have older copies sometimes."""
 
 
 class _Pages:
@@ -185,6 +205,7 @@ class _Pages:
         self.valid = head.startswith(SQLITE_MAGIC) and self.size in [2**n for n in range(9, 17)]
         self.usable = self.size - head[20]
         self.count = self.bytes // self.size if self.valid else 0
+        self._budget = Budget(self.bytes, ratio=_COPIES)
         # How many there were at the last commit, if that is known.
         self.committed = int.from_bytes(head[28:32], 'big') if head[24:28] == head[92:96] else 0
 
@@ -197,7 +218,9 @@ class _Pages:
         page, start = self.page(number), 100 if number == 1 else 0
         if page[start] != _LEAF:
             return
-        for index in range(int.from_bytes(page[start + 3 : start + 5], 'big')):
+        count = int.from_bytes(page[start + 3 : start + 5], 'big')
+        # A row takes six bytes at least.
+        for index in range(min(count, self.size // 6)):
             row, at = 0, start + 8 + 2 * index
             try:
                 length, at = _varint(page, int.from_bytes(page[at : at + 2], 'big'))
@@ -213,20 +236,27 @@ class _Pages:
         if length > most:
             local = least + (length - least) % (self.usable - 4)
             local = local if local <= most else least
-        data = page[at : at + local]
+        check_record(length, 'a row')
+        self._budget.spend(length)
+        parts = [page[at : at + local]]
+        missing = length - len(parts[0])
         following = page[at + local : at + local + 4] if local < length else b''
-        while len(data) < length and len(data) >= local:
+        seen: set[int] = set()
+        while missing > 0 and len(parts[0]) == local:
             number = int.from_bytes(following, 'big')
-            if not 1 < number <= self.count:
-                raise ValueError('the chain breaks off')
+            if not 1 < number <= self.count or number in seen:
+                raise ValueError('the chain breaks off or goes in a circle')
+            seen.add(number)
             more = self.page(number)
             # Of a commit that never came, pages may be there without their content.
             if number > self.committed and not any(more):
                 raise ValueError('a page of the chain was never written')
-            data, following = data + more[4 : min(self.usable, 4 + length - len(data))], more[:4]
-        if len(data) != length or any(following):
-            raise ValueError(f'{length} bytes expected, got {len(data)}')
-        return data
+            parts.append(more[4 : min(self.usable, 4 + missing)])
+            missing -= len(parts[-1])
+            following = more[:4]
+        if missing or any(following):
+            raise ValueError(f'{length} bytes expected, {missing} are missing')
+        return b''.join(parts)
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
@@ -245,8 +275,8 @@ def _values(record: bytes) -> list[Any]:
     values: list[Any] = []
     while at < body:
         kind, at = _varint(record, at)
-        if kind in (10, 11):
-            raise ValueError(f'no serial type: {kind}')
+        if kind in (10, 11) or len(values) == _MAX_COLUMNS:
+            raise ValueError(f'no serial type, or too many columns: {kind}')
         width = _WIDTHS[kind] if kind < 10 else (kind - 12) // 2
         raw, place = record[place : place + width], place + width
         if kind >= 12:

@@ -1,0 +1,240 @@
+"""rosbags' reader for bags of unknown origin: memory and time stay in proportion to the bag's size.
+
+rosbags decompresses whatever a file claims, evaluates views and generated columns of SQLite, and takes
+the characters `#`, `?` and `%` in a path for parts of a URI. The classes here check before it does so.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Collection, Generator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import apsw
+from rosbags.interfaces import Connection, Qos
+from rosbags.rosbag2 import Reader, ReaderError, storage_mcap, storage_sqlite3
+from rosbags.rosbag2 import reader as rosbags_reader
+from rosbags.rosbag2.metadata import parse_qos
+from rosbags.rosbag2.reader import DirectoryReader
+from rosbags.rosbag2.storage_mcap import McapReader
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+from ruamel.yaml.error import YAMLError
+
+from diffdrive_jacobian.bags.bounded_yaml import check_yaml, load_yaml
+from diffdrive_jacobian.bags.limits import (
+    MAX_OVERLAP,
+    MAX_RECORD,
+    Budget,
+    TooLargeError,
+    check_record,
+    format_size,
+    unpack,
+    unpack_file,
+    unpack_message,
+)
+
+Messages = Generator[tuple[Connection, int, bytes], None, None]
+
+# --- What rosbags' modules call by name
+
+
+def parse_bounded_qos(profiles: Any) -> list[Qos]:
+    """Parse offered profiles as `rosbags.rosbag2.metadata.parse_qos`, whose errors it raises.
+
+    Raises:
+        TooLargeError: The text, or what its aliases stand for, is too large.
+    """
+    if isinstance(profiles, str):
+        with suppress(YAMLError):
+            # Which rosbags reports itself.
+            check_yaml(profiles)
+    return parse_qos(profiles)
+
+
+def _unpack_lz4(data: bytes, size: int) -> bytes:
+    return unpack('lz4', data, size)
+
+
+def _unpack_zstd(data: bytes, size: int) -> bytes:
+    return unpack('zstd', data, size)
+
+
+# These are the only places in which rosbags decompresses chunks and parses profiles.
+storage_mcap.DECOMPRESSORS.update(lz4=_unpack_lz4, zstd=_unpack_zstd)
+for _module in (rosbags_reader, storage_mcap, storage_sqlite3):
+    vars(_module)['parse_qos'] = parse_bounded_qos
+
+# --- MCAP
+
+_CHUNK = 0x06
+_HEAD = 9
+_CHUNK_HEAD = 24
+
+
+class _BoundedFile(io.BufferedReader):
+    """A file that refuses to read records of any size."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is not None:
+            check_record(size, 'a record')
+        return super().read(size)
+
+
+class _McapReader(McapReader):
+    """Checks how much the chunks claim to unpack to before any is unpacked."""
+
+    def _open(self) -> None:
+        assert self.bio is not None
+        size = self.bio.seek(0, io.SEEK_END)
+        self.bio.seek(0)
+        self.bio = _BoundedFile(self.bio.detach())  # type: ignore[attr-defined]
+        self._budget = Budget(size)
+        super()._open()
+
+    def read_index(self) -> None:
+        super().read_index()
+        for chunk in self.chunks:
+            check_record(chunk.uncompressed_size, 'a chunk')
+            check_record(chunk.compressed_size, 'a chunk')
+            self._budget.spend(chunk.uncompressed_size)
+        # rosbags holds all chunks whose times overlap at once.
+        ends = ((one.message_end_time, 1, -one.uncompressed_size) for one in self.chunks)
+        begins = ((one.message_start_time, 0, one.uncompressed_size) for one in self.chunks)
+        held = 0
+        for _, _, change in sorted([*begins, *ends]):
+            held += change
+            if held > MAX_OVERLAP:
+                raise TooLargeError(
+                    'its chunks overlap in time and unpack to more than '
+                    f'{format_size(MAX_OVERLAP)} at once'
+                )
+
+    def meta_scan(self) -> None:
+        if not self.chunks:
+            self._check_chunks()
+        super().meta_scan()
+
+    def _check_chunks(self) -> None:
+        """Add up the sizes that the chunks of a file without an index claim."""
+        assert self.bio is not None
+        at = self.data_start
+        while at < self.data_end:
+            self.bio.seek(at)
+            head = self.bio.read(_HEAD + _CHUNK_HEAD)
+            if len(head) < _HEAD:
+                break
+            if head[0] == _CHUNK:
+                size = int.from_bytes(head[_HEAD + 16 : _HEAD + 24], 'little')
+                check_record(size, 'a chunk')
+                self._budget.spend(size)
+            at += _HEAD + int.from_bytes(head[1:_HEAD], 'little')
+
+
+# --- SQLite
+
+_TABLES = ('messages', 'topics', 'schema', 'metadata', 'message_definitions')
+_STEPS = 100_000
+"""After how many instructions SQLite asks whether to go on."""
+_FREE_STEPS, _STEPS_PER_BYTE = 50_000_000, 100
+"""How many instructions queries of a database may take: at least, and per byte of its file."""
+
+
+class _SqliteReader(Sqlite3Reader):
+    """Reads plain tables only, and values of moderate size."""
+
+    def __init__(self, path: Path) -> None:
+        # rosbags makes a URI of it: 'file:' + path + '?immutable=1'.
+        super().__init__(Path(quote(str(path.absolute()))))
+        self._file = path
+
+    def open(self) -> None:
+        # Official, but for every connection of the process: this thread opens none but rosbags'.
+        apsw.connection_hooks.append(self._limit)
+        try:
+            super().open()
+        except ReaderError as error:
+            raise ReaderError(str(error).replace(str(self.path), str(self._file))) from error
+        finally:
+            apsw.connection_hooks.remove(self._limit)
+
+    def _limit(self, connection: apsw.Connection) -> None:
+        connection.limit(apsw.SQLITE_LIMIT_LENGTH, MAX_RECORD)
+        left = (_FREE_STEPS + _STEPS_PER_BYTE * self._file.stat().st_size) // _STEPS
+
+        def count() -> bool:
+            nonlocal left
+            left -= 1
+            if left < 0:
+                raise TooLargeError('its queries take longer than those of a file of its size may')
+            return False
+
+        connection.set_progress_handler(count, _STEPS)
+        for _, name, kind, *_ in connection.execute('PRAGMA main.table_list').fetchall():
+            if str(name).lower() not in _TABLES:
+                continue
+            columns = connection.execute(f'PRAGMA main.table_xinfo({name})').fetchall()
+            hidden = [column[1] for column in columns if column[6]]
+            if kind != 'table' or hidden:
+                what = f'has the computed column {hidden[0]!r}' if hidden else f'is a {kind}'
+                raise ReaderError(f'{name} must be a plain table, but {what}')
+
+
+# --- Directories
+
+
+class _DirectoryReader(DirectoryReader):
+    """Checks metadata and compressed files before they are loaded."""
+
+    STORAGE_PLUGINS: Mapping[str, Any] = {'mcap': _McapReader, 'sqlite3': _SqliteReader}
+
+    def open(self) -> None:
+        folder = Path(str(self.path))
+        metadata = load_yaml(folder / 'metadata.yaml')
+        for file in _compressed_files(folder, metadata):
+            unpack_file(file, None)
+        super().open()
+        # rosbags would unpack messages to any size.
+        self._packed = self.metadata.compression_mode == 'message'
+        self.metadata = self.metadata._replace(compression_mode=None)
+        self._budget = Budget(sum(file.stat().st_size for file in folder.iterdir()))
+
+    def messages(
+        self,
+        connections: Collection[Connection],
+        start: int | None = None,
+        stop: int | None = None,
+    ) -> Messages:
+        for connection, stamp, data in super().messages(connections, start, stop):
+            if self._packed:
+                data = unpack_message(data)
+                self._budget.spend(len(data))
+            yield connection, stamp, data
+
+
+def _compressed_files(folder: Path, metadata: Any) -> list[Path]:
+    """Return the files of a bag that are compressed as a whole."""
+    try:
+        information = metadata['rosbag2_bagfile_information']
+        if information['compression_mode'].lower() != 'file':
+            return []
+        files = [folder / Path(name).name for name in information['relative_file_paths']]
+    except (KeyError, TypeError, AttributeError):
+        # rosbags reports what is missing or of another type.
+        return []
+    return [file for file in files if file.is_file()]
+
+
+class BoundedReader(Reader):
+    """rosbags' reader of directories, MCAP and SQLite files, for bags of unknown origin.
+
+    `open` and `messages` also raise TooLargeError, and errors of YAML, Zstandard and SQLite.
+    """
+
+    STORAGE_PLUGINS: Mapping[str, Any] = {
+        'dir': _DirectoryReader,
+        '.mcap': _McapReader,
+        '.db3': _SqliteReader,
+    }
