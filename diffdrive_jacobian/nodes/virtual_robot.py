@@ -127,7 +127,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         messages.set_joint_state(self._states, now, state.wheel_speeds, state.wheel_angles)
         self._joint_states.publish(self._states)
         if self._transforms is not None:
-            self._transforms.sendTransform(_transform(self._odometry))
+            self._transforms.sendTransform(transform_of(self._odometry))
 
     # --- Commands
 
@@ -256,8 +256,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         return TransformBroadcaster(self)
 
 
-def _transform(odometry: Odometry) -> TransformStamped:
-    """Write a pose as the transform from the odometry's frame to the robot's."""
+def transform_of(odometry: Odometry) -> TransformStamped:
+    """Return the transform from the frame of an odometry message to that of the robot."""
     message = TransformStamped(header=odometry.header, child_frame_id=odometry.child_frame_id)
     position, translation = odometry.pose.pose.position, message.transform.translation
     translation.x, translation.y = position.x, position.y
