@@ -50,6 +50,7 @@ setup(
             f'ros-sensor-msgs=={MESSAGES}',
             f'ros-std-msgs=={MESSAGES}',
             f'ros-std-srvs=={MESSAGES}',
+            'ros-unique-identifier-msgs==2.5.0',
         ],
         'plot': ['matplotlib>=3.5'],
         'test': ['mcap>=1.2', 'hypothesis>=6', 'matplotlib>=3.5', 'pytest>=7', 'pyyaml>=5'],

@@ -210,3 +210,12 @@ def test_second_clock_is_named(lockstep):
     node.create_publisher(ClockMessage, '/clock', 10)
     with pytest.raises(LockstepError, match='node /rival publishes /clock, which the world does'):
         lockstep.add(node)
+
+
+def test_what_the_executor_of_the_world_lacks_is_an_attribute_error(lockstep):
+    executor = lockstep.add(Node('asking')).executor
+    assert not hasattr(executor, 'spin_once')
+    assert getattr(executor, 'context', 'none') == 'none'
+    assert hasattr(executor, 'create_task')
+    with pytest.raises(LockstepError, match=r'a node in lockstep cannot call executor\.spin_once'):
+        executor.spin_once()

@@ -69,6 +69,58 @@ def test_mistakes_of_the_user_are_named():
         pass
 
 
+LONG = {
+    'topic': (('-r', f'odom:={248 * "t"}'), 'at most 247 characters, got 248'),
+    'absolute topic': (('--remap', f'odom:=/{247 * "t"}'), 'at most 247 characters, got 248'),
+    'node': (('-r', f'__node:={300 * "n"}'), 'at most 247 characters, got 300'),
+    'namespace': (('-r', f'__ns:=/{247 * "n"}'), 'at most 247 characters, got 248'),
+    'service': (('-r', f'reset_odometry:={255 * "s"}'), 'at most 247 characters, got 255'),
+    'of one node': (('-r', f'virtual_robot:odom:={300 * "t"}'), "'virtual_robot:odom:=tttt"),
+    # Each of these is short enough by itself.
+    'node and its services': (('-r', f'__node:={240 * "n"}'), 'Invalid service name: topic length'),
+    'namespace and topic': (('-r', f'__ns:=/{240 * "n"}'), 'should not exceed'),
+    'namespace and service': (
+        ('-r', f'__ns:=/{120 * "n"}', '-r', f'reset_odometry:={130 * "s"}'),
+        'topic length should not exceed',
+    ),
+    'namespace and topic, both given': (
+        ('-r', f'__ns:=/{120 * "n"}', '-r', f'odom:={130 * "t"}'),
+        'topic length should not exceed',
+    ),
+}
+
+
+@pytest.mark.parametrize(('arguments', 'words'), LONG.values(), ids=LONG)
+def test_names_that_are_too_long_are_mistakes_of_the_user(arguments, words):
+    with (
+        pytest.raises(UserError) as caught,
+        ros_context(['test', '--ros-args', *arguments]) as context,
+        running(context, closed_world=True) as runner,
+    ):
+        runner.add(lambda: VirtualRobot(context=context))
+    message = str(caught.value)
+    assert words in message
+    assert len(message) < 300
+    assert '\n' not in message
+
+
+@pytest.mark.parametrize(
+    'arguments',
+    [
+        ('-r', f'odom:={246 * "t"}'),
+        ('-r', f'odom:=/{246 * "t"}'),
+        ('-r', f'reset_odometry:={245 * "s"}'),
+        ('-r', f'__node:={200 * "n"}'),
+    ],
+)
+def test_names_of_the_greatest_length_are_accepted(arguments):
+    with (
+        ros_context(['test', '--ros-args', *arguments]) as context,
+        running(context, closed_world=True) as runner,
+    ):
+        runner.add(lambda: VirtualRobot(context=context))
+
+
 @pytest.mark.parametrize('domain', ['233', '-1', 'home'])
 def test_domains_that_do_not_exist_are_named(monkeypatch, domain):
     monkeypatch.setenv('ROS_DOMAIN_ID', domain)

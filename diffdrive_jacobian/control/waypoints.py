@@ -60,6 +60,13 @@ class Waypoints:
             return here, None
         return here, turn_in_place(pose[2], goal[2], turning_gain)
 
+    def resumed(self) -> Waypoints:
+        """Return the waypoints with the last position to be reached again if the robot is not there.
+
+        For a change of the law or of the point that has to arrive, while the robot turns in place.
+        """
+        return replace(self, turning=False) if self.turning else self
+
     def _there(self, pose: NDArray[np.float64], arrival: Arrival) -> bool:
         x, y, _ = self.poses[self.index].tolist()
         distance = arrival.distance(float(pose[0]), float(pose[1]), float(pose[2]), x, y)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from action_msgs.msg import GoalInfo, GoalStatus
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Goals, Odometry
 from std_srvs.srv import Trigger
@@ -28,6 +29,10 @@ from diffdrive_jacobian.ros import messages
 from diffdrive_jacobian.ros.messages import MessageError
 from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
+from diffdrive_jacobian.text import printable
+
+MAX_WAYPOINTS = 10_000
+"""Longest `goals` message that is converted: about 0.2 s, less than the odometry timeout."""
 
 LAWS: dict[str, Callable[[GoToGoalParameters], Law]] = {
     'go_to_goal': lambda gains: lambda pose, goal: go_to_goal(pose, goal[:2], gains.kp, gains.kv),
@@ -73,8 +78,9 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._status = self.advertise(GoalStatus, 'goal_status', latched=True)
         self.subscribe(Odometry, 'odom', self._on_odometry)
         self.subscribe(PoseStamped, 'goal_pose', self._on_goal_pose)
-        self.subscribe(Goals, 'goals', self._on_goals)
-        self.create_service(Trigger, 'cancel_goal', self._on_cancel)
+        # As bytes: to make Python objects of a long message blocks the node for seconds.
+        self.subscribe(Goals, 'goals', self._on_goals, raw=True)
+        self.provide(Trigger, 'cancel_goal', self._on_cancel)
         self._message: Twist | TwistStamped = TwistStamped() if stamped else Twist()
         self._watchdog = Watchdog(self, self._on_stale_odometry)
         self._configure()
@@ -93,40 +99,59 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
     # --- Goals
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
-        self._accept(message.header, [message])
-
-    def _on_goals(self, message: Goals) -> None:
-        self._accept(message.header, message.goals)
-
-    def _accept(self, header: Any, poses: Sequence[PoseStamped]) -> None:
-        """Take the poses of one message as the goal, in the place of the active one; or refuse it."""
-        info = GoalInfo(goal_id=UUID(uuid=list(uuid.uuid4().bytes)), stamp=header.stamp)
+        info = _goal_info(message.header.stamp)
         try:
-            goal = Goal(info, *_read_goal(header.frame_id, poses))
+            goal = Goal(info, *_read_goal(message.header.frame_id, [message]))
             self._match_frames(goal)
         except MessageError as error:
-            self.get_logger().warning(f'goal refused: {error}')
-            self._publish_status(info, GoalStatus.STATUS_ABORTED)
-            if self._goal is not None:
-                # What is latched last must be what goes on.
-                self._publish_status(self._goal.info, self._goal_status(self._goal))
+            self._refuse(info, error)
             return
+        self._accept(goal)
+
+    def _on_goals(self, data: bytes) -> None:
+        try:
+            stamp, count = messages.goals_header(data)
+        except MessageError as error:
+            self.get_logger().warning(f'goals dropped: {error}', throttle_duration_sec=THROTTLE)
+            return
+        info = _goal_info(stamp)
+        try:
+            if count > MAX_WAYPOINTS:
+                raise MessageError(f'goals must hold at most {MAX_WAYPOINTS} poses, got {count}')
+            message = messages.deserialized(data, Goals)
+            goal = Goal(info, *_read_goal(message.header.frame_id, message.goals))
+            self._match_frames(goal)
+        except MessageError as error:
+            self._refuse(info, error)
+            return
+        self._accept(goal)
+
+    def _refuse(self, info: GoalInfo, error: MessageError) -> None:
+        """Report a goal as aborted; the active one goes on."""
+        self.log_event_warning('goal refused', f'goal refused: {error}')
+        self._publish_status(info, GoalStatus.STATUS_ABORTED)
+        if self._goal is not None:
+            # What is latched last must be what goes on.
+            self._publish_status(self._goal.info, self._goal_status(self._goal))
+
+    def _accept(self, goal: Goal) -> None:
+        """Replace the active goal, if there is one."""
         if self._goal is not None:
             self._publish_status(self._goal.info, GoalStatus.STATUS_CANCELED)
         if not self._driving:
             # A robot that moves is watched already; a new goal is no sign of life of its odometry.
             self._watchdog.start(nanoseconds(self.parameters.odom_timeout))
         self._goal = goal
-        self._publish_status(info, GoalStatus.STATUS_ACCEPTED)
+        self._publish_status(goal.info, GoalStatus.STATUS_ACCEPTED)
         x, y, _ = goal.waypoints.poses[-1]
         more = f' by way of {count} more' if (count := len(goal.waypoints.poses) - 1) else ''
-        self.get_logger().info(f'goal accepted: x {x:.3f}, y {y:.3f}{more}')
+        self.log_event_info('goal accepted', f'goal accepted: x {x:.3f}, y {y:.3f}{more}')
 
     def _match_frames(self, goal: Goal) -> None:
         if goal.frame and self._odom_frame and goal.frame != self._odom_frame:
             raise MessageError(
-                f"it must be given in the frame of the odometry, {self._odom_frame!r} or '' for it, "
-                f'got {goal.frame!r}'
+                f"it must be given in the frame of the odometry, '{printable(self._odom_frame)}' "
+                f"or '' for it, got '{printable(goal.frame)}'"
             )
 
     def _on_cancel(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -146,7 +171,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._publish_status(self._goal.info, status)
             self._goal = None
             self._watchdog.stop()
-            self.get_logger().info(f'goal {what}')
+            self.log_event_info(f'goal {what}', f'goal {what}')
 
     def _publish_status(self, info: GoalInfo, status: int) -> None:
         self._status.publish(GoalStatus(goal_info=info, status=status))
@@ -164,7 +189,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             underway = self._driving or (goal is not None and goal.executing)
             if underway and message.header.frame_id != self._odom_frame:
                 raise MessageError(
-                    f'it must stay in frame {self._odom_frame!r}, got {message.header.frame_id!r}'
+                    f"it must stay in frame '{printable(self._odom_frame)}', "
+                    f"got '{printable(message.header.frame_id)}'"
                 )
             if goal is not None and self.now() == 0:
                 raise MessageError('simulated time has not begun, nothing came on /clock')
@@ -179,7 +205,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             return
         if goal.stale:
             goal.stale = False
-            self.get_logger().info('odometry is back: driving on')
+            self.log_event_info('odometry is back', 'odometry is back: driving on')
         goal.waypoints, command = goal.waypoints.follow(
             pose, self._law, self._arrival, self.parameters.kp
         )
@@ -195,7 +221,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         try:
             self._match_frames(goal)
         except MessageError as error:
-            self.get_logger().warning(f'goal refused: {error}')
+            self.log_event_warning('goal refused', f'goal refused: {error}')
             self._end(GoalStatus.STATUS_ABORTED, 'refused')
             return False
         goal.executing = True
@@ -211,11 +237,14 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         goal.stale = goal.executing
         if self._driving:
             self._publish_command(0.0, 0.0)
-            self.get_logger().warning(
-                f'no valid odometry on {topic} for {timeout:g} s: zero sent, waiting'
+            self.log_event_warning(
+                'odometry is stale',
+                f'no valid odometry on {topic} for {timeout:g} s: zero sent, waiting',
             )
         else:
-            self.get_logger().warning(f'the goal waits for odometry on {topic}: is the robot running?')
+            self.log_event_warning(
+                'goal waits', f'the goal waits for odometry on {topic}: is the robot running?'
+            )
 
     def _publish_command(self, v: float, omega: float) -> None:
         self._driving = (v, omega) != (0.0, 0.0)
@@ -238,8 +267,15 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
 
     def parameters_changed(self, previous: GoToGoalParameters) -> None:
         """Control on with the new parameters."""
+        driven = previous.controller, self._arrival.offset
         self._configure()
-        if self._goal is not None and self.parameters.odom_timeout != previous.odom_timeout:
+        goal = self._goal
+        if goal is None:
+            return
+        if (self.parameters.controller, self._arrival.offset) != driven:
+            # Another point of the robot may have to arrive, or another law decides how.
+            goal.waypoints = goal.waypoints.resumed()
+        if self.parameters.odom_timeout != previous.odom_timeout:
             self._watchdog.start(nanoseconds(self.parameters.odom_timeout))
 
     def _configure(self) -> None:
@@ -256,33 +292,43 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             offset=parameters.offset if parameters.controller == 'offset_point' else 0.0,
         )
         if self._limits.max_v == 0.0:
-            self.get_logger().warning(
-                'linear.x.max_velocity is 0: the robot may not drive forward, goals stay out of reach'
+            self.log_event_warning(
+                'max_v',
+                'linear.x.max_velocity is 0: the robot may not drive forward, goals stay out of reach',
             )
         if self._limits.min_v == 0.0 and parameters.controller == 'offset_point':
-            self.get_logger().warning(
+            self.log_event_warning(
+                'min_v',
                 'linear.x.min_velocity is 0: the robot may not back up, which controller offset_point '
-                'does where the goal lies behind; it may come to rest before the goal'
+                'does where the goal lies behind; it may come to rest before the goal',
             )
         if 0.0 in (self._limits.min_omega, self._limits.max_omega):
-            self.get_logger().warning(
+            self.log_event_warning(
+                'omega',
                 'angular.z.min_velocity or max_velocity is 0: the robot may turn one way only or not at '
-                'all, goals and headings may stay out of reach'
+                'all, goals and headings may stay out of reach',
             )
         self._judge_gains()
 
     def _judge_gains(self) -> None:
         kp, kv = self.parameters.kp, self.parameters.kv
         if self.parameters.controller == 'pose' and kp <= 2.0 * kv:
-            self.get_logger().warning(
+            self.log_event_warning(
+                'gains',
                 f'kp {kp:g} is not larger than twice kv {kv:g}: the robot is at the position before it '
-                'has the heading, and turns in place there; choose kp > 2 kv'
+                'has the heading, and turns in place there; choose kp > 2 kv',
             )
         elif self.parameters.controller == 'go_to_goal' and kp <= kv:
-            self.get_logger().warning(
+            self.log_event_warning(
+                'gains',
                 f'kp {kp:g} is not larger than kv {kv:g}: the robot approaches faster than it turns '
-                'and spirals in; choose kp > kv'
+                'and spirals in; choose kp > kv',
             )
+
+
+def _goal_info(stamp: Time) -> GoalInfo:
+    """Return a new identity of a goal that has a stamp."""
+    return GoalInfo(goal_id=UUID(uuid=list(uuid.uuid4().bytes)), stamp=stamp)
 
 
 def _read_goal(frame: str, poses: Sequence[PoseStamped]) -> tuple[str, Waypoints]:
@@ -295,6 +341,8 @@ def _read_goal(frame: str, poses: Sequence[PoseStamped]) -> tuple[str, Waypoints
         raise MessageError('goals must hold at least one pose, got none (to stop, call cancel_goal)')
     frames = {pose.header.frame_id or frame for pose in poses}
     if len(frames) > 1:
-        raise MessageError(f'all poses must be given in one frame, got {sorted(frames)}')
+        raise MessageError(
+            f'all poses must be given in one frame, got {messages.quoted(sorted(frames))}'
+        )
     read = np.array([messages.from_pose(pose.pose) for pose in poses])
     return frames.pop(), Waypoints(read)

@@ -12,6 +12,7 @@ from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.ros.messages import MAX_POSITION, MAX_SPEED
 from diffdrive_jacobian.ros.parameters import NodeParameters, ParameterError, parameter
 from diffdrive_jacobian.simulation.robot import NANOSECONDS, RobotModel
+from diffdrive_jacobian.text import printable
 
 CONTROLLERS = ('go_to_goal', 'offset_point', 'pose')
 MIN_OFFSET = 1e-3
@@ -229,7 +230,9 @@ class WheelBridgeParameters(NodeParameters):
 
 def _differ(first: str, value: str, second: str, other: str) -> None:
     if value == other:
-        raise ParameterError(f"parameters '{first}' and '{second}' must differ, both are {value!r}")
+        raise ParameterError(
+            f"parameters '{first}' and '{second}' must differ, both are '{printable(value)}'"
+        )
 
 
 def nanoseconds(seconds: float) -> int:

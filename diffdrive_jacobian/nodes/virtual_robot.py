@@ -6,6 +6,7 @@ alone, whatever `publish_rate` is and however late a timer comes.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from diffdrive_jacobian.ros import messages
 from diffdrive_jacobian.ros.messages import MessageError
 from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot
+from diffdrive_jacobian.text import printable
 
 
 class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
@@ -59,7 +61,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         else:
             self.subscribe(Twist, source, self._on_twist)
         self.subscribe(PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose)
-        self.create_service(Trigger, 'reset_odometry', self._on_reset)
+        self.provide(Trigger, 'reset_odometry', self._on_reset)
         self._timer = self.create_timer(1.0 / self.parameters.publish_rate, self._on_tick)
         self._jumps = self._watch_jumps()
         self._advance()
@@ -92,9 +94,10 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             robot = Robot(model=self.parameters.model(), stamp=now, pose=self._initial_pose())
             self._begin(robot)
         elif now < self._latest:
-            self.get_logger().warning(
+            self.log_event_warning(
+                'time went back',
                 f'time went back by {(self._latest - now) / NANOSECONDS:.3f} s: '
-                'the robot stands still where it is'
+                'the robot stands still where it is',
             )
             robot = robot.at(self._latest).restarted(now)
             self._begin(robot)
@@ -124,33 +127,39 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         messages.set_joint_state(self._states, now, state.wheel_speeds, state.wheel_angles)
         self._joint_states.publish(self._states)
         if self._transforms is not None:
-            self._transforms.sendTransform(_transform(self._odometry))
+            self._transforms.sendTransform(transform_of(self._odometry))
 
     # --- Commands
 
     def _on_twist(self, message: Twist) -> None:
-        self._take(lambda: messages.from_twist(message), 0)
+        self._take(lambda: (messages.from_twist(message), 0))
 
     def _on_twist_stamped(self, message: TwistStamped) -> None:
-        self._take(lambda: messages.from_twist(message.twist), messages.from_time(message.header.stamp))
+        self._take(
+            lambda: (messages.from_twist(message.twist), messages.from_time(message.header.stamp))
+        )
 
     def _on_joint_command(self, message: JointState) -> None:
-        def twist() -> tuple[float, float]:
+        def read() -> tuple[tuple[float, float], int]:
             speeds = messages.from_joint_state(message, self._joint_names())
             parameters = self.parameters
             v, omega = wheel_to_body(*speeds, parameters.wheel_radius, parameters.wheel_separation)
-            return messages.plausible_twist(v, omega)
+            return messages.plausible_twist(v, omega), messages.from_time(message.header.stamp)
 
-        self._take(twist, messages.from_time(message.header.stamp))
+        self._take(read)
 
-    def _take(self, read: Any, stamp: int) -> None:
-        """Apply the command that `read` gives, or say why not."""
+    def _take(self, read: Callable[[], tuple[tuple[float, float], int]]) -> None:
+        """Apply a command, or log why not.
+
+        Args:
+            read: Returns its twist `(v, omega)` and its stamp (ns; 0: none).
+        """
         advanced = self._advance()
         try:
             if advanced is None:
                 raise MessageError('simulated time has not begun, nothing came on /clock')
             now, robot = advanced
-            twist = read()
+            twist, stamp = read()
             timeout = robot.model.command_timeout
             instant = messages.command_instant(stamp, now, robot.stamp, timeout)
         except MessageError as error:
@@ -173,7 +182,9 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             if advanced is None:
                 raise MessageError('simulated time has not begun, nothing came on /clock')
             if frame not in ('', ours):
-                raise MessageError(f'it must be given in frame {ours!r}, got {frame!r}')
+                raise MessageError(
+                    f"it must be given in frame '{printable(ours)}', got '{printable(frame)}'"
+                )
             pose, covariance = messages.from_pose_with_covariance(message.pose)
         except MessageError as error:
             self.get_logger().warning(f'initialpose dropped: {error}', throttle_duration_sec=THROTTLE)
@@ -195,7 +206,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self._robot = robot
         self._begin(robot)
         x, y, theta = robot.pose
-        self.get_logger().info(f'odometry begins at x {x:.3f}, y {y:.3f}, theta {theta:.3f}')
+        self.log_event_info('placed', f'odometry begins at x {x:.3f}, y {y:.3f}, theta {theta:.3f}')
 
     # --- Parameters
 
@@ -245,8 +256,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         return TransformBroadcaster(self)
 
 
-def _transform(odometry: Odometry) -> TransformStamped:
-    """Write a pose as the transform from the odometry's frame to the robot's."""
+def transform_of(odometry: Odometry) -> TransformStamped:
+    """Return the transform from the frame of an odometry message to that of the robot."""
     message = TransformStamped(header=odometry.header, child_frame_id=odometry.child_frame_id)
     position, translation = odometry.pose.pose.position, message.transform.translation
     translation.x, translation.y = position.x, position.y

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Twist, TwistStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -42,12 +43,12 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         self.announce('from and to', 'cmd_vel', 'joint_command')
 
     def _on_twist(self, message: Twist) -> None:
-        self._take(message, 0)
+        self._take(message, None)
 
     def _on_twist_stamped(self, message: TwistStamped) -> None:
-        self._take(message.twist, messages.from_time(message.header.stamp))
+        self._take(message.twist, message.header.stamp)
 
-    def _take(self, twist: Twist, stamp: int) -> None:
+    def _take(self, twist: Twist, time: Time | None) -> None:
         now = self.now()
         # After time went back the last command's instant means nothing any more.
         last = self._last if self._last <= now else 0
@@ -55,6 +56,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
             if now == 0:
                 raise MessageError('simulated time has not begun, nothing came on /clock')
             v, omega = messages.from_twist(twist)
+            stamp = 0 if time is None else messages.from_time(time)
             timeout = nanoseconds(self.parameters.cmd_vel_timeout)
             self._last = messages.command_instant(stamp, now, last, timeout)
         except MessageError as error:
@@ -86,9 +88,10 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
     def _on_silence(self) -> None:
         if self._moving:
             self._publish((0.0, 0.0), self.now())
-            self.get_logger().warning(
+            self.log_event_warning(
+                'silence',
                 f'no command on {self.resolve_topic_name("cmd_vel")} '
-                f'for {self.parameters.cmd_vel_timeout:g} s: the wheels are stopped'
+                f'for {self.parameters.cmd_vel_timeout:g} s: the wheels are stopped',
             )
 
     def stop(self, why: str) -> None:

@@ -11,16 +11,22 @@ raises MessageError, which says what was got and what is allowed.
 from __future__ import annotations
 
 import math
-from typing import Any
+import struct
+from collections.abc import Iterable
+from typing import Any, TypeVar
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, PoseWithCovariance, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
 from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot
+from diffdrive_jacobian.text import printable
+
+T = TypeVar('T')
 
 MAX_SPEED = 1e3
 """Twists beyond this are not plausible (m/s, rad/s)."""
@@ -36,14 +42,64 @@ class MessageError(ValueError):
     """A message that cannot be meant."""
 
 
+def quoted(texts: Iterable[str], most: int = 4) -> str:
+    """Return texts of unknown origin as a list of limited length, for an error message."""
+    texts = list(texts)
+    shown = [f"'{printable(text)}'" for text in texts[:most]]
+    if len(texts) > most:
+        shown.append(f'... ({len(texts)} in all)')
+    return f'[{", ".join(shown)}]'
+
+
 def set_time(stamp: Time, nanoseconds: int) -> None:
     """Write an instant into a stamp."""
     stamp.sec, stamp.nanosec = divmod(nanoseconds, NANOSECONDS)
 
 
 def from_time(stamp: Time) -> int:
-    """Read a stamp (ns)."""
-    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+    """Return a timestamp (ns).
+
+    Raises:
+        MessageError: Its seconds are negative, or its nanoseconds are a second or more.
+    """
+    sec, nanosec = int(stamp.sec), int(stamp.nanosec)
+    if sec < 0 or nanosec >= NANOSECONDS:
+        raise MessageError(
+            'its stamp must have sec of at least 0 and nanosec below 1000000000, '
+            f'got sec {sec}, nanosec {nanosec}'
+        )
+    return sec * NANOSECONDS + nanosec
+
+
+def deserialized(data: bytes, message_type: type[T]) -> T:
+    """Return the message that serialized bytes hold.
+
+    Raises:
+        MessageError: They hold no such message.
+    """
+    try:
+        message: T = deserialize_message(data, message_type)
+    except RuntimeError as error:
+        raise MessageError(f'it is no {message_type.__name__} message') from error
+    return message
+
+
+def goals_header(data: bytes) -> tuple[Time, int]:
+    """Return the stamp and the number of poses of a serialized Goals message, and convert nothing else.
+
+    The layout is that of CDR: 4 bytes of encapsulation, of which the second is odd for little-endian;
+    the stamp, the frame as length and text, and the number of poses, aligned to 4 bytes.
+
+    Raises:
+        MessageError: The bytes are too short.
+    """
+    try:
+        order = '<' if data[1] & 1 else '>'
+        sec, nanosec, length = struct.unpack_from(f'{order}iII', data, 4)
+        (count,) = struct.unpack_from(f'{order}I', data, 16 + (length + 3) // 4 * 4)
+    except (IndexError, struct.error) as error:
+        raise MessageError('it is no Goals message') from error
+    return Time(sec=sec, nanosec=nanosec), count
 
 
 def from_twist(message: Twist) -> tuple[float, float]:
@@ -207,7 +263,7 @@ def from_joint_state(message: JointState, names: tuple[str, str]) -> tuple[float
     speeds = dict(zip(message.name, message.velocity, strict=True))
     if any(message.name.count(name) != 1 for name in names):
         raise MessageError(
-            f'joint command must name each of {list(names)} once, got {list(message.name)}'
+            f'joint command must name each of {quoted(names)} once, got {quoted(message.name)}'
         )
     left, right = (speeds[name] for name in names)
     if not (math.isfinite(left) and math.isfinite(right)):

@@ -24,15 +24,21 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.service import Service
 from rclpy.subscription import Subscription
 
 from diffdrive_jacobian.ros import parameters as ros_parameters
+from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
+from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.parameters import NodeParameters, ParameterError
+from diffdrive_jacobian.ros.rate_limit import RateLimit
 
 P = TypeVar('P', bound=NodeParameters)
 
-THROTTLE = 2.0
-"""What may go wrong with every message is said so often at most (s). rclpy counts per line of code."""
+EVENT_BURST = 10
+"""Number of log lines about one kind of event that are written at once."""
+EVENT_PERIOD = 1.0
+"""Shortest time between further log lines about that kind of event (s)."""
 FLUSH_PATIENCE = Duration(seconds=0.1)
 """How long the last message may take to be acknowledged; it arrives long before (s)."""
 WATCH_PERIOD = 1.0
@@ -65,6 +71,8 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         except ros_parameters.ParameterError:
             self.destroy_node()
             raise
+        guard_inputs(self)
+        self._event_limits: dict[str, RateLimit] = {}
         self.add_pre_set_parameters_callback(self._before_parameters)
         self.add_on_set_parameters_callback(self._judge_parameters)
         self.add_post_set_parameters_callback(self._after_parameters)
@@ -93,8 +101,10 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )
 
-    def subscribe(self, message: type, topic: str, callback: Callable[[Any], None]) -> Subscription:
-        """Create a subscription: reliable, keep last 10."""
+    def subscribe(
+        self, message: type, topic: str, callback: Callable[[Any], None], *, raw: bool = False
+    ) -> Subscription:
+        """Create a subscription: reliable, keep last 10; raw: the callback gets the serialized bytes."""
         self._watched.append((topic, _type_name(message), True))
         with self._naming_the_reason(message, topic):
             return self.create_subscription(
@@ -103,7 +113,32 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
                 callback,
                 QoSProfile(depth=10),
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+                raw=raw,
             )
+
+    def provide(self, service: Any, name: str, callback: Callable[[Any, Any], Any]) -> Service:
+        """Create a service.
+
+        Raises:
+            RuntimeError: Its name is invalid.
+        """
+        # rclpy resolves the name only after it failed, and then raises UnboundLocalError.
+        self.resolve_service_name(name)
+        return self.create_service(service, name, callback)
+
+    def log_event_info(self, event: str, text: str) -> None:
+        """Log what a message caused: of one kind EVENT_BURST lines, then one per EVENT_PERIOD."""
+        if self._may_log(event):
+            self.get_logger().info(text)
+
+    def log_event_warning(self, event: str, text: str) -> None:
+        """Log a problem that a message caused, as often as `log_event_info` does."""
+        if self._may_log(event):
+            self.get_logger().warning(text)
+
+    def _may_log(self, event: str) -> bool:
+        limit = self._event_limits.setdefault(event, RateLimit(EVENT_BURST, EVENT_PERIOD))
+        return limit.permits(time.monotonic())
 
     @contextmanager
     def _naming_the_reason(self, message: type, topic: str) -> Iterator[None]:

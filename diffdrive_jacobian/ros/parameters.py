@@ -27,6 +27,12 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from diffdrive_jacobian.text import printable
+
+MAX_LENGTH = 256
+"""Longest string that a parameter may be (characters)."""
+NOT_EMPTY = f'not empty and at most {MAX_LENGTH} characters'
+
 
 class ParameterError(ValueError):
     """A set of parameters that a node cannot run with; the message names parameter, value and range."""
@@ -64,7 +70,7 @@ class _Specification:
         if self.choices:
             return value in self.choices
         if isinstance(value, str):
-            return bool(value)
+            return 0 < len(value) <= MAX_LENGTH
         if isinstance(value, float) and math.isnan(value):
             return self.nan_is_none
         return (
@@ -127,11 +133,12 @@ class NodeParameters:
             if type(value) is not wanted:
                 raise ParameterError(
                     f"parameter '{name}' must be a {_TYPE_NAMES[wanted]}"
-                    f'{_example(wanted)}, got {value!r}'
+                    f'{_example(wanted)}, got {_got(value)}'
                 )
             if not specification.permits(value):
-                allowed = specification.allowed or 'not empty'
-                raise ParameterError(f"parameter '{name}' must be {allowed}, got {value!r}")
+                raise ParameterError(
+                    f"parameter '{name}' must be {specification.allowed or NOT_EMPTY}, got {_got(value)}"
+                )
         self.check()
 
     def check(self) -> None:
@@ -139,6 +146,15 @@ class NodeParameters:
 
 
 P = TypeVar('P', bound=NodeParameters)
+
+
+def _got(value: object) -> str:
+    """Return a value as it is quoted in an error message, of limited length."""
+    if not isinstance(value, str):
+        return printable(repr(value))
+    length = f' ({len(value)} characters)' if len(value) > MAX_LENGTH else ''
+    return f"'{printable(value)}'{length}"
+
 
 _TYPE_NAMES = {bool: 'bool', int: 'integer', float: 'double', str: 'string'}
 

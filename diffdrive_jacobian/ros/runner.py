@@ -18,18 +18,23 @@ import rclpy
 from rclpy.context import Context
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.logging import get_logger_level, set_logger_level
 from rclpy.node import Node
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.signals import SignalHandlerOptions
 
+from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.node import ParameterizedNode
 from diffdrive_jacobian.ros.parameters import ParameterError, report_unknown
+from diffdrive_jacobian.text import printable
 
 N = TypeVar('N', bound=Node)
 
 MAX_DOMAIN_ID = 232
 """Beyond it a domain's ports do not exist."""
+MAX_NAME_LENGTH = 247
+"""Longest name of a topic or service, with its leading slash, that Fast DDS can have (characters)."""
 LOOK_PERIOD = 0.1
 """How long the loop may wait before it looks at its condition again (s)."""
 
@@ -72,6 +77,8 @@ def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[
     if domain and not (domain.isdecimal() and int(domain) <= MAX_DOMAIN_ID):
         raise UserError(f'ROS_DOMAIN_ID must be in 0 to {MAX_DOMAIN_ID}, got {domain!r}')
     for flag, value in pairwise(arguments):
+        if flag in ('-r', '--remap'):
+            _check_name_length(value)
         if flag == '--params-file' and not os.access(value, os.R_OK):
             raise UserError(f'--params-file must name a file that can be read, got {value!r}')
     context = rclpy.get_default_context() if default else Context()
@@ -92,6 +99,20 @@ def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[
         # Of the default context rclpy makes a new one then.
         rclpy.try_shutdown(context=None if default else context)
         set_logger_level('', log_level)
+
+
+def _check_name_length(rule: str) -> None:
+    """Check the new name of a remap rule; rcl reports one that is too long without naming it.
+
+    Raises:
+        UserError: It is longer than a topic, a service, a node or a namespace can be.
+    """
+    name = rule.rpartition(':=')[2]
+    if len(name) + (not name.startswith('/')) > MAX_NAME_LENGTH:
+        raise UserError(
+            f"ROS arguments: remap rule '{printable(rule)}' must give a name of at most "
+            f'{MAX_NAME_LENGTH} characters, got {len(name)}'
+        )
 
 
 def make_executor(context: Context, *, closed_world: bool) -> Executor:
@@ -136,13 +157,15 @@ def made(make: Callable[[], N]) -> N:
     """
     try:
         return make()
-    except (
-        ParameterError,
-        ParameterException,
-        NameValidationException,
-        InvalidQosOverridesError,
-    ) as error:
+    except NameValidationException as error:
+        # Its lines: the kind of name and the rule, the name, a mark under the place.
+        rule, name, *_ = str(error).splitlines()
+        raise UserError(f'{rule} {printable(name.strip())}') from error
+    except (ParameterError, ParameterException, InvalidQosOverridesError) as error:
         raise UserError(str(error)) from error
+    except rclpy_implementation.RCLError as error:
+        # Names that only together are too long: rcl appends the place in its sources.
+        raise UserError(str(error).split(', at /')[0]) from error
 
 
 class Runner:
@@ -166,6 +189,8 @@ class Runner:
             UserError: The name, the parameters or the QoS that its user gave cannot be.
         """
         node = made(make)
+        if not isinstance(node, ParameterizedNode):
+            guard_inputs(node)
         self._nodes.append(node)
         self._executor.add_node(node)
         return node

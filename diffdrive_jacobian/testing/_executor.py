@@ -301,6 +301,10 @@ class _Facade:
         return self._executor.create_task(callback, *args, **kwargs)
 
     def __getattr__(self, name: str) -> Any:
-        raise LockstepError(
+        raise _NoAttributeError(
             f'a node in lockstep cannot call executor.{name}: the world does the spinning'
         )
+
+
+class _NoAttributeError(LockstepError, AttributeError):
+    """What the executor does not have; `hasattr` gives False."""

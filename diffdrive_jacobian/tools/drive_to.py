@@ -110,11 +110,12 @@ class Observer(Node):  # type: ignore[misc]
     def _on_odometry(self, message: Odometry) -> None:
         # With --open anybody may publish, and anything.
         try:
-            self.pose = messages.from_pose(message.pose.pose)
+            pose = messages.from_pose(message.pose.pose)
+            stamp = messages.from_time(message.header.stamp)
         except MessageError as error:
             self.get_logger().warning(f'odometry dropped: {error}', throttle_duration_sec=THROTTLE)
             return
-        self.seen = messages.from_time(message.header.stamp)
+        self.pose, self.seen = pose, stamp
         twist = message.twist.twist
         self.moving = (twist.linear.x, twist.angular.z) != (0.0, 0.0)
         if self._sent is None and not self.over:

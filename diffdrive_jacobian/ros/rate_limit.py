@@ -1,0 +1,28 @@
+"""How often something may happen."""
+
+from __future__ import annotations
+
+
+class RateLimit:
+    """A token bucket: `burst` events at once, then one for each `period`."""
+
+    def __init__(self, burst: int, period: float) -> None:
+        """Start with a full bucket.
+
+        Args:
+            burst: Number of events that are permitted at once.
+            period: Time after which one more is permitted (s).
+        """
+        self._burst = burst
+        self._period = period
+        self._tokens = float(burst)
+        self._updated = 0.0
+
+    def permits(self, now: float) -> bool:
+        """Return whether an event is permitted at a time (s, monotonic), and count it if so."""
+        self._tokens = min(self._burst, self._tokens + (now - self._updated) / self._period)
+        self._updated = now
+        if self._tokens < 1.0:
+            return False
+        self._tokens -= 1.0
+        return True

@@ -1,0 +1,211 @@
+"""What rclpy itself cannot parse, parameter requests and /clock, is refused and ends no node."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterType, ParameterValue
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    GetParameters,
+    GetParameterTypes,
+    ListParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
+
+from diffdrive_jacobian.control import Arrival
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.ros.runner import ros_context, running
+from diffdrive_jacobian.tools.drive_to import Observer
+from diffdrive_jacobian.tools.send_goal import Sender
+
+NODES = {'virtual_robot': VirtualRobot, 'go_to_goal': GoToGoal, 'wheel_bridge': WheelBridge}
+CHANGEABLE = {'virtual_robot': 'cmd_vel_timeout', 'go_to_goal': 'kp', 'wheel_bridge': 'cmd_vel_timeout'}
+BAD_CLOCKS = {'negative': (-1, 0), 'lowest': (-(2**31), 0), 'misleading zero': (-1, 1_000_000_000)}
+
+
+def double(name, value):
+    kind = ParameterType.PARAMETER_DOUBLE
+    return ParameterMessage(name=name, value=ParameterValue(type=kind, double_value=value))
+
+
+def of_type(name, number):
+    return ParameterMessage(name=name, value=ParameterValue(type=number))
+
+
+def clock(sec, nanosec):
+    message = Clock()
+    message.clock.sec, message.clock.nanosec = sec, nanosec
+    return message
+
+
+# --- Parameter requests
+
+
+@pytest.mark.parametrize('number', [10, 42, 255])
+@pytest.mark.parametrize('name', NODES)
+def test_value_of_an_unknown_type_is_refused_and_the_others_are_set(lockstep, add, name, number):
+    node, changed = add(NODES[name]), CHANGEABLE[name]
+    parameters = [of_type(changed, number), double(changed, 2.5), of_type('no such', number)]
+    request = SetParameters.Request(parameters=parameters)
+    results = lockstep.call(SetParameters, f'{name}/set_parameters', request).results
+    assert [one.successful for one in results] == [False, True, False]
+    assert f"parameter '{changed}' must have a type in 0 to 9, got type {number}" in results[0].reason
+    assert node.get_parameter(changed).value == 2.5
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_atomic_request_with_a_value_of_an_unknown_type_is_refused_whole(lockstep, add, name):
+    node, changed = add(NODES[name]), CHANGEABLE[name]
+    before = node.parameters
+    request = SetParametersAtomically.Request(
+        parameters=[double(changed, 2.5), of_type('kv', 10), double(changed, 3.5)]
+    )
+    service = f'{name}/set_parameters_atomically'
+    result = lockstep.call(SetParametersAtomically, service, request).result
+    assert not result.successful
+    assert "parameter 'kv' must have a type in 0 to 9, got type 10" in result.reason
+    assert node.parameters is before
+    request.parameters.pop(1)
+    assert lockstep.call(SetParametersAtomically, service, request).result.successful
+    assert node.get_parameter(changed).value == 3.5
+
+
+def test_parameter_without_a_name_is_not_set(lockstep, add):
+    node = add(GoToGoal)
+    request = SetParameters.Request(parameters=[double('', 1.0)])
+    (result,) = lockstep.call(SetParameters, 'go_to_goal/set_parameters', request).results
+    assert (result.successful, result.reason) == (False, 'a parameter must have a name, got none')
+    assert not node.has_parameter('')
+
+
+def test_refused_name_is_quoted_in_short_and_without_control_characters(lockstep, add, capfd):
+    add(GoToGoal)
+    request = SetParameters.Request(parameters=[of_type('\x1b[2J' + 100_000 * 'n', 10)])
+    (result,) = lockstep.call(SetParameters, 'go_to_goal/set_parameters', request).results
+    written = capfd.readouterr().err
+    assert 'parameter request refused: ' in written
+    for text in (result.reason, written):
+        assert len(text) < 300
+        assert '\x1b' not in text
+        assert r'\x1b[2Jnn' in text
+
+
+SERVICES = {
+    'describe_parameters': DescribeParameters,
+    'get_parameters': GetParameters,
+    'get_parameter_types': GetParameterTypes,
+    'list_parameters': ListParameters,
+}
+ODD_NAMES = ['', '.', '..', ' ', '\n', 'kp.', 'kp.kp', 'ü', '%s', '\x00', 1_000 * 'n']
+
+
+def test_other_parameter_services_answer_odd_requests(lockstep, add):
+    add(GoToGoal)
+    for name in ODD_NAMES:
+        for service, request in (
+            ('describe_parameters', DescribeParameters.Request(names=[name])),
+            ('get_parameters', GetParameters.Request(names=[name])),
+            ('get_parameter_types', GetParameterTypes.Request(names=[name])),
+            ('list_parameters', ListParameters.Request(prefixes=[name], depth=2**64 - 1)),
+        ):
+            assert lockstep.call(SERVICES[service], f'go_to_goal/{service}', request)
+    request = SetParameters.Request(parameters=[of_type(one, 0) for one in [*ODD_NAMES, 'kp']])
+    results = lockstep.call(SetParameters, 'go_to_goal/set_parameters', request).results
+    assert [one.successful for one in results] == [False] * len(results)
+
+
+# --- /clock
+
+
+@pytest.mark.parametrize('bad', BAD_CLOCKS.values(), ids=BAD_CLOCKS)
+@pytest.mark.parametrize('name', NODES)
+def test_node_survives_a_clock_that_cannot_be(ros, capfd, name, bad):
+    node = ros.add(NODES[name], parameters={'use_sim_time': True})
+    time = ros.talk(Clock, '/clock')
+    time.publish(clock(5, 0))
+    ros.until(lambda: node.now() == 5_000_000_000, 'the time is known')
+    time.publish(clock(*bad))
+    ros.until_said(capfd, '/clock dropped: ', f'got sec {bad[0]}, nanosec {bad[1]}')
+    assert node.now() == 5_000_000_000
+    time.publish(clock(6, 0))
+    ros.until(lambda: node.now() == 6_000_000_000, 'time goes on')
+
+
+def test_clock_is_guarded_when_simulated_time_is_switched_on_later(ros, capfd, executor_kind):
+    node = ros.add(GoToGoal)
+    assert node.set_parameters([Parameter('use_sim_time', value=True)])[0].successful
+    time = ros.talk(Clock, '/clock')
+    time.publish(clock(-1, 0))
+    ros.until_said(capfd, '/clock dropped: ')
+    time.publish(clock(6, 0))
+    ros.until(lambda: node.now() == 6_000_000_000, 'time goes on')
+
+
+def observer(context):
+    return Observer(np.zeros((1, 3)), Arrival(), ('left', 'right'), context)
+
+
+def sender(context):
+    return Sender(np.zeros(3), '', context)
+
+
+def plain(context):
+    return Node('plain', context=context)
+
+
+@pytest.mark.parametrize('isolated', [False, True])
+@pytest.mark.parametrize('make', [observer, sender, plain])
+def test_runner_guards_the_nodes_of_the_tools(capfd, make, isolated):
+    arguments = ['test', '--ros-args', '-p', 'use_sim_time:=true']
+    with ros_context(arguments) as context, running(context, closed_world=isolated) as runner:
+        node = runner.add(lambda: make(context))
+        peer = runner.add(lambda: Node('peer', context=context))
+        time = peer.create_publisher(Clock, '/clock', 10)
+        assert runner.spin(lambda: time.get_subscription_count() == 2)
+        time.publish(clock(-1, 0))
+        assert runner.spin(lambda: '/clock dropped: ' in capfd.readouterr().err)
+        time.publish(clock(6, 0))
+        assert runner.spin(lambda: node.get_clock().now().nanoseconds == 6_000_000_000)
+        if make is sender:
+            return
+        client = peer.create_client(SetParameters, f'{node.get_name()}/set_parameters')
+        assert runner.spin(client.service_is_ready)
+        future = client.call_async(SetParameters.Request(parameters=[of_type('use_sim_time', 10)]))
+        assert runner.spin(future.done)
+        assert not future.result().results[0].successful
+
+
+def test_exception_of_our_own_callbacks_is_not_caught(lockstep, add):
+    node = add(GoToGoal)
+
+    def fail(_):
+        raise ZeroDivisionError('of the node itself')
+
+    node.add_post_set_parameters_callback(fail)
+    request = SetParameters.Request(parameters=[of_type('kp', 10), double('kp', 2.5)])
+    with pytest.raises(ZeroDivisionError, match='of the node itself'):
+        lockstep.call(SetParameters, 'go_to_goal/set_parameters', request)
+
+
+def test_names_of_rclpy_that_the_guard_relies_on(ros):
+    node = ros.add(Node, node_name='bare', parameters={'use_sim_time': True})
+    source = node._time_source
+    assert source._clock_sub.callback == source.clock_callback
+    services = {service.srv_type: service.callback for service in node.services}
+    assert services[SetParameters].__name__ == '_set_parameters_callback'
+    assert services[SetParametersAtomically].__name__ == '_set_parameters_atomically_callback'
+    # What it refuses is what rclpy raises for: once that ends, the guard can go.
+    with pytest.raises(ValueError, match='10 is not a valid'):
+        services[SetParameters](
+            SetParameters.Request(parameters=[of_type('kp', 10)]), SetParameters.Response()
+        )
+    with pytest.raises(ValueError, match='must not be negative'):
+        source.clock_callback(clock(-1, 0))
