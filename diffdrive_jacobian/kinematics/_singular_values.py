@@ -11,60 +11,77 @@ are 0. Arrays are checked by the callers.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import operator
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.kinematics._elementary import minimum, sqrt, where
+
 CUTOFF = 1e-15
 """Without damping, singular values below `CUTOFF max(m, n)` times the largest one count as zero."""
 FILTER = 0.1
 """Width of the projector's filter, relative to the damping."""
-_TINY = float(np.finfo(np.float64).tiny)
+TINY = float(np.finfo(np.float64).tiny)
+"""Smaller numbers have no inverse."""
 
 Array = NDArray[np.float64]
 
 
-def gains_and_removals(values: Array, damping: Array, least: Array) -> tuple[Array, Array]:
-    """Compute g and f of singular values, shape (..., k), with damping, shape (..., 1).
+def gain(value: Any, damping: Any, least: Any) -> Any:
+    """Compute g(s), of floats or arrays; without damping singular values up to `least` count as zero."""
+    kept = value > where(damping > 0.0, TINY, least)
+    safe = where(kept, value, 1.0)
+    return where(kept, 1.0 / (safe + damping * (damping / safe)), 0.0)
 
-    Args:
-        values: Singular values, shape (..., k).
-        damping: lambda, shape (..., 1).
-        least: Without damping, values up to this count as zero, shape (..., 1).
-    """
+
+def removal(value: Any, damping: Any, least: Any) -> Any:
+    """Compute f(s), of floats or arrays; without damping singular values up to `least` count as zero."""
     damped = damping > 0.0
-    kept = values > np.where(damped, _TINY, least)
-    safe = np.where(kept, values, 1.0)
-    with np.errstate(over='ignore', under='ignore', divide='ignore', invalid='ignore'):
-        gains = np.where(kept, 1.0 / (safe + damping * (damping / safe)), 0.0)
-        # Divided one after the other: the product may be too small for a number.
-        filtered = np.fmin(values / damping / FILTER, 1.0)
-    return gains, np.where(damped, filtered, kept)
+    # Divided one after the other: the product may be too small for a number.
+    filtered = minimum(value / where(damped, damping, 1.0) / FILTER, 1.0)
+    return where(damped, filtered, where(value > least, 1.0, 0.0))
+
+
+def gains(values: Array, damping: Array, least: Array) -> Array:
+    """Compute g(s) of singular values, shape (..., k), with damping and least of shape (...)."""
+    return _each(gain, values, damping, least)
+
+
+def removals(values: Array, damping: Array, least: Array) -> Array:
+    """Compute f(s) of singular values, shape (..., k), with damping and least of shape (...)."""
+    return _each(removal, values, damping, least)
 
 
 def negligible(values: Array, shape: tuple[int, ...]) -> Array:
-    """Return up to which singular value they count as zero without damping, shape (..., 1)."""
-    least: Array = np.maximum(CUTOFF * max(shape[-2:]) * values[..., :1], _TINY)
-    return least
+    """Return up to which value singular values count as zero without damping, shape (...)."""
+    return np.asarray(np.maximum(CUTOFF * max(shape[-2:]) * values[..., 0], TINY))
 
 
-def inverse_and_projector(J: Array, damping: Array, least: Array | None = None) -> tuple[Array, Array]:
-    """Compute the damped inverse, shape (..., n, m), and the projector, shape (..., n, n).
-
-    Args:
-        J: Jacobians, shape (..., m, n).
-        damping: lambda, shape (...).
-        least: Without damping, singular values up to this count as zero, shape (...); None: `CUTOFF`.
-    """
+def pseudoinverse(J: Array) -> Array:
+    """Compute J^+, shape (..., n, m)."""
     left, values, right = np.linalg.svd(J, full_matrices=False)
-    zero = negligible(values, J.shape) if least is None else np.maximum(least, _TINY)[..., np.newaxis]
-    gains, removals = gains_and_removals(values, damping[..., np.newaxis], zero)
-    columns = np.swapaxes(right, -1, -2)
-    inverse = columns * gains[..., np.newaxis, :] @ np.swapaxes(left, -1, -2)
-    projector = np.eye(J.shape[-1]) - columns * removals[..., np.newaxis, :] @ right
-    return inverse, projector
+    kept = values > negligible(values, J.shape)[..., np.newaxis]
+    inverses = kept / np.where(kept, values, 1.0)
+    inverse: Array = (
+        np.swapaxes(right, -1, -2) * inverses[..., np.newaxis, :] @ np.swapaxes(left, -1, -2)
+    )
+    return inverse
+
+
+def null_space_projector(J: Array, damping: Array) -> Array:
+    """Compute N with damping of shape (...), shape (..., n, n)."""
+    _, values, right = np.linalg.svd(J, full_matrices=False)
+    return projector(right, removals(values, damping, negligible(values, J.shape)))
+
+
+def projector(right: Array, removed: Array) -> Array:
+    """Compute `I - sum_i f_i v_i v_i^T` of the rows v_i and the f_i, shape (..., n, n)."""
+    columns = np.swapaxes(right, -1, -2) * removed[..., np.newaxis, :]
+    return np.asarray(np.eye(right.shape[-1]) - columns @ right)
 
 
 def joint_velocities(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None = None) -> Array:
@@ -82,22 +99,23 @@ def joint_velocities(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | No
     method = _two_rows if J.shape[-2] == 2 else _by_svd
     with np.errstate(all='ignore'):
         q_dot, exact = method(J, x_dot, damping, q_dot_0)
-        if exact.all():
-            return q_dot
+        if np.all(exact):
+            return np.asarray(q_dot)
         batch = q_dot.shape[:-1]
         redo = ~np.broadcast_to(exact, batch)
 
         def selected(value: Array, axes: int) -> Array:
-            return np.broadcast_to(value, (*batch, *value.shape[value.ndim - axes :]))[redo]
+            whole = np.broadcast_to(value, (*batch, *value.shape[value.ndim - axes :]))
+            return np.asarray(whole[redo])
 
         secondary = None if q_dot_0 is None else selected(q_dot_0, 1)
         q_dot[redo] = _scaled(selected(J, 2), selected(x_dot, 1), selected(damping, 0), secondary)
-    return q_dot
+    return np.asarray(q_dot)
 
 
 def manipulability(J: Array) -> Array:
     """Compute the product of the singular values of Jacobians with m <= n, shape (...)."""
-    with np.errstate(over='ignore', under='ignore', invalid='ignore'):
+    with np.errstate(all='ignore'):
         if J.shape[-2] != 2:
             return np.asarray(np.linalg.svd(J, compute_uv=False).prod(axis=-1))
         w = _minors(J)
@@ -105,10 +123,19 @@ def manipulability(J: Array) -> Array:
         extreme = ~((squares > 1e-60) & (squares < 1e60))
         if extreme.any():
             exponents = _exponent(J[extreme], 2)
-            w[extreme] = np.ldexp(
-                _minors(np.ldexp(J[extreme], -exponents[:, np.newaxis, np.newaxis])), 2 * exponents
-            )
+            scaled = np.ldexp(J[extreme], -exponents[:, np.newaxis, np.newaxis])
+            w[extreme] = np.ldexp(_minors(scaled), 2 * exponents)
     return w
+
+
+def _each(function: Any, values: Array, damping: Array, least: Array) -> Array:
+    """Apply a function to each singular value, of a single Jacobian as a float, which is faster."""
+    if values.ndim == 1 and damping.ndim == least.ndim == 0:
+        factor, zero = float(damping), float(least)
+        return np.array([function(value, factor, zero) for value in values.tolist()])
+    with np.errstate(all='ignore'):
+        computed: Array = function(values, damping[..., np.newaxis], least[..., np.newaxis])
+    return computed
 
 
 def _minors(J: Array) -> Array:
@@ -130,11 +157,11 @@ def _exponent(values: Array, axes: int) -> NDArray[np.int32]:
 
 
 def _scaled(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None) -> Array:
-    """Compute joint velocities, shape (k, n), by way of entries near 1: nothing overflows on the way."""
+    """Compute joint velocities, shape (k, n), from entries scaled to about 1, which cannot overflow."""
     units, speeds = _exponent(J, 2)[:, np.newaxis], _exponent(x_dot, 1)[:, np.newaxis]
     J, damping = np.ldexp(J, -units[..., np.newaxis]), np.ldexp(damping, -units[:, 0])
-    # What has no inverse that is a number counts as zero, in the units of J.
-    tiny = np.ldexp(np.full(units.shape, _TINY), -units)
+    # Without damping, singular values of J count as zero if their inverse is not a number.
+    tiny = np.ldexp(np.full(len(units), TINY), -units[:, 0])
     task, _ = _by_svd(J, np.ldexp(x_dot, -speeds), damping, None, tiny)
     q_dot: Array = np.ldexp(task, speeds - units)
     if q_dot_0 is not None:
@@ -145,66 +172,93 @@ def _scaled(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None) -> Ar
 
 
 def _by_svd(
-    J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None, tiny: Array | float = _TINY
+    J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None, tiny: Array | float = 0.0
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Compute joint velocities, and where neither overflow nor underflow can have spoilt them."""
     left, values, right = np.linalg.svd(J, full_matrices=False)
-    along = (x_dot[..., np.newaxis, :] @ left)[..., 0, :]
     least = np.maximum(negligible(values, J.shape), tiny)
-    gains, removals = gains_and_removals(values, damping[..., np.newaxis], least)
-    weights = gains * along
+    along = gains(values, damping, least) * (x_dot[..., np.newaxis, :] @ left)[..., 0, :]
     if q_dot_0 is not None:
-        weights = weights - removals * (right @ q_dot_0[..., np.newaxis])[..., 0]
-    q_dot: Array = (weights[..., np.newaxis, :] @ right)[..., 0, :]
+        secondary = (right @ q_dot_0[..., np.newaxis])[..., 0]
+        along = along - removals(values, damping, least) * secondary
+    q_dot: Array = (along[..., np.newaxis, :] @ right)[..., 0, :]
     if q_dot_0 is not None:
         q_dot = q_dot + q_dot_0
     largest = values[..., 0]
     return q_dot, (largest > 1e-30) & (largest < 1e30) & np.isfinite(q_dot).all(axis=-1)
 
 
-def _two_rows(
-    J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None
-) -> tuple[Array, NDArray[np.bool_]]:
+def _two_rows(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None) -> tuple[Array, Any]:
     """Compute the same for two rows, in closed form: a rotation in the plane of the task makes the rows
-    orthogonal (one-sided Jacobi), then they are `s_i v_i^T`. Many times as fast as LAPACK on batches.
+    orthogonal (one-sided Jacobi), then they are `s_i v_i^T`. Many times as fast as LAPACK.
     """
-    # Column by column, for loops over the short last axis take longer.
-    columns: list[tuple[Any, Any]] = [(J[..., 0, k], J[..., 1, k]) for k in range(J.shape[-1])]
-    one, other = x_dot[..., 0], x_dot[..., 1]
+    # Column by column, because loops over the short last axis take longer; of a single Jacobian floats.
+    n = J.shape[-1]
+    columns: list[tuple[Any, Any]]
+    secondary: list[Any] = []
+    one: Any
+    other: Any
+    factor: Any = damping
+    if J.ndim == 2 and x_dot.ndim == 1 and damping.ndim == 0 and (q_dot_0 is None or q_dot_0.ndim == 1):
+        first_row, second_row = J.tolist()
+        columns = list(zip(first_row, second_row, strict=True))
+        (one, other), factor = x_dot.tolist(), float(damping)
+        secondary = [] if q_dot_0 is None else q_dot_0.tolist()
+    else:
+        columns = [(J[..., 0, k], J[..., 1, k]) for k in range(n)]
+        one, other = x_dot[..., 0], x_dot[..., 1]
+        secondary = [] if q_dot_0 is None else [q_dot_0[..., k] for k in range(n)]
     for _ in range(2):  # The second rotation removes the rounding of the first near a singularity.
-        first, second, both = _products(columns)
-        angle = 0.5 * np.arctan2(2.0 * both, first - second)
-        c, s = np.cos(angle), np.sin(angle)
+        c, s = _rotation(*_products(columns))
         one, other = c * one + s * other, c * other - s * one
         columns = [(c * a + s * b, c * b - s * a) for a, b in columns]
     first, second, _ = _products(columns)
-    squares = np.stack([first, second], axis=-1)
-    values = np.sqrt(squares)
-    gains, removals = gains_and_removals(values, damping[..., np.newaxis], negligible(values, J.shape))
-    nonzero = np.where(squares > 0.0, squares, 1.0)
-    gains = gains / np.sqrt(nonzero)
-    one, other = gains[..., 0] * one, gains[..., 1] * other
-    if q_dot_0 is not None:
-        removals = removals / nonzero
-        secondary = [q_dot_0[..., k] for k in range(J.shape[-1])]
-        one = one - removals[..., 0] * sum(a * q for (a, _), q in zip(columns, secondary, strict=True))
-        other = other - removals[..., 1] * sum(
-            b * q for (_, b), q in zip(columns, secondary, strict=True)
-        )
-    q_dot = np.stack([one * a + other * b for a, b in columns], axis=-1)
-    if q_dot_0 is not None:
-        q_dot = q_dot + q_dot_0
-    exact = (first > 1e-60) & (first < 1e60) & np.isfinite(q_dot).all(axis=-1)
+    largest, smallest = sqrt(first), sqrt(second)
+    least = where(largest > TINY, CUTOFF * max(2, n) * largest, TINY)
+    # The rows are singular vectors times singular values: divide by these once more.
+    by_first, by_second = where(first > 0.0, largest, 1.0), where(second > 0.0, smallest, 1.0)
+    one = gain(largest, factor, least) / by_first * one
+    other = gain(smallest, factor, least) / by_second * other
+    if secondary:
+        along = _sum(a * q for (a, _), q in zip(columns, secondary, strict=True)) / by_first
+        across = _sum(b * q for (_, b), q in zip(columns, secondary, strict=True)) / by_second
+        one = one - removal(largest, factor, least) * along / by_first
+        other = other - removal(smallest, factor, least) * across / by_second
+        q_dot = [one * a + other * b + q for (a, b), q in zip(columns, secondary, strict=True)]
+    else:
+        q_dot = [one * a + other * b for a, b in columns]
+    exact = (first > 1e-60) & (first < 1e60) & (abs(_sum(map(abs, q_dot))) < np.inf)
     small = second < 1e-200
-    if small.any():  # Its square may have underflowed although that of the first has not.
-        exact = exact & ~(small & np.any([b != 0.0 for _, b in columns], axis=0))
-    return q_dot, exact
+    if np.any(small):  # Its square may have underflowed although that of the first has not.
+        exact = exact & ~(np.asarray(small) & np.any([b != 0.0 for _, b in columns], axis=0))
+    return np.stack(q_dot, axis=-1), exact
 
 
-def _products(columns: Sequence[tuple[Any, Any]]) -> tuple[Any, Any, Any]:
+def _rotation(first: Any, second: Any, both: Any) -> tuple[Any, Any]:
+    """Return cosine and sine of the angle that makes two rows orthogonal, the first the longer one.
+
+    Only with operations that are correctly rounded: floats and arrays give the same.
+    """
+    difference = first - second
+    double = sqrt(difference * difference + 4.0 * both * both)
+    safe = where(double > 0.0, double, 1.0)
+    # Half of the angle whose cosine is difference / double, without cancellation.
+    larger = sqrt(0.5 + 0.5 * abs(difference) / safe)
+    smaller = abs(both) / (safe * larger)
+    sign = where(both < 0.0, -1.0, 1.0)
+    turned = difference < 0.0
+    return where(turned, smaller, larger), sign * where(turned, larger, smaller)
+
+
+def _products(columns: list[tuple[Any, Any]]) -> tuple[Any, Any, Any]:
     """Return the squares of two rows, and their product."""
     return (
-        sum(a * a for a, _ in columns),
-        sum(b * b for _, b in columns),
-        sum(a * b for a, b in columns),
+        _sum(a * a for a, _ in columns),
+        _sum(b * b for _, b in columns),
+        _sum(a * b for a, b in columns),
     )
+
+
+def _sum(terms: Iterable[Any]) -> Any:
+    """Add from left to right: `sum` of floats may compensate rounding, that of arrays does not."""
+    return functools.reduce(operator.add, terms)

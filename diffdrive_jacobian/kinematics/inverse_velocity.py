@@ -36,14 +36,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from diffdrive_jacobian.kinematics import _singular_values
 from diffdrive_jacobian.kinematics._adjugate import adjugate, refuse_singular
 from diffdrive_jacobian.kinematics._checks import array, floats, leading, not_negative, positive
-from diffdrive_jacobian.kinematics._singular_values import (
-    CUTOFF,
-    FILTER,
-    inverse_and_projector,
-    joint_velocities,
-)
+from diffdrive_jacobian.kinematics._singular_values import CUTOFF, FILTER, joint_velocities
 from diffdrive_jacobian.kinematics._task_checks import checked_damping, checked_task, weighted
 from diffdrive_jacobian.kinematics.secondary_tasks import (
     joint_limit_cost,
@@ -71,7 +67,6 @@ __all__ = [
 ]
 
 _EPSILON = float(np.finfo(np.float64).eps)
-_NONE = np.zeros(())
 
 Array = NDArray[np.float64]
 
@@ -123,9 +118,9 @@ def pseudoinverse(J: ArrayLike, *, weights: ArrayLike | None = None) -> Array:
     """
     J = array('J', J, 'm', 'n')
     if weights is None:
-        return inverse_and_projector(J, _NONE)[0]
+        return _singular_values.pseudoinverse(J)
     scaled, roots = weighted(J, weights)
-    return inverse_and_projector(scaled, _NONE)[0] / roots[..., np.newaxis]
+    return _singular_values.pseudoinverse(scaled) / roots[..., np.newaxis]
 
 
 def damping(manipulability: ArrayLike, threshold: ArrayLike, maximum: ArrayLike) -> Array:
@@ -195,10 +190,10 @@ def null_space_projector(
     J, factor = array('J', J, 'm', 'n'), checked_damping(damping)
     if weights is None:
         leading(J=J.shape[:-2], damping=factor.shape)
-        return inverse_and_projector(J, factor)[1]
+        return _singular_values.null_space_projector(J, factor)
     scaled, roots = weighted(J, weights)
     leading(J=scaled.shape[:-2], damping=factor.shape)
-    projector = inverse_and_projector(scaled, factor)[1]
+    projector = _singular_values.null_space_projector(scaled, factor)
     return projector * roots[..., np.newaxis, :] / roots[..., np.newaxis]
 
 

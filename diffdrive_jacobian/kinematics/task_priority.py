@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._checks import array, floats, leading, number, positive
-from diffdrive_jacobian.kinematics._singular_values import inverse_and_projector
+from diffdrive_jacobian.kinematics._singular_values import TINY, gains, projector, removals
 from diffdrive_jacobian.kinematics._task_checks import checked_damping, checked_task, weighted
 
 Array = NDArray[np.float64]
@@ -79,16 +79,17 @@ def prioritized(
         **{f'task {k} x_dot': x_dot.shape[:-1] for k, (_, x_dot) in enumerate(pairs)},
         damping=factor.shape,
     )
-    q_dot = np.zeros((*batch, n))
-    free = np.broadcast_to(np.eye(n), (*batch, n, n))
-    undamped = not factor.all()
+    q_dot, free = np.zeros((*batch, n)), np.eye(n)
     for k, (J, x_dot) in enumerate(pairs):
-        least = np.asarray(cutoff * np.linalg.norm(J, ord=2, axis=(-2, -1)) if undamped else 0.0)
-        inverse, remaining = inverse_and_projector(J @ free, factor, least)
-        missing = x_dot - (J @ q_dot[..., np.newaxis])[..., 0]
-        q_dot = q_dot + (free @ (inverse @ missing[..., np.newaxis]))[..., 0]
+        left, values, right = np.linalg.svd(J @ free if k else J, full_matrices=False)
+        norm = np.linalg.norm(J, ord=2, axis=(-2, -1)) if k else values[..., 0]
+        least = np.maximum(cutoff * norm, TINY)
+        missing = x_dot - (J @ q_dot[..., np.newaxis])[..., 0] if k else x_dot
+        along = gains(values, factor, least) * (missing[..., np.newaxis, :] @ left)[..., 0, :]
+        step = np.swapaxes(right, -1, -2) @ along[..., np.newaxis]
+        q_dot = q_dot + (free @ step if k else step)[..., 0]
         if k < len(pairs) - 1:
-            free = free @ remaining
+            free = free @ projector(right, removals(values, factor, least))
     if roots is not None:
         q_dot = q_dot / roots
     return q_dot if max_velocity is None else limit_velocity(q_dot, max_velocity)
