@@ -243,7 +243,7 @@ def _rotation(first: Any, second: Any, both: Any) -> tuple[Any, Any]:
     double = sqrt(difference * difference + 4.0 * both * both)
     safe = where(double > 0.0, double, 1.0)
     # Half of the angle whose cosine is difference / double, without cancellation.
-    larger = sqrt(0.5 + 0.5 * abs(difference) / safe)
+    larger = sqrt(0.5 + 0.5 * where(double > 0.0, abs(difference) / safe, 1.0))
     smaller = abs(both) / (safe * larger)
     sign = where(both < 0.0, -1.0, 1.0)
     turned = difference < 0.0

@@ -71,13 +71,14 @@ def prioritized(
     n = pairs[0][0].shape[-1]
     roots = None
     if weights is not None:
-        for k, (J, x_dot) in enumerate(pairs):
-            scaled, roots = weighted(J, weights)
-            pairs[k] = scaled, x_dot
+        scaled = [weighted(J, weights) for J, _ in pairs]
+        pairs = [(J, x_dot) for (J, _), (_, x_dot) in zip(scaled, pairs, strict=True)]
+        roots = scaled[0][1]
     batch = leading(
         **{f'task {k} J': J.shape[:-2] for k, (J, _) in enumerate(pairs)},
         **{f'task {k} x_dot': x_dot.shape[:-1] for k, (_, x_dot) in enumerate(pairs)},
         damping=factor.shape,
+        weights=() if roots is None else roots.shape[:-1],
     )
     q_dot, free = np.zeros((*batch, n)), np.eye(n)
     for k, (J, x_dot) in enumerate(pairs):

@@ -88,11 +88,11 @@ def track_line(
             mapped to inputs by the robot's `configuration_jacobian` G: `W^-1 G^T gradient`. With damping
             it moves the tip by at most `lambda / 40 |q_dot_0|`, see `inverse_velocity.redundant`.
         settling: Time after the end of the line (s).
-        weights: Weights of the inputs, positive, shape (..., inputs); None: all 1. An input with a larger
-            weight is used less. The manipulability, its threshold and lambda are then those of
+        weights: Weights of the inputs, positive, shape (..., inputs); None: all 1. An input with a
+            larger weight is used less. The manipulability, its threshold and lambda are then those of
             `J W^-1/2`, and bounds hold for `W^1/2 q_dot`.
-        max_velocity: Largest inputs, positive, shape (..., inputs), or one for all: all inputs are slowed
-            down alike, and the tip falls behind; None: no limits.
+        max_velocity: Largest inputs, positive, shape (..., inputs), or one for all: all inputs are
+            slowed down alike, and the tip falls behind; None: no limits.
 
     Returns:
         Everything at each sample. An error that remains is the price of damping, of limits, or of a line
