@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from diffdrive_jacobian.kinematics import diff_drive
+from diffdrive_jacobian.kinematics import diff_drive, secondary_tasks, task_priority
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
 
 EPS = np.finfo(float).eps
@@ -270,37 +270,50 @@ def test_manipulability_is_the_volume_of_the_velocities_and_does_not_depend_on_a
 
 # --- Shapes and bad input
 
-J, X_DOT, Q = np.ones((2, 3)), np.ones(2), np.zeros(3)
+J, X_DOT, Q, WEIGHTS = np.ones((2, 3)), np.ones(2), np.zeros(3), np.array([1.0, 2.0, 0.5])
 VALID = {
     iv.adjugate_inverse: {'J': np.array([[1.0, 2.0], [0.5, 3.0]])},
-    iv.pseudoinverse: {'J': J},
+    iv.pseudoinverse: {'J': J, 'weights': WEIGHTS},
     iv.manipulability: {'J': J},
     iv.damping: {'manipulability': 0.1, 'threshold': 0.2, 'maximum': 0.3},
-    iv.damped_least_squares: {'J': J, 'x_dot': X_DOT, 'damping': 0.1},
-    iv.null_space_projector: {'J': J},
+    iv.damped_least_squares: {'J': J, 'x_dot': X_DOT, 'damping': 0.1, 'weights': WEIGHTS},
+    iv.null_space_projector: {'J': J, 'damping': 0.1, 'weights': WEIGHTS},
     iv.manipulability_gradient: {'jacobian': lambda q: np.cos(q)[..., np.newaxis, :], 'q': Q},
     iv.joint_limit_cost: {'q': Q, 'lower': Q - 1.0, 'upper': Q + 1.0},
     iv.joint_limit_gradient: {'q': Q, 'lower': Q - 1.0, 'upper': Q + 1.0},
-    iv.redundant: {'J': J, 'x_dot': X_DOT, 'q_dot_0': Q},
-    iv.prioritized: {'tasks': [(J, X_DOT)], 'cutoff': 1e-9},
+    iv.redundant: {'J': J, 'x_dot': X_DOT, 'q_dot_0': Q, 'damping': 0.1, 'weights': WEIGHTS},
+    iv.prioritized: {
+        **{'tasks': [(J, X_DOT), (np.array([[1.0, 0.0, 2.0]]), [0.5])], 'damping': 0.1},
+        **{'cutoff': 1e-9, 'weights': WEIGHTS, 'max_velocity': WEIGHTS},
+    },
+    iv.limit_velocity: {'q_dot': WEIGHTS, 'max_velocity': WEIGHTS},
 }
 RAGGED = [[1.0], [1.0, 2.0]]
 NO_ARRAYS = ('jacobian', 'tasks', 'cutoff')
+MAY_BE_NONE = ('weights', 'max_velocity')
 ARGUMENTS = [(function, name) for function, arguments in VALID.items() for name in arguments]
 
 
 def test_every_public_function_is_given_bad_input_here():
-    functions = {f for _, f in inspect.getmembers(iv, inspect.isfunction) if f.__module__ == iv.__name__}
+    modules = (iv, secondary_tasks, task_priority)
+    functions = {
+        function
+        for module in modules
+        for _, function in inspect.getmembers(module, inspect.isfunction)
+        if function.__module__ == module.__name__
+    }
+    assert all(hasattr(iv, function.__name__) for function in functions if function.__name__[0] != '_')
     assert {f for f in functions if not f.__name__.startswith('_')} == set(VALID)
 
 
 @pytest.mark.parametrize(('function', 'name'), [of for of in ARGUMENTS if of[1] not in NO_ARRAYS[:2]])
 def test_what_is_no_finite_real_number_is_named(function, name):
     shape = np.shape(VALID[function][name])
-    for number in (np.nan, np.inf, -np.inf, 1j):
+    infinite = () if name == 'max_velocity' else (np.inf,)
+    for number in (np.nan, *infinite, -np.inf, 1j):
         with pytest.raises(ValueError, match=rf'^{name} must .*got'):
             function(**VALID[function] | {name: np.full(shape, number)[()]})
-    for bad in ('north', RAGGED, None, {}):
+    for bad in ('north', RAGGED, {}) + (() if name in MAY_BE_NONE else (None,)):
         with pytest.raises(ValueError, match=rf'^{name} must .*got'):
             function(**VALID[function] | {name: bad})
 
@@ -326,7 +339,7 @@ def test_every_function_broadcasts_over_leading_axes_and_names_those_that_do_not
     wrong = {key: np.stack([VALID[function][key]] * (2 if key == name else 3)) for key in shapes}
     if not alone:
         with pytest.raises(ValueError, match=rf'\b{name}\b.* must .*got'):
-            function(**wrong)
+            function(**wrong, **fixed)
 
 
 TWO, THREE = (np.eye(2), np.ones(2)), (np.eye(3), np.ones(3))
@@ -339,6 +352,13 @@ BAD = [
     (iv.redundant, {'q_dot_0': [1.0, 2.0]}, r'^q_dot_0 must have shape .*3.* got \(2,\)'),
     (iv.damped_least_squares, {'x_dot': np.ones(3)}, r'^x_dot must have shape .*2.* got \(3,\)'),
     (iv.damped_least_squares, {'damping': -0.1}, r'^damping must be zero or positive.* got -0\.1'),
+    (iv.damped_least_squares, {'weights': [1.0, 0.0, 1.0]}, r'^weights must be positive .* got 0\.0'),
+    (iv.pseudoinverse, {'weights': -WEIGHTS}, r'^weights must be positive .* got -1\.0'),
+    (iv.redundant, {'weights': [1.0, 2.0]}, r'^weights must have shape .*3.* got \(2,\)'),
+    (iv.null_space_projector, {'damping': -0.1}, r'^damping must be zero or positive.* got -0\.1'),
+    (iv.prioritized, {'damping': -0.1}, r'^damping must be zero or positive.* got -0\.1'),
+    (iv.prioritized, {'max_velocity': [1.0, 0.0, 1.0]}, r'^max_velocity must be positive, got'),
+    (iv.limit_velocity, {'max_velocity': [1.0, 2.0]}, r'^max_velocity must have shape .* got \(2,\)'),
     (iv.damping, {'manipulability': -1e-9}, r'^manipulability must be zero or .* got -1e-09'),
     (iv.damping, {'threshold': 0.0}, r'^threshold must be positive .* got 0'),
     (iv.damping, {'maximum': -1.0}, r'^maximum must be zero or positive .* got -1'),

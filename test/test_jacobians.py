@@ -118,6 +118,16 @@ def mobile_manipulator(rng, links, heading, mount):
     return robot.jacobian(q, heading=heading), differences(tip, np.zeros((COUNT, 2 + links)))
 
 
+def configuration(rng, links):
+    arm = PlanarArm(rng.uniform(0.1, 1.0, links))
+    robot, q = MobileManipulator(r=0.05, L=0.3, arm=arm), rng.uniform(-3.0, 3.0, (COUNT, 3 + links))
+
+    def moved(u):
+        return robot.integrate(q[:, np.newaxis], u, 1.0)
+
+    return robot.configuration_jacobian(q), differences(moved, np.zeros((COUNT, 2 + links)))
+
+
 def manipulability(rng, links, heading):
     arm, q = PlanarArm(rng.uniform(0.3, 1.0, links)), rng.uniform(-4.0, 4.0, (COUNT, links))
     if links == 2:  # The measure has an edge where the arm is singular.
@@ -166,10 +176,18 @@ CASES = [
         for heading in (False, True)
         for mount in MOUNTS
     ),
-    ('inverse_velocity.manipulability_gradient', manipulability, {'links': 2, 'heading': False}),
-    ('inverse_velocity.manipulability_gradient', manipulability, {'links': 3, 'heading': False}),
-    ('inverse_velocity.manipulability_gradient', manipulability, {'links': 4, 'heading': True}),
-    ('inverse_velocity.joint_limit_gradient', joint_limit, {}),
+    *(
+        (
+            'mobile_manipulator.MobileManipulator.configuration_jacobian',
+            configuration,
+            {'links': links},
+        )
+        for links in (1, 3)
+    ),
+    ('secondary_tasks.manipulability_gradient', manipulability, {'links': 2, 'heading': False}),
+    ('secondary_tasks.manipulability_gradient', manipulability, {'links': 3, 'heading': False}),
+    ('secondary_tasks.manipulability_gradient', manipulability, {'links': 4, 'heading': True}),
+    ('secondary_tasks.joint_limit_gradient', joint_limit, {}),
 ]
 
 

@@ -1,8 +1,8 @@
-"""Resolved rate: the tip of an arm, or of a mobile manipulator, along a given way.
+"""Resolved rate: the tip of an arm, or of a mobile manipulator, along a given path.
 
-The robot is asked for velocities of its joints that move the tip as wished, through the inverse of its
-Jacobian. Feedback of the position, an addition to the documents, keeps the tip from drifting off;
-damping keeps the joints from racing where the Jacobian is nearly singular.
+The inverse of the Jacobian turns a desired velocity of the tip into joint velocities. Feedback of the
+position, an addition to the documents, keeps the tip from drifting off. Damping bounds the joint
+velocities where the Jacobian is nearly singular.
 
 Everything broadcasts over leading axes. Wrong shapes and values that are not finite raise ValueError.
 
@@ -17,8 +17,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import array, floats, leading, not_negative, positive
-from diffdrive_jacobian.kinematics.inverse_velocity import damped_least_squares, redundant
+from diffdrive_jacobian.kinematics._checks import (
+    array,
+    finite,
+    floats,
+    leading,
+    not_negative,
+    number,
+    positive,
+)
+from diffdrive_jacobian.kinematics.inverse_velocity import (
+    damped_least_squares,
+    limit_velocity,
+    redundant,
+)
 
 
 def resolved_rate(
@@ -31,20 +43,26 @@ def resolved_rate(
     q_dot_0: ArrayLike | None = None,
     *,
     max_correction: ArrayLike = np.inf,
+    weights: ArrayLike | None = None,
+    max_velocity: ArrayLike | None = None,
 ) -> NDArray[np.float64]:
-    """Give joint velocities for a moving target: `q_dot = J^+ (x_dot_d + K (x_d - x))` (A, C, D).
+    """Return joint velocities for a moving target: `q_dot = J^+ (x_dot_d + K (x_d - x))` (A, C, D).
 
     Args:
         J: Jacobians, shape (..., m, n).
-        x: Where the tip is, shape (..., m) (m).
-        x_desired: Where it should be, shape (..., m) (m).
-        x_dot_desired: How it should move, shape (..., m) (m/s).
+        x: Position of the tip, shape (..., m) (m).
+        x_desired: Desired position, shape (..., m) (m).
+        x_dot_desired: Desired velocity, shape (..., m) (m/s).
         gain: K, how fast an error decays, zero or positive, shape (...) (1/s).
         damping: lambda of damped least squares, zero or positive, shape (...), in the units of J.
-        q_dot_0: Joint velocities that are wished for besides, where the task leaves them free, shape
-            (..., n); None: the least ones.
+        q_dot_0: Secondary joint velocities, projected into the null space of the task (see
+            `inverse_velocity.redundant`), shape (..., n); None: the least ones.
         max_correction: Longest `K (x_d - x)`, positive, shape (...) (m/s): the feedback of an error that
             cannot be reduced, of a target out of reach, would drive the joints ever faster.
+        weights: Weights of the joints, positive, shape (..., n); None: all 1. A joint with a larger
+            weight moves less.
+        max_velocity: Largest joint speeds, positive, shape (..., n), or one for all joints: all joints
+            are slowed down alike (see `inverse_velocity.limit_velocity`); None: no limits.
 
     Returns:
         Joint velocities, shape (..., n).
@@ -70,42 +88,59 @@ def resolved_rate(
     correction = correction / np.maximum(length / longest, 1.0)[..., np.newaxis]
     x_dot = x_dot_desired + correction
     if q_dot_0 is None:
-        return damped_least_squares(J, x_dot, damping)
-    return redundant(J, x_dot, q_dot_0, damping)
+        q_dot = damped_least_squares(J, x_dot, damping, weights=weights)
+    else:
+        q_dot = redundant(J, x_dot, q_dot_0, damping, weights=weights)
+    return q_dot if max_velocity is None else limit_velocity(q_dot, max_velocity)
 
 
 @dataclass(frozen=True, eq=False)
 class StraightLine:
-    """A way at a constant speed from one point to another, and then rest (D, 4.1).
+    """A straight path at constant speed from one point to another, and rest before and after (D, 4.1).
 
     Raises:
-        ValueError: The ends have different or no coordinates, or the speed is not positive and finite.
+        ValueError: The ends have different or no coordinates, the speed is not positive and finite, or
+            the duration is not a finite number.
     """
 
     start: Any
-    """Shape (..., m) (m)."""
+    """Shape (..., m) (m), read-only."""
     end: Any
-    """Shape (..., m) (m)."""
+    """Shape (..., m) (m), read-only."""
     speed: Any
-    """Along the line, shape (...) (m/s)."""
+    """Along the line, shape (...) (m/s), read-only."""
 
     def __post_init__(self) -> None:
-        """Check everything."""
+        """Check everything, and copy it."""
         start = array('start', self.start, 'm')
         end, speed = array('end', self.end, start.shape[-1]), floats('speed', self.speed)
         positive('speed', speed)
         leading(start=start.shape[:-1], end=end.shape[:-1], speed=speed.shape)
         for name, value in (('start', start), ('end', end), ('speed', speed)):
-            object.__setattr__(self, name, np.array(value))
+            copied = np.array(value)
+            copied.flags.writeable = False
+            object.__setattr__(self, name, copied)
+        with np.errstate(over='ignore'):
+            duration = self.duration
+        if not np.isfinite(duration).all():
+            raise ValueError(f'the duration, length over speed, must be finite, got {duration} s')
 
     @property
     def duration(self) -> NDArray[np.float64]:
-        """How long the way takes, shape (...) (s)."""
+        """Time from start to end, shape (...) (s)."""
         return np.asarray(np.linalg.norm(self.end - self.start, axis=-1) / self.speed)
 
     def position(self, t: float) -> NDArray[np.float64]:
-        """Give the position at an instant (s), shape (..., m) (m)."""
+        """Return the position at a time, shape (..., m) (m).
+
+        Args:
+            t: Time since the start (s): before 0 it is the start, after the duration the end.
+
+        Raises:
+            ValueError: t is not a single finite number.
+        """
+        t = number('t', t, finite)
         duration = self.duration[..., np.newaxis]
         moving = t < duration
-        part = np.where(moving, t / np.where(moving, duration, 1.0), 1.0)
+        part = np.where(moving, max(t, 0.0) / np.where(duration > 0.0, duration, 1.0), 1.0)
         return np.asarray(self.start + part * (self.end - self.start))

@@ -114,6 +114,11 @@ def hypot(x: Any, y: Any) -> Any:
     return math.hypot(x, y) if type(x) is type(y) is float else np.sqrt(x * x + y * y)
 
 
+def sqrt(x: Any) -> Any:
+    """Square root of what is not negative."""
+    return math.sqrt(x) if type(x) is float else np.sqrt(x)
+
+
 def maximum(x: Any, y: Any) -> Any:
     """The larger one."""
     return max(x, y) if type(x) is type(y) is float else np.maximum(x, y)

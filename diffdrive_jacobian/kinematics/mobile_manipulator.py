@@ -5,7 +5,8 @@ Input: `[omega_R, omega_L, q_1_dot, ..., q_n_dot]` (rad/s). Task: position (m) a
 tip in the world.
 
 Everything broadcasts over leading axes: q has shape (..., 3 + n). Wrong shapes and values that are not
-finite raise ValueError. There are more inputs than velocities of the task: see `inverse_velocity`.
+finite raise ValueError. There are more inputs than task velocities: `inverse_velocity` chooses among
+them, with weights between wheels and joints, and with secondary tasks.
 
 Source: document A, 3.2.4, "Mobile Manipulators"; MATH.md, "Manipulators and inverse velocity".
 """
@@ -20,13 +21,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics._checks import array, leading, number, positive
-from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body, wheel_to_body_jacobian
+from diffdrive_jacobian.kinematics.diff_drive import (
+    wheel_to_body,
+    wheel_to_body_jacobian,
+    wheel_to_world_jacobian,
+)
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 
 
 @dataclass(frozen=True, eq=False)
 class MobileManipulator:
-    """The base, and the arm that stands on it.
+    """A differential-drive base with a planar arm.
 
     Raises:
         ValueError: r or L is not positive and finite, or the mount is not `[m_x, m_y]`.
@@ -39,7 +44,7 @@ class MobileManipulator:
     arm: PlanarArm
     """Its x axis points forward."""
     mount: Any = (0.0, 0.0)
-    """Where the arm's base is in the frame of the axle centre, `[m_x, m_y]` (m)."""
+    """Position of the arm's base in the frame of the axle centre, `[m_x, m_y]` (m)."""
 
     def __post_init__(self) -> None:
         """Check every dimension."""
@@ -54,7 +59,7 @@ class MobileManipulator:
         object.__setattr__(self, 'mount', mount)
 
     def forward_kinematics(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Give the pose of the tip in the world.
+        """Return the pose of the tip in the world.
 
         Args:
             q: Configurations, shape (..., 3 + n).
@@ -98,13 +103,32 @@ class MobileManipulator:
         jacobian[..., 2, :] = in_base[..., 2, :]
         return jacobian if heading else jacobian[..., :2, :]
 
+    def configuration_jacobian(self, q: ArrayLike) -> NDArray[np.float64]:
+        """Map the inputs to the velocity of the configuration: `q_dot = G(q) [omega_R, omega_L, ...]`.
+
+        G is `S(theta) J_w` for the pose of the base and the identity for the joints. The gradient of a
+        function of q becomes one over the inputs by `G^T gradient`: with it, secondary tasks such as
+        `manipulability_gradient(robot.jacobian, q)` fit `redundant` (A, 3.2.5).
+
+        Args:
+            q: Configurations, shape (..., 3 + n).
+
+        Returns:
+            G, shape (..., 3 + n, 2 + n).
+        """
+        base, joints = self._split(q)
+        jacobian = np.zeros((*joints.shape[:-1], 3 + self.arm.joints, 2 + self.arm.joints))
+        jacobian[..., :3, :2] = wheel_to_world_jacobian(base[..., 2], self.r, self.L)
+        jacobian[..., 3:, 2:] = np.eye(self.arm.joints)
+        return jacobian
+
     def integrate(self, q: ArrayLike, q_dot: ArrayLike, dt: ArrayLike) -> NDArray[np.float64]:
-        """Hold the velocities of wheels and joints for a time; the base drives an exact arc.
+        """Return the configuration after a time at constant input; the base drives an exact arc.
 
         Args:
             q: Configurations at the start, shape (..., 3 + n).
             q_dot: `[omega_R, omega_L, q_1_dot, ...]`, shape (..., 2 + n) (rad/s).
-            dt: Time for which they are held, shape (...) (s).
+            dt: Duration, shape (...) (s).
 
         Returns:
             Configurations at the end, shape (..., 3 + n), theta wrapped.
@@ -117,5 +141,5 @@ class MobileManipulator:
         return np.concatenate([driven, self.arm.integrate(joints, speeds[..., 2:], dt)], axis=-1)
 
     def _split(self, q: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        made = array('q', q, 3 + self.arm.joints)
-        return made[..., :3], made[..., 3:]
+        checked = array('q', q, 3 + self.arm.joints)
+        return checked[..., :3], checked[..., 3:]

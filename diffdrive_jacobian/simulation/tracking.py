@@ -1,4 +1,4 @@
-"""Arms and mobile manipulators whose tip follows a straight line, sampled as a controller samples.
+"""Arms and mobile manipulators whose tip follows a straight line, at the rate of a controller.
 
 Source: document D, 4.1; documents A and C on damping and redundancy; MATH.md, "Control laws".
 """
@@ -22,26 +22,30 @@ MAX_STEPS = 1e8
 
 
 class Manipulator(Protocol):
-    """What is needed of a robot: `PlanarArm` and `MobileManipulator` have it."""
+    """The methods of a robot that are needed: `PlanarArm` and `MobileManipulator` have them.
+
+    A robot whose inputs are not the rates of its coordinates needs `configuration_jacobian(q)` besides,
+    shape (..., n, inputs), for secondary tasks that are gradients over its configuration.
+    """
 
     def forward_kinematics(self, q: ArrayLike) -> Array:
-        """Give the tip's `[x, y, heading]`, shape (..., 3)."""
+        """Return the tip's `[x, y, heading]`, shape (..., 3), of configurations, shape (..., n)."""
 
     def jacobian(self, q: ArrayLike) -> Array:
-        """Give the Jacobian of the tip's position, shape (..., 2, n)."""
+        """Return the Jacobian of the tip's position, shape (..., 2, inputs)."""
 
     def integrate(self, q: ArrayLike, q_dot: ArrayLike, dt: ArrayLike) -> Array:
-        """Give the configuration after a time with these velocities."""
+        """Return the configuration after a time at constant input, shape (..., n)."""
 
 
 class Tracking(NamedTuple):
-    """How a line was followed, at k + 1 samples.
+    """The motion along a line, at k + 1 samples.
 
     Attributes:
         times: Shape (k + 1,) (s).
         q: Configurations, shape (k + 1, ..., n).
-        q_dot: Velocities held from each sample to the next, shape (k, ..., inputs) (rad/s).
-        error: Distance of the tip from where it should be, shape (k + 1, ...) (m).
+        q_dot: Inputs from each sample to the next, shape (k, ..., inputs) (rad/s).
+        error: Distance of the tip from its desired position, shape (k + 1, ...) (m).
     """
 
     times: Array
@@ -61,34 +65,46 @@ def track_line(
     maximum_damping: float = 0.1,
     secondary: Callable[[Array], ArrayLike] | None = None,
     settling: float = 0.0,
+    weights: ArrayLike | None = None,
+    max_velocity: ArrayLike | None = None,
 ) -> Tracking:
     """Follow a straight line by resolved rate, damped where the Jacobian is nearly singular.
 
     The feedback adds no more than the speed of the line, so that `|q_dot| <= speed / lambda` with the
-    damping lambda of the moment.
+    damping lambda at that time, as long as there is no secondary task.
 
     Args:
         robot: The arm or the mobile manipulator.
         q0: Configurations at the start, shape (..., n).
-        line: Where the tip is to be, a `control.StraightLine`; leading axes as those of q0.
-        rate: How often velocities are computed; each is held until the next (Hz).
+        line: Desired path of the tip, a `control.StraightLine`; leading axes as those of q0.
+        rate: Control rate (Hz). Inputs are constant between samples.
         gain: K of the feedback (1/s); below the rate.
-        threshold: Manipulability below which damping sets in; None: never, and near a singularity the
-            joints race.
+        threshold: Manipulability below which there is damping; None: no damping, and near a singularity
+            the joint velocities are not bounded.
         maximum_damping: lambda of a singular Jacobian.
-        secondary: Gives, for configurations, joint velocities that are wished for besides.
-        settling: How long to go on when the line has ended (s).
+        secondary: Secondary task (null-space velocity), a function of the configurations. Returns either
+            inputs, shape (..., inputs), or where the robot has a different number of coordinates the
+            gradient over the configuration of a function to increase, shape (..., n). The gradient is
+            mapped to inputs by the robot's `configuration_jacobian` G: `W^-1 G^T gradient`. With damping
+            it moves the tip by at most `lambda / 40 |q_dot_0|`, see `inverse_velocity.redundant`.
+        settling: Time after the end of the line (s).
+        weights: Weights of the inputs, positive, shape (..., inputs); None: all 1. An input with a
+            larger weight is used less. The manipulability, its threshold and lambda are then those of
+            `J W^-1/2`, and bounds hold for `W^1/2 q_dot`.
+        max_velocity: Largest inputs, positive, shape (..., inputs), or one for all: all inputs are
+            slowed down alike, and the tip falls behind; None: no limits.
 
     Returns:
-        Everything at each sample. An error that stays is the price of damping, or of a line that leaves
-        what the robot can reach.
+        Everything at each sample. An error that remains is the price of damping, of limits, or of a line
+        that leaves the reach of the robot.
 
     Raises:
         ValueError: Rate, threshold or speed is not positive, another number negative, the gain not below
-            the rate, or a shape is wrong.
+            the rate, a shape is wrong, or the robot lacks a method.
 
-    A tip that is far from the axle, on a mobile base, needs a higher rate: the wheels then swing it.
+    On a mobile base a tip that is far from the axle needs a higher rate, because the wheels swing it.
     """
+    _check_callables(robot, secondary)
     rate = number('rate', rate, positive)
     settling = number('settling', settling, not_negative)
     gain = number('gain', gain, not_negative)
@@ -107,6 +123,12 @@ def track_line(
         raise ValueError(f'line must have 2 coordinates, got {line.start.shape[-1]}')
     leading(q0=q.shape[:-1], line=line.duration.shape)
     inputs = robot.jacobian(q).shape[-1]
+    roots = None
+    if weights is not None:
+        weights = array('weights', weights, inputs)
+        positive('weights', weights)
+        leading(q0=q.shape[:-1], weights=weights.shape[:-1])
+        roots = np.sqrt(weights)
     track: list[Array] = []
     velocities: list[Array] = []
     errors: list[Array] = []
@@ -120,12 +142,18 @@ def track_line(
         J = robot.jacobian(q)
         factor: ArrayLike = 0.0
         if threshold is not None:
-            factor = damping_factor(manipulability(J), threshold, most)
-        wish = None if secondary is None else secondary(q)
-        # What moves the target to its next sample, also in the period in which the line ends.
+            measured = J if roots is None else J / roots[..., np.newaxis, :]
+            factor = damping_factor(manipulability(measured), threshold, most)
+        q_dot_0 = None if secondary is None else _inputs(robot, secondary, q, inputs, roots)
+        # The velocity that moves the target to its next sample, also when the line ends before it.
         moving = (line.position((step + 1) / rate) - wanted) * rate
         velocities.append(
-            resolved_rate(J, x, wanted, moving, gain, factor, wish, max_correction=line.speed)
+            resolved_rate(
+                *(J, x, wanted, moving, gain, factor, q_dot_0),
+                max_correction=line.speed,
+                weights=weights,
+                max_velocity=max_velocity,
+            )
         )
         q = robot.integrate(q, velocities[-1], 1.0 / rate)
     shape = np.broadcast_shapes(track[0].shape, track[-1].shape)
@@ -136,3 +164,33 @@ def track_line(
         np.array(velocities) if steps else np.empty((0, *shape[:-1], inputs)),
         np.array(errors),
     )
+
+
+def _check_callables(robot: Manipulator, secondary: object) -> None:
+    for method in ('forward_kinematics', 'jacobian', 'integrate'):
+        if not callable(getattr(robot, method, None)):
+            raise ValueError(f'robot must have the method {method}, got {robot!r:.60}')
+    if secondary is not None and not callable(secondary):
+        raise ValueError(f'secondary must be a function of the configuration, got {secondary!r:.60}')
+
+
+def _inputs(
+    robot: Manipulator,
+    secondary: Callable[[Array], ArrayLike],
+    q: Array,
+    inputs: int,
+    roots: Array | None,
+) -> Array:
+    """Compute the secondary task's inputs, shape (..., inputs)."""
+    task = array('what secondary returns', secondary(q), 'n')
+    n = q.shape[-1]
+    if task.shape[-1] == inputs:
+        return task
+    to_configuration = getattr(robot, 'configuration_jacobian', None)
+    allowed = f'(..., {inputs})' if to_configuration is None else f'(..., {inputs}) or (..., {n})'
+    if to_configuration is None or task.shape[-1] != n:
+        raise ValueError(f'what secondary returns must have shape {allowed}, got {task.shape}')
+    uphill = task[..., np.newaxis, :] @ array('configuration_jacobian', to_configuration(q), n, inputs)
+    found: Array = uphill[..., 0, :]
+    # Least in the weighted norm for the same increase, and uphill also after the projection.
+    return found if roots is None else found / (roots * roots)

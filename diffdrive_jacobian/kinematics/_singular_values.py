@@ -1,0 +1,264 @@
+"""Functions of the singular values of a Jacobian: damped inverses and null-space projectors.
+
+With `J = sum_i s_i u_i v_i^T`, damping lambda and the width `e = FILTER lambda`:
+
+    gain      g(s) = s / (s^2 + lambda^2)    of the damped inverse    sum_i g(s_i) v_i u_i^T
+    removal   f(s) = min(s / e, 1)           of the projector         I - sum_i f(s_i) v_i v_i^T
+
+Without damping `g(s) = 1 / s` and `f(s) = 1`, except for singular values that count as zero: there both
+are 0. Arrays are checked by the callers.
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffdrive_jacobian.kinematics._elementary import minimum, sqrt, where
+
+CUTOFF = 1e-15
+"""Without damping, singular values below `CUTOFF max(m, n)` times the largest one count as zero."""
+FILTER = 0.1
+"""Width of the projector's filter, relative to the damping."""
+TINY = float(np.finfo(np.float64).tiny)
+"""Smaller numbers have no inverse."""
+
+Array = NDArray[np.float64]
+
+
+def gain(value: Any, damping: Any, least: Any) -> Any:
+    """Compute g(s), of floats or arrays; without damping singular values up to `least` count as zero."""
+    kept = value > where(damping > 0.0, TINY, least)
+    safe = where(kept, value, 1.0)
+    return where(kept, 1.0 / (safe + damping * (damping / safe)), 0.0)
+
+
+def removal(value: Any, damping: Any, least: Any) -> Any:
+    """Compute f(s), of floats or arrays; without damping singular values up to `least` count as zero."""
+    damped = damping > 0.0
+    # Divided one after the other: the product may be too small for a number.
+    filtered = minimum(value / where(damped, damping, 1.0) / FILTER, 1.0)
+    return where(damped, filtered, where(value > least, 1.0, 0.0))
+
+
+def gains(values: Array, damping: Array, least: Array) -> Array:
+    """Compute g(s) of singular values, shape (..., k), with damping and least of shape (...)."""
+    return _each(gain, values, damping, least)
+
+
+def removals(values: Array, damping: Array, least: Array) -> Array:
+    """Compute f(s) of singular values, shape (..., k), with damping and least of shape (...)."""
+    return _each(removal, values, damping, least)
+
+
+def negligible(values: Array, shape: tuple[int, ...]) -> Array:
+    """Return up to which value singular values count as zero without damping, shape (...)."""
+    return np.asarray(np.maximum(CUTOFF * max(shape[-2:]) * values[..., 0], TINY))
+
+
+def pseudoinverse(J: Array) -> Array:
+    """Compute J^+, shape (..., n, m)."""
+    left, values, right = np.linalg.svd(J, full_matrices=False)
+    kept = values > negligible(values, J.shape)[..., np.newaxis]
+    inverses = kept / np.where(kept, values, 1.0)
+    inverse: Array = (
+        np.swapaxes(right, -1, -2) * inverses[..., np.newaxis, :] @ np.swapaxes(left, -1, -2)
+    )
+    return inverse
+
+
+def null_space_projector(J: Array, damping: Array) -> Array:
+    """Compute N with damping of shape (...), shape (..., n, n)."""
+    _, values, right = np.linalg.svd(J, full_matrices=False)
+    return projector(right, removals(values, damping, negligible(values, J.shape)))
+
+
+def projector(right: Array, removed: Array) -> Array:
+    """Compute `I - sum_i f_i v_i v_i^T` of the rows v_i and the f_i, shape (..., n, n)."""
+    columns = np.swapaxes(right, -1, -2) * removed[..., np.newaxis, :]
+    return np.asarray(np.eye(right.shape[-1]) - columns @ right)
+
+
+def joint_velocities(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None = None) -> Array:
+    """Compute `sum_i g(s_i) v_i u_i^T x_dot`, and with q_dot_0 its projection added.
+
+    Args:
+        J: Jacobians, shape (..., m, n).
+        x_dot: Task velocities, shape (..., m).
+        damping: lambda, shape (...).
+        q_dot_0: Secondary joint velocities, shape (..., n), or None.
+
+    Returns:
+        Joint velocities, shape (..., n); infinite where a number cannot represent them.
+    """
+    method = _two_rows if J.shape[-2] == 2 else _by_svd
+    with np.errstate(all='ignore'):
+        q_dot, exact = method(J, x_dot, damping, q_dot_0)
+        if np.all(exact):
+            return np.asarray(q_dot)
+        batch = q_dot.shape[:-1]
+        redo = ~np.broadcast_to(exact, batch)
+
+        def selected(value: Array, axes: int) -> Array:
+            whole = np.broadcast_to(value, (*batch, *value.shape[value.ndim - axes :]))
+            return np.asarray(whole[redo])
+
+        secondary = None if q_dot_0 is None else selected(q_dot_0, 1)
+        q_dot[redo] = _scaled(selected(J, 2), selected(x_dot, 1), selected(damping, 0), secondary)
+    return np.asarray(q_dot)
+
+
+def manipulability(J: Array) -> Array:
+    """Compute the product of the singular values of Jacobians with m <= n, shape (...)."""
+    with np.errstate(all='ignore'):
+        if J.shape[-2] != 2:
+            return np.asarray(np.linalg.svd(J, compute_uv=False).prod(axis=-1))
+        w = _minors(J)
+        squares = np.einsum('...ij,...ij->...', J, J)
+        extreme = ~((squares > 1e-60) & (squares < 1e60))
+        if extreme.any():
+            exponents = _exponent(J[extreme], 2)
+            scaled = np.ldexp(J[extreme], -exponents[:, np.newaxis, np.newaxis])
+            w[extreme] = np.ldexp(_minors(scaled), 2 * exponents)
+    return w
+
+
+def _each(function: Any, values: Array, damping: Array, least: Array) -> Array:
+    """Apply a function to each singular value, of a single Jacobian as a float, which is faster."""
+    if values.ndim == 1 and damping.ndim == least.ndim == 0:
+        factor, zero = float(damping), float(least)
+        return np.array([function(value, factor, zero) for value in values.tolist()])
+    with np.errstate(all='ignore'):
+        computed: Array = function(values, damping[..., np.newaxis], least[..., np.newaxis])
+    return computed
+
+
+def _minors(J: Array) -> Array:
+    """Compute the manipulability of two rows: the root of the sum of all squared minors (Cauchy and
+    Binet), which loses no digits.
+    """
+    squares: Any = np.zeros(J.shape[:-2])
+    for i in range(J.shape[-1]):
+        for j in range(i):
+            minor = J[..., 0, i] * J[..., 1, j] - J[..., 0, j] * J[..., 1, i]
+            squares = squares + minor * minor
+    return np.array(np.sqrt(squares))
+
+
+def _exponent(values: Array, axes: int) -> NDArray[np.int32]:
+    """Return the binary exponent of the largest entry along the last axes."""
+    largest = np.abs(values).max(axis=tuple(range(-axes, 0)))
+    return np.asarray(np.frexp(largest)[1], dtype=np.int32)
+
+
+def _scaled(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None) -> Array:
+    """Compute joint velocities, shape (k, n), from entries scaled to about 1, which cannot overflow."""
+    units, speeds = _exponent(J, 2)[:, np.newaxis], _exponent(x_dot, 1)[:, np.newaxis]
+    J, damping = np.ldexp(J, -units[..., np.newaxis]), np.ldexp(damping, -units[:, 0])
+    # Without damping, singular values of J count as zero if their inverse is not a number.
+    tiny = np.ldexp(np.full(len(units), TINY), -units[:, 0])
+    task, _ = _by_svd(J, np.ldexp(x_dot, -speeds), damping, None, tiny)
+    q_dot: Array = np.ldexp(task, speeds - units)
+    if q_dot_0 is not None:
+        own = _exponent(q_dot_0, 1)[:, np.newaxis]
+        free, _ = _by_svd(J, np.zeros_like(x_dot), damping, np.ldexp(q_dot_0, -own), tiny)
+        q_dot = q_dot + np.ldexp(free, own)
+    return q_dot
+
+
+def _by_svd(
+    J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None, tiny: Array | float = 0.0
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Compute joint velocities, and where neither overflow nor underflow can have spoilt them."""
+    left, values, right = np.linalg.svd(J, full_matrices=False)
+    least = np.maximum(negligible(values, J.shape), tiny)
+    along = gains(values, damping, least) * (x_dot[..., np.newaxis, :] @ left)[..., 0, :]
+    if q_dot_0 is not None:
+        secondary = (right @ q_dot_0[..., np.newaxis])[..., 0]
+        along = along - removals(values, damping, least) * secondary
+    q_dot: Array = (along[..., np.newaxis, :] @ right)[..., 0, :]
+    if q_dot_0 is not None:
+        q_dot = q_dot + q_dot_0
+    largest = values[..., 0]
+    return q_dot, (largest > 1e-30) & (largest < 1e30) & np.isfinite(q_dot).all(axis=-1)
+
+
+def _two_rows(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None) -> tuple[Array, Any]:
+    """Compute the same for two rows, in closed form: a rotation in the plane of the task makes the rows
+    orthogonal (one-sided Jacobi), then they are `s_i v_i^T`. Many times as fast as LAPACK.
+    """
+    # Column by column, because loops over the short last axis take longer; of a single Jacobian floats.
+    n = J.shape[-1]
+    columns: list[tuple[Any, Any]]
+    secondary: list[Any] = []
+    one: Any
+    other: Any
+    factor: Any = damping
+    if J.ndim == 2 and x_dot.ndim == 1 and damping.ndim == 0 and (q_dot_0 is None or q_dot_0.ndim == 1):
+        first_row, second_row = J.tolist()
+        columns = list(zip(first_row, second_row, strict=True))
+        (one, other), factor = x_dot.tolist(), float(damping)
+        secondary = [] if q_dot_0 is None else q_dot_0.tolist()
+    else:
+        columns = [(J[..., 0, k], J[..., 1, k]) for k in range(n)]
+        one, other = x_dot[..., 0], x_dot[..., 1]
+        secondary = [] if q_dot_0 is None else [q_dot_0[..., k] for k in range(n)]
+    for _ in range(2):  # The second rotation removes the rounding of the first near a singularity.
+        c, s = _rotation(*_products(columns))
+        one, other = c * one + s * other, c * other - s * one
+        columns = [(c * a + s * b, c * b - s * a) for a, b in columns]
+    first, second, _ = _products(columns)
+    largest, smallest = sqrt(first), sqrt(second)
+    least = where(largest > TINY, CUTOFF * max(2, n) * largest, TINY)
+    # The rows are singular vectors times singular values: divide by these once more.
+    by_first, by_second = where(first > 0.0, largest, 1.0), where(second > 0.0, smallest, 1.0)
+    one = gain(largest, factor, least) / by_first * one
+    other = gain(smallest, factor, least) / by_second * other
+    if secondary:
+        along = _sum(a * q for (a, _), q in zip(columns, secondary, strict=True)) / by_first
+        across = _sum(b * q for (_, b), q in zip(columns, secondary, strict=True)) / by_second
+        one = one - removal(largest, factor, least) * along / by_first
+        other = other - removal(smallest, factor, least) * across / by_second
+        q_dot = [one * a + other * b + q for (a, b), q in zip(columns, secondary, strict=True)]
+    else:
+        q_dot = [one * a + other * b for a, b in columns]
+    exact = (first > 1e-60) & (first < 1e60) & (abs(_sum(map(abs, q_dot))) < np.inf)
+    small = second < 1e-200
+    if np.any(small):  # Its square may have underflowed although that of the first has not.
+        exact = exact & ~(np.asarray(small) & np.any([b != 0.0 for _, b in columns], axis=0))
+    return np.stack(q_dot, axis=-1), exact
+
+
+def _rotation(first: Any, second: Any, both: Any) -> tuple[Any, Any]:
+    """Return cosine and sine of the angle that makes two rows orthogonal, the first the longer one.
+
+    Only with operations that are correctly rounded: floats and arrays give the same.
+    """
+    difference = first - second
+    double = sqrt(difference * difference + 4.0 * both * both)
+    safe = where(double > 0.0, double, 1.0)
+    # Half of the angle whose cosine is difference / double, without cancellation.
+    larger = sqrt(0.5 + 0.5 * where(double > 0.0, abs(difference) / safe, 1.0))
+    smaller = abs(both) / (safe * larger)
+    sign = where(both < 0.0, -1.0, 1.0)
+    turned = difference < 0.0
+    return where(turned, smaller, larger), sign * where(turned, larger, smaller)
+
+
+def _products(columns: list[tuple[Any, Any]]) -> tuple[Any, Any, Any]:
+    """Return the squares of two rows, and their product."""
+    return (
+        _sum(a * a for a, _ in columns),
+        _sum(b * b for _, b in columns),
+        _sum(a * b for a, b in columns),
+    )
+
+
+def _sum(terms: Iterable[Any]) -> Any:
+    """Add from left to right: `sum` of floats may compensate rounding, that of arrays does not."""
+    return functools.reduce(operator.add, terms)

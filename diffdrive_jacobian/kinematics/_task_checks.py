@@ -1,0 +1,48 @@
+"""Checks of Jacobians, task velocities, damping and weights."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from diffdrive_jacobian.kinematics._checks import array, floats, leading, not_negative, positive
+
+Array = NDArray[np.float64]
+
+
+def checked_task(
+    J: ArrayLike, x_dot: ArrayLike, name_J: str = 'J', name_x_dot: str = 'x_dot'
+) -> tuple[Array, Array]:
+    """Return Jacobians, shape (..., m, n), and task velocities, shape (..., m).
+
+    Raises:
+        ValueError: A shape is wrong, they do not broadcast, or an entry is not a finite number.
+    """
+    J = array(name_J, J, 'm', 'n')
+    x_dot = array(name_x_dot, x_dot, J.shape[-2])
+    leading(**{name_J: J.shape[:-2], name_x_dot: x_dot.shape[:-1]})
+    return J, x_dot
+
+
+def checked_damping(damping: ArrayLike) -> Array:
+    """Return lambda, shape (...).
+
+    Raises:
+        ValueError: An entry is negative or not a finite number.
+    """
+    factor = floats('damping', damping)
+    not_negative('damping', factor)
+    return factor
+
+
+def weighted(J: Array, weights: ArrayLike) -> tuple[Array, Array]:
+    """Return `J W^-1/2` and the roots of the weights, shape (..., n).
+
+    Raises:
+        ValueError: A weight is not positive and finite, or the shape is wrong.
+    """
+    given = array('weights', weights, J.shape[-1])
+    positive('weights', given)
+    leading(J=J.shape[:-2], weights=given.shape[:-1])
+    roots = np.sqrt(given)
+    return J / roots[..., np.newaxis, :], roots

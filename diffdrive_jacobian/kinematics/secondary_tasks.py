@@ -1,0 +1,119 @@
+"""What the joints that a task leaves free are used for: manipulability, and distance from joint limits.
+
+The gradients are secondary joint velocities for `inverse_velocity.redundant`. They are taken over the
+configuration q. A mobile manipulator's inputs are fewer than its coordinates: with its
+`configuration_jacobian` G the gradient over the inputs is `G^T gradient`.
+
+Everything broadcasts over leading axes. Wrong shapes, shapes that do not broadcast and values that are
+not finite raise ValueError.
+
+Source: document A, 3.2.3 and 3.2.5; document D, 3; MATH.md, "Manipulators and inverse velocity".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from diffdrive_jacobian.kinematics import _singular_values
+from diffdrive_jacobian.kinematics._checks import array, leading
+
+_STEP = float(np.finfo(np.float64).eps) ** (1.0 / 3.0)
+"""Step of central differences, at which rounding and truncation errors are of the same size."""
+
+Array = NDArray[np.float64]
+
+
+def manipulability(J: ArrayLike) -> Array:
+    """Return Yoshikawa's distance of a Jacobian from singular: `w = sqrt(det(J J^T))` (A, D).
+
+    Args:
+        J: Jacobians, shape (..., m, n).
+
+    Returns:
+        w, shape (...): the product of the singular values, 0 where J is singular. Also 0 where it has
+        more rows than columns, because then some velocity cannot be produced.
+    """
+    J = array('J', J, 'm', 'n')
+    rows, columns = J.shape[-2:]
+    return np.zeros(J.shape[:-2]) if rows > columns else _singular_values.manipulability(J)
+
+
+def manipulability_gradient(jacobian: Callable[[Array], ArrayLike], q: ArrayLike) -> Array:
+    """Return the gradient of the manipulability, `dw / dq`: a motion away from singularities.
+
+    It is computed by central differences, which are accurate to about ten digits. At a singular
+    configuration, where w has an edge, they give the mean of both sides. As a secondary task:
+    `redundant(J, x_dot, k * manipulability_gradient(arm.jacobian, q))`, k > 0 (A, 3.2.5).
+
+    Args:
+        jacobian: Returns the Jacobians, shape (..., m, inputs), of configurations of shape (..., n).
+        q: Configurations, shape (..., n) (rad; the base of a mobile manipulator also m).
+
+    Returns:
+        The gradients, shape (..., n).
+    """
+    q = array('q', q, 'n')
+    steps = _STEP * np.eye(q.shape[-1])
+    around = q[..., np.newaxis, :]
+    above, below = (manipulability(jacobian(around + sign * steps)) for sign in (1.0, -1.0))
+    if above.shape != q.shape:
+        raise ValueError(
+            f'jacobian must give one Jacobian for each configuration, shape (*{q.shape}, m, n), got '
+            f'manipulabilities of shape {above.shape}'
+        )
+    gradient: Array = (above - below) / (2.0 * _STEP)
+    return gradient
+
+
+def joint_limit_cost(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> Array:
+    """Return how far joints are from the middle of their ranges: `1/(2n) sum(((q - middle) / range)^2)`.
+
+    Source: A. Liegeois, "Automatic supervisory control of the configuration and behavior of multibody
+    mechanisms", 1977. A names it as a use of the null space (3.2.5).
+
+    Args:
+        q: Joint angles, shape (..., n) (rad).
+        lower: Lower limits, shape (..., n), or one for all joints (rad).
+        upper: Upper limits, above the lower ones, shape (..., n), or one for all joints (rad).
+
+    Returns:
+        The cost, shape (...): 0 in the middle, 1/8 with every joint at a limit.
+    """
+    deviation, _ = _deviation(q, lower, upper)
+    cost: Array = (deviation * deviation).mean(axis=-1) / 2.0
+    return cost
+
+
+def joint_limit_gradient(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> Array:
+    """Return the gradient of `joint_limit_cost`, which points towards the limits.
+
+    As a secondary task: `redundant(J, x_dot, -k * joint_limit_gradient(q, lower, upper))`, k > 0.
+
+    Args:
+        q: Joint angles, shape (..., n) (rad).
+        lower: Lower limits, shape (..., n), or one for all joints (rad).
+        upper: Upper limits, above the lower ones, shape (..., n), or one for all joints (rad).
+
+    Returns:
+        The gradients, shape (..., n) (1/rad).
+    """
+    deviation, span = _deviation(q, lower, upper)
+    gradient: Array = deviation / (span * deviation.shape[-1])
+    return gradient
+
+
+def _deviation(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array]:
+    """Return each joint's distance from the middle of its range in units of the range, and the range."""
+    q = array('q', q, 'n')
+    lower, upper = (array(name, value) for name, value in (('lower', lower), ('upper', upper)))
+    for name, value in (('lower', lower), ('upper', upper)):
+        if value.shape[-1:] not in ((), q.shape[-1:]):
+            raise ValueError(f'{name} must have shape () or (..., {q.shape[-1]}), got {value.shape}')
+    leading(q=q.shape, lower=lower.shape, upper=upper.shape)
+    span = upper - lower
+    if not (span > 0.0).all():
+        raise ValueError(f'upper must be above lower for every joint, got {upper} and {lower}')
+    return (q - (lower + upper) / 2.0) / span, span
