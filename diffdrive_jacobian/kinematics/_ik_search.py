@@ -1,0 +1,294 @@
+"""Iterations of numeric inverse kinematics over a batch: steps, damping, limits, restarts.
+
+`inverse_kinematics.solve` checks the arguments and describes the methods. Here each target is a row of
+`_Open` while it is searched for, and a row of `Outcome` throughout. All rows advance together: in each
+iteration forward is called once, for one step of every open row or for the start of its next search.
+Rows do not influence each other: all use the same restart points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from diffdrive_jacobian.kinematics._ik_task import EPS, Flags, Floats, Integers, Task
+from diffdrive_jacobian.kinematics.inverse_velocity import damped_least_squares
+
+STATIONARY = {'newton': 1e-6, 'transpose': 1e-6, 'levenberg_marquardt': 1e-7}
+"""Cosine between the error and what a joint does, below which the joint cannot lower the error.
+
+The last one converges quadratically, to about the square root of the precision."""
+RELAXED = 0.9
+"""Share of the way to the least error that the line search goes: all of it, the path would zigzag."""
+SECOND_ORDER_AFTER = 10
+"""Steps of a search after which `levenberg_marquardt` adds the second derivatives of forward."""
+STALLED_AFTER = 30
+"""Steps in a row without a lower error after which a method that lets the error grow is restarted."""
+AGREEING = 3
+"""Searches that end at the same least error, after which a target is taken for unreachable."""
+SAME = 1e-6
+"""Relative difference up to which two errors are the same."""
+NUDGE = 0.1
+"""Share of the way to the restart point that a search goes which could not take a single step."""
+STEP = EPS**0.25
+"""Of central differences of Jacobians, which may be differences themselves."""
+
+
+@dataclass
+class Outcome:
+    """What was found for each target, and the state of its search; shapes (k,), q (k, n)."""
+
+    q: Floats
+    error: Floats
+    iterations: Integers
+    restarts: Integers
+    start: Integers
+    """The search that found q: 0 from q0, 1 from the first restart point."""
+    begun: Integers
+    """Iterations before the present search."""
+    lowered: Integers
+    """Iterations when the error was last lowered."""
+    level: Floats
+    agreeing: Integers
+    """The lowest error at which searches ended, and how many did."""
+
+    @classmethod
+    def of(cls, q: Floats, error: Floats) -> Outcome:
+        """Return the state before the first step."""
+        iterations, restarts, start, begun, lowered, agreeing = np.zeros((6, len(q)), dtype=np.int64)
+        return cls(
+            q.copy(), error.copy(), iterations, restarts, start, begun, lowered, error.copy(), agreeing
+        )
+
+
+class _Open(NamedTuple):
+    """The targets that are still searched for, one row each; e and J as `Task` gives them."""
+
+    which: Integers
+    q: Floats
+    e: Floats
+    error: Floats
+    J: Floats
+    factor: Floats
+    """Lambda, or the share of the step that would be best if forward were linear."""
+
+    def keep(self, rows: Flags) -> _Open:
+        return self if rows.all() else _Open._make(values[rows] for values in self)
+
+
+@dataclass
+class Search:
+    """How a task is searched for."""
+
+    task: Task
+    method: str
+    tolerance: float
+    step_tolerance: float
+    damping: float
+    alpha: float | None
+    restarts: int
+    seed: int | np.random.Generator | None
+    _starts: Floats | None = field(default=None, init=False)
+
+    def run(self, q: Floats, max_iterations: int) -> Outcome:
+        """Search from q, shape (k, n), and from restart points, in max_iterations steps per target."""
+        if self.task.limits is not None:
+            q = np.clip(q, *self.task.limits)
+        which = np.arange(len(q))
+        e, error = self.task.errors(q, which)
+        found = Outcome.of(q, error)
+        J = np.zeros((*e.shape, q.shape[-1]))
+        still = _Open(which, q.copy(), e, error, J, np.full(len(q), self._first_factor()))
+        still = still.keep(np.isfinite(error) & (error > self.tolerance))
+        ended = np.zeros(len(still.which), dtype=np.bool_)
+        self._differentiate(still, ~ended)
+        for _ in range(max_iterations):
+            J, gradient = self._free(still)
+            ended |= ~self._movable(still, J, gradient)
+            again = None
+            if ended.any():
+                again = ended & self._may_restart(still, ended, found)
+                kept = again | ~ended
+                still, again, J, gradient = still.keep(kept), again[kept], J[kept], gradient[kept]
+            if not len(still.which):
+                break
+            still, ended = self._advance(still, found, J, gradient, again)
+        return found
+
+    def _advance(
+        self, still: _Open, found: Outcome, J: Floats, gradient: Floats, again: Flags | None
+    ) -> tuple[_Open, Flags]:
+        """Try a step for every row, or restart it; return the open rows, and whose search ended."""
+        tried = still.q + self._step(still, found, J, gradient)
+        if self.task.limits is not None:
+            tried = np.clip(tried, *self.task.limits)
+        # A step that overflows is not taken.
+        tried = np.where(np.isfinite(tried).all(axis=-1, keepdims=True), tried, still.q)
+        restarting = again is not None and bool(again.any())
+        if again is not None and restarting:
+            tried[again] = self._restart(still, found, again)
+        e, error = self.task.errors(tried, still.which)
+        by = tried - still.q
+        change = (error - still.error) * (error + still.error)
+        slope = np.einsum('kn,kn->k', by, gradient)
+        finite = np.isfinite(error)
+        least = np.maximum(EPS * np.linalg.norm(still.q, axis=-1), self.step_tolerance)
+        ended = np.linalg.norm(by, axis=-1) <= least
+        taken = finite & (change < 0.0) if self._descends() else finite
+        if self.method == 'levenberg_marquardt':
+            # A decrease that rounding would hide is none.
+            predicted = slope + still.factor * np.einsum('kn,kn->k', by, by)
+            ended |= ~taken & (predicted <= 4.0 * EPS * still.error**2)
+        still.factor[:] = self._adapted(still, by, slope, change, taken)
+        if again is not None and restarting:
+            taken, ended = taken | (again & finite), ended & ~again
+            still.factor[again] = self._first_factor()
+        for values, new in (still.q, tried), (still.e, e), (still.error, error):
+            values[taken] = new[taken]
+        found.iterations[still.which] += 1
+        self._record(still, found)
+        if not self._descends():
+            idle = found.iterations[still.which] - found.lowered[still.which] >= STALLED_AFTER
+            ended |= idle & (found.restarts[still.which] < self.restarts)
+        closed = ~finite | (still.error <= self.tolerance)
+        self._differentiate(still, taken & ~closed & ~ended)
+        return still.keep(~closed), ended[~closed]
+
+    def _record(self, still: _Open, found: Outcome) -> None:
+        """Keep the best joints of each target."""
+        best = still.error < found.error[still.which]
+        which = still.which[best]
+        found.q[which], found.error[which] = still.q[best], still.error[best]
+        found.start[which] = found.restarts[which]
+        found.lowered[which] = found.iterations[which]
+
+    # --- Restarts
+
+    def _may_restart(self, still: _Open, ended: Flags, found: Outcome) -> Flags:
+        """Note at which errors searches ended; return which targets, shape (k,), are worth another."""
+        which, error = still.which[ended], still.error[ended]
+        # A search without a single step may have begun at a saddle point: its error says nothing.
+        moved = found.iterations[which] > found.begun[which]
+        level = found.level[which]
+        lower, same = moved & (error < (1.0 - SAME) * level), moved & (error <= (1.0 + SAME) * level)
+        found.agreeing[which] = np.where(lower, 1, found.agreeing[which] + same)
+        found.level[which] = np.where(lower, error, level)
+        allowed = found.restarts[still.which] < self.restarts
+        allowed &= found.agreeing[still.which] < AGREEING
+        # A function that fails once would fail again.
+        return np.asarray(allowed & np.isfinite(still.J).all(axis=(1, 2)))
+
+    def _restart(self, still: _Open, found: Outcome, again: Flags) -> Floats:
+        """Return where the next search of these rows begins."""
+        if self._starts is None:
+            self._starts = self._sampled(still.q.shape[-1])
+        which, q = still.which[again], still.q[again]
+        starts = self._starts[found.restarts[which]]
+        moved = (found.iterations[which] > found.begun[which])[:, np.newaxis]
+        found.restarts[which] += 1
+        found.begun[which] = found.lowered[which] = found.iterations[which] + 1
+        # From a singular start a little aside is enough, and solutions near q0 are preferred.
+        return np.where(moved, starts, q + NUDGE * (starts - q))
+
+    def _sampled(self, n: int) -> Floats:
+        """Draw restart points, shape (restarts, n): within the limits, and over a turn without any."""
+        lower, upper = (
+            np.full((2, n), np.inf) * [[-1.0], [1.0]] if self.task.limits is None else self.task.limits
+        )
+        open_below, open_above = np.isneginf(lower), np.isposinf(upper)
+        least = np.where(open_below, np.where(open_above, -np.pi, upper - 2.0 * np.pi), lower)
+        most = np.where(open_above, np.where(open_below, np.pi, lower + 2.0 * np.pi), upper)
+        share = np.random.default_rng(self.seed).random((self.restarts, n))
+        # Both ends scaled apart, as limits may be as far apart as floats can be.
+        return np.asarray(np.clip(most * (1.0 - share) + least * share, least, most))
+
+    # --- Steps
+
+    def _descends(self) -> bool:
+        """Return whether steps that raise the error are rejected."""
+        return self.method == 'levenberg_marquardt' or (
+            self.method == 'transpose' and self.alpha is None
+        )
+
+    def _first_factor(self) -> float:
+        return {'newton': 0.0, 'transpose': RELAXED, 'levenberg_marquardt': self.damping}[self.method]
+
+    def _step(self, still: _Open, found: Outcome, J: Floats, gradient: Floats) -> Floats:
+        if self.method == 'transpose':
+            if self.alpha is not None:
+                return self.alpha * gradient
+            along = np.einsum('kmn,kn->km', J, gradient)
+            linear = np.linalg.norm(gradient, axis=-1) / np.linalg.norm(along, axis=-1)
+            return np.asarray(gradient * (still.factor * linear**2)[:, np.newaxis])
+        # With lambda zero it is the pseudo-inverse's.
+        step = damped_least_squares(J, still.e, np.sqrt(still.factor))
+        if self.method == 'levenberg_marquardt':
+            late = found.iterations[still.which] - found.begun[still.which] >= SECOND_ORDER_AFTER
+            if late.any():
+                some = _Open._make(values[late] for values in still)._replace(J=J[late])
+                self._second_order(step, late, some, gradient[late])
+        return step
+
+    def _second_order(self, step: Floats, late: Flags, still: _Open, gradient: Floats) -> None:
+        """Write the steps of these rows, with the second derivatives of forward in the Hessian.
+
+        `H = J^T M J - sum (M e)_i d^2 forward_i / dq^2`, its eigenvalues made positive, so that the step
+        `(|H| + lambda I)^-1 J^T M e` goes downhill. J^T M J alone is wrong by more than its smallest
+        eigenvalues where J is nearly singular: lambda would have to make up for that in all directions,
+        and hundreds of steps would be needed along the others.
+        """
+        around, width = self.task.around(still.q, STEP)
+        k, n = still.q.shape
+        J = self.task.jacobians(around.reshape(-1, n)).reshape(k, 2, n, *still.J.shape[1:])
+        bend = np.einsum('klmn,km->kln', J[:, 0] - J[:, 1], still.e)
+        bend = np.divide(
+            bend, width[:, :, np.newaxis], out=0.0 * bend, where=width[:, :, np.newaxis] > 0
+        )
+        free = np.any(still.J != 0.0, axis=1)
+        bend *= free[:, :, np.newaxis] & free[:, np.newaxis]
+        H = np.einsum('kmi,kmj->kij', still.J, still.J) - 0.5 * (bend + np.swapaxes(bend, 1, 2))
+        good = np.isfinite(H).all(axis=(1, 2))
+        values, vectors = np.linalg.eigh(H[good])
+        along = np.einsum('kij,ki->kj', vectors, gradient[good])
+        along /= np.abs(values) + still.factor[good][:, np.newaxis]
+        step[np.flatnonzero(late)[good]] = np.einsum('kij,kj->ki', vectors, along)
+
+    def _adapted(self, still: _Open, by: Floats, slope: Floats, change: Floats, taken: Flags) -> Floats:
+        """Return the factors for the next step from what this one did to `e^T M e`."""
+        if self.method == 'newton' or self.alpha is not None:
+            return still.factor
+        if self.method == 'transpose':
+            # As far as would have been best by the parabola through this step's slope and end.
+            bend = change + 2.0 * slope
+            best = np.where(bend > 0.0, slope / bend, np.inf)
+            return still.factor * np.clip(RELAXED * best, 0.1, np.where(taken, 4.0, 0.5))
+        # Lower where the error fell as predicted, higher where a step is rejected.
+        gain = -change / (slope + still.factor * np.einsum('kn,kn->k', by, by))
+        lowered = still.factor * np.maximum(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
+        # Less would drown in the rounding of J^T M J, and would take long to raise.
+        least = EPS * np.einsum('kmn,kmn->k', still.J, still.J)
+        changed = np.where(taken, lowered, 4.0 * still.factor)
+        return np.asarray(np.fmax(changed, least))
+
+    def _free(self, still: _Open) -> tuple[Floats, Floats]:
+        """Return J and `J^T M e`, zero for joints at a limit that would have to go beyond it."""
+        gradient = np.einsum('kmn,km->kn', still.J, still.e)
+        if self.task.limits is None:
+            return still.J, gradient
+        lower, upper = self.task.limits
+        blocked = ((still.q <= lower) & (gradient < 0.0)) | ((still.q >= upper) & (gradient > 0.0))
+        return np.where(blocked[:, np.newaxis], 0.0, still.J), np.where(blocked, 0.0, gradient)
+
+    def _movable(self, still: _Open, J: Floats, gradient: Floats) -> Flags:
+        """Return where a joint lowers the error to first order; nowhere if a Jacobian is not finite."""
+        # Joint by joint, so that their units do not matter.
+        most = np.linalg.norm(J, axis=1) * still.error[:, np.newaxis]
+        movable: Flags = (np.abs(gradient) > STATIONARY[self.method] * most).any(axis=-1)
+        return movable & np.isfinite(J).all(axis=(1, 2))
+
+    def _differentiate(self, still: _Open, where: Flags) -> None:
+        """Write the Jacobians of these rows."""
+        if where.any():
+            still.J[where] = self.task.jacobians(still.q[where])
