@@ -319,6 +319,31 @@ def test_progress_counts_up_to_the_batch(monkeypatch, block):
     assert said[-1] == 15
 
 
+@pytest.mark.parametrize('block', [5, 8192])
+def test_on_step_is_called_at_every_step_of_every_block_and_its_exception_ends_the_batch(
+    monkeypatch, block
+):
+    monkeypatch.setattr(closed_loop, 'BLOCK', block)
+    starts, targets = random_batch(10, 5, 3)
+    arguments = go_to_goal, starts, targets[..., :2], 3.0, 0.5
+    numbers = []
+    outcomes = closed_loops(*arguments, duration=8.0, rate=20.0, on_step=numbers.append)
+    assert numbers[0] == 0
+    assert numbers == sorted(numbers)
+    blocks = math.ceil(15 / block)
+    # One that never arrives takes all 160 steps and the sample after the last one.
+    assert not outcomes.arrived.all()
+    assert 161 <= len(numbers) <= 161 * blocks
+    without = closed_loops(*arguments, duration=8.0, rate=20.0)
+    assert all(np.array_equal(*pair, equal_nan=True) for pair in zip(outcomes, without, strict=True))
+
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        closed_loops(*arguments, on_step=interrupt)
+
+
 # --- Laws of one's own
 
 

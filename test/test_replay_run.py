@@ -11,10 +11,15 @@ from geometry_msgs.msg import Twist
 from lockstep_nodes import make
 from nav_msgs.msg import Goals
 from processes import open_world
+from rclpy.serialization import serialize_message
 from recorded import recorded
 from ros_messages import goal, goals
+from rosbags.rosbag2 import StoragePlugin, Writer
 from rosgraph_msgs.msg import Clock
 
+from diffdrive_jacobian.bags.definitions import definition
+from diffdrive_jacobian.bags.lateness import Lateness
+from diffdrive_jacobian.bags.replayer import Replayer
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.ros.signals import Signals
@@ -45,6 +50,11 @@ def bag(tmp_path_factory):
 def world(tmp_path):
     with open_world(tmp_path) as made:
         yield made
+
+
+def play(bag, *arguments, signals=None):
+    """Run the tool in this process; return the exit code."""
+    return replay_run.main([str(bag), *arguments], signals or Signals())
 
 
 def twists(received):
@@ -107,12 +117,150 @@ def test_offset_leaves_the_beginning_out(world, bag):
     assert twists(commands) == run.cmd_vel.values[-count:].tolist()
 
 
+def test_fast_playback_is_acknowledged_within_a_second(world, bag, monkeypatch):
+    # Not with the heartbeats of a user's profile.
+    monkeypatch.delenv('FASTRTPS_DEFAULT_PROFILES_FILE')
+    path, run = bag
+    commands = world.harness.listen(Twist, 'cmd_vel')
+    child = world.start('replay_run', str(path), '-w', '1', '-r', '20', '--wait-for-all-acked', '1000')
+    world.harness.until(lambda: len(commands) == len(run.cmd_vel), 'all have come')
+    assert (child.exit(), child.stderr) == (0, '')
+    assert child.last_line == f'{len(run.cmd_vel)} messages played'
+
+
+def test_readers_that_do_not_acknowledge_are_reported(world, bag, capsys, monkeypatch):
+    monkeypatch.setattr(replay_run, 'MATCH_PATIENCE', 0.1)
+    monkeypatch.setattr(Replayer, 'unacknowledged', lambda player: ['/cmd_vel'])
+    assert play(bag[0], '-r', '50', '--wait-for-all-acked', '1') == 1
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        'replay_run: error: the readers of /cmd_vel have not acknowledged all messages within 0.001 s'
+    )
+
+
+def test_acknowledgements_are_not_waited_for_after_a_signal(world, bag, monkeypatch):
+    signals = Signals()
+
+    def unacknowledged(_):
+        signals.count = 1
+        return ['/cmd_vel']
+
+    monkeypatch.setattr(replay_run, 'MATCH_PATIENCE', 0.1)
+    monkeypatch.setattr(Replayer, 'unacknowledged', unacknowledged)
+    assert play(bag[0], '-r', '50', '--wait-for-all-acked', '0', signals=signals) == 130
+
+
+def test_it_waits_for_as_many_readers_as_asked_for(world, bag):
+    path, run = bag
+    child = world.start('replay_run', str(path), '-w', '2', '-r', '4')
+    received = [world.harness.listen(Twist, 'cmd_vel')]
+    child.until_says('waiting: /cmd_vel has 1 of 2 readers')
+    received.append(world.harness.listen(Twist, 'cmd_vel'))
+    world.harness.until(lambda: not child.running, 'it is played')
+    assert child.exit() == 0
+    world.harness.until(
+        lambda: [len(one) for one in received] == [len(run.cmd_vel)] * 2, 'both have received everything'
+    )
+
+
+def test_nothing_is_played_to_fewer_readers_than_asked_for(world, bag, capsys):
+    assert play(bag[0], '-w', '2', '--timeout', '0.2') == 1
+    out = capsys.readouterr().out
+    assert out == 'nothing was played: /cmd_vel has 0 of 2 readers after --timeout 0.2 s\n'
+    signals = Signals()
+    signals.count = 1
+    assert play(bag[0], '-w', '1', signals=signals) == 130
+    assert capsys.readouterr().out == 'interrupted: nothing was played, /cmd_vel has 0 of 1 readers\n'
+
+
+def test_a_missing_reader_is_reported_with_the_remedy(world, bag, capfd, monkeypatch):
+    monkeypatch.setattr(replay_run, 'MATCH_PATIENCE', 0.1)
+    assert play(bag[0], '-r', '50') == 0
+    assert 'nobody listens on /cmd_vel (-w 1 waits until somebody does)' in capfd.readouterr().err
+
+
 def test_rival_is_named(world, bag):
     path, _ = bag
     world.harness.peer.create_publisher(Twist, 'cmd_vel', 10)
     child = world.start('replay_run', str(path), '-r', '50')
     world.harness.until(lambda: not child.running, 'it is played')
     assert '/peer also publishes on /cmd_vel' in child.stderr
+
+
+# --- Nothing to play
+
+
+@pytest.mark.parametrize('loop', [(), ('--loop',)], ids=['once', 'loop'])
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (('--goals', '--start-offset', '1'), 'no messages of /goals after --start-offset 1'),
+        (('--topics', '/goals', '--start-offset', '1.5'), 'no messages of /goals after'),
+        (('SPARSE',), 'no messages of cmd_vel, only of /goals (--all-topics plays them)'),
+        (('SPARSE', '--topics', '/cmd_vel'), 'no messages of /cmd_vel, only of /goals'),
+        (('EMPTY',), 'EMPTY has no messages'),
+        (('EMPTY', '--all-topics'), 'EMPTY has no messages'),
+    ],
+    ids=lambda value: ' '.join(value) if isinstance(value, tuple) else '',
+)
+def test_nothing_to_play_is_an_error(world, bag, tmp_path, monkeypatch, capsys, arguments, words, loop):
+    monkeypatch.chdir(tmp_path)
+    build(tmp_path / 'EMPTY', {'/cmd_vel': [], '/goals': []})
+    build(tmp_path / 'SPARSE', {'/cmd_vel': [], '/goals': [Goals()]})
+    path = arguments[0] if arguments[0].isupper() else bag[0]
+    assert play(path, *[one for one in arguments if not one.isupper()], *loop) == 1
+    out, err = capsys.readouterr()
+    assert out == ''
+    assert err.startswith('replay_run: error: nothing to play: ')
+    assert words in err
+    assert err.count('\n') == 1
+
+
+def build(path, topics):
+    """Write a bag with the messages of each topic at 1 s, 2 s, ..."""
+    types = {'/cmd_vel': 'geometry_msgs/msg/Twist', '/goals': 'nav_msgs/msg/Goals'}
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, sent in topics.items():
+            known = definition(types[topic])
+            connection = writer.add_connection(
+                topic, known.name, msgdef=known.text, rihs01=known.type_hash
+            )
+            for second, message in enumerate(sent, 1):
+                writer.write(connection, second * 1_000_000_000, serialize_message(message))
+
+
+def test_every_round_takes_as_long_as_the_recording(world, bag):
+    """The one message of /goals is the first of the run: it is not published without a pause."""
+    path, _ = bag
+    received = world.harness.listen(Goals, 'goals')
+    clock = world.harness.listen(Clock, '/clock')
+    child = world.start('replay_run', str(path), '--goals', '-w', '1', '-l', '-r', '8', '--clock', '200')
+    world.harness.until(lambda: len(received) >= 4, 'the fourth round')
+    child.signal(signal.SIGINT)
+    assert child.exit() == 130
+    count = len(received)
+    times = np.array([one.clock.sec + 1e-9 * one.clock.nanosec for one in clock])
+    rounds = np.flatnonzero(np.diff(times) < -LENGTH / 2)
+    assert len(rounds) + 1 <= count <= len(rounds) + 2
+
+
+# --- Lateness
+
+
+def test_lateness_is_a_histogram_of_bounded_size():
+    delays = np.random.default_rng(1).lognormal(np.log(2e5), 2.0, 20_000).astype(int)
+    lateness = Lateness()
+    for delay in delays.tolist():
+        lateness.add(delay)
+    assert (lateness.count, lateness.maximum) == (len(delays), delays.max())
+    assert len(lateness._bins) < 1000
+    for percent in (0.0, 1.0, 50.0, 99.0, 100.0):
+        exact = np.percentile(delays, percent, method='inverted_cdf')
+        assert exact * 15 / 16 <= lateness.percentile(percent) <= exact
+    lateness.add(-5)
+    assert lateness.percentile(0.0) == 0.0
+    assert np.isnan(Lateness().percentile(50.0))
+    with pytest.raises(ValueError, match=r'percent must be in \[0, 100\], got 101'):
+        lateness.percentile(101.0)
 
 
 # --- Verification
@@ -159,6 +307,7 @@ def test_bag_of_others_is_verified_with_parameters_from_a_file(capsys, request, 
         (['BAG', '--topics', '/nothing'], 'has no topic /nothing; it has /cmd_vel'),
         (['BAG', '-m', 'nonsense'], 'must be OLD:=NEW'),
         (['BAG', '-w', '0'], 'must be a whole number of at least 1'),
+        (['BAG', '--timeout', '1'], '--timeout is the time to wait for the readers of -w'),
         (
             ['BAG', '--verify', '--params-file', 'file.txt'],
             'file of ROS parameters, got file.txt',

@@ -21,10 +21,12 @@ from diffdrive_jacobian.control import Arrival, VelocityLimits, go_to_goal, go_t
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.simulation import RobotModel, closed_loops
+from diffdrive_jacobian.simulation import _block as block
 from diffdrive_jacobian.tools import _sweep_figure, sweep_gains
 from diffdrive_jacobian.tools._sweep_figure import BORDERS, TITLES, figure
 from diffdrive_jacobian.tools.sweep_gains import (
     COLUMNS,
+    CONTROLLERS,
     MEASURES,
     Setup,
     describe,
@@ -118,6 +120,16 @@ def final_heading_error(kp, kv):
         middle = (low + high) / 2.0
         low, high = (middle, high) if np.sinc(2.0 * middle / math.pi) > kp / kv else (low, middle)
     return low
+
+
+@pytest.mark.parametrize('controller', CONTROLLERS)
+def test_the_fast_form_of_the_law_is_used_though_the_sweep_can_be_interrupted(monkeypatch, controller):
+    laws = []
+    known = block.steered
+    monkeypatch.setattr(block, 'steered', lambda law: laws.append((law, known(law))) or known(law))
+    sweep(replace(SMALL, grid=2, controller=controller), lambda done: None)
+    assert laws
+    assert all(law is CONTROLLERS[controller] and fast is not None for law, fast in laws)
 
 
 def test_beyond_the_border_it_spirals_in_as_the_theory_says():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,6 +17,7 @@ from rosbags.rosbag2 import Reader
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from diffdrive_jacobian.bags.definitions import UnknownTypeError
+from diffdrive_jacobian.bags.lateness import Lateness
 from diffdrive_jacobian.bags.qos import to_offer_again
 from diffdrive_jacobian.bags.reading import BagError, base_name, messages
 from diffdrive_jacobian.bags.recorder import message_class
@@ -27,6 +28,10 @@ COMMANDED = ('cmd_vel',)
 """What a robot was told."""
 TOLD = ('goal_pose', 'goals')
 """What its controller was told."""
+
+
+class NothingToPlayError(BagError):
+    """The bag is readable, but has no message of what was chosen."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -50,10 +55,11 @@ class Playback:
     """Whether it waits for somebody to resume it."""
 
     def choose(self, reader: Reader) -> list[Connection]:
-        """Say what of a bag is played.
+        """Return the connections of a bag that are played.
 
         Raises:
-            BagError: The bag has nothing of it.
+            BagError: The bag lacks one of `topics`.
+            NothingToPlayError: It has no message of them.
         """
         there = sorted({connection.topic for connection in reader.connections})
         missing = [topic for topic in self.topics if topic not in there]
@@ -63,12 +69,30 @@ class Playback:
             )
         chosen = [one for one in reader.connections if self._wants(one.topic)]
         if not any(connection.msgcount for connection in chosen):
-            wanted = ' or '.join(self.names or ())
-            raise BagError(
-                f'{reader.path} has no messages of {wanted or "any topic"} to play; it has '
-                f'{", ".join(there) or "no topics"} (--all-topics plays what there is)'
+            if not reader.message_count:
+                raise NothingToPlayError(f'nothing to play: {reader.path} has no messages')
+            wanted = ' or '.join(self.topics or self.names or ())
+            full = sorted({one.topic for one in reader.connections if one.msgcount})
+            raise NothingToPlayError(
+                f'nothing to play: {reader.path} has no messages of {wanted}, only of '
+                f'{", ".join(full)} (--all-topics plays them)'
             )
         return chosen
+
+    def start(self, reader: Reader) -> int:
+        """Return the time in the bag at which playing starts (ns).
+
+        Raises:
+            BagError: The bag is not that long.
+        """
+        start = reader.start_time + round(self.start_offset * NANOSECONDS)
+        if start >= reader.end_time:
+            length = (reader.end_time - reader.start_time) / NANOSECONDS
+            raise BagError(
+                f'--start-offset must be less than the length of the bag, {length:.3f} s, '
+                f'got {self.start_offset:g}'
+            )
+        return start
 
     def _wants(self, topic: str) -> bool:
         if self.topics:
@@ -77,7 +101,11 @@ class Playback:
 
 
 class Replayer(Node):  # type: ignore[misc]
-    """Publishes, from `begin` on, each message when its time has come."""
+    """Publishes, from `begin` on, each message when it is due.
+
+    With `loop` the next round starts when the end of the bag has come, also where what is played ends
+    sooner: every round takes as long as the recording did, divided by the rate.
+    """
 
     def __init__(self, reader: Reader, playback: Playback, **kwargs: Any) -> None:
         """Advertise the topics.
@@ -88,29 +116,32 @@ class Replayer(Node):  # type: ignore[misc]
             kwargs: As for `rclpy.node.Node`.
 
         Raises:
-            BagError: The bag has nothing to play, or of a type that is not installed.
+            NothingToPlayError: The bag has no message of what is chosen, or none after the offset.
+            BagError: The bag cannot be played: it is too short for the offset, lacks a topic, or has
+                messages of a type that is not installed.
         """
+        connections, start = playback.choose(reader), playback.start(reader)
+        if next(_messages_from(reader, connections, start), None) is None:
+            topics = ', '.join(sorted({one.topic for one in connections}))
+            raise NothingToPlayError(
+                f'nothing to play: {reader.path} has no messages of {topics} after '
+                f'--start-offset {playback.start_offset:g}'
+            )
         super().__init__('replay_run', start_parameter_services=False, **kwargs)
         self._reader = reader
         self._playback = playback
-        self._connections = playback.choose(reader)
-        self.start = reader.start_time + round(playback.start_offset * NANOSECONDS)
-        """The instant of the bag at which it begins (ns)."""
+        self._connections = connections
+        self.start = start
+        """Time in the bag at which playing starts (ns)."""
         self.end = reader.end_time
-        """The instant after its last message (ns)."""
-        if self.start >= self.end:
-            length = (reader.end_time - reader.start_time) / NANOSECONDS
-            raise BagError(
-                f'--start-offset must be less than the length of the bag, {length:.3f} s, '
-                f'got {playback.start_offset:g}'
-            )
+        """Time in the bag after its last message (ns)."""
         self.sent = 0
-        """How many messages were published."""
-        self.lateness: list[int] = []
-        """How late each was (ns)."""
+        """Number of messages that were published."""
+        self.lateness = Lateness()
+        """How late the messages were published."""
         self.done = False
         self.position = self.start
-        """The instant of the bag that is played (ns)."""
+        """Time in the bag that is being played (ns)."""
         self._outlets = {one.id: self._advertise(one) for one in self._connections}
         self._clock_outlet: Publisher | None = None
         if playback.clock:
@@ -137,13 +168,17 @@ class Replayer(Node):  # type: ignore[misc]
 
     @property
     def unheard(self) -> list[str]:
-        """The topics that nobody is matched to."""
-        return self.heard_by_fewer(1)
+        """The topics without a matched reader."""
+        return [topic for topic, readers in self.readers().items() if not readers]
 
-    def heard_by_fewer(self, readers: int) -> list[str]:
-        """Give the topics that have fewer readers."""
-        outlets = self._outlets.values()
-        return [one.topic_name for one in outlets if one.get_subscription_count() < readers]
+    def readers(self) -> dict[str, int]:
+        """Return the number of matched readers of each topic."""
+        found: dict[str, int] = {}
+        for outlet in self._outlets.values():
+            # Several connections of a bag can have one topic; each has a publisher of its own.
+            count = outlet.get_subscription_count()
+            found[outlet.topic_name] = min(count, found.get(outlet.topic_name, count))
+        return found
 
     def rivals(self) -> dict[str, list[str]]:
         """Name the others that publish on the same topics."""
@@ -157,23 +192,32 @@ class Replayer(Node):  # type: ignore[misc]
                 found[publisher.topic_name] = others
         return found
 
-    def wait_for_all_acked(self, timeout: Duration) -> bool:
-        """Wait until every reader has everything; whether that came true."""
-        acked = [one.wait_for_all_acked(timeout) for one in self._outlets.values()]
-        return all(acked)
+    def unacknowledged(self) -> list[str]:
+        """Return the topics with a reliable reader that has not acknowledged all messages yet."""
+        return sorted(
+            {
+                one.topic_name
+                for one in self._outlets.values()
+                if not one.wait_for_all_acked(Duration(seconds=0))
+            }
+        )
 
     # --- Playing
 
     def begin(self) -> None:
-        """Play from the start."""
-        self._coming = messages(self._reader, self._connections)
-        self._next = next((one for one in self._coming if one[1] >= self.start), None)
-        self._wall = time.monotonic_ns()
-        self.position = self.start
-        if self._playback.paused and self._paused_at is None and not self.sent:
+        """Start to play."""
+        self._rewind(time.monotonic_ns())
+        if self._playback.paused:
             self._paused_at = self._wall
             return
         self._arm()
+
+    def _rewind(self, wall: int) -> None:
+        """Return to the start, which is due at a wall time (ns)."""
+        self._coming = _messages_from(self._reader, self._connections, self.start)
+        self._next = next(self._coming, None)
+        self._wall = wall
+        self.position = self.start
 
     @property
     def paused(self) -> bool:
@@ -193,7 +237,7 @@ class Replayer(Node):  # type: ignore[misc]
         self._arm()
 
     def _due(self, stamp: int) -> int:
-        """Give the wall time at which an instant of the bag has come (ns)."""
+        """Return the wall time at which a time in the bag is due (ns)."""
         return self._wall + round((stamp - self.start) / self._playback.rate)
 
     def _bag_time(self, wall: int) -> int:
@@ -208,19 +252,20 @@ class Replayer(Node):  # type: ignore[misc]
                 break
             self._outlets[connection.id].publish(data)
             self.sent += 1
-            self.lateness.append(late)
+            self.lateness.add(late)
             self.position = stamp
             self._next = next(self._coming, None)
+        if self._next is None and self._playback.loop and time.monotonic_ns() >= self._due(self.end):
+            self._rewind(time.monotonic_ns())
         self._arm()
 
     def _arm(self) -> None:
-        if self._next is None:
-            if self._playback.loop:
-                self.begin()
-            else:
-                self.done = True
+        """Set the timer to the next message, or to the end of the bag if another round follows."""
+        if self._next is None and not self._playback.loop:
+            self.done = True
             return
-        self._timer.timer_period_ns = max(self._due(self._next[1]) - time.monotonic_ns(), 1)
+        due = self._due(self.end if self._next is None else self._next[1])
+        self._timer.timer_period_ns = max(due - time.monotonic_ns(), 1)
         self._timer.reset()
 
     def _tell_time(self) -> None:
@@ -230,3 +275,10 @@ class Replayer(Node):  # type: ignore[misc]
         message = ClockMessage()
         message.clock.sec, message.clock.nanosec = divmod(now, NANOSECONDS)
         self._clock_outlet.publish(message)
+
+
+def _messages_from(
+    reader: Reader, connections: Sequence[Connection], start: int
+) -> Iterator[tuple[Connection, int, bytes]]:
+    """Yield the messages that were recorded at `start` (ns) or later, in the order of recording."""
+    return (one for one in messages(reader, connections) if one[1] >= start)

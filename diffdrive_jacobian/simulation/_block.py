@@ -64,10 +64,17 @@ class Block:
         self.along: Array = np.array((way / np.where(length > 0.0, length, 1.0)[:, np.newaxis]).T)
         self.too_far: Array = (length + LOST) ** 2
 
-    def drive(self, keep: Keep | None) -> Iterator[tuple[Rows, Outcomes]]:
-        """Drive them to their ends; gives who is done, and what became of them."""
+    def drive(
+        self, keep: Keep | None, on_step: Callable[[], object] | None = None
+    ) -> Iterator[tuple[Rows, Outcomes]]:
+        """Drive them to their ends; gives who is done, and what became of them.
+
+        `on_step` is called at the beginning of every step.
+        """
         batch = self.batch
         for step in range(batch.steps + 1):
+            if on_step is not None:
+                on_step()
             if step % ANEW == 0:
                 # By the number of the step alone, so that the result does not depend on the company.
                 self.c, self.s = np.cos(self.theta), np.sin(self.theta)

@@ -58,6 +58,7 @@ def closed_loops(
     r: ArrayLike = 0.033,
     L: ArrayLike = 0.16,
     progress: Callable[[int], object] | None = None,
+    on_step: Callable[[int], object] | None = None,
 ) -> Outcomes:
     """Drive every robot to its goal and tell what became of it; memory does not grow with the time.
 
@@ -76,6 +77,8 @@ def closed_loops(
         r: Wheel radius, shape (...) (m).
         L: Wheel separation, shape (...) (m).
         progress: Called now and then with the number of robots that are done.
+        on_step: Called with that number at every step of every block of robots, so that a computation
+            can be interrupted: an exception that it raises ends the batch and is passed on.
 
     Returns:
         The outcomes. A law that drives a robot away has not arrived; nothing is raised.
@@ -84,7 +87,7 @@ def closed_loops(
         ValueError: An argument has a wrong shape or value, or the law gives something that does not fit.
     """
     batch = Batch.of(law, starts, goals, gains, rate, duration, arrival, turning_gain, limits, r, L)
-    return _drive(batch, None, progress)
+    return _drive(batch, None, progress, on_step)
 
 
 def trajectories(
@@ -119,7 +122,7 @@ def trajectories(
         if v is not None:
             twists[step, rows, 0], twists[step, rows, 1] = v, omega
 
-    outcomes = _drive(batch, keep, None)
+    outcomes = _drive(batch, keep)
     steps = int(max(last, default=0))
     held = np.minimum(np.arange(steps + 1)[:, np.newaxis], last)
     poses = poses[held, np.arange(batch.size)]
@@ -131,7 +134,12 @@ def trajectories(
     )
 
 
-def _drive(batch: Batch, keep: Keep | None, progress: Callable[[int], object] | None) -> Outcomes:
+def _drive(
+    batch: Batch,
+    keep: Keep | None,
+    progress: Callable[[int], object] | None = None,
+    on_step: Callable[[int], object] | None = None,
+) -> Outcomes:
     """Drive a batch, block by block."""
     if steered(batch.law) is not None:
         # It checks its arguments; on their way the robots ask only for what it gives.
@@ -146,9 +154,10 @@ def _drive(batch: Batch, keep: Keep | None, progress: Callable[[int], object] | 
         np.empty((count, 3)),
     )
     done = 0
+    at_step = None if on_step is None else lambda: on_step(done)
     for begin in range(0, count, BLOCK):
         rows = np.arange(begin, min(begin + BLOCK, count))
-        for finished, values in Block(batch.some(rows), rows).drive(keep):
+        for finished, values in Block(batch.some(rows), rows).drive(keep, at_step):
             for field, value in zip(found, values, strict=True):
                 field[finished] = value
             done += len(finished)

@@ -79,16 +79,21 @@ def count(text: str) -> int:
     return int(text)
 
 
-def add_wait_matching(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add the option that `ros2 topic pub` has for readers which are found late."""
+def add_wait_matching(parser: argparse.ArgumentParser, what: str, otherwise: str) -> None:
+    """Add the option that `ros2 topic pub` has for readers that are discovered late.
+
+    Args:
+        parser: The parser.
+        what: What must have the readers, with its verb.
+        otherwise: What is done without the option.
+    """
     parser.add_argument(
         '-w',
         '--wait-matching-subscriptions',
         dest='readers',
         metavar='N',
         type=count,
-        default=1,
-        help=f'wait until {what} N readers (%(default)s); discovery may take three seconds for each',
+        help=f'wait until {what} N readers; {otherwise}',
     )
 
 
@@ -125,7 +130,7 @@ def with_params_file(ros: list[str], options: argparse.Namespace) -> list[str]:
     return ['--ros-args', '--params-file', options.params_file, '--', *ros]
 
 
-def complain(program: str, message: object) -> int:
-    """Report a user's mistake as argparse does; gives the exit code."""
+def complain(program: str, message: object, code: int = USER_ERROR) -> int:
+    """Print an error as argparse does, a user's mistake unless told otherwise; return its exit code."""
     print(f'{program}: error: {message}', file=sys.stderr)
-    return USER_ERROR
+    return code

@@ -3,30 +3,33 @@
 from __future__ import annotations
 
 import argparse
+import math
 import select
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
-from rclpy.duration import Duration
 
 from diffdrive_jacobian.bags.reading import BagError, open_bag, read_run
-from diffdrive_jacobian.bags.replayer import COMMANDED, TOLD, Playback, Replayer
+from diffdrive_jacobian.bags.replayer import COMMANDED, TOLD, NothingToPlayError, Playback, Replayer
 from diffdrive_jacobian.bags.verification import Verification, verify
+from diffdrive_jacobian.ros.heartbeats import fast_heartbeats
 from diffdrive_jacobian.ros.parameters import ParameterError
 from diffdrive_jacobian.ros.runner import Runner, UserError, ros_context, running
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._params_file import robot_parameters
 from diffdrive_jacobian.tools._progress import Playing
+from diffdrive_jacobian.tools._waiting import Waiting
 
 PROGRAM = 'replay_run'
 MATCH_PATIENCE = 5.0
-"""How long subscribers may take to be found (s): a participant that is older is announced every 3 s."""
+"""How long readers are waited for without -w (s): an older participant is announced every 3 s."""
 MATCH_QUIET = 0.5
-"""For how long no new one must have been found before it begins (s)."""
+"""How long the numbers of readers must not have changed before playing starts (s)."""
 
 
 def replay(
@@ -34,68 +37,139 @@ def replay(
     playback: Playback,
     ros: Sequence[str],
     signals: Signals,
-    acked: float | None,
-    readers: int = 1,
+    *,
+    acked: float | None = None,
+    readers: int | None = None,
+    timeout: float = math.inf,
 ) -> int:
-    """Play a bag; gives the exit code.
+    """Play a bag; return the exit code.
 
     Args:
         bag: The bag.
-        playback: What of it, and how.
+        playback: What of it is played, and how.
         ros: ROS arguments.
-        signals: What was caught so far.
-        acked: How long to wait at the end until all readers have everything (s; 0: for ever); None:
-            not at all.
-        readers: How many each topic should have before anything is played.
+        signals: Signals that were caught so far.
+        acked: How long to wait at the end until all readers have acknowledged everything (s; 0: for
+            ever); None: not at all.
+        readers: Number of readers that each topic must have before anything is played; None: whoever is
+            discovered within `MATCH_PATIENCE`.
+        timeout: How long to wait for so many readers (s).
 
     Raises:
-        UserError: The ROS arguments cannot be.
+        UserError: The ROS arguments are invalid.
         BagError: The bag cannot be played.
+        NothingToPlayError: It has no message to play.
     """
     with (
         open_bag(bag) as reader,
+        nullcontext() if acked is None else fast_heartbeats(),
         ros_context([PROGRAM, *ros]) as context,
         running(context, closed_world=False) as runner,
     ):
         player = runner.add(lambda: Replayer(reader, playback, context=context))
-        _wait_for_subscribers(player, runner, signals, readers)
+        if readers is None:
+            _wait_for_discovery(player, runner, signals)
+        elif not _wait_for_readers(player, runner, signals, readers, timeout):
+            counts = _too_few(player, readers)
+            if signals.count:
+                print(f'interrupted: nothing was played, {counts}')
+                return _cli.INTERRUPTED
+            print(f'nothing was played: {counts} after --timeout {timeout:g} s')
+            return _cli.FAILED
         for topic, others in player.rivals().items():
             player.get_logger().warning(f'{", ".join(others)} also publishes on {topic}')
         for topic in player.unheard:
-            player.get_logger().warning(f'nobody listens on {topic}')
-        with Playing((player.end - player.start) / 1e9) as progress:
-
-            def over() -> bool:
-                if _pressed_enter():
-                    player.toggle()
-                progress.show((player.position - player.start) / 1e9, paused=player.paused)
-                return bool(player.done or signals.count)
-
-            player.begin()
-            alive = runner.spin(over)
-        if alive and not signals.count and acked is not None:
-            patience = Duration(nanoseconds=-1) if acked == 0.0 else Duration(seconds=acked)
-            alive = player.wait_for_all_acked(patience)
+            player.get_logger().warning(f'nobody listens on {topic} (-w 1 waits until somebody does)')
+        played = _play(player, runner, signals)
+        unacknowledged: list[str] = []
+        if played and acked is not None:
+            unacknowledged = _wait_for_acknowledgements(player, runner, signals, acked)
         print(f'{player.sent} messages played')
     if signals.count:
         return _cli.INTERRUPTED
-    return _cli.DONE if alive and player.done else _cli.FAILED
+    if unacknowledged:
+        topics = ', '.join(unacknowledged)
+        reason = f'the readers of {topics} have not acknowledged all messages within {acked:g} s'
+        return _cli.complain(PROGRAM, reason, _cli.FAILED)
+    return _cli.DONE if played else _cli.FAILED
 
 
-def _wait_for_subscribers(player: Replayer, runner: Runner, signals: Signals, readers: int) -> None:
-    """Wait until those who listen are matched: what is sent before is lost to them."""
-    begun = quiet = time.monotonic()
-    heard = -1
+def _wait_for_discovery(player: Replayer, runner: Runner, signals: Signals) -> None:
+    """Wait until each topic has a reader and no more are discovered, `MATCH_PATIENCE` at most."""
+    started = quiet = time.monotonic()
+    counts: dict[str, int] = {}
 
-    def matched() -> bool:
-        nonlocal quiet, heard
-        now, unheard = time.monotonic(), len(player.heard_by_fewer(readers))
-        if unheard != heard:
-            quiet, heard = now, unheard
-        complete = unheard == 0 and now - quiet >= MATCH_QUIET
-        return bool(complete or now - begun >= MATCH_PATIENCE or signals.count)
+    def over() -> bool:
+        nonlocal quiet, counts
+        now, found = time.monotonic(), player.readers()
+        if found != counts:
+            quiet, counts = now, found
+        complete = min(counts.values()) > 0 and now - quiet >= MATCH_QUIET
+        return bool(complete or now - started >= MATCH_PATIENCE or signals.count)
 
-    runner.spin(matched)
+    runner.spin(over)
+
+
+def _wait_for_readers(
+    player: Replayer, runner: Runner, signals: Signals, readers: int, timeout: float
+) -> bool:
+    """Wait until each topic has so many readers; return False after the timeout (s) or a signal."""
+    deadline = time.monotonic() + timeout
+    waiting = Waiting()
+    complete = False
+
+    def over() -> bool:
+        nonlocal complete
+        complete = not (few := _too_few(player, readers))
+        if not complete:
+            waiting.show(few)
+        return bool(complete or signals.count or time.monotonic() > deadline)
+
+    return runner.spin(over) and complete
+
+
+def _too_few(player: Replayer, readers: int) -> str:
+    """List the topics that have fewer readers, with their numbers; empty: none has."""
+    few = {topic: count for topic, count in player.readers().items() if count < readers}
+    return ', '.join(f'{topic} has {count} of {readers} readers' for topic, count in few.items())
+
+
+def _play(player: Replayer, runner: Runner, signals: Signals) -> bool:
+    """Play until the end or a signal; return whether everything was played."""
+    with Playing((player.end - player.start) / 1e9) as progress:
+
+        def over() -> bool:
+            if _pressed_enter():
+                player.toggle()
+            progress.show((player.position - player.start) / 1e9, paused=player.paused)
+            return bool(player.done or signals.count)
+
+        player.begin()
+        runner.spin(over)
+    return player.done
+
+
+def _wait_for_acknowledgements(
+    player: Replayer, runner: Runner, signals: Signals, seconds: float
+) -> list[str]:
+    """Wait until all readers have acknowledged everything (s; 0: for ever).
+
+    Returns:
+        The topics with readers that have not.
+    """
+    deadline = time.monotonic() + (seconds or math.inf)
+    waiting = Waiting()
+    missing: list[str] = []
+
+    def over() -> bool:
+        nonlocal missing
+        missing = player.unacknowledged()
+        if missing:
+            waiting.show(f'readers of {", ".join(missing)} have not acknowledged all messages')
+        return bool(not missing or signals.count or time.monotonic() > deadline)
+
+    runner.spin(over)
+    return missing
 
 
 def _pressed_enter() -> bool:
@@ -157,11 +231,16 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         clock=options.clock,
         paused=options.start_paused,
     )
+    if options.timeout is not None and options.readers is None:
+        parser.error('--timeout is the time to wait for the readers of -w, which is missing')
     acked = None if options.wait_for_all_acked is None else options.wait_for_all_acked / 1000.0
     try:
         if options.verify:
             return _verify(bag, options)
-        return replay(bag, playback, ros, signals, acked, options.readers)
+        timeout = math.inf if options.timeout is None else options.timeout
+        return replay(bag, playback, ros, signals, acked=acked, readers=options.readers, timeout=timeout)
+    except NothingToPlayError as error:
+        return _cli.complain(PROGRAM, error, _cli.FAILED)
     except (UserError, BagError, ParameterError) as error:
         return _cli.complain(PROGRAM, error)
 
@@ -186,8 +265,8 @@ def _parser() -> argparse.ArgumentParser:
         usage=f'{PROGRAM} BAG [options] [--ros-args ...]',
         description='Replay a recorded run: what was commanded (cmd_vel), unless something else is '
         'asked for. On a terminal, Enter pauses and resumes. With --verify nothing is published: the '
-        'robot is driven again in memory and its way compared with the odometry. Exit code 0: played, '
-        'or as recorded; 1: not; 2: wrong arguments or no bag; 130: interrupted.',
+        'robot is driven again in memory and its path compared with the odometry. Exit code 0: played, '
+        'or as recorded; 1: not, or nothing to play; 2: wrong arguments or no bag; 130: interrupted.',
     )
     parser.add_argument('bag', metavar='BAG', help='the directory of a rosbag2 bag')
     what = parser.add_mutually_exclusive_group()
@@ -196,7 +275,9 @@ def _parser() -> argparse.ArgumentParser:
     what.add_argument('--topics', nargs='+', metavar='TOPIC', help='these, by their full names')
     what.add_argument('--verify', action='store_true', help='compare the robot with the odometry')
     parser.add_argument('-r', '--rate', type=_cli.positive, default=1.0, help='how much faster; 1')
-    parser.add_argument('-l', '--loop', action='store_true', help='begin anew at the end')
+    parser.add_argument(
+        '-l', '--loop', action='store_true', help='start again when the end of the bag is reached'
+    )
     parser.add_argument(
         '--start-offset', type=_not_negative, default=0.0, help='begin so late in the bag (s)'
     )
@@ -219,12 +300,23 @@ def _parser() -> argparse.ArgumentParser:
         help="publish the bag's time on /clock (40)",
     )
     parser.add_argument('-p', '--start-paused', action='store_true', help='begin with a pause')
-    _cli.add_wait_matching(parser, 'each topic has')
+    _cli.add_wait_matching(
+        parser,
+        'each topic has',
+        f'without it, playing starts with the readers that are discovered within {MATCH_PATIENCE:g} s',
+    )
+    parser.add_argument(
+        '--timeout',
+        type=_cli.positive,
+        metavar='SECONDS',
+        help='with -w: give up after this time and play nothing (default: wait for ever)',
+    )
     parser.add_argument(
         '--wait-for-all-acked',
         type=_not_negative,
         metavar='MS',
-        help='wait so long at the end until all readers have everything; 0: for ever',
+        help='at the end wait up to this time (ms) until all reliable readers have acknowledged all '
+        'messages, 0: for ever; exit code 1 if they have not (default: do not wait)',
     )
     parser.add_argument('--tolerance', type=_cli.positive, help='with --verify: position (m)')
     parser.add_argument('--yaw-tolerance', type=_cli.positive, help='with --verify: heading (rad)')

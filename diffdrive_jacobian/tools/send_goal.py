@@ -271,7 +271,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument('x', metavar='X', type=_cli.coordinate, help='goal (m)')
     parser.add_argument('y', metavar='Y', type=_cli.coordinate, help='goal (m)')
-    _cli.add_wait_matching(parser, 'goal_pose has')
+    _cli.add_wait_matching(parser, 'goal_pose has', 'one without it')
     parser.add_argument(
         '--heading',
         type=_cli.number,

@@ -16,8 +16,6 @@ import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
-
 TOPICS = [f'topic_{index}' for index in range(6)]
 RECORD = (
     'import sys; from diffdrive_jacobian.tools.entry_points import record_run; sys.exit(record_run())'
@@ -87,7 +85,7 @@ def replay(bag):
         player = runner.add(lambda: Replayer(reader, playback, context=context))
         player.begin()
         runner.spin(lambda: player.done)
-        return np.percentile(np.array(player.lateness) / 1e3, [50, 99])
+        return [player.lateness.percentile(percent) / 1e3 for percent in (50, 99)]
 
 
 def main():
