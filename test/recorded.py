@@ -14,12 +14,12 @@ class LockstepRecording:
 
     def __init__(self, world, path, storage='mcap', **selection):
         self.world = world
-        self.recording = Recording(path, storage)
-        self.recorder = world.add(Recorder(Selection(**selection), self.recording.journal))
+        self.recording = Recording(path, storage, lossless=True)
+        self.recorder = world.add(Recorder(Selection(**selection), self.recording))
 
     def look(self):
         """Find what is new; what was published before is lost, unless it is latched."""
-        self.recorder.look()
+        self.recorder.discover()
         self.world.settle()
 
     def finish(self):

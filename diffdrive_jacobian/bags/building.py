@@ -6,17 +6,22 @@ import errno
 import os
 import shutil
 import sqlite3
+import tempfile
+import zlib
+from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import StoragePlugin
 
 from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
 from diffdrive_jacobian.bags.qos import to_rosbags
+from diffdrive_jacobian.bags.storage import BagReader, BagWriter
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
+_SUM = (1 << 64) - 1
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -30,40 +35,76 @@ class Summary:
     """Stamp of the first message (ns); None: there is none."""
     end: int | None
     """Stamp of the last one (ns)."""
+    lost: dict[str, int] = field(default_factory=dict)
+    """Messages that are known to be missing, by topic."""
+
+
+def check_target(target: Path) -> None:
+    """Check that a bag can have this path, before anything is recorded for it.
+
+    Raises:
+        FileExistsError: It exists, be it as a symbolic link to nothing.
+        OSError: Its name is not UTF-8, which metadata.yaml has to be.
+    """
+    if os.path.lexists(target):
+        raise FileExistsError(f'{target} exists already')
+    try:
+        target.name.encode()
+    except UnicodeEncodeError:
+        raise OSError(errno.EILSEQ, f'the name of a bag must be UTF-8, got {target.name!a}') from None
 
 
 def build_bag(records: Callable[[], Iterable[Record]], target: Path, storage: str) -> Summary:
-    """Write records into a new bag, which appears whole or not at all.
+    """Write records into a new bag, read it back, and only then give it its name.
 
     Args:
-        records: Gives them, from the beginning with each call.
+        records: Returns them, from the beginning with each call.
         target: The bag's directory; it must not exist.
         storage: `mcap` or `sqlite3`.
 
     Raises:
         FileExistsError: `target` exists.
-        OSError: It cannot be written; nothing is left of it.
+        OSError: It cannot be written, or differs from what was written. Nothing is left of it.
     """
-    if target.exists():
-        raise FileExistsError(f'{target} exists already')
+    check_target(target)
     channels = {record.id: record for record in records() if isinstance(record, Channel)}
-    workshop = target.parent / f'.{target.name}.building'
-    shutil.rmtree(workshop, ignore_errors=True)
+    scratch = Path(tempfile.mkdtemp(prefix=f'.{target.name[:40]}.building-', dir=target.parent))
     try:
         # In a directory of the final name, for rosbags names the files after it.
-        summary = _write(records(), channels, workshop / target.name, storage)
-        for path in (workshop / target.name).iterdir():
+        bag = scratch / target.name
+        summary, written = _write(records(), channels, bag, storage)
+        if _contents(bag) != written:
+            raise OSError(errno.EIO, 'what was read back from it is not what was written to it')
+        for path in bag.iterdir():
             _sync(path)
-        _sync(workshop / target.name)
-        os.rename(workshop / target.name, target)
+        _sync(bag)
+        # Renaming would replace an empty directory of somebody else.
+        check_target(target)
+        os.rename(bag, target)
         _sync(target.parent)
     finally:
-        shutil.rmtree(workshop, ignore_errors=True)
+        shutil.rmtree(scratch, ignore_errors=True)
     return summary
 
 
-def _write(records: Iterable[Record], channels: dict[int, Channel], path: Path, storage: str) -> Summary:
-    writer = Writer(path, version=9, storage_plugin=STORAGES[storage])
+@dataclass(slots=True)
+class Content:
+    """Messages by topic, in numbers that do not depend on their order."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+    checksums: Counter[str] = field(default_factory=Counter)
+
+    def add(self, topic: str, stamp: int, data: bytes | memoryview) -> None:
+        """Count a message and add its checksum to that of its topic."""
+        self.counts[topic] += 1
+        self.checksums[topic] += (zlib.crc32(data) * 0x9E3779B97F4A7C15 + stamp) & _SUM
+
+
+def _write(
+    records: Iterable[Record], channels: dict[int, Channel], path: Path, storage: str
+) -> tuple[Summary, Content]:
+    writer = BagWriter(path, version=9, storage_plugin=STORAGES[storage])
+    content = Content()
     try:
         writer.open()
         connections = {
@@ -76,14 +117,13 @@ def _write(records: Iterable[Record], channels: dict[int, Channel], path: Path, 
             )
             for channel in channels.values()
         }
-        topics = {channel.topic: 0 for channel in channels.values()}
         start = end = None
         for record in records:
             if isinstance(record, Text):
                 writer.set_custom_data(record.key, record.value)
             elif isinstance(record, Message):
                 writer.write(connections[record.channel], record.stamp, record.data)
-                topics[channels[record.channel].topic] += 1
+                content.add(channels[record.channel].topic, record.stamp, record.data)
                 start = record.stamp if start is None else min(start, record.stamp)
                 end = record.stamp if end is None else max(end, record.stamp)
         writer.close()
@@ -94,7 +134,28 @@ def _write(records: Iterable[Record], channels: dict[int, Channel], path: Path, 
         if isinstance(error, sqlite3.Error):
             raise OSError(errno.EIO, str(error)) from error
         raise
-    return Summary(messages=sum(topics.values()), topics=topics, start=start, end=end)
+    topics = {channel.topic: content.counts[channel.topic] for channel in channels.values()}
+    return Summary(messages=sum(topics.values()), topics=topics, start=start, end=end), content
+
+
+def _contents(path: Path) -> Content:
+    """Read a whole bag.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    content = Content()
+    reader = BagReader(path)
+    try:
+        reader.open()
+        try:
+            for connection, stamp, data in reader.messages(reader.connections):
+                content.add(connection.topic, stamp, data)
+        finally:
+            reader.close()
+    except Exception as error:  # whatever the parsers of a wrong file raise
+        raise OSError(errno.EIO, f'it cannot be read back: {error!r}') from error
+    return content
 
 
 def _sync(path: Path) -> None:

@@ -14,8 +14,11 @@ import fcntl
 import json
 import os
 import struct
+import tempfile
+import threading
 import zlib
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -24,6 +27,10 @@ MAGIC = b'\x89ddjournal1\r\n\x1a\n'
 _HEAD = struct.Struct('<cII')
 _MESSAGE = struct.Struct('<Hq')
 _CONNECTION, _DATA, _TEXT = b'C', b'M', b'T'
+BLOCK = 8 << 20
+"""What is written at once (bytes), about."""
+OVERHEAD = 250
+"""Memory that a record takes besides its payload (bytes), about."""
 
 
 class JournalError(Exception):
@@ -64,7 +71,7 @@ Record = Channel | Message | Text
 
 
 class JournalWriter:
-    """Appends records to a new file."""
+    """Appends records to a new file. Records may be added in one thread and flushed in another."""
 
     def __init__(self, path: Path) -> None:
         """Create the file.
@@ -75,50 +82,122 @@ class JournalWriter:
         """
         self.path = path
         # Its own buffer: that of `open` would raise once more for what could not be written.
-        self._file = open(path, 'xb', buffering=0)  # noqa: SIM115
-        # It ends with the process, however that ends.
+        self._file = open(path, 'x+b', buffering=0)  # noqa: SIM115
+        # The lock ends with the process, however that ends.
         fcntl.flock(self._file, fcntl.LOCK_EX)
-        self._pending = bytearray(MAGIC)
+        self._lock = threading.Lock()
+        self._pending = [MAGIC]
+        self.waiting = len(MAGIC)
+        """Memory held by records that are not yet written, or being written (bytes)."""
         self._written = 0
+        self._synced = 0
+        self._added = len(MAGIC)
 
     @property
     def size(self) -> int:
-        """Bytes so far."""
-        return self._written + len(self._pending)
+        """Bytes of all records so far, written or not."""
+        return self._added
 
     def add(self, record: Record) -> None:
-        """Append a record; it is kept once `flush` has returned."""
+        """Append a record; it is written by `flush`."""
         if isinstance(record, Message):
-            kind, payload = _DATA, _MESSAGE.pack(record.channel, record.stamp) + record.data
+            kind, payload = _DATA, record.data
+            start = _MESSAGE.pack(record.channel, record.stamp)
         else:
             kind = _CONNECTION if isinstance(record, Channel) else _TEXT
-            payload = json.dumps(asdict(record)).encode()
-        self._pending += _HEAD.pack(kind, len(payload), zlib.crc32(payload, ord(kind)))
-        self._pending += payload
+            payload, start = json.dumps(asdict(record)).encode(), b''
+        checksum = zlib.crc32(payload, zlib.crc32(start, ord(kind)))
+        head = _HEAD.pack(kind, len(start) + len(payload), checksum) + start
+        with self._lock:
+            # The payload is kept as it is: large messages are not copied before they are written.
+            self._pending += (head, payload)
+            self._added += len(head) + len(payload)
+            self.waiting += OVERHEAD + len(payload)
 
     def flush(self) -> None:
-        """Hand everything to the operating system: a killed process loses nothing of it.
+        """Hand everything to the operating system. A killed process loses nothing of it.
 
         Raises:
-            OSError: The disk is full, or gone; what was not written is dropped.
+            OSError: The disk is full, or gone. What was not written is dropped.
         """
-        data, self._pending = memoryview(self._pending), bytearray()
-        while data:
-            written = self._file.write(data)
-            self._written += written
-            data = data[written:]
+        with self._lock:
+            pending, self._pending = self._pending, []
+            waiting = self.waiting
+        try:
+            for block in _blocks(pending):
+                data = memoryview(block)
+                while data:
+                    written = os.write(self._file.fileno(), data)
+                    self._written += written
+                    data = data[written:]
+        finally:
+            with self._lock:
+                self.waiting -= waiting
 
     def sync(self) -> None:
-        """Wait until everything flushed is on the disk: a power cut loses nothing of it.
+        """Wait until everything flushed is on the disk. A power cut loses nothing of it.
 
         Raises:
             OSError: The disk is full, or gone.
         """
-        os.fsync(self._file.fileno())
+        written = self._written
+        if written > self._synced:
+            os.fsync(self._file.fileno())
+            self._synced = written
+
+    def in_place(self) -> bool:
+        """Whether the file is still found at `path`: not removed, renamed or replaced."""
+        try:
+            return os.path.samestat(os.stat(self.path), os.fstat(self._file.fileno()))
+        except OSError:
+            return False
+
+    def rescue(self) -> Path:
+        """Return where a file that is not `in_place` was moved to, or, if it was removed, a copy of it.
+
+        The copy is in the directory of `path`, or in the nearest one above that still exists. It is
+        complete when this returns.
+
+        Raises:
+            OSError: The copy cannot be written.
+        """
+        descriptor = self._file.fileno()
+        with suppress(OSError):
+            # Linux knows its name.
+            moved = Path(os.readlink(f'/proc/self/fd/{descriptor}'))
+            if os.path.samestat(os.stat(moved), os.fstat(descriptor)):
+                return moved
+        path = Path(os.path.abspath(self.path))
+        folders = (*path.parents, Path(tempfile.gettempdir()))
+        folder = next(one for one in folders if one.is_dir() and os.access(one, os.W_OK))
+        handle, name = tempfile.mkstemp(path.suffix, f'{path.stem[:50]}_rescued_', folder)
+        with open(handle, 'wb') as copy:
+            # The descriptor still has what the removed file held.
+            while data := os.pread(descriptor, BLOCK, copy.tell()):
+                copy.write(data)
+            copy.flush()
+            os.fsync(copy.fileno())
+        return Path(name)
 
     def close(self) -> None:
-        """Close the file; flush before."""
+        """Close the file. Flush before."""
         self._file.close()
+
+
+def _blocks(pieces: list[bytes]) -> Iterator[bytes]:
+    """Yield bytes joined to blocks of about BLOCK: a write to a slow disk takes long, however small."""
+    block: list[bytes] = []
+    size = 0
+    for index, piece in enumerate(pieces):
+        # Memory is given back while the rest is being written.
+        pieces[index] = b''
+        block.append(piece)
+        size += len(piece)
+        if size >= BLOCK:
+            yield b''.join(block)
+            block, size = [], 0
+    if block:
+        yield b''.join(block)
 
 
 def is_being_written(path: Path) -> bool:

@@ -1,22 +1,27 @@
-"""The node that records: it hears topics as raw CDR and hands them to a journal."""
+"""The node that records: it receives topics as raw CDR and hands them to a recording."""
 
 from __future__ import annotations
 
 import importlib
 import json
 import re
+import time
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
-from rcl_interfaces.srv import GetParameters, ListParameters
-from rclpy.client import Client
+from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
-from rclpy.parameter import parameter_value_to_python
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
 
 from diffdrive_jacobian.bags.definitions import UnknownTypeError, definition
-from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
+from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
+from diffdrive_jacobian.bags.missed import MissedMessages
+from diffdrive_jacobian.bags.parameter_query import ParameterQuery
 from diffdrive_jacobian.bags.qos import to_fields, to_hear_all
 from diffdrive_jacobian.ros.parameters import ParameterError
 
@@ -36,9 +41,23 @@ RUN_TOPICS = (
 )
 """What there is to know about a run."""
 DEPTH = 4000
-"""How many messages of a topic may wait: at 1,000 per second, four seconds of a disk that hesitates."""
+"""How many messages of a topic may wait in the middleware."""
+BURST = 0.01
+"""How long the waiting messages of a topic are taken before other topics have their turn (s)."""
+DRAIN_PATIENCE = 3.0
+"""How long it may take to collect what waits at the end (s)."""
 PARAMETERS = 'parameters of '
 """Before a node's name, the key of the custom data that holds its parameters as JSON."""
+
+
+class Sink(Protocol):
+    """What a recorder records to."""
+
+    def add(self, record: Record) -> None:
+        """Record something."""
+
+    def set_missed(self, topic: str, messages: int) -> None:
+        """Note how many messages of a topic are known never to have reached the recorder so far."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -50,53 +69,58 @@ class Selection:
     everything: bool = False
     """Every topic that is not hidden."""
     pattern: str = ''
-    """Topics whose whole name this regular expression finds something in, too."""
+    """Also topics in whose full name this regular expression is found."""
 
 
 class Recorder(Node):  # type: ignore[misc]
-    """Hears what was selected, from the moment at which somebody publishes it."""
+    """Records the selected topics, each from the moment at which somebody publishes it."""
 
     def __init__(
         self,
         selection: Selection,
-        journal: JournalWriter,
+        sink: Sink,
         *,
-        stamped_on_receipt: bool = True,
+        with_info: bool = False,
         **kwargs: Any,
     ) -> None:
-        """Begin without topics; `look` finds them.
+        """Start without topics; `discover` finds them.
 
         Args:
             selection: Which topics.
-            journal: Where the messages go; it is flushed and synced by others.
-            stamped_on_receipt: Whether a message is recorded with the time at which the middleware
-                received it; else with that of the node's clock when it is handled, as always with
-                simulated time. The EventsExecutor of Jazzy cannot tell the former.
+            sink: Where the messages go.
+            with_info: Whether the executor gives the information that comes with a message: all do
+                but the EventsExecutor of Jazzy. Then missed messages are counted, and a message is
+                recorded with the time at which the middleware received it. Otherwise, and always with
+                simulated time, it is recorded with the time of the node's clock when it is handled.
             kwargs: As for `rclpy.node.Node`.
 
         Raises:
-            ParameterError: A topic cannot be called so.
+            ParameterError: The name of a topic is invalid.
         """
         super().__init__('record_run', start_parameter_services=False, **kwargs)
-        self._journal = journal
+        self._sink = sink
         self._everything = selection.everything
         self._names = {self._resolved(topic) for topic in selection.topics}
         self._pattern = re.compile(selection.pattern) if selection.pattern else None
         self._channels: dict[str, Channel] = {}
+        self._subscriptions_by_topic: dict[str, Subscription] = {}
+        self._takers: dict[str, Callable[[bytes, dict[str, int]], None]] = {}
         self._refused: set[str] = set()
-        self._asking: dict[str, tuple[Client, Client]] = {}
-        self._asked: set[str] = set()
-        self._stamped = stamped_on_receipt and not self.get_parameter('use_sim_time').value
+        self._queries: dict[str, ParameterQuery] = {}
+        self._with_info = with_info
+        self._stamped = with_info and not self.get_parameter('use_sim_time').value
+        self._missed: dict[str, MissedMessages] = {}
+        self._reported: Counter[str] = Counter()
         self.messages = 0
-        """How many came."""
+        """How many were received."""
 
     @property
     def topics(self) -> list[str]:
-        """What is heard."""
+        """The topics that are recorded."""
         return list(self._channels)
 
-    def look(self) -> None:
-        """Look for topics, publishers and nodes that are new."""
+    def discover(self) -> None:
+        """Find new topics, publishers and nodes; to be called often."""
         for topic, types in self.get_topic_names_and_types():
             if not self._wants(topic) or topic in self._refused:
                 continue
@@ -104,12 +128,33 @@ class Recorder(Node):  # type: ignore[misc]
             if not publishers:
                 continue
             if topic not in self._channels:
-                self._hear(topic, types, publishers)
+                self._subscribe(topic, types, publishers)
             else:
                 self._note_profiles(self._channels[topic], publishers)
                 self._note_types(self._channels[topic], publishers)
             for publisher in publishers:
                 self._ask_for_parameters(publisher.node_namespace, publisher.node_name)
+        for query in self._queries.values():
+            query.advance()
+        self._report_missed()
+
+    def drain(self) -> None:
+        """Collect what the middleware received before this call and nobody has handled.
+
+        For a recorder `with_info`, while its executor does not spin.
+        """
+        end, deadline = time.time_ns(), time.monotonic() + DRAIN_PATIENCE
+        for topic, subscription in self._subscriptions_by_topic.items():
+            if not self._take(topic, subscription, deadline, received_before=end):
+                self.get_logger().error(f'not all of {topic} could be collected at the end')
+        self._report_missed()
+
+    def _report_missed(self) -> None:
+        for topic in self._channels:
+            # Where messages are numbered, that counts what was overwritten in the middleware, too.
+            missed = self._missed[topic].count or self._reported[topic]
+            if missed:
+                self._sink.set_missed(topic, missed)
 
     def _resolved(self, topic: str) -> str:
         try:
@@ -127,7 +172,7 @@ class Recorder(Node):  # type: ignore[misc]
             return True
         return self._pattern is not None and self._pattern.search(topic) is not None
 
-    def _hear(self, topic: str, types: list[str], publishers: list[Any]) -> None:
+    def _subscribe(self, topic: str, types: list[str], publishers: list[Any]) -> None:
         if len(types) > 1:
             self._refuse(topic, f'it has several types: {", ".join(types)}')
             return
@@ -145,14 +190,32 @@ class Recorder(Node):  # type: ignore[misc]
             type_hash=described.type_hash,
             qos=_profiles(publishers),
         )
-        self._channels[topic] = channel
-        self._journal.add(channel)
         profile = to_hear_all((one.qos_profile for one in publishers), DEPTH)
-        callback = partial(self._on_stamped if self._stamped else self._on_message, channel.id)
+        self._channels[topic] = channel
+        self._missed[topic] = MissedMessages(partial(self.count_publishers, topic))
+        self._sink.add(channel)
         try:
-            self.create_subscription(message, topic, callback, profile, raw=True)
-        except RuntimeError as error:
+            self._create_subscription(channel, message, profile)
+        except (RuntimeError, NameValidationException) as error:
             self._refuse(topic, str(error).split(', at /')[0])
+
+    def _create_subscription(self, channel: Channel, message: Any, profile: QoSProfile) -> None:
+        topic = channel.topic
+        if not self._with_info:
+            self.create_subscription(
+                message, topic, partial(self._on_message, channel.id), profile, raw=True
+            )
+            return
+        self._takers[topic] = partial(self._record, channel.id, self._missed[topic])
+        callback = partial(self._on_informed, topic)
+        # A callable with two arguments is given the information that comes with a message.
+        create = partial(self.create_subscription, message, topic, callback, profile, raw=True)
+        try:
+            events = SubscriptionEventCallbacks(message_lost=partial(self._on_lost, topic))
+            subscription = create(event_callbacks=events)
+        except UnsupportedEventTypeError:
+            subscription = create()
+        self._subscriptions_by_topic[topic] = subscription
 
     def _refuse(self, topic: str, why: str) -> None:
         self._refused.add(topic)
@@ -164,19 +227,57 @@ class Recorder(Node):  # type: ignore[misc]
         if new:
             channel = replace(channel, qos=channel.qos + new)
             self._channels[channel.topic] = channel
-            self._journal.add(channel)
+            self._sink.add(channel)
 
     def _note_types(self, channel: Channel, publishers: list[Any]) -> None:
         for other in {one.topic_type for one in publishers} - {channel.type_name}:
             if (mismatch := f'{channel.topic} of {other}') not in self._refused:
                 self._refuse(mismatch, f'{channel.topic} is recorded as {channel.type_name}')
 
-    def _on_stamped(self, channel: int, data: bytes, info: dict[str, int]) -> None:
-        self._journal.add(Message(channel, info['received_timestamp'], data))
-        self.messages += 1
+    # --- Messages
 
     def _on_message(self, channel: int, data: bytes) -> None:
-        self._journal.add(Message(channel, self.get_clock().now().nanoseconds, data))
+        self._add(channel, self._now(), data)
+
+    def _on_informed(self, topic: str, data: bytes, info: dict[str, int]) -> None:
+        self._takers[topic](data, info)
+        # The executor takes one message at a time, at many times the cost: a burst would overflow.
+        self._take(topic, self._subscriptions_by_topic[topic], time.monotonic() + BURST)
+
+    def _take(
+        self,
+        topic: str,
+        subscription: Subscription,
+        deadline: float,
+        received_before: int | None = None,
+    ) -> bool:
+        """Record what waits on a topic. Return whether that was done before a deadline."""
+        record = self._takers[topic]
+        with subscription.handle:
+            while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
+                record(*taken)
+                if received_before is not None and taken[1]['received_timestamp'] > received_before:
+                    break
+                if time.monotonic() > deadline:
+                    return False
+        return True
+
+    def _record(self, channel: int, missed: MissedMessages, data: bytes, info: dict[str, int]) -> None:
+        number = info['publication_sequence_number']
+        # None: the middleware does not number them.
+        if number is not None:
+            missed.received(number)
+        self._add(channel, info['received_timestamp'] if self._stamped else self._now(), data)
+
+    def _on_lost(self, topic: str, event: Any) -> None:
+        self._reported[topic] = event.total_count
+
+    def _now(self) -> int:
+        # No bag has room for a negative time.
+        return max(0, int(self.get_clock().now().nanoseconds))
+
+    def _add(self, channel: int, stamp: int, data: bytes) -> None:
+        self._sink.add(Message(channel, stamp, data))
         self.messages += 1
 
     # --- Parameters of the nodes that are recorded
@@ -184,27 +285,17 @@ class Recorder(Node):  # type: ignore[misc]
     def _ask_for_parameters(self, namespace: str, name: str) -> None:
         node = f'{namespace.rstrip("/")}/{name}'
         # Names are found out later than topics; without one there is nobody to ask.
-        if name.startswith('_') or node == self.get_fully_qualified_name():
+        if name.startswith('_') or node in self._queries or node == self.get_fully_qualified_name():
             return
-        if node not in self._asking:
-            self._asking[node] = (
-                self.create_client(ListParameters, f'{node}/list_parameters'),
-                self.create_client(GetParameters, f'{node}/get_parameters'),
-            )
-        names, values = self._asking[node]
-        if node not in self._asked and names.service_is_ready() and values.service_is_ready():
-            self._asked.add(node)
-            names.call_async(ListParameters.Request()).add_done_callback(partial(self._on_names, node))
+        self._queries[node] = ParameterQuery(
+            self, node, partial(self._on_parameters, node), partial(self._on_trouble, node)
+        )
 
-    def _on_names(self, node: str, future: Any) -> None:
-        names = list(future.result().result.names)
-        values = self._asking[node][1].call_async(GetParameters.Request(names=names))
-        values.add_done_callback(partial(self._on_values, node, names))
+    def _on_parameters(self, node: str, values: dict[str, Any]) -> None:
+        self._sink.add(Text(PARAMETERS + node, json.dumps(values, default=list)))
 
-    def _on_values(self, node: str, names: list[str], future: Any) -> None:
-        values = [parameter_value_to_python(value) for value in future.result().values]
-        text = json.dumps(dict(zip(names, values, strict=True)), default=list)
-        self._journal.add(Text(PARAMETERS + node, text))
+    def _on_trouble(self, node: str, trouble: str) -> None:
+        self.get_logger().warning(f'parameters of {node} are not all recorded: {trouble}')
 
 
 def _profiles(publishers: list[Any]) -> tuple[dict[str, Any], ...]:

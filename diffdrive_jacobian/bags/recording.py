@@ -2,68 +2,105 @@
 
 from __future__ import annotations
 
-import threading
+import json
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
 from datetime import datetime
 from itertools import count
 from pathlib import Path
 
 from diffdrive_jacobian import __version__
-from diffdrive_jacobian.bags.building import Summary, build_bag
-from diffdrive_jacobian.bags.journal import JournalWriter, Text, read_journal
+from diffdrive_jacobian.bags.building import Summary, build_bag, check_target
+from diffdrive_jacobian.bags.journal import (
+    Channel,
+    JournalWriter,
+    Message,
+    Record,
+    Text,
+    read_journal,
+)
+from diffdrive_jacobian.bags.journal_thread import CAPACITY, JournalThread
 
-FLUSH_PERIOD = 0.1
-"""How much a killed recorder may lose (s)."""
-SYNC_PERIOD = 0.4
-"""How much a power cut may lose, beside that and the time that the disk takes (s)."""
 JOURNAL = '.journal'
 """Ends the name of a journal; before it stands the name of the bag."""
+LOST = 'messages lost'
+"""Key of the custom data with the number of messages that are known to be missing, by topic, as JSON."""
 
 
 def journal_of(bag: Path) -> Path:
-    """Give the journal that lies beside a bag while it is recorded, and after a crash."""
+    """Return the journal that lies beside a bag while it is recorded, and after a crash."""
     return bag.with_name(bag.name + JOURNAL)
 
 
-class Recording:
-    """A journal that is on the disk within half a second, and becomes a bag at the end."""
+class RecordingError(Exception):
+    """A recording is not complete; the message says why, and where what was recorded is."""
 
-    def __init__(self, bag: Path, storage: str) -> None:
-        """Begin; the bag's directory appears at the end.
+    def __init__(self, message: str, summary: Summary | None = None) -> None:
+        """Create the error.
+
+        Args:
+            message: What happened.
+            summary: What the bag holds; None: there is no bag.
+        """
+        super().__init__(message)
+        self.summary = summary
+
+
+class Recording:
+    """A journal that is on the disk within half a second, and becomes a bag at the end.
+
+    It is written in a thread of its own, so that a slow disk delays no callback. What that thread cannot
+    take any more is dropped and counted.
+    """
+
+    def __init__(
+        self, bag: Path, storage: str, *, lossless: bool = False, capacity: int = CAPACITY
+    ) -> None:
+        """Start to record; the bag's directory appears at the end.
 
         Args:
             bag: The bag's directory; neither it nor its journal may exist.
             storage: `mcap` or `sqlite3`.
+            lossless: Whether `add` waits for a disk that is too slow. Otherwise messages are dropped.
+            capacity: Memory that messages may hold while they wait for the disk (bytes).
 
         Raises:
-            FileExistsError: One of them exists.
-            OSError: It cannot be written there.
+            FileExistsError: The bag or its journal exists.
+            OSError: They cannot be written there.
         """
-        if bag.exists():
-            raise FileExistsError(f'{bag} exists already')
-        self.bag = bag
+        check_target(bag)
         journal = journal_of(bag)
         if journal.exists():
             raise FileExistsError(
                 f'{journal} exists already: recover_run {journal} makes the bag of what is in it'
             )
+        self.bag = bag
         self.journal = JournalWriter(journal)
         self._storage = storage
-        self.begun = time.monotonic()
-        self._flushed = self.begun
-        self.error: OSError | None = None
-        """Why nothing more can be written; None: all is well."""
-        self._ended = threading.Event()
-        self._syncing = threading.Thread(target=self._sync, name='journal sync', daemon=True)
+        self.started = time.monotonic()
+        self._channels: dict[int, str] = {}
+        self._added: Counter[int] = Counter()
+        self._dropped: Counter[int] = Counter()
+        self._missed: dict[str, int] = {}
+        self._noted: dict[str, int] = {}
+        self._open = True
         self.journal.add(Text('recorder', f'diffdrive_jacobian {__version__}'))
         self.journal.add(Text('storage', storage))
-        self.journal.flush()
-        self._syncing.start()
+        try:
+            self.journal.flush()
+        except OSError:
+            self.journal.close()
+            journal.unlink()
+            raise
+        self._thread = JournalThread(
+            self.journal, capacity=capacity, lossless=lossless, before_sync=self._note_losses
+        )
 
     @classmethod
-    def named_by_time(cls, prefix: str, storage: str) -> Recording:
-        """Begin one in the present directory, named `prefix_DATE-TIME`, or so and a number.
+    def named_by_time(cls, prefix: str, storage: str, *, lossless: bool = False) -> Recording:
+        """Start one in the present directory, named `prefix_DATE-TIME`, or that and a number.
 
         Raises:
             OSError: It cannot be written there.
@@ -71,48 +108,126 @@ class Recording:
         name = f'{prefix}_{datetime.now():%Y_%m_%d-%H_%M_%S}'
         for number in count(2):
             try:
-                return cls(Path(name), storage)
+                return cls(Path(name), storage, lossless=lossless)
             except FileExistsError:
                 name = f'{name.split("__")[0]}__{number}'
         raise AssertionError('there is always another number')
 
-    def tend(self) -> None:
-        """Flush when it is time; to be called often."""
-        now = time.monotonic()
-        if now - self._flushed >= FLUSH_PERIOD and self.error is None:
-            self._flushed = now
-            self._try(self.journal.flush)
+    @property
+    def error(self) -> OSError | None:
+        """Why nothing more can be recorded. None: no error. `finish` raises it."""
+        return self._thread.error
+
+    @property
+    def lost(self) -> dict[str, int]:
+        """Messages that are known to be lost so far, by topic."""
+        lost = Counter(dict(self._missed))
+        for channel, dropped in list(self._dropped.items()):
+            lost[self._channels[channel]] += dropped
+        return {topic: number for topic, number in sorted(lost.items()) if number}
+
+    def add(self, record: Record) -> None:
+        """Record something. After the end of the recording this does nothing."""
+        if not self._open:
+            return
+        if isinstance(record, Channel):
+            self._channels[record.id] = record.topic
+        added = self._thread.add(record)
+        if isinstance(record, Message):
+            (self._added if added else self._dropped)[record.channel] += 1
+
+    def set_missed(self, topic: str, messages: int) -> None:
+        """Note how many messages of a topic are known never to have reached the recorder so far."""
+        self._missed[topic] = messages
 
     def finish(self) -> Summary:
-        """Make the bag, and let the journal go once that is on the disk.
+        """Make the bag, read it back, and remove the journal.
 
         Raises:
-            OSError: The bag cannot be written. The journal stays, for `recover_run`.
+            RecordingError: Messages are known to be lost, or the disk failed, or the bag cannot be
+                written. What was recorded is in the bag, if the error has a summary, or in a journal.
         """
-        if self.error is None:
-            self._try(self.journal.flush)
-        self._ended.set()
-        self._syncing.join()
-        self.journal.close()
-        path = self.journal.path
-        summary = build_bag(lambda: read_journal(path), self.bag, self._storage)
-        if self.error is None:
-            path.unlink()
+        self._open = False
+        self._thread.close()
+        journal = self.journal.path
+        if not self.journal.in_place():
+            self._raise_gone()
+        try:
+            self._count_unwritten()
+            summary = build_bag(self._records, self.bag, self._storage)
+        # Whatever rosbags raises: the journal is there, and the user must be told.
+        except Exception as error:
+            why = getattr(error, 'strerror', None) or str(error) or repr(error)
+            raise RecordingError(
+                f'{self.bag} cannot be written: {why}. What was recorded is in {journal}: '
+                f'recover_run {journal} makes the bag of it, where there is room'
+            ) from error
+        finally:
+            self.journal.close()
+        summary = replace(summary, lost=self.lost)
+        if self.error is not None:
+            raise RecordingError(
+                f'the recording broke off: {self.error.strerror or self.error}. {self.bag} holds what '
+                f'was recorded before, and so does {journal}',
+                summary,
+            )
+        if summary.messages != self._added.total():
+            raise RecordingError(
+                f'{self._added.total()} messages were recorded, but {self.bag} holds '
+                f'{summary.messages}. The journal {journal} is kept',
+                summary,
+            )
+        journal.unlink()
+        if summary.lost:
+            raise RecordingError(self._describe_losses(), summary)
         return summary
 
     def discard(self) -> None:
-        """Let go of what was recorded: nothing has begun."""
-        self._ended.set()
-        self._syncing.join()
+        """Remove what was recorded."""
+        self._open = False
+        self._thread.close()
+        ours = self.journal.in_place()
         self.journal.close()
-        self.journal.path.unlink()
+        if ours:
+            self.journal.path.unlink(missing_ok=True)
 
-    def _sync(self) -> None:
-        while not self._ended.wait(SYNC_PERIOD):
-            self._try(self.journal.sync)
+    def _records(self) -> Iterator[Record]:
+        yield from read_journal(self.journal.path)
+        if lost := self.lost:
+            yield Text(LOST, json.dumps(lost))
 
-    def _try(self, write: Callable[[], None]) -> None:
+    def _note_losses(self) -> None:
+        """Write what is lost so far into the journal, for recover_run."""
+        if (lost := self.lost) != self._noted:
+            self._noted = lost
+            self.journal.add(Text(LOST, json.dumps(lost)))
+
+    def _count_unwritten(self) -> None:
+        """Count what was taken, but could not be written, as dropped."""
+        if self.error is None:
+            return
+        records = read_journal(self.journal.path)
+        written = Counter(record.channel for record in records if isinstance(record, Message))
+        self._dropped += self._added - written
+
+    def _describe_losses(self) -> str:
+        causes = []
+        if dropped := self._dropped.total():
+            causes.append(f'{dropped} came faster than the disk could write them')
+        if missed := sum(self._missed.values()):
+            causes.append(f'{missed} never reached the recorder')
+        topics = ', '.join(f'{topic} {number}' for topic, number in self.lost.items())
+        return f'messages are lost: {"; ".join(causes)} ({topics})'
+
+    def _raise_gone(self) -> None:
+        journal = self.journal.path
+        what = f'{journal} was removed, renamed or replaced while it was being recorded'
         try:
-            write()
+            found = self.journal.rescue()
         except OSError as error:
-            self.error = error
+            raise RecordingError(f'{what}, and its content cannot be saved: {error}') from error
+        finally:
+            self.journal.close()
+        raise RecordingError(
+            f'{what}. What was recorded is in {found}: recover_run {found} makes the bag of it'
+        )

@@ -18,7 +18,7 @@ from rclpy.parameter import Parameter
 from diffdrive_jacobian.bags import BagError, read_run
 from diffdrive_jacobian.bags.figure import draw
 from diffdrive_jacobian.bags.recorder import Recorder, Selection
-from diffdrive_jacobian.bags.recording import Recording
+from diffdrive_jacobian.bags.recording import Recording, RecordingError
 from diffdrive_jacobian.nodes.parameters import VirtualRobotParameters
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.ros.parameters import specifications
@@ -34,18 +34,26 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[None]:
-    """Add the last messages to the report of a failure that does not tell them itself."""
+    """Add the last messages to the report of a failure that does not contain them itself."""
     outcome: Any = yield
     report = outcome.get_result()
     world = getattr(item, 'funcargs', {}).get('lockstep')
-    told = call.excinfo is not None and call.excinfo.errisinstance(LockstepError)
+    contained = call.excinfo is not None and call.excinfo.errisinstance(LockstepError)
     if call.when != 'call' or not report.failed:
         return
-    if isinstance(world, Lockstep) and not told:
-        report.sections.append(('lockstep', world.report()))
+    if isinstance(world, Lockstep) and not contained:
+        report.sections.append(('lockstep', _or_error(world.report)))
     recorded = getattr(item, 'funcargs', {}).get('recorded_run')
     if isinstance(recorded, RecordedRun):
-        report.sections.append(('recorded run', recorded.keep()))
+        report.sections.append(('recorded run', _or_error(recorded.keep)))
+
+
+def _or_error(describe: Callable[[], str]) -> str:
+    """Return a text, or the error that prevents it: what a hook raises ends the whole session."""
+    try:
+        return describe()
+    except Exception as error:
+        return str(error) if isinstance(error, RecordingError) else f'not available: {error!r}'
 
 
 @pytest.fixture
@@ -79,28 +87,49 @@ class RecordedRun:
 
     def __init__(self, world: Lockstep, directory: Path) -> None:
         """Record all topics of a world from here on, into a directory."""
-        self._recording = Recording(directory / 'run', 'mcap')
-        self._kept = False
-        recorder = Recorder(Selection(everything=True), self._recording.journal)
+        self._recording = Recording(directory / 'run', 'mcap', lossless=True)
+        self._finished = False
+        self._error: RecordingError | None = None
+        self._kept: str | None = None
+        recorder = Recorder(Selection(everything=True), self._recording)
         world.add(recorder)
-        world.on_new_topics(recorder.look)
-        recorder.look()
+        world.on_new_topics(recorder.discover)
+        recorder.discover()
 
     def keep(self) -> str:
-        """Make the bag and, where there is odometry and matplotlib, the picture; says where they are."""
-        self._kept = True
-        self._recording.finish()
+        """End the recording and keep it; return where it is, in two lines.
+
+        That makes the bag and, where there is odometry and matplotlib, the picture. What is published
+        after the first call is not recorded; later calls return or raise the same.
+
+        Raises:
+            RecordingError: The recording is not complete.
+        """
+        if not self._finished:
+            self._finished = True
+            try:
+                self._recording.finish()
+            except RecordingError as error:
+                self._error = error
+        if self._error is not None:
+            raise self._error
+        if self._kept is None:
+            self._kept = self._draw()
+        return self._kept
+
+    def _draw(self) -> str:
         bag = self._recording.bag
         picture = bag.with_suffix('.png')
         try:
             draw([read_run(bag)], picture)
-        except (BagError, ModuleNotFoundError) as error:
+        except (BagError, ModuleNotFoundError, OSError) as error:
             return f'{bag}\nnot drawn: {error}'
         return f'{bag}\n{picture}'
 
     def close(self) -> None:
-        """Let go of it, unless it was kept."""
-        if not self._kept:
+        """Remove it, unless it was kept."""
+        if not self._finished:
+            self._finished = True
             self._recording.discard()
 
 

@@ -10,7 +10,7 @@ import argparse
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +29,7 @@ from sensor_msgs.msg import JointState
 from diffdrive_jacobian.bags.figure import draw
 from diffdrive_jacobian.bags.reading import BagError, read_run
 from diffdrive_jacobian.bags.recorder import Recorder, Selection
-from diffdrive_jacobian.bags.recording import Recording
+from diffdrive_jacobian.bags.recording import Recording, RecordingError
 from diffdrive_jacobian.control import Arrival
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.parameters import CONTROLLERS, nanoseconds
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 PROGRAM = 'drive_to'
 SETTLING = 0.1
 """Odometry this much later than the last command knows of it (s)."""
-LOOK_PERIOD = 0.5
+DISCOVERY_PERIOD = 0.5
 """How often new topics to record are looked for (s)."""
 STOP_PATIENCE = 2.0
 """How long the robot may take to come to rest at the end, and to say so (s)."""
@@ -139,6 +139,10 @@ class Observer(Node):  # type: ignore[misc]
             self.status = message.status
 
 
+class DriveError(Exception):
+    """A drive in simulated time broke off; the message says why."""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Outcome:
     """How a drive ended."""
@@ -186,12 +190,12 @@ def drive(
     controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=overrides))
     names = robot.parameters.left_wheel_name, robot.parameters.right_wheel_name
     observer = runner.add(lambda: Observer(goals, controller.arrival, names, context))
-    tend = _recorder(runner, recording)
+    discover = _recorder(runner, recording)
     begun = runner.seconds()
     with Drive(runner.seconds) as progress:
 
         def over() -> bool:
-            tend()
+            discover()
             if observer.pose is not None and not observer.ended:
                 index = controller.waypoint
                 if index is not None and index != observer.index:
@@ -213,7 +217,7 @@ def drive(
         patience = runner.seconds() + STOP_PATIENCE + 1.0 / robot.parameters.publish_rate
 
         def settled_or_late() -> bool:
-            tend()
+            discover()
             if controller.waypoint is not None:
                 # The goals were still on their way to it.
                 controller.stop(why)
@@ -233,29 +237,24 @@ def drive(
 
 
 def _recorder(runner: Runner | LockstepRunner, recording: Recording | None) -> Callable[[], None]:
-    """Record what the nodes say; gives what must be called often."""
+    """Record what the nodes publish. Return what must be called often, to find new topics."""
     if recording is None:
         return lambda: None
-    recorder = runner.add(
-        lambda: Recorder(
-            Selection(), recording.journal, stamped_on_receipt=False, context=runner.context
-        )
-    )
-    looked = -math.inf
+    recorder = runner.add(lambda: Recorder(Selection(), recording, context=runner.context))
+    discovered = -math.inf
 
-    def tend() -> None:
-        nonlocal looked
-        if runner.seconds() - looked >= LOOK_PERIOD:
-            looked = runner.seconds()
-            recorder.look()
-        recording.tend()
+    def discover() -> None:
+        nonlocal discovered
+        if runner.seconds() - discovered >= DISCOVERY_PERIOD:
+            discovered = runner.seconds()
+            recorder.discover()
 
-    tend()
-    return tend
+    discover()
+    return discover
 
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
-    """Run the tool; gives the exit code."""
+    """Run the tool; return the exit code."""
     own, ros = _cli.split_arguments(arguments)
     parser = _parser()
     options = parser.parse_args(own)
@@ -269,7 +268,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     recording = None
     try:
         if not options.no_record:
-            recording = begin_recording('drive', options.output, 'mcap')
+            recording = begin_recording('drive', options.output, 'mcap', lossless=options.lockstep)
     except OSError as error:
         return _cli.complain(PROGRAM, error)
     if recording is not None and not options.no_plot and _picture(recording).exists():
@@ -289,10 +288,22 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         if recording is not None:
             recording.discard()
         return _cli.complain(PROGRAM, error)
-    code = _report(outcome, options.timeout, ' of simulated time' if options.lockstep else '')
+    except DriveError as error:
+        # The recording shows how it came to that.
+        print(f'{PROGRAM}: error: {error}', file=sys.stderr)
+        code = _cli.FAILED
+    except BaseException:
+        if recording is not None:
+            with suppress(RecordingError):
+                recording.finish()
+        raise
+    else:
+        code = _report(outcome, options.timeout, ' of simulated time' if options.lockstep else '')
     if recording is None:
         return code
-    return _keep(recording, plot=not options.no_plot) or code
+    kept = _keep(recording, plot=not options.no_plot)
+    # An interruption stays one.
+    return code if code == _cli.INTERRUPTED else kept or code
 
 
 def _goals(places: NDArray[np.float64], heading: float | None) -> NDArray[np.float64]:
@@ -314,20 +325,29 @@ def _picture(recording: Recording) -> Path:
 
 
 def _keep(recording: Recording, *, plot: bool) -> int:
-    """Make the bag and its picture, and say where they are; gives the exit code."""
+    """Make the bag and its picture, and print where they are; return the exit code."""
+    code = _cli.DONE
     try:
         recording.finish()
         print(f'recorded: {recording.bag}')
-        if plot:
-            picture = _picture(recording)
-            draw([read_run(recording.bag)], picture)
-            print(f'drawn: {picture}')
+    except RecordingError as error:
+        print(f'{PROGRAM}: error: {error}', file=sys.stderr)
+        if error.summary is None:
+            return _cli.FAILED
+        print(f'recorded in part: {recording.bag}')
+        code = _cli.FAILED
+    if not plot:
+        return code
+    picture = _picture(recording)
+    try:
+        draw([read_run(recording.bag)], picture)
+        print(f'drawn: {picture}')
     except ModuleNotFoundError:
         print('not drawn: matplotlib is not installed (the extra plot brings it)')
     except (OSError, BagError) as error:
         print(f'{PROGRAM}: error: {error}', file=sys.stderr)
         return _cli.FAILED
-    return _cli.DONE
+    return code
 
 
 @contextmanager
@@ -343,16 +363,25 @@ def _real_time(ros: list[str], *, open_to_all: bool) -> Iterator[Runner]:
 
 @contextmanager
 def _lockstep(ros: list[str]) -> Iterator[LockstepRunner]:
-    """Hold nodes that live as fast as they can."""
+    """Run nodes in simulated time, as fast as they can.
+
+    Raises:
+        UserError: The ROS arguments are invalid.
+        DriveError: A callback blocks, or simulated time could not pass for another reason.
+    """
     # Not needed otherwise, and slow to import.
     from diffdrive_jacobian.testing import LockstepError
     from diffdrive_jacobian.testing.runner import running_in_lockstep
 
-    try:
-        with running_in_lockstep(ros) as runner:
+    with ExitStack() as stack:
+        try:
+            runner = stack.enter_context(running_in_lockstep(ros))
+        except LockstepError as error:
+            raise UserError(str(error)) from error
+        try:
             yield runner
-    except LockstepError as error:
-        raise UserError(str(error)) from error
+        except LockstepError as error:
+            raise DriveError(str(error)) from error
 
 
 def _report(outcome: Outcome, timeout: float, time: str) -> int:
@@ -388,8 +417,8 @@ def _parser() -> argparse.ArgumentParser:
         prog=PROGRAM,
         usage=f'{PROGRAM} X Y [X Y ...] [options] [--ros-args ...]',
         description='Drive the virtual robot to goals, in order: robot, controller and wheel bridge '
-        'in one process, the whole Jacobian chain in use. Exit code 0: arrived; 1: not; '
-        '2: wrong arguments; 130: interrupted.',
+        'in one process, the whole Jacobian chain in use. Exit code 0: arrived; 1: not, '
+        'or the recording is not complete; 2: wrong arguments; 130: interrupted.',
     )
     parser.add_argument('coordinates', metavar='X Y', nargs='+', type=_cli.coordinate, help='goals (m)')
     parser.add_argument(

@@ -7,21 +7,22 @@ import re
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from diffdrive_jacobian.bags.building import STORAGES, Summary
 from diffdrive_jacobian.bags.recorder import RUN_TOPICS, Recorder, Selection
-from diffdrive_jacobian.bags.recording import Recording
+from diffdrive_jacobian.bags.recording import Recording, RecordingError
 from diffdrive_jacobian.ros.runner import UserError, ros_context, running
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._recording import begin_recording
 
 PROGRAM = 'record_run'
-LOOK_PERIOD = 0.2
+DISCOVERY_PERIOD = 0.2
 """How often new topics are looked for (s)."""
 STATUS_PERIOD = {True: 0.5, False: 10.0}
-"""How often the status is told, on a terminal and elsewhere (s)."""
+"""How often the status is printed, on a terminal and elsewhere (s)."""
 
 
 def record(
@@ -32,25 +33,27 @@ def record(
     *,
     max_duration: float | None,
 ) -> Summary:
-    """Record until a signal comes, the time is up, ROS is shut down or the disk is full.
+    """Record until a signal comes, the time is up, ROS is shut down or the disk fails.
 
     Raises:
-        UserError: The ROS arguments cannot be.
-        OSError: The bag cannot be written.
+        UserError: The ROS arguments are invalid.
+        RecordingError: The recording is not complete.
     """
     try:
         if not signals.count:
-            _hear(recording, selection, ros, signals, max_duration)
+            _receive(recording, selection, ros, signals, max_duration)
     except UserError:
         recording.discard()
         raise
     except BaseException:
-        recording.finish()
+        # The first error is the one to report.
+        with suppress(RecordingError):
+            recording.finish()
         raise
     return recording.finish()
 
 
-def _hear(
+def _receive(
     recording: Recording,
     selection: Selection,
     ros: Sequence[str],
@@ -62,36 +65,36 @@ def _hear(
         ros_context([PROGRAM, *ros]) as context,
         running(context, closed_world=False) as runner,
     ):
-        recorder = runner.add(lambda: Recorder(selection, recording.journal, context=context))
-        looked = -LOOK_PERIOD
+        recorder = runner.add(lambda: Recorder(selection, recording, with_info=True, context=context))
+        discovered = -DISCOVERY_PERIOD
 
         def over() -> bool:
-            nonlocal looked
+            nonlocal discovered
             now = time.monotonic()
-            if now - looked >= LOOK_PERIOD:
-                looked = now
-                recorder.look()
+            if now - discovered >= DISCOVERY_PERIOD:
+                discovered = now
+                recorder.discover()
                 status.show(recorder)
-            recording.tend()
-            late = max_duration is not None and now - recording.begun >= max_duration
+            late = max_duration is not None and now - recording.started >= max_duration
             return bool(signals.count or late or recording.error)
 
-        runner.spin(over)
+        if runner.spin(over):
+            recorder.drain()
     status.end()
 
 
 class Status:
-    """A line of how the recording goes."""
+    """A line about the state of the recording."""
 
     def __init__(self, recording: Recording) -> None:
-        """Begin without messages."""
+        """Start without messages."""
         self._recording = recording
         self._terminal = sys.stdout.isatty()
-        self._shown = self._recording.begun
+        self._shown = self._recording.started
         self._messages = 0
 
     def show(self, recorder: Recorder) -> None:
-        """Tell it anew, if it is time."""
+        """Print it again, if it is time."""
         now = time.monotonic()
         elapsed = now - self._shown
         if elapsed < STATUS_PERIOD[self._terminal]:
@@ -100,20 +103,22 @@ class Status:
         self._shown, self._messages = now, recorder.messages
         line = (
             f'{recorder.messages} messages of {len(recorder.topics)} topics, {rate:.0f} per second, '
-            f'{self._recording.journal.size / 1e6:.1f} MB, {now - self._recording.begun:.0f} s'
+            f'{self._recording.journal.size / 1e6:.1f} MB, {now - self._recording.started:.0f} s'
         )
+        if lost := sum(self._recording.lost.values()):
+            line += f', {lost} LOST'
         print(
             f'\r{line}\x1b[K' if self._terminal else line, end='' if self._terminal else '\n', flush=True
         )
 
     def end(self) -> None:
-        """Leave the line to others."""
+        """End the line."""
         if self._terminal:
             print()
 
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
-    """Run the tool; gives the exit code."""
+    """Run the tool; return the exit code."""
     own, ros = _cli.split_arguments(arguments)
     parser = _parser()
     options = parser.parse_args(own)
@@ -133,28 +138,24 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         summary = record(recording, selection, ros, signals, max_duration=options.max_duration)
     except UserError as error:
         return _cli.complain(PROGRAM, error)
-    except OSError as error:
-        journal = recording.journal.path
-        print(
-            f'{PROGRAM}: error: {bag} cannot be written: {error.strerror or error}. What was '
-            f'recorded is in {journal}: recover_run {journal} makes the bag of it, where there is room',
-            file=sys.stderr,
-        )
+    except RecordingError as error:
+        if error.summary is not None:
+            print(describe(bag, error.summary, complete=False))
+        print(f'{PROGRAM}: error: {error}', file=sys.stderr)
         return _cli.FAILED
     print(describe(bag, summary))
-    if recording.error is not None:
-        print(f'{PROGRAM}: error: the recording broke off: {recording.error}', file=sys.stderr)
-        return _cli.FAILED
     return _cli.DONE
 
 
-def describe(bag: Path, summary: Summary) -> str:
-    """Say in a line what a bag holds."""
+def describe(bag: Path, summary: Summary, *, complete: bool = True) -> str:
+    """Return a line about what a bag holds."""
+    what = 'complete' if complete else 'incomplete'
     if summary.start is None or summary.end is None:
-        return f'{bag} is complete and empty: no message came'
+        return f'{bag} is {what} and empty: no message came'
     topics = ', '.join(f'{topic} {count}' for topic, count in sorted(summary.topics.items()) if count)
     seconds = (summary.end - summary.start) / 1e9
-    return f'{bag} is complete: {summary.messages} messages in {seconds:.1f} s ({topics})'
+    lost = f'; {sum(summary.lost.values())} lost' if summary.lost else ''
+    return f'{bag} is {what}: {summary.messages} messages in {seconds:.1f} s ({topics}){lost}'
 
 
 def _pattern(text: str) -> str:
@@ -171,7 +172,7 @@ def _parser() -> argparse.ArgumentParser:
         usage=f'{PROGRAM} [TOPIC ...] [options] [--ros-args ...]',
         description='Record topics as a rosbag2 bag until Ctrl-C. What was received is on the disk '
         'within a second: after a crash recover_run makes the bag of it. Exit code 0: the bag is '
-        'complete; 1: it broke off; 2: wrong arguments.',
+        'complete; 1: it is not (messages were lost, or the disk failed), and why; 2: wrong arguments.',
     )
     parser.add_argument(
         'topics',

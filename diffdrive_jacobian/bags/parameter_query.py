@@ -1,0 +1,148 @@
+"""Asks a node of whatever origin for all its parameters, and survives every answer."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from rcl_interfaces.msg import ParameterType
+from rcl_interfaces.srv import GetParameters, ListParameters
+from rclpy.exceptions import NameValidationException
+from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
+
+PATIENCE = 5.0
+"""How long a node may take for each answer (s)."""
+MAX_PARAMETERS = 10_000
+"""More parameters of a node are not recorded."""
+MAX_TEXT = 1 << 20
+"""Size of the parameters of a node (characters); what does not fit is not recorded."""
+MAX_NAMED = 5
+"""How many missing parameters a message lists."""
+
+
+class ParameterQuery:
+    """The parameters of one node, asked for once.
+
+    A node may declare parameters without a value. It lists them, and rclcpp answers a request that
+    contains one with no values at all. So when there are not as many values as names, each half is asked
+    for alone, and so on down to the single parameters that cannot be had.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        target: str,
+        on_values: Callable[[dict[str, Any]], None],
+        on_trouble: Callable[[str], None],
+    ) -> None:
+        """Create the clients; `advance` asks when the services are there.
+
+        Args:
+            node: The node that asks.
+            target: Full name of the node that is asked.
+            on_values: Called once with the values by name that could be had.
+            on_trouble: Called at most once, before that, with what could not be had.
+        """
+        self._target = target
+        self._on_values = on_values
+        self._on_trouble = on_trouble
+        self._values: dict[str, Any] = {}
+        self._missing: list[str] = []
+        self._waiting: list[list[str]] = []
+        self._size = 0
+        self._deadline: float | None = None
+        self._done = False
+        try:
+            self._list = node.create_client(ListParameters, f'{target}/list_parameters')
+            self._get = node.create_client(GetParameters, f'{target}/get_parameters')
+        except (RuntimeError, NameValidationException) as error:
+            self._finish(f'it cannot be asked: {_short(error)}')
+
+    def advance(self) -> None:
+        """Ask, if that is possible now, and give up a node that does not answer; to be called often."""
+        if self._done:
+            return
+        if self._deadline is None:
+            if self._list.service_is_ready() and self._get.service_is_ready():
+                self._call(self._list, ListParameters.Request(), self._on_names)
+        elif time.monotonic() > self._deadline:
+            self._finish(f'it did not answer within {PATIENCE:g} s')
+
+    def _call(self, client: Any, request: Any, on_answer: Callable[[Any], None]) -> None:
+        self._deadline = time.monotonic() + PATIENCE
+        client.call_async(request).add_done_callback(partial(self._on_done, on_answer))
+
+    def _on_done(self, on_answer: Callable[[Any], None], future: Any) -> None:
+        if self._done:
+            # It comes too late.
+            return
+        if future.cancelled() or future.exception() is not None:
+            self._finish(f'its answer cannot be read: {_short(future.exception())}')
+        else:
+            on_answer(future.result())
+
+    def _on_names(self, response: Any) -> None:
+        names = list(dict.fromkeys(response.result.names))
+        if len(names) > MAX_PARAMETERS:
+            self._missing += names[MAX_PARAMETERS:]
+            del names[MAX_PARAMETERS:]
+        if names:
+            self._waiting.append(names)
+        self._ask()
+
+    def _ask(self) -> None:
+        if not self._waiting:
+            self._finish('')
+            return
+        names = self._waiting.pop()
+        self._call(self._get, GetParameters.Request(names=names), partial(self._on_answer, names))
+
+    def _on_answer(self, names: list[str], response: Any) -> None:
+        if len(response.values) == len(names):
+            for name, value in zip(names, response.values, strict=True):
+                self._keep(name, value)
+        elif len(names) == 1:
+            self._missing += names
+        else:
+            middle = len(names) // 2
+            self._waiting += [names[middle:], names[:middle]]
+        self._ask()
+
+    def _keep(self, name: str, value: Any) -> None:
+        try:
+            if value.type == ParameterType.PARAMETER_NOT_SET:
+                raise ValueError('it has no value')
+            found = parameter_value_to_python(value)
+            size = len(json.dumps({name: found}, default=list))
+            if self._size + size > MAX_TEXT:
+                raise ValueError('it is too large')
+        # RuntimeError is rclpy's for a type that it does not know.
+        except (RuntimeError, TypeError, ValueError):
+            self._missing.append(name)
+            return
+        self._size += size
+        self._values[name] = found
+
+    def _finish(self, trouble: str) -> None:
+        self._done = True
+        self._missing += [name for names in self._waiting for name in names]
+        self._waiting.clear()
+        if self._missing:
+            shown = ', '.join(_short(name) for name in self._missing[:MAX_NAMED])
+            more = len(self._missing) - MAX_NAMED
+            missing = f'{shown} and {more} more' if more > 0 else shown
+            trouble = f'{trouble}; missing: {missing}' if trouble else f'no value of {missing}'
+        if trouble:
+            self._on_trouble(trouble)
+        if self._values or not trouble:
+            self._on_values(self._values)
+
+
+def _short(text: object) -> str:
+    """Return the beginning of a text of somebody else, in printable characters."""
+    line = str(text).split(', at /')[0]
+    return ascii(line[:80])[1:-1] + ('...' if len(line) > 80 else '')
