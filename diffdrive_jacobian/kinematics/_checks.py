@@ -182,7 +182,7 @@ def read_only(value: Any) -> NDArray[np.float64]:
 
 def equal(first: Any, second: Any) -> bool:
     """Return whether numbers or arrays have equal shapes and entries; NaN equals NaN."""
-    return np.array_equal(first, second, equal_nan=True)
+    return bool(np.array_equal(first, second, equal_nan=True))
 
 
 def hashable(value: Any) -> Any:
