@@ -108,7 +108,7 @@ class Arrival:
             Booleans, shape (...).
 
         Raises:
-            ValueError: An argument is not finite, shapes do not broadcast, or their difference overflows.
+            ValueError: An argument is not finite, shapes do not broadcast, or the difference overflows.
         """
         theta, heading = operand('theta', theta), operand('heading', heading)
         single = agree(theta=theta, heading=heading)
