@@ -86,16 +86,19 @@ class Arrival:
         x, y, theta = operand('x', x), operand('y', y), operand('theta', theta)
         x_goal, y_goal = operand('x_goal', x_goal), operand('y_goal', y_goal)
         single = agree(x=x, y=y, theta=theta, x_goal=x_goal, y_goal=y_goal, offset=self.offset)
-
-        def formula(x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any) -> tuple[Any]:
-            if type(self.offset) is not float or self.offset != 0.0:
-                x, y = x + self.offset * cos(theta), y + self.offset * sin(theta)
-            return (hypot(x_goal - x, y_goal - y),)
-
         (distance,) = evaluated(
-            single, 'x, y, x_goal, y_goal and offset', formula, x, y, theta, x_goal, y_goal
+            single, 'x, y, x_goal, y_goal and offset', self._distance, x, y, theta, x_goal, y_goal
         )
         return distance
+
+    def _distance(self, x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any) -> tuple[Any]:
+        if type(self.offset) is not float or self.offset != 0.0:
+            x, y = x + self.offset * cos(theta), y + self.offset * sin(theta)
+        return (hypot(x_goal - x, y_goal - y),)
+
+    def reached(self, x: float, y: float, theta: float, x_goal: float, y_goal: float) -> bool:
+        """Return whether the distance to a goal is within the tolerance, without checks."""
+        return bool(self._distance(x, y, theta, x_goal, y_goal)[0] <= self.xy_tolerance)
 
     def faces(self, theta: Any, heading: Any) -> Any:
         """Return whether the robot has the heading of a goal.

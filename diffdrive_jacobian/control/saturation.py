@@ -22,7 +22,6 @@ from diffdrive_jacobian.kinematics._checks import (
     read_only,
 )
 from diffdrive_jacobian.kinematics._elementary import agree, alike, maximum, minimum, operand, where
-from diffdrive_jacobian.kinematics.diff_drive import wheel_speeds
 
 SMALLEST = 5e-324
 """Smallest positive float."""
@@ -156,55 +155,52 @@ def saturate(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tupl
 def _saturated(
     v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, wheels: bool
 ) -> tuple[Any, Any]:
-    (v_floor, v_ceiling, v_low, v_high), (omega_floor, omega_ceiling, omega_low, omega_high) = (
-        limits._bounds
-    )
-    limit = limits.max_wheel_speed
+    (v_floor, v_ceiling, *_), (omega_floor, omega_ceiling, *_) = limits._bounds
     v = minimum(maximum(v, v_floor), v_ceiling)
     omega = minimum(maximum(omega, omega_floor), omega_ceiling)
-
-    def excess(v: Any, omega: Any, least: Any) -> Any:
-        """Compute how many times too fast a twist is; at least `least`."""
-        v_excess = maximum(v / v_low, v / v_high)
-        omega_excess = maximum(omega / omega_low, omega / omega_high)
-        most = maximum(least, maximum(v_excess, omega_excess))
-        if not wheels:
-            return most
-        fastest = _fastest(v, omega, r, L)
-        # An infinite speed over no limit would be NaN; only arrays have both.
-        ratio = (
-            fastest / limit if type(limit) is float else np.where(limit < np.inf, fastest / limit, 0.0)
-        )
-        return maximum(most, ratio)
-
-    divisor = excess(v, omega, 1.0)
+    divisor = _excess(v, omega, limits, r, L, 1.0)
     if _any(divisor == np.inf):
-        v, omega, divisor = _scaled_down(v, omega, divisor, excess)
+        v, omega, divisor = _scaled_down(v, omega, limits, r, L, divisor)
     # The quotient may round to one unit in the last place beyond the limit.
     v = minimum(maximum(v / divisor, limits.min_v), limits.max_v)
     omega = minimum(maximum(omega / divisor, limits.min_omega), limits.max_omega)
     if wheels:
         # So may the wheel speeds: shrink by a unit in the last place, then by twice as much, and so on.
         step = 2.0**-53
-        while _any(above := _fastest(v, omega, r, L) > limit):
+        while _any(above := _fastest(v, omega, r, L) > limits.max_wheel_speed):
             v, omega = where(above, v - step * v, v), where(above, omega - step * omega, omega)
             step *= 2.0
     return v, omega
 
 
-def _scaled_down(v: Any, omega: Any, divisor: Any, excess: Any) -> tuple[Any, Any, Any]:
+def _excess(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, least: Any) -> Any:
+    """Compute how many times too fast a twist is; at least `least`."""
+    (_, _, v_low, v_high), (_, _, omega_low, omega_high) = limits._bounds
+    most = maximum(maximum(v / v_low, v / v_high), maximum(omega / omega_low, omega / omega_high))
+    limit = limits.max_wheel_speed
+    if type(limit) is not float:
+        # An infinite speed without a limit would be NaN.
+        most = maximum(most, np.where(limit < np.inf, _fastest(v, omega, r, L) / limit, 0.0))
+    elif limit < np.inf:
+        most = maximum(most, _fastest(v, omega, r, L) / limit)
+    return maximum(most, least)
+
+
+def _scaled_down(
+    v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, divisor: Any
+) -> tuple[Any, Any, Any]:
     """Scale what is infinitely too fast until its excess can be computed."""
     least: Any = 1.0
     while _any(infinite := divisor == np.inf):
         factor = where(infinite, 2.0**-600, 1.0)
         v, omega, least = v * factor, omega * factor, where(infinite, SMALLEST, least)
-        divisor = excess(v, omega, least)
+        divisor = _excess(v, omega, limits, r, L, least)
     return v, omega, divisor
 
 
 def _fastest(v: Any, omega: Any, r: Any, L: Any) -> Any:
-    right, left = wheel_speeds(v, omega, r, L)
-    return maximum(abs(right), abs(left))
+    """Compute the speed of the faster wheel, to the last bit what `body_to_wheel` has for it."""
+    return (abs(v) + abs(omega * L / 2.0)) / r
 
 
 def _any(condition: Any) -> bool:

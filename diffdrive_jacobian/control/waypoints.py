@@ -78,7 +78,7 @@ class Waypoints:
             return here, None
         while not here.turning:
             x_goal, y_goal, _ = here.poses[here.index].tolist()
-            if not arrival.distance(x, y, theta, x_goal, y_goal) <= arrival.xy_tolerance:
+            if not arrival.reached(x, y, theta, x_goal, y_goal):
                 return here, law(pose, here.poses[here.index])
             if here.index + 1 < len(here.poses):
                 here = here._progressed(here.index + 1, turning=False)

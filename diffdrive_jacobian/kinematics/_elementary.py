@@ -27,9 +27,10 @@ def components(name: str, value: Any, size: int) -> list[Any]:
         ValueError: The last axis has another length, or there is none, or an entry is infinite, NaN
             or no number.
     """
-    if type(value) is tuple and len(value) == size and set(map(type, value)) == {float}:
-        entries = list(value)
-    else:
+    entries: list[Any] = []
+    if type(value) is tuple and len(value) == size:
+        entries = [entry for entry in value if type(entry) is float]
+    if len(entries) < size:
         array = floats(name, value)
         if array.ndim == 0 or array.shape[-1] != size:
             raise ValueError(f'{name} must have shape (..., {size}), got {array.shape}')
@@ -62,7 +63,10 @@ def agree(**values: Any) -> bool:
     Raises:
         ValueError: They do not broadcast; all are named.
     """
-    if set(map(type, values.values())) == {float}:
+    for value in values.values():
+        if type(value) is not float:
+            break
+    else:
         return True
     leading(**{name: np.shape(value) for name, value in values.items()})
     return False

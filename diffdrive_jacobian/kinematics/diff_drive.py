@@ -237,12 +237,11 @@ def body_to_wheel(v: Any, omega: Any, r: Any, L: Any) -> tuple[Any, Any]:
     v, omega = operand('v', v), operand('omega', omega)
     r, L = operand('r', r, positive), operand('L', L, positive)
     single = agree(v=v, omega=omega, r=r, L=L)
-    omega_R, omega_L = evaluated(single, 'v, omega, r and L', wheel_speeds, v, omega, r, L)
+    omega_R, omega_L = evaluated(single, 'v, omega, r and L', _wheel_speeds, v, omega, r, L)
     return omega_R, omega_L
 
 
-def wheel_speeds(v: Any, omega: Any, r: Any, L: Any) -> tuple[Any, Any]:
-    """Compute what `body_to_wheel` returns, without its checks."""
+def _wheel_speeds(v: Any, omega: Any, r: Any, L: Any) -> tuple[Any, Any]:
     half = omega * L / 2.0
     return (v + half) / r, (v - half) / r
 

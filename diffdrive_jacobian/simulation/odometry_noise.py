@@ -18,13 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import array, not_negative, positive
+from diffdrive_jacobian.kinematics._checks import floats, not_negative, positive
 from diffdrive_jacobian.kinematics._elementary import (
     agree,
     components,
     cos,
     evaluated,
-    maximum,
     operand,
     sin,
     sinc,
@@ -71,6 +70,18 @@ def _twist_covariance(v: Any, omega: Any, L: Any, k: Any, interval: Any) -> tupl
     right, left = _wheel_variances(v, omega, L, k)
     cross = (right - left) / (2.0 * L * interval)
     return (right + left) / (4.0 * interval), cross, cross, (right + left) / (L**2 * interval)
+
+
+def twist_covariance_checked(
+    twist: tuple[float, float], L: float, wheel_travel_variance: float, interval: float
+) -> NDArray[np.float64]:
+    """Compute what `twist_covariance` returns for one robot whose values were checked before.
+
+    Raises:
+        ValueError: The result overflows.
+    """
+    operands = *twist, L, wheel_travel_variance, interval
+    return _matrix(*evaluated(True, 'twist and interval', _twist_covariance, *operands))
 
 
 def propagate_covariance(
@@ -138,30 +149,47 @@ def covariance_entries(name: str, covariance: ArrayLike) -> tuple[Any, ...]:
         ValueError: The shape is another one, an entry is not finite, or the matrix is not symmetric and
             positive semidefinite up to rounding.
     """
-    made = array(name, covariance, 3, 3)
-    rows: Any
+    made = floats(name, covariance)
+    if made.shape[-2:] != (3, 3):
+        raise ValueError(f'{name} must have shape (..., 3, 3), got {made.shape}')
+    rows = components(name, made.reshape(*made.shape[:-2], 9), 9)
     if made.ndim == 2:
-        rows = made.tolist()
-        largest: Any = max(max(map(abs, row)) for row in rows)
+        valid: Any = min(_margins(max(map(abs, rows)), *rows)) >= -ROUNDING
     else:
-        rows = np.moveaxis(made, (-2, -1), (0, 1))
-        largest = np.abs(made).max(axis=(-2, -1))
-    (xx, xy, xt), (yx, yy, yt), (tx, ty, tt) = rows
-    # All principal minors must be at least zero; the scale keeps their products from overflow.
-    scale = where(largest > 0.0, largest, 1.0)
-    a, b, c, d, e, f = xx / scale, xy / scale, xt / scale, yy / scale, yt / scale, tt / scale
-    minors = (a, d, f, a * d - b * b, a * f - c * c, d * f - e * e)
-    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
-    asymmetry = maximum(maximum(abs(yx / scale - b), abs(tx / scale - c)), abs(ty / scale - e))
-    valid = (asymmetry <= ROUNDING) & (determinant >= -ROUNDING)
-    for minor in minors:
-        valid = valid & (minor >= -ROUNDING)
-    if not np.all(valid):
+        largest = np.abs(made).max(axis=(-2, -1), initial=0.0)
+        valid = np.minimum.reduce(_margins(largest, *rows)) >= -ROUNDING
+    if valid is not True and not np.all(valid):
         index = tuple(np.argwhere(~np.asarray(valid))[0])
         raise ValueError(
             f'{name} must be symmetric and positive semidefinite, got {made[index].tolist()}'
         )
+    xx, xy, xt, _, yy, yt, _, _, tt = rows
     return xx, xy, xt, yy, yt, tt
+
+
+def _margins(
+    largest: Any,
+    xx: Any,
+    xy: Any,
+    xt: Any,
+    yx: Any,
+    yy: Any,
+    yt: Any,
+    tx: Any,
+    ty: Any,
+    tt: Any,
+) -> tuple[Any, ...]:
+    """Compute what must not be negative: all principal minors, and minus the asymmetry.
+
+    They are relative to the largest entry, which keeps products from overflow.
+    """
+    scale = largest + (largest == 0.0)
+    a, b, c, d, e, f = xx / scale, xy / scale, xt / scale, yy / scale, yt / scale, tt / scale
+    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+    return (
+        *(a, d, f, a * d - b * b, a * f - c * c, d * f - e * e, determinant),
+        *(-abs(yx / scale - b), -abs(tx / scale - c), -abs(ty / scale - e)),
+    )
 
 
 def _propagated(

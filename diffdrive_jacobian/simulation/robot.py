@@ -28,13 +28,13 @@ from diffdrive_jacobian.kinematics._checks import (
     positive,
     read_only,
 )
-from diffdrive_jacobian.kinematics._elementary import components
+from diffdrive_jacobian.kinematics._elementary import components, operand
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
 from diffdrive_jacobian.kinematics.se2 import integrate
 from diffdrive_jacobian.simulation.odometry_noise import (
     covariance_entries,
     propagate_checked,
-    twist_covariance,
+    twist_covariance_checked,
 )
 
 NANOSECONDS = 1_000_000_000
@@ -161,7 +161,10 @@ class Robot:
             ValueError: The interval is not positive and finite, or the result overflows.
         """
         model = self.model
-        return twist_covariance(
+        interval = operand('interval', interval, positive)
+        if type(interval) is not float:
+            raise ValueError(f'interval must be a single number, got shape {np.shape(interval)}')
+        return twist_covariance_checked(
             self.twist, model.wheel_separation, model.wheel_travel_variance, interval
         )
 
