@@ -17,7 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import array, floats, leading, not_negative, positive
+from diffdrive_jacobian.kinematics._checks import (
+    array,
+    floats,
+    leading,
+    not_negative,
+    number,
+    positive,
+    read_only,
+)
 from diffdrive_jacobian.kinematics.inverse_velocity import damped_least_squares, redundant
 
 
@@ -95,8 +103,12 @@ class StraightLine:
         end, speed = array('end', self.end, start.shape[-1]), floats('speed', self.speed)
         positive('speed', speed)
         leading(start=start.shape[:-1], end=end.shape[:-1], speed=speed.shape)
+        with np.errstate(over='ignore'):
+            duration = np.linalg.norm(end - start, axis=-1) / speed
+        if not np.isfinite(duration).all():
+            raise ValueError('start, end and speed must give a finite duration, but it overflows')
         for name, value in (('start', start), ('end', end), ('speed', speed)):
-            object.__setattr__(self, name, np.array(value))
+            object.__setattr__(self, name, read_only(value))
 
     @property
     def duration(self) -> NDArray[np.float64]:
@@ -104,7 +116,12 @@ class StraightLine:
         return np.asarray(np.linalg.norm(self.end - self.start, axis=-1) / self.speed)
 
     def position(self, t: float) -> NDArray[np.float64]:
-        """Give the position at an instant (s), shape (..., m) (m)."""
+        """Return the position at a time (s), shape (..., m) (m).
+
+        Raises:
+            ValueError: The time is not a single finite number, zero or positive.
+        """
+        t = number('t', t, not_negative)
         duration = self.duration[..., np.newaxis]
         moving = t < duration
         part = np.where(moving, t / np.where(moving, duration, 1.0), 1.0)

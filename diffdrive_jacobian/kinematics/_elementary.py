@@ -89,20 +89,20 @@ def evaluated(
     Raises:
         ValueError: A result overflows.
     """
-    results: tuple[Any, ...]
-    if single:
-        try:
+    try:
+        if single:
             results = formula(*operands)
-        except (OverflowError, ValueError, ZeroDivisionError):
-            # Of `x**2`, of `math.sin(inf)`, and of a divisor that underflows to zero.
-            results = (math.nan,)
-        if all(map(math.isfinite, results)):
-            return results
-    else:
-        with np.errstate(all='ignore'):
-            results = formula(*operands)
-        if all(np.isfinite(result).all() for result in results):
-            return alike(*results)
+            if all(map(math.isfinite, results)):
+                return results
+        else:
+            with np.errstate(all='ignore'):
+                results = formula(*operands)
+            if all(np.isfinite(result).all() for result in results):
+                return alike(*results)
+    except (OverflowError, ValueError, ZeroDivisionError):
+        # Floats raise where arrays give infinity or NaN: in `x**2`, `math.sin(inf)`, and where a divisor
+        # underflows to zero.
+        pass
     raise ValueError(f'{names} must give a finite result, but it overflows')
 
 
