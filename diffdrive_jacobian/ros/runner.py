@@ -18,6 +18,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.logging import get_logger_level, set_logger_level
 from rclpy.node import Node
 from rclpy.qos_overriding_options import InvalidQosOverridesError
@@ -83,6 +84,11 @@ def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[
             context=context,
             signal_handler_options=SignalHandlerOptions.NO,
         )
+    except _rclpy.UnknownROSArgsError as error:
+        raise UserError(
+            f'unknown ROS arguments: {error}; other arguments come before --ros-args, or after the -- '
+            'that ends the ROS arguments'
+        ) from error
     except (RuntimeError, UnicodeError) as error:
         # rcl appends where in its sources it gave up.
         raise UserError(f'ROS arguments: {str(error).split(", at /")[0].strip()}') from error

@@ -99,7 +99,8 @@ class Status:
         rate = (recorder.messages - self._messages) / elapsed
         self._shown, self._messages = now, recorder.messages
         line = (
-            f'{recorder.messages} messages of {len(recorder.topics)} topics, {rate:.0f} per second, '
+            f'{_cli.counted(recorder.messages, "message")} of '
+            f'{_cli.counted(len(recorder.topics), "topic")}, {rate:.0f} per second, '
             f'{self._recording.journal.size / 1e6:.1f} MB, {now - self._recording.begun:.0f} s'
         )
         print(
@@ -116,7 +117,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; gives the exit code."""
     own, ros = _cli.split_arguments(arguments)
     parser = _parser()
-    options = parser.parse_args(own)
+    options = _cli.parse(parser, own)
     topics = tuple(options.topics)
     selection = Selection(
         topics=topics or (() if options.regex else RUN_TOPICS),
@@ -154,7 +155,9 @@ def describe(bag: Path, summary: Summary) -> str:
         return f'{bag} is complete and empty: no message came'
     topics = ', '.join(f'{topic} {count}' for topic, count in sorted(summary.topics.items()) if count)
     seconds = (summary.end - summary.start) / 1e9
-    return f'{bag} is complete: {summary.messages} messages in {seconds:.1f} s ({topics})'
+    return (
+        f'{bag} is complete: {_cli.counted(summary.messages, "message")} in {seconds:.1f} s ({topics})'
+    )
 
 
 def _pattern(text: str) -> str:
@@ -179,7 +182,13 @@ def _parser() -> argparse.ArgumentParser:
         nargs='*',
         help=f'topics; else those of a run: {", ".join(RUN_TOPICS)}',
     )
-    parser.add_argument('-o', '--output', metavar='BAG', help='the directory to write; run_DATE-TIME')
+    parser.add_argument(
+        '-o',
+        '--output',
+        metavar='BAG',
+        type=_cli.bag_folder,
+        help='the directory to write; run_DATE-TIME',
+    )
     parser.add_argument(
         '-s', '--storage', choices=sorted(STORAGES), default='mcap', help='file format; %(default)s'
     )
