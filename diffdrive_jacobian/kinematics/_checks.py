@@ -86,9 +86,9 @@ def floats(name: str, value: Any) -> NDArray[np.float64]:
             raise TypeError('neither text, complex numbers nor None are')
         return array.astype(np.float64, copy=False)
     except (OverflowError, TypeError, ValueError) as error:
-        got = str(value)
-        got = got if len(got) <= 60 else f'{got[:57]}...'
-        raise ValueError(f'{name} must be an array of real numbers, got {got} ({error})') from error
+        raise ValueError(
+            f'{name} must be an array of real numbers, got {_short(value)} ({error})'
+        ) from error
 
 
 def number(name: str, value: Any, check: Callable[[str, Any], None]) -> float:
@@ -135,10 +135,10 @@ def nanoseconds(name: str, value: Any) -> int:
             value = operator.index(value)
         except TypeError:
             raise ValueError(
-                f'{name} must be an integer number of nanoseconds (ns), got {value!r:.60}'
+                f'{name} must be an integer number of nanoseconds (ns), got {_short(value)}'
             ) from None
     if not -MAX_NANOSECONDS <= value <= MAX_NANOSECONDS:
-        raise ValueError(f'{name} must fit into 64 bits (ns), got {value:.3e}')
+        raise ValueError(f'{name} must fit into 64 bits (ns), got {_short(value)}')
     return int(value)
 
 
@@ -149,7 +149,7 @@ def boolean(name: str, value: Any) -> bool:
         ValueError: It is something else.
     """
     if not isinstance(value, bool | np.bool_):
-        raise ValueError(f'{name} must be True or False, got {value!r:.60}')
+        raise ValueError(f'{name} must be True or False, got {_short(value)}')
     return bool(value)
 
 
@@ -160,7 +160,7 @@ def instance(name: str, value: Any, wanted: type) -> None:
         ValueError: It is of another one.
     """
     if not isinstance(value, wanted):
-        raise ValueError(f'{name} must be of class {wanted.__name__}, got {value!r:.60}')
+        raise ValueError(f'{name} must be of class {wanted.__name__}, got {_short(value)}')
 
 
 def function(name: str, value: Any) -> None:
@@ -170,7 +170,7 @@ def function(name: str, value: Any) -> None:
         ValueError: It cannot be called.
     """
     if not callable(value):
-        raise ValueError(f'{name} must be a function, got {value!r:.60}')
+        raise ValueError(f'{name} must be a function, got {_short(value)}')
 
 
 def read_only(value: Any) -> NDArray[np.float64]:
@@ -211,6 +211,15 @@ def leading(**shapes: tuple[int, ...]) -> tuple[int, ...]:
         raise ValueError(
             f'{" and ".join(several)} must have leading axes that broadcast, got {told}'
         ) from None
+
+
+def _short(value: Any) -> str:
+    """Return how a value is written, in at most 60 characters."""
+    try:
+        got = str(value) if not isinstance(value, str) else repr(value)
+    except ValueError:  # of an integer with thousands of digits
+        got = f'an object of class {type(value).__name__}'
+    return got if len(got) <= 60 else f'{got[:57]}...'
 
 
 def _first(value: Any, inside: Any) -> str:
