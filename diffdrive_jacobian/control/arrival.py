@@ -9,18 +9,32 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
+from diffdrive_jacobian.kinematics._checks import (
+    boolean,
+    equal,
+    hashable,
+    not_negative,
+    number,
+    read_only,
+)
+from diffdrive_jacobian.kinematics._elementary import (
+    agree,
+    cos,
+    evaluated,
+    hypot,
+    operand,
+    sin,
+    wrapped,
+)
 
-from diffdrive_jacobian.kinematics._checks import not_negative, number
-from diffdrive_jacobian.kinematics._elementary import cos, hypot, operand, sin, wrapped
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Arrival:
-    """What counts as having arrived.
+    """What counts as having arrived. A value: it can be compared and hashed, and does not change.
 
     Raises:
-        ValueError: A tolerance is negative or not finite, or the offset is not finite.
+        ValueError: A tolerance is negative or not finite, the offset is not finite, or `use_heading` is
+            not a Boolean.
     """
 
     xy_tolerance: float = 0.02
@@ -36,15 +50,76 @@ class Arrival:
         """Check every value."""
         for name in ('xy_tolerance', 'yaw_tolerance'):
             object.__setattr__(self, name, number(name, getattr(self, name), not_negative))
+        object.__setattr__(self, 'use_heading', boolean('use_heading', self.use_heading))
         offset = operand('offset', self.offset)
-        object.__setattr__(self, 'offset', offset if type(offset) is float else np.array(offset))
+        object.__setattr__(self, 'offset', offset if type(offset) is float else read_only(offset))
+
+    def __eq__(self, other: object) -> bool:
+        """Compare every field, arrays by shape and entries."""
+        if not isinstance(other, Arrival):
+            return NotImplemented
+        return self._scalars() == other._scalars() and equal(self.offset, other.offset)
+
+    def __hash__(self) -> int:
+        """Return a hash that equal values share."""
+        return hash((*self._scalars(), hashable(self.offset)))
+
+    def _scalars(self) -> tuple[float, float, bool]:
+        return self.xy_tolerance, self.yaw_tolerance, self.use_heading
 
     def distance(self, x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any) -> Any:
-        """Give the distance to a goal (m) of the point that is to arrive; arguments broadcast."""
+        """Compute the distance to a goal of the point that is to arrive.
+
+        Args:
+            x: Position of the axle centre, shape (...) (m).
+            y: Likewise.
+            theta: Heading, shape (...) (rad).
+            x_goal: Position of the goal, shape (...) (m).
+            y_goal: Likewise.
+
+        Returns:
+            The distance, shape (...) (m).
+
+        Raises:
+            ValueError: An argument is not finite, shapes do not broadcast, or the distance overflows.
+        """
+        x, y, theta = operand('x', x), operand('y', y), operand('theta', theta)
+        x_goal, y_goal = operand('x_goal', x_goal), operand('y_goal', y_goal)
+        single = agree(x=x, y=y, theta=theta, x_goal=x_goal, y_goal=y_goal, offset=self.offset)
+        (distance,) = evaluated(
+            single, 'x, y, x_goal, y_goal and offset', self._distance, x, y, theta, x_goal, y_goal
+        )
+        return distance
+
+    def _distance(self, x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any) -> tuple[Any]:
         if type(self.offset) is not float or self.offset != 0.0:
             x, y = x + self.offset * cos(theta), y + self.offset * sin(theta)
-        return hypot(x_goal - x, y_goal - y)
+        return (hypot(x_goal - x, y_goal - y),)
+
+    def reached(self, x: float, y: float, theta: float, x_goal: float, y_goal: float) -> bool:
+        """Return whether the distance to a goal is within the tolerance, without checks."""
+        return bool(self._distance(x, y, theta, x_goal, y_goal)[0] <= self.xy_tolerance)
 
     def faces(self, theta: Any, heading: Any) -> Any:
-        """Tell whether the heading of a goal is taken; arguments broadcast."""
-        return abs(wrapped(heading - theta)) <= self.yaw_tolerance
+        """Return whether the robot has the heading of a goal.
+
+        Args:
+            theta: Heading of the robot, shape (...) (rad).
+            heading: Heading of the goal, shape (...) (rad).
+
+        Returns:
+            Booleans, shape (...).
+
+        Raises:
+            ValueError: An argument is not finite, shapes do not broadcast, or the difference overflows.
+        """
+        theta, heading = operand('theta', theta), operand('heading', heading)
+        single = agree(theta=theta, heading=heading)
+        (error,) = evaluated(
+            single,
+            'theta and heading',
+            lambda theta, heading: (wrapped(heading - theta),),
+            theta,
+            heading,
+        )
+        return abs(error) <= self.yaw_tolerance

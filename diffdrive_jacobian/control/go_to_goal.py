@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.kinematics._elementary import (
     agree,
-    alike,
     arctan2,
     components,
     cos,
+    evaluated,
     operand,
     sin,
     wrapped,
@@ -42,19 +42,23 @@ def go_to_goal(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any) -> tuple[Any
         towards it is undefined, both are zero.
 
     Raises:
-        ValueError: The last axis of state or goal has a wrong length, shapes do not broadcast, or
-            something is not finite.
+        ValueError: The last axis of state or goal has a wrong length, shapes do not broadcast,
+            something is not finite, or the twist overflows.
     """
     x, y, theta = components('state', state, 3)
     x_goal, y_goal = components('goal', goal, 2)
     Kp, Kv = operand('Kp', Kp), operand('Kv', Kv)
-    agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv)
+    single = agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv)
+    v, omega = evaluated(single, 'state, goal, Kp and Kv', _law, x, y, theta, x_goal, y_goal, Kp, Kv)
+    return v, omega
+
+
+def _law(x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any, Kp: Any, Kv: Any) -> tuple[Any, Any]:
     dx, dy = x_goal - x, y_goal - y
     c, s = cos(theta), sin(theta)
-    # d cos(e) and d sin(e): the way to the goal, seen from the robot. It needs no wrapping. Without
+    # d cos(e) and d sin(e): the goal's position in the body frame. It needs no wrapping. Without
     # negative zeros the angle of (0, 0) is 0.
-    v, omega = steer(c * dx + s * dy + 0.0, c * dy - s * dx + 0.0, Kp, Kv)
-    return alike(v, omega)
+    return steer(c * dx + s * dy + 0.0, c * dy - s * dx + 0.0, Kp, Kv)
 
 
 def steer(ahead: Any, aside: Any, Kp: Any, Kv: Any) -> tuple[Any, Any]:
@@ -74,9 +78,16 @@ def turn_in_place(theta: Any, heading: Any, Kp: Any) -> tuple[Any, Any]:
         `(v, omega)`, each of shape (...) (m/s, rad/s).
 
     Raises:
-        ValueError: Shapes do not broadcast, or something is not finite.
+        ValueError: Shapes do not broadcast, something is not finite, or the twist overflows.
     """
     theta, heading, Kp = operand('theta', theta), operand('heading', heading), operand('Kp', Kp)
-    agree(theta=theta, heading=heading, Kp=Kp)
-    omega = Kp * wrapped(heading - theta)
+    single = agree(theta=theta, heading=heading, Kp=Kp)
+    (omega,) = evaluated(
+        single,
+        'theta, heading and Kp',
+        lambda theta, heading, Kp: (Kp * wrapped(heading - theta),),
+        theta,
+        heading,
+        Kp,
+    )
     return 0.0 * omega, omega

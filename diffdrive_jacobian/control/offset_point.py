@@ -16,7 +16,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.kinematics._checks import offset
-from diffdrive_jacobian.kinematics._elementary import agree, alike, components, cos, operand, sin
+from diffdrive_jacobian.kinematics._elementary import agree, components, cos, evaluated, operand, sin
 
 
 def offset_point(state: ArrayLike, goal: ArrayLike, k: Any, d: Any) -> tuple[Any, Any]:
@@ -39,16 +39,20 @@ def offset_point(state: ArrayLike, goal: ArrayLike, k: Any, d: Any) -> tuple[Any
 
     Raises:
         ValueError: d is 0, the last axis of state or goal has a wrong length, shapes do not broadcast,
-            or something is not finite.
+            something is not finite, or the twist overflows.
     """
     x, y, theta = components('state', state, 3)
     x_goal, y_goal = components('goal', goal, 2)
     k, d = operand('k', k), operand('d', d, offset)
-    agree(state=x, goal=x_goal, k=k, d=d)
+    single = agree(state=x, goal=x_goal, k=k, d=d)
+    v, omega = evaluated(single, 'state, goal, k and d', _law, x, y, theta, x_goal, y_goal, k, d)
+    return v, omega
+
+
+def _law(x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any, k: Any, d: Any) -> tuple[Any, Any]:
     dx, dy = x_goal - x, y_goal - y
     c, s = cos(theta), sin(theta)
-    v, omega = steer(c * dx + s * dy, c * dy - s * dx, k, d)
-    return alike(v, omega)
+    return steer(c * dx + s * dy, c * dy - s * dx, k, d)
 
 
 def steer(ahead: Any, aside: Any, k: Any, d: Any) -> tuple[Any, Any]:

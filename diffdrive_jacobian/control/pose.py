@@ -23,16 +23,16 @@ from numpy.typing import ArrayLike
 from diffdrive_jacobian.kinematics._checks import positive
 from diffdrive_jacobian.kinematics._elementary import (
     agree,
-    alike,
     arctan2,
     components,
     cos,
+    evaluated,
     minimum,
     operand,
     sin,
+    sinc,
     wrapped,
 )
-from diffdrive_jacobian.kinematics.se2 import sinc
 
 FASTER = 2.0
 """How many times as fast as the distance the heading settles, if nothing else is asked for."""
@@ -48,15 +48,17 @@ def go_to_pose(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any, h: Any = Non
     like exp(-Kv t): for the heading to be there first, Kp should be above 2 Kv. A weight that is larger
     than it needs to be makes long ways round. Where the goal lies behind, the robot backs up while it
     turns to it, then drives on forwards; where it may not back up, it turns first. Sampled, Kp should be
-    below a quarter of the rate.
+    below a quarter of the rate; with a weight h of your own also `Kv^2 h < Kp rate`, beyond which
+    heading and bearing oscillate ever more near the goal.
 
     Args:
         state: Pose of the robot, shape (..., 3).
         goal: Pose to take `[x, y, theta]`, shape (..., 3).
         Kp: Gain on the bearing, positive, shape (...) (1/s).
         Kv: Gain on the distance, positive, shape (...) (1/s).
-        h: Weight of the heading, positive, shape (...). None: `(Kp / (2 Kv))^2`, which damps critically,
-            or from `Kp = 4 Kv` on `2 Kp / Kv - 4`, with which the heading settles like exp(-2 Kv t).
+        h: Weight of the heading, positive, shape (...); sampled, below `Kp rate / Kv^2`. None:
+            `(Kp / (2 Kv))^2`, which damps critically, or from `Kp = 4 Kv` on `2 Kp / Kv - 4`, with which
+            the heading settles like exp(-2 Kv t).
 
     Returns:
         `(v, omega)`, each of shape (...) (m/s, rad/s). Exactly on the goal's position, where the bearing
@@ -64,21 +66,28 @@ def go_to_pose(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any, h: Any = Non
 
     Raises:
         ValueError: A gain is not positive, the last axis of state or goal has a wrong length, shapes do
-            not broadcast, or something is not finite.
+            not broadcast, something is not finite, or the twist overflows.
     """
     x, y, theta = components('state', state, 3)
     x_goal, y_goal, heading = components('goal', goal, 3)
     Kp, Kv = operand('Kp', Kp, positive), operand('Kv', Kv, positive)
-    agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv)
-    if h is not None:
-        h = operand('h', h, positive)
-        agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv, h=h)
+    names = 'state, goal, Kp and Kv'
+    if h is None:
+        single = agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv)
+    else:
+        h, names = operand('h', h, positive), 'state, goal, Kp, Kv and h'
+        single = agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv, h=h)
+    v, omega = evaluated(single, names, _law, x, y, theta, x_goal, y_goal, heading, Kp, Kv, h)
+    return v, omega
+
+
+def _law(
+    x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any, heading: Any, Kp: Any, Kv: Any, h: Any
+) -> tuple[Any, Any]:
     dx, dy = x_goal - x, y_goal - y
     c, s = cos(theta), sin(theta)
     # Without negative zeros the angle of (0, 0) is 0.
-    ahead, aside = c * dx + s * dy + 0.0, c * dy - s * dx + 0.0
-    v, omega = steer(ahead, aside, heading - theta, Kp, Kv, h)
-    return alike(v, omega)
+    return steer(c * dx + s * dy + 0.0, c * dy - s * dx + 0.0, heading - theta, Kp, Kv, h)
 
 
 def steer(ahead: Any, aside: Any, turn: Any, Kp: Any, Kv: Any, h: Any = None) -> tuple[Any, Any]:

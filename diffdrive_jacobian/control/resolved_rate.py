@@ -25,6 +25,7 @@ from diffdrive_jacobian.kinematics._checks import (
     not_negative,
     number,
     positive,
+    read_only,
 )
 from diffdrive_jacobian.kinematics.inverse_velocity import (
     damped_least_squares,
@@ -116,14 +117,12 @@ class StraightLine:
         end, speed = array('end', self.end, start.shape[-1]), floats('speed', self.speed)
         positive('speed', speed)
         leading(start=start.shape[:-1], end=end.shape[:-1], speed=speed.shape)
-        for name, value in (('start', start), ('end', end), ('speed', speed)):
-            copied = np.array(value)
-            copied.flags.writeable = False
-            object.__setattr__(self, name, copied)
         with np.errstate(over='ignore'):
-            duration = self.duration
+            duration = np.linalg.norm(end - start, axis=-1) / speed
         if not np.isfinite(duration).all():
-            raise ValueError(f'the duration, length over speed, must be finite, got {duration} s')
+            raise ValueError('start, end and speed must give a finite duration, but it overflows')
+        for name, value in (('start', start), ('end', end), ('speed', speed)):
+            object.__setattr__(self, name, read_only(value))
 
     @property
     def duration(self) -> NDArray[np.float64]:

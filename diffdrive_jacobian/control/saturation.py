@@ -12,18 +12,30 @@ from typing import Any
 
 import numpy as np
 
-from diffdrive_jacobian.kinematics._checks import floats
+from diffdrive_jacobian.kinematics._checks import (
+    equal,
+    floats,
+    hashable,
+    instance,
+    leading,
+    positive,
+    read_only,
+)
 from diffdrive_jacobian.kinematics._elementary import agree, alike, maximum, minimum, operand, where
-from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
+
+SMALLEST = 5e-324
+"""Smallest positive float."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class VelocityLimits:
     """Limits of a differential drive; infinity means none. Each is a number, or an array, for as many
-    robots, that broadcasts with the commands.
+    robots, that broadcasts with the commands. A value: it can be compared and hashed, and does not
+    change.
 
     Raises:
         ValueError: A limit is NaN or lies on the wrong side of zero: standing still must be allowed.
+            Or arrays do not broadcast.
     """
 
     min_v: Any = -np.inf
@@ -46,7 +58,7 @@ class VelocityLimits:
     def __post_init__(self) -> None:
         """Check every limit."""
         for name, limit in zip(self.names(), self.all(), strict=True):
-            value = limit if type(limit) is float else np.array(floats(name, limit))
+            value = limit if type(limit) is float else read_only(floats(name, limit))
             if name == 'max_wheel_speed':
                 inside, allowed = value > 0.0, 'positive'
             elif name.startswith('min'):
@@ -56,10 +68,11 @@ class VelocityLimits:
             if not np.all(inside):
                 raise ValueError(f'{name} must be {allowed}, got {limit}')
             object.__setattr__(self, name, float(value) if np.ndim(value) == 0 else value)
+        leading(**{name: np.shape(limit) for name, limit in zip(self.names(), self.all(), strict=True)})
         unlimited = all(type(limit) is float and abs(limit) == np.inf for limit in self.all())
         object.__setattr__(self, 'unlimited', unlimited)
         object.__setattr__(self, 'alike', all(type(limit) is float for limit in self.all()))
-        # Made once, for it is asked for with every message.
+        # Computed once, for every message needs it.
         bounds = (
             (
                 where(low == 0.0, 0.0, -np.inf),
@@ -71,13 +84,25 @@ class VelocityLimits:
         )
         object.__setattr__(self, '_bounds', tuple(bounds))
 
+    def __eq__(self, other: object) -> bool:
+        """Compare every limit, arrays by shape and entries."""
+        if not isinstance(other, VelocityLimits):
+            return NotImplemented
+        if self.alike and other.alike:
+            return self.all() == other.all()
+        return all(map(equal, self.all(), other.all()))
+
+    def __hash__(self) -> int:
+        """Return a hash that equal limits share."""
+        return hash(tuple(map(hashable, self.all())))
+
     def all(self) -> tuple[Any, ...]:
-        """Give the limits in their order."""
+        """Return the limits in their order."""
         return self.min_v, self.max_v, self.min_omega, self.max_omega, self.max_wheel_speed
 
     @staticmethod
     def names() -> tuple[str, ...]:
-        """Give the names of the limits in their order."""
+        """Return the names of the limits in their order."""
         return 'min_v', 'max_v', 'min_omega', 'max_omega', 'max_wheel_speed'
 
 
@@ -86,6 +111,9 @@ def saturate(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tupl
 
     A direction whose limit is zero is forbidden rather than slow: its component is dropped first,
     for no factor but 0 would do. So a robot that may not reverse still turns on the spot.
+
+    The result meets every limit exactly, also that of the wheels: no speed that `body_to_wheel` returns
+    for it is larger. Twists whose wheel speeds would overflow are scaled, too.
 
     Args:
         v: Forward speed, shape (...) (m/s).
@@ -98,38 +126,82 @@ def saturate(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tupl
         The limited `(v, omega)`, each of shape (...).
 
     Raises:
-        ValueError: v or omega is not finite; shapes do not broadcast; the wheels have a limit, and r or
-            L is not positive and finite.
+        ValueError: v or omega is not finite; limits are of another class; shapes do not broadcast; the
+            wheels have a limit, and r or L is not positive and finite.
     """
     v, omega = operand('v', v), operand('omega', omega)
+    instance('limits', limits, VelocityLimits)
+    single = type(v) is type(omega) is float
     if limits.unlimited:
+        if single:
+            return v, omega
         agree(v=v, omega=omega)
         v, omega = alike(v, omega)
-        return (v, omega) if type(v) is float else (np.array(v), np.array(omega))
-    if type(v) is type(omega) is float and limits.alike:
-        return _saturated(v, omega, limits, r, L)
-    agree(v=v, omega=omega, **dict(zip(limits.names(), limits.all(), strict=True)))
-    # What is infinitely too fast is slowed down to nothing.
-    with np.errstate(over='ignore'):
-        return _saturated(v, omega, limits, r, L)
+        return np.array(v), np.array(omega)
+    wheels = type(limits.max_wheel_speed) is not float or limits.max_wheel_speed < np.inf
+    if wheels:
+        r, L = operand('r', r, positive), operand('L', L, positive)
+        single = single and type(r) is type(L) is float
+    else:
+        r = L = 1.0
+    if single and limits.alike:
+        return _saturated(v, omega, limits, r, L, wheels)
+    agree(v=v, omega=omega, r=r, L=L, **dict(zip(limits.names(), limits.all(), strict=True)))
+    with np.errstate(all='ignore'):
+        limited_v, limited_omega = alike(*_saturated(v, omega, limits, r, L, wheels))
+    return limited_v, limited_omega
 
 
-def _saturated(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tuple[Any, Any]:
-    v, v_excess = _allowed(v, *limits._bounds[0])
-    omega, omega_excess = _allowed(omega, *limits._bounds[1])
-    excess = maximum(1.0, maximum(v_excess, omega_excess))
-    if type(limits.max_wheel_speed) is not float or limits.max_wheel_speed < np.inf:
-        omega_R, omega_L = body_to_wheel(v, omega, r, L)
-        agree(wheel_speeds=omega_R, max_wheel_speed=limits.max_wheel_speed)
-        excess = maximum(excess, maximum(abs(omega_R), abs(omega_L)) / limits.max_wheel_speed)
+def _saturated(
+    v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, wheels: bool
+) -> tuple[Any, Any]:
+    (v_floor, v_ceiling, *_), (omega_floor, omega_ceiling, *_) = limits._bounds
+    v = minimum(maximum(v, v_floor), v_ceiling)
+    omega = minimum(maximum(omega, omega_floor), omega_ceiling)
+    divisor = _excess(v, omega, limits, r, L, 1.0)
+    if _any(divisor == np.inf):
+        v, omega, divisor = _scaled_down(v, omega, limits, r, L, divisor)
     # The quotient may round to one unit in the last place beyond the limit.
-    return (
-        minimum(maximum(v / excess, limits.min_v), limits.max_v),
-        minimum(maximum(omega / excess, limits.min_omega), limits.max_omega),
-    )
+    v = minimum(maximum(v / divisor, limits.min_v), limits.max_v)
+    omega = minimum(maximum(omega / divisor, limits.min_omega), limits.max_omega)
+    if wheels:
+        # So may the wheel speeds: shrink by a unit in the last place, then by twice as much, and so on.
+        step = 2.0**-53
+        while _any(above := _fastest(v, omega, r, L) > limits.max_wheel_speed):
+            v, omega = where(above, v - step * v, v), where(above, omega - step * omega, omega)
+            step *= 2.0
+    return v, omega
 
 
-def _allowed(speed: Any, floor: Any, ceiling: Any, low: Any, high: Any) -> tuple[Any, Any]:
-    """Drop forbidden directions, and tell how many times too fast the rest is."""
-    speed = minimum(maximum(speed, floor), ceiling)
-    return speed, maximum(speed / low, speed / high)
+def _excess(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, least: Any) -> Any:
+    """Compute how many times too fast a twist is; at least `least`."""
+    (_, _, v_low, v_high), (_, _, omega_low, omega_high) = limits._bounds
+    most = maximum(maximum(v / v_low, v / v_high), maximum(omega / omega_low, omega / omega_high))
+    limit = limits.max_wheel_speed
+    if type(limit) is not float:
+        # An infinite speed without a limit would be NaN.
+        most = maximum(most, np.where(limit < np.inf, _fastest(v, omega, r, L) / limit, 0.0))
+    elif limit < np.inf:
+        most = maximum(most, _fastest(v, omega, r, L) / limit)
+    return maximum(most, least)
+
+
+def _scaled_down(
+    v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, divisor: Any
+) -> tuple[Any, Any, Any]:
+    """Scale what is infinitely too fast until its excess can be computed."""
+    least: Any = 1.0
+    while _any(infinite := divisor == np.inf):
+        factor = where(infinite, 2.0**-600, 1.0)
+        v, omega, least = v * factor, omega * factor, where(infinite, SMALLEST, least)
+        divisor = _excess(v, omega, limits, r, L, least)
+    return v, omega, divisor
+
+
+def _fastest(v: Any, omega: Any, r: Any, L: Any) -> Any:
+    """Compute the speed of the faster wheel, to the last bit what `body_to_wheel` has for it."""
+    return (abs(v) + abs(omega * L / 2.0)) / r
+
+
+def _any(condition: Any) -> bool:
+    return condition if type(condition) is bool else bool(np.any(condition))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.go_to_goal import turn_in_place
+from diffdrive_jacobian.kinematics._checks import array, boolean, function, instance, read_only
+from diffdrive_jacobian.kinematics._elementary import components, operand
 
 Law = Callable[[NDArray[np.float64], NDArray[np.float64]], tuple[Any, Any]]
 """A control law: pose (3,) and goal (3,) to `(v, omega)`; it may look at the goal's heading or not."""
@@ -18,7 +20,12 @@ Law = Callable[[NDArray[np.float64], NDArray[np.float64]], tuple[Any, Any]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Waypoints:
-    """Poses to reach in order, and how far along they are."""
+    """Poses to reach in order, and the progress along them. A value: it does not change.
+
+    Raises:
+        ValueError: The poses have another shape than (n, 3) with n >= 1 or are not finite, there is no
+            pose of that index, or `turning` is not a Boolean.
+    """
 
     poses: NDArray[np.float64]
     """`[x, y, theta]` each, shape (n, 3), n >= 1."""
@@ -26,6 +33,20 @@ class Waypoints:
     """The waypoint that is driven to."""
     turning: bool = False
     """Whether the last position was reached and only its heading is left to take."""
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        poses = array('poses', self.poses, 'n', 3)
+        if poses.ndim != 2:
+            raise ValueError(f'poses must have shape (n, 3), got {poses.shape}')
+        object.__setattr__(self, 'poses', read_only(poses))
+        index = self.index
+        if isinstance(index, bool) or not isinstance(index, int | np.integer):
+            raise ValueError(f'index must be an integer, got {index!r:.60}')
+        if not 0 <= index < len(poses):
+            raise ValueError(f'index must be in 0 to {len(poses) - 1}, got {index}')
+        object.__setattr__(self, 'index', int(index))
+        object.__setattr__(self, 'turning', boolean('turning', self.turning))
 
     def follow(
         self, pose: NDArray[np.float64], law: Law, arrival: Arrival, turning_gain: float
@@ -41,33 +62,45 @@ class Waypoints:
         Returns:
             The waypoints with their progress, and the command `(v, omega)` (m/s, rad/s), or None in
             its place when everything is reached.
+
+        Raises:
+            ValueError: An argument is of another class or shape, or not finite.
         """
+        x, y, theta = components('pose', pose, 3)
+        if type(theta) is not float:
+            raise ValueError(f'pose must have shape (3,), got {np.shape(pose)}')
+        function('law', law)
+        instance('arrival', arrival, Arrival)
+        turning_gain = operand('turning_gain', turning_gain)
         here = self
         if here.turning and not arrival.use_heading:
             # Asked for no longer: the position was reached.
             return here, None
-        while not here.turning and here._there(pose, arrival):
+        while not here.turning:
+            x_goal, y_goal, _ = here.poses[here.index].tolist()
+            if not arrival.reached(x, y, theta, x_goal, y_goal):
+                return here, law(pose, here.poses[here.index])
             if here.index + 1 < len(here.poses):
-                here = replace(here, index=here.index + 1)
+                here = here._progressed(here.index + 1, turning=False)
             elif arrival.use_heading:
-                here = replace(here, turning=True)
+                here = here._progressed(here.index, turning=True)
             else:
                 return here, None
-        goal = here.poses[here.index]
-        if not here.turning:
-            return here, law(pose, goal)
-        if arrival.faces(pose[2], goal[2]):
+        heading = float(here.poses[here.index, 2])
+        if arrival.faces(theta, heading):
             return here, None
-        return here, turn_in_place(pose[2], goal[2], turning_gain)
+        return here, turn_in_place(theta, heading, turning_gain)
 
     def resumed(self) -> Waypoints:
         """Return the waypoints with the last position to be reached again if the robot is not there.
 
         For a change of the law or of the point that has to arrive, while the robot turns in place.
         """
-        return replace(self, turning=False) if self.turning else self
+        return self._progressed(self.index, turning=False) if self.turning else self
 
-    def _there(self, pose: NDArray[np.float64], arrival: Arrival) -> bool:
-        x, y, _ = self.poses[self.index].tolist()
-        distance = arrival.distance(float(pose[0]), float(pose[1]), float(pose[2]), x, y)
-        return bool(distance <= arrival.xy_tolerance)
+    def _progressed(self, index: int, *, turning: bool) -> Waypoints:
+        # Without checks and copies, which would cost time in proportion to the number of poses.
+        progressed = object.__new__(Waypoints)
+        for name, value in (('poses', self.poses), ('index', index), ('turning', turning)):
+            object.__setattr__(progressed, name, value)
+        return progressed

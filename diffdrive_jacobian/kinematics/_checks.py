@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable
 from numbers import Real
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+MAX_NANOSECONDS = 2**63 - 1
+"""Largest time in nanoseconds, which is that of ROS clocks."""
+_FLOAT64 = np.dtype(np.float64)
 
 
 def positive(name: str, value: Any) -> None:
@@ -69,6 +74,8 @@ def floats(name: str, value: Any) -> NDArray[np.float64]:
     Raises:
         ValueError: It holds something else than real numbers, or rows of several lengths.
     """
+    if type(value) is np.ndarray and value.dtype is _FLOAT64:
+        return value
     try:
         array = np.asarray(value)
         # Objects may be numbers, too, such as fractions.
@@ -79,9 +86,9 @@ def floats(name: str, value: Any) -> NDArray[np.float64]:
             raise TypeError('neither text, complex numbers nor None are')
         return array.astype(np.float64, copy=False)
     except (OverflowError, TypeError, ValueError) as error:
-        got = str(value)
-        got = got if len(got) <= 60 else f'{got[:57]}...'
-        raise ValueError(f'{name} must be an array of real numbers, got {got} ({error})') from error
+        raise ValueError(
+            f'{name} must be an array of real numbers, got {_short(value)} ({error})'
+        ) from error
 
 
 def number(name: str, value: Any, check: Callable[[str, Any], None]) -> float:
@@ -115,6 +122,74 @@ def array(name: str, value: Any, *trailing: int | str) -> NDArray[np.float64]:
     return made
 
 
+def nanoseconds(name: str, value: Any) -> int:
+    """Return a time or a duration in nanoseconds as an int.
+
+    Raises:
+        ValueError: It is no integer, as seconds are not, or does not fit into 64 bits.
+    """
+    if type(value) is not int:
+        try:
+            if isinstance(value, bool | np.bool_):
+                raise TypeError
+            value = operator.index(value)
+        except TypeError:
+            raise ValueError(
+                f'{name} must be an integer number of nanoseconds (ns), got {_short(value)}'
+            ) from None
+    if not -MAX_NANOSECONDS <= value <= MAX_NANOSECONDS:
+        raise ValueError(f'{name} must fit into 64 bits (ns), got {_short(value)}')
+    return int(value)
+
+
+def boolean(name: str, value: Any) -> bool:
+    """Return a Boolean.
+
+    Raises:
+        ValueError: It is something else.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f'{name} must be True or False, got {_short(value)}')
+    return bool(value)
+
+
+def instance(name: str, value: Any, wanted: type) -> None:
+    """Require an object of a class.
+
+    Raises:
+        ValueError: It is of another one.
+    """
+    if not isinstance(value, wanted):
+        raise ValueError(f'{name} must be of class {wanted.__name__}, got {_short(value)}')
+
+
+def function(name: str, value: Any) -> None:
+    """Require something that can be called.
+
+    Raises:
+        ValueError: It cannot be called.
+    """
+    if not callable(value):
+        raise ValueError(f'{name} must be a function, got {_short(value)}')
+
+
+def read_only(value: Any) -> NDArray[np.float64]:
+    """Return a copy of an array that cannot be changed, for objects that are values."""
+    copy = np.array(value, dtype=np.float64)
+    copy.setflags(write=False)
+    return copy
+
+
+def equal(first: Any, second: Any) -> bool:
+    """Return whether numbers or arrays have equal shapes and entries; NaN equals NaN."""
+    return bool(np.array_equal(first, second, equal_nan=True))
+
+
+def hashable(value: Any) -> Any:
+    """Return what equal numbers and arrays have in common, for a hash."""
+    return value if isinstance(value, float) else (value.shape, *value.ravel().tolist())
+
+
 def leading(**shapes: tuple[int, ...]) -> tuple[int, ...]:
     """Broadcast the leading axes of arguments.
 
@@ -136,6 +211,15 @@ def leading(**shapes: tuple[int, ...]) -> tuple[int, ...]:
         raise ValueError(
             f'{" and ".join(several)} must have leading axes that broadcast, got {told}'
         ) from None
+
+
+def _short(value: Any) -> str:
+    """Return how a value is written, in at most 60 characters."""
+    try:
+        got = str(value) if not isinstance(value, str) else repr(value)
+    except ValueError:  # of an integer with thousands of digits
+        got = f'an object of class {type(value).__name__}'
+    return got if len(got) <= 60 else f'{got[:57]}...'
 
 
 def _first(value: Any, inside: Any) -> str:

@@ -20,7 +20,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._checks import array, floats, leading, offset, positive
-from diffdrive_jacobian.kinematics._elementary import agree, components, cos, operand, sin, stack
+from diffdrive_jacobian.kinematics._elementary import (
+    agree,
+    components,
+    cos,
+    evaluated,
+    operand,
+    sin,
+    stack,
+)
 
 
 def unicycle_jacobian(theta: ArrayLike) -> NDArray[np.float64]:
@@ -56,8 +64,9 @@ def wheel_to_body_jacobian(r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
     r, L = _geometry(r, L)
     jacobian = np.empty((*np.broadcast(r, L).shape, 2, 2))
     jacobian[..., 0, 0] = jacobian[..., 0, 1] = r / 2.0
-    jacobian[..., 1, 0] = r / L
-    jacobian[..., 1, 1] = -r / L
+    (ratio,) = evaluated(False, 'r and L', lambda: (r / L,))
+    jacobian[..., 1, 0] = ratio
+    jacobian[..., 1, 1] = -ratio
     return jacobian
 
 
@@ -76,9 +85,10 @@ def body_to_wheel_jacobian(r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
     """
     r, L = _geometry(r, L)
     jacobian = np.empty((*np.broadcast(r, L).shape, 2, 2))
-    jacobian[..., 0, 0] = jacobian[..., 1, 0] = 1.0 / r
-    jacobian[..., 0, 1] = L / (2.0 * r)
-    jacobian[..., 1, 1] = -L / (2.0 * r)
+    along, across = evaluated(False, 'r and L', lambda: (1.0 / r, L / (2.0 * r)))
+    jacobian[..., 0, 0] = jacobian[..., 1, 0] = along
+    jacobian[..., 0, 1] = across
+    jacobian[..., 1, 1] = -across
     return jacobian
 
 
@@ -161,8 +171,12 @@ def offset_point(pose: ArrayLike, d: ArrayLike) -> NDArray[np.float64]:
     """
     x, y, theta = components('pose', pose, 3)
     d = operand('d', d)
-    agree(pose=x, d=d)
-    return stack(x + d * cos(theta), y + d * sin(theta))
+    single = agree(pose=x, d=d)
+
+    def point(x: Any, y: Any, theta: Any, d: Any) -> tuple[Any, Any]:
+        return x + d * cos(theta), y + d * sin(theta)
+
+    return stack(*evaluated(single, 'pose and d', point, x, y, theta, d))
 
 
 def offset_point_jacobian(
@@ -190,11 +204,18 @@ def offset_point_jacobian(
     offset('d', d)
     theta = _angles(theta, r=r, L=L, d=d)
     c, s = np.cos(theta), np.sin(theta)
-    along, across = r / 2.0, d * r / L
-    jacobian = np.empty((*np.broadcast(theta, r, L, d).shape, 2, 2))
-    jacobian[..., 0, 0], jacobian[..., 0, 1] = c * along - s * across, c * along + s * across
-    jacobian[..., 1, 0], jacobian[..., 1, 1] = s * along + c * across, s * along - c * across
-    return jacobian
+
+    def entries() -> tuple[Any, ...]:
+        along, across = r / 2.0, d * r / L
+        return (
+            c * along - s * across,
+            c * along + s * across,
+            s * along + c * across,
+            s * along - c * across,
+        )
+
+    jacobian = stack(*evaluated(False, 'r, L and d', entries))
+    return jacobian.reshape(*jacobian.shape[:-1], 2, 2)
 
 
 def body_to_wheel(v: Any, omega: Any, r: Any, L: Any) -> tuple[Any, Any]:
@@ -210,9 +231,17 @@ def body_to_wheel(v: Any, omega: Any, r: Any, L: Any) -> tuple[Any, Any]:
         `(omega_R, omega_L)`, each of shape (...) (rad/s).
 
     Raises:
-        ValueError: r or L is not positive and finite.
+        ValueError: r or L is not positive and finite, v or omega is not finite, shapes do not
+            broadcast, or a wheel speed overflows.
     """
-    v, omega, r, L = _operands(r, L, v=v, omega=omega)
+    v, omega = operand('v', v), operand('omega', omega)
+    r, L = operand('r', r, positive), operand('L', L, positive)
+    single = agree(v=v, omega=omega, r=r, L=L)
+    omega_R, omega_L = evaluated(single, 'v, omega, r and L', _wheel_speeds, v, omega, r, L)
+    return omega_R, omega_L
+
+
+def _wheel_speeds(v: Any, omega: Any, r: Any, L: Any) -> tuple[Any, Any]:
     half = omega * L / 2.0
     return (v + half) / r, (v - half) / r
 
@@ -230,9 +259,17 @@ def wheel_to_body(omega_R: Any, omega_L: Any, r: Any, L: Any) -> tuple[Any, Any]
         `(v, omega)`, each of shape (...) (m/s, rad/s).
 
     Raises:
-        ValueError: r or L is not positive and finite.
+        ValueError: r or L is not positive and finite, a wheel speed is not finite, shapes do not
+            broadcast, or v or omega overflows.
     """
-    omega_R, omega_L, r, L = _operands(r, L, omega_R=omega_R, omega_L=omega_L)
+    omega_R, omega_L = operand('omega_R', omega_R), operand('omega_L', omega_L)
+    r, L = operand('r', r, positive), operand('L', L, positive)
+    single = agree(omega_R=omega_R, omega_L=omega_L, r=r, L=L)
+    v, omega = evaluated(single, 'omega_R, omega_L, r and L', _body_twist, omega_R, omega_L, r, L)
+    return v, omega
+
+
+def _body_twist(omega_R: Any, omega_L: Any, r: Any, L: Any) -> tuple[Any, Any]:
     return r * (omega_R + omega_L) / 2.0, r * (omega_R - omega_L) / L
 
 
@@ -297,10 +334,3 @@ def _geometry(r: ArrayLike, L: ArrayLike) -> tuple[NDArray[np.float64], NDArray[
     positive('L', L)
     leading(r=r.shape, L=L.shape)
     return r, L
-
-
-def _operands(r: Any, L: Any, **speeds: Any) -> tuple[Any, ...]:
-    made = {name: operand(name, value) for name, value in speeds.items()}
-    r, L = operand('r', r, positive), operand('L', L, positive)
-    agree(**made, r=r, L=L)
-    return *made.values(), r, L

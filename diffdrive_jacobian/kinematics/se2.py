@@ -4,8 +4,8 @@ Model: a pose `[x, y, theta]` (m, m, rad) is the placement of a frame B in a fra
 y left, theta counter-clockwise and wrapped to (-pi, pi]. A twist `[vx, vy, omega]` (m/s, m/s,
 rad/s) is a velocity in B.
 
-Everything broadcasts over leading axes: a pose has shape (..., 3). Wrong shapes, and values that are
-not finite, raise ValueError.
+Everything broadcasts over leading axes: a pose has shape (..., 3). Wrong shapes, values that are not
+finite, and results that overflow raise ValueError, in single and in batched calls.
 
 Source: MATH.md, "Motion of a virtual robot"; document B for the homogeneous transform.
 """
@@ -17,10 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from diffdrive_jacobian.kinematics import _elementary
 from diffdrive_jacobian.kinematics._elementary import (
     agree,
     components,
     cos,
+    evaluated,
     operand,
     sin,
     stack,
@@ -46,11 +48,19 @@ def wrap_angle(angle: ArrayLike) -> Any:
     return wrapped(operand('angle', angle))
 
 
-def sinc(angle: Any) -> Any:
-    """Compute sin(angle) / angle without a hole at zero (not NumPy's sin(pi x) / (pi x))."""
-    # A tiny angle in the place of zero gives exactly 1.
-    angle = angle + (angle == 0.0) * 1e-20
-    return sin(angle) / angle
+def sinc(angle: ArrayLike) -> Any:
+    """Compute sin(angle) / angle, which is 1 at zero (not NumPy's sin(pi x) / (pi x)).
+
+    Args:
+        angle: Angles, any shape (rad).
+
+    Returns:
+        The quotients, same shape.
+
+    Raises:
+        ValueError: An angle is infinite or NaN.
+    """
+    return _elementary.sinc(operand('angle', angle))
 
 
 def exp(twist: ArrayLike) -> NDArray[np.float64]:
@@ -63,9 +73,13 @@ def exp(twist: ArrayLike) -> NDArray[np.float64]:
         The pose reached, shape (..., 3), theta wrapped.
     """
     vx, vy, turn = components('twist', twist, 3)
-    chord = sinc(turn / 2.0)
+    return stack(*evaluated(type(turn) is float, 'twist', _exp, vx, vy, turn))
+
+
+def _exp(vx: Any, vy: Any, turn: Any) -> tuple[Any, ...]:
+    chord = _elementary.sinc(turn / 2.0)
     along, across = chord * cos(turn / 2.0), chord * sin(turn / 2.0)
-    return stack(along * vx - across * vy, across * vx + along * vy, wrapped(turn))
+    return along * vx - across * vy, across * vx + along * vy, wrapped(turn)
 
 
 def log(pose: ArrayLike) -> NDArray[np.float64]:
@@ -78,9 +92,13 @@ def log(pose: ArrayLike) -> NDArray[np.float64]:
         The twist `[vx, vy, omega]`, shape (..., 3), with the turn of least magnitude.
     """
     x, y, theta = components('pose', pose, 3)
+    return stack(*evaluated(type(theta) is float, 'pose', _log, x, y, theta))
+
+
+def _log(x: Any, y: Any, theta: Any) -> tuple[Any, ...]:
     turn = wrapped(theta)
-    along = cos(turn / 2.0) / sinc(turn / 2.0)
-    return stack(along * x + turn / 2.0 * y, along * y - turn / 2.0 * x, turn)
+    along = cos(turn / 2.0) / _elementary.sinc(turn / 2.0)
+    return along * x + turn / 2.0 * y, along * y - turn / 2.0 * x, turn
 
 
 def compose(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
@@ -95,16 +113,24 @@ def compose(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
     """
     x, y, theta = components('first', first, 3)
     dx, dy, turn = components('second', second, 3)
-    agree(first=x, second=dx)
+    single = agree(first=x, second=dx)
+    return stack(*evaluated(single, 'first and second', _compose, x, y, theta, dx, dy, turn))
+
+
+def _compose(x: Any, y: Any, theta: Any, dx: Any, dy: Any, turn: Any) -> tuple[Any, ...]:
     c, s = cos(theta), sin(theta)
-    return stack(x + c * dx - s * dy, y + s * dx + c * dy, wrapped(theta + turn))
+    return x + c * dx - s * dy, y + s * dx + c * dy, wrapped(theta + turn)
 
 
 def inverse(pose: ArrayLike) -> NDArray[np.float64]:
-    """Give the pose of W in B from the pose of B in W, shape (..., 3), theta wrapped."""
+    """Return the pose of W in B for the pose of B in W, shape (..., 3), theta wrapped."""
     x, y, theta = components('pose', pose, 3)
+    return stack(*evaluated(type(theta) is float, 'pose', _inverse, x, y, theta))
+
+
+def _inverse(x: Any, y: Any, theta: Any) -> tuple[Any, ...]:
     c, s = cos(theta), sin(theta)
-    return stack(-c * x - s * y, s * x - c * y, wrapped(-theta))
+    return -c * x - s * y, s * x - c * y, wrapped(-theta)
 
 
 def homogeneous(pose: ArrayLike) -> NDArray[np.float64]:
@@ -142,8 +168,12 @@ def integrate(pose: ArrayLike, twist: ArrayLike, dt: ArrayLike) -> NDArray[np.fl
     x, y, theta = components('pose', pose, 3)
     v, omega = components('twist', twist, 2)
     dt = operand('dt', dt)
-    agree(pose=x, twist=v, dt=dt)
+    single = agree(pose=x, twist=v, dt=dt)
+    return stack(*evaluated(single, 'pose, twist and dt', _arc, x, y, theta, v, omega, dt))
+
+
+def _arc(x: Any, y: Any, theta: Any, v: Any, omega: Any, dt: Any) -> tuple[Any, ...]:
     turn = omega * dt
-    chord = v * dt * sinc(turn / 2.0)
+    chord = v * dt * _elementary.sinc(turn / 2.0)
     heading = theta + turn / 2.0
-    return stack(x + chord * cos(heading), y + chord * sin(heading), wrapped(theta + turn))
+    return x + chord * cos(heading), y + chord * sin(heading), wrapped(theta + turn)

@@ -90,6 +90,11 @@ def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[
             context=context,
             signal_handler_options=SignalHandlerOptions.NO,
         )
+    except rclpy_implementation.UnknownROSArgsError as error:
+        raise UserError(
+            f'unknown ROS arguments: {error}; other arguments come before --ros-args, or after the -- '
+            'that ends the ROS arguments'
+        ) from error
     except (RuntimeError, UnicodeError) as error:
         # rcl appends where in its sources it gave up.
         raise UserError(f'ROS arguments: {str(error).split(", at /")[0].strip()}') from error

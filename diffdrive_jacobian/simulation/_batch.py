@@ -12,7 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.saturation import VelocityLimits
-from diffdrive_jacobian.kinematics._checks import array, floats, leading, number, positive
+from diffdrive_jacobian.kinematics._checks import (
+    array,
+    floats,
+    function,
+    instance,
+    leading,
+    number,
+    positive,
+)
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -78,6 +86,9 @@ class Batch:
     ) -> Batch:
         """Check the arguments and flatten the batch."""
         arrival = Arrival() if arrival is None else arrival
+        function('law', law)
+        instance('arrival', arrival, Arrival)
+        instance('limits', limits, VelocityLimits)
         starts, goals = array('starts', starts, 3), array('goals', goals, 'm')
         if goals.shape[-1] not in (2, 3) or (arrival.use_heading and goals.shape[-1] != 3):
             wanted = '(..., 3)' if arrival.use_heading else '(..., 2) or (..., 3)'
@@ -88,8 +99,6 @@ class Batch:
             raise ValueError(
                 f'duration must be below {MAX_STEPS / rate:g} s at that rate, got {duration:g}'
             )
-        if not isinstance(limits, VelocityLimits):
-            raise ValueError(f'limits must be VelocityLimits, got {limits!r:.60}')
         columns = {f'gain {index}': array(f'gain {index}', gain) for index, gain in enumerate(gains)}
         columns['turning_gain'] = array('turning_gain', turning_gain)
         columns['offset'] = floats('offset', arrival.offset)

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.saturation import VelocityLimits
+from diffdrive_jacobian.kinematics._checks import function
 from diffdrive_jacobian.simulation._batch import Array, Batch, Law, Outcomes, Rows
 from diffdrive_jacobian.simulation._block import Block, Keep, steered
 
@@ -87,6 +88,10 @@ def closed_loops(
         ValueError: An argument has a wrong shape or value, or the law gives something that does not fit.
     """
     batch = Batch.of(law, starts, goals, gains, rate, duration, arrival, turning_gain, limits, r, L)
+    if progress is not None:
+        function('progress', progress)
+    if on_step is not None:
+        function('on_step', on_step)
     return _drive(batch, None, progress, on_step)
 
 

@@ -18,87 +18,218 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._elementary import components, cos, operand, sin, stack, where
-from diffdrive_jacobian.kinematics.se2 import sinc
+from diffdrive_jacobian.kinematics._checks import floats, not_negative, positive
+from diffdrive_jacobian.kinematics._elementary import (
+    agree,
+    components,
+    cos,
+    evaluated,
+    operand,
+    sin,
+    sinc,
+    stack,
+    where,
+)
 
+ROUNDING = 1e-8
+"""How far a covariance may be from symmetric and semidefinite, relative to its largest entry."""
 # Taylor coefficients of _sinc_defect in the square of its argument, (-1)^n / (2n + 3)!
 _DEFECT = [(-1.0) ** n / math.factorial(2 * n + 3) for n in range(9)]
 
 
 def twist_covariance(
-    twist: ArrayLike, L: float, wheel_travel_variance: float, interval: float
+    twist: ArrayLike, L: Any, wheel_travel_variance: Any, interval: Any
 ) -> NDArray[np.float64]:
-    """Give the covariance of a twist measured by the wheels' travel over an interval: `W / interval`.
+    """Compute the covariance of a twist measured by the wheels' travel over an interval: `W / interval`.
 
     Args:
         twist: `[v, omega]`, shape (..., 2) (m/s, rad/s).
-        L: Wheel separation (m).
-        wheel_travel_variance: k, variance per way of each wheel (m).
-        interval: Time over which the travel is measured (s).
+        L: Wheel separation, positive, shape (...) (m).
+        wheel_travel_variance: k, variance per distance travelled of each wheel, zero or positive, shape
+            (...) (m).
+        interval: Time over which the travel is measured, positive, shape (...) (s).
 
     Returns:
         Covariance of `[v, omega]`, shape (..., 2, 2).
+
+    Raises:
+        ValueError: An argument has a wrong shape or sign, is not finite, or the result overflows.
     """
     v, omega = components('twist', twist, 2)
-    right, left = _wheel_variances(v, omega, L, wheel_travel_variance)
+    L, k = (
+        operand('L', L, positive),
+        operand('wheel_travel_variance', wheel_travel_variance, not_negative),
+    )
+    interval = operand('interval', interval, positive)
+    single = agree(twist=v, L=L, wheel_travel_variance=k, interval=interval)
+    names = 'twist, L, wheel_travel_variance and interval'
+    return _matrix(*evaluated(single, names, _twist_covariance, v, omega, L, k, interval))
+
+
+def _twist_covariance(v: Any, omega: Any, L: Any, k: Any, interval: Any) -> tuple[Any, ...]:
+    right, left = _wheel_variances(v, omega, L, k)
     cross = (right - left) / (2.0 * L * interval)
-    return _matrix((right + left) / (4.0 * interval), cross, cross, (right + left) / (L**2 * interval))
+    return (right + left) / (4.0 * interval), cross, cross, (right + left) / (L**2 * interval)
+
+
+def twist_covariance_checked(
+    twist: tuple[float, float], L: float, wheel_travel_variance: float, interval: float
+) -> NDArray[np.float64]:
+    """Compute what `twist_covariance` returns for one robot whose values were checked before.
+
+    Raises:
+        ValueError: The result overflows.
+    """
+    operands = *twist, L, wheel_travel_variance, interval
+    return _matrix(*evaluated(True, 'twist and interval', _twist_covariance, *operands))
 
 
 def propagate_covariance(
-    covariance: NDArray[np.float64],
+    covariance: ArrayLike,
     pose: ArrayLike,
     twist: ArrayLike,
     dt: Any,
-    L: float,
-    wheel_travel_variance: float,
+    L: Any,
+    wheel_travel_variance: Any,
 ) -> NDArray[np.float64]:
     """Carry the covariance of a pose along an arc.
 
     Args:
-        covariance: Covariance of `[x, y, theta]` at the start, shape (..., 3, 3).
+        covariance: Covariance of `[x, y, theta]` at the start, symmetric and positive semidefinite up
+            to rounding, shape (..., 3, 3).
         pose: Pose at the start, shape (..., 3).
         twist: The twist held, `[v, omega]`, shape (..., 2) (m/s, rad/s).
-        dt: Time for which it is held, not negative, shape (...) (s).
-        L: Wheel separation (m).
-        wheel_travel_variance: k, variance per way of each wheel (m).
+        dt: Time for which it is held, zero or positive, shape (...) (s).
+        L: Wheel separation, positive, shape (...) (m).
+        wheel_travel_variance: k, variance per distance travelled of each wheel, zero or positive, shape
+            (...) (m).
 
     Returns:
         Covariance of the pose at the end, shape (..., 3, 3), symmetric.
+
+    Raises:
+        ValueError: An argument has a wrong shape or sign, is not finite, or the result overflows; the
+            covariance is not symmetric and positive semidefinite.
     """
+    entries = covariance_entries('covariance', covariance)
     _, _, theta = components('pose', pose, 3)
     v, omega = components('twist', twist, 2)
-    dt = operand('dt', dt)
+    dt = operand('dt', dt, not_negative)
+    L, k = (
+        operand('L', L, positive),
+        operand('wheel_travel_variance', wheel_travel_variance, not_negative),
+    )
+    single = agree(covariance=entries[0], pose=theta, twist=v, dt=dt, L=L, wheel_travel_variance=k)
+    names = 'covariance, pose, twist, dt, L and wheel_travel_variance'
+    return _matrix(*evaluated(single, names, _propagated, *entries, theta, v, omega, dt, L, k))
+
+
+def propagate_checked(
+    covariance: NDArray[np.float64],
+    theta: float,
+    twist: tuple[float, float],
+    dt: float,
+    L: float,
+    wheel_travel_variance: float,
+) -> NDArray[np.float64]:
+    """Compute what `propagate_covariance` returns for one robot whose values were checked before.
+
+    Raises:
+        ValueError: The result overflows.
+    """
+    (pxx, pxy, pxt), (_, pyy, pyt), (_, _, ptt) = covariance.tolist()
+    operands = pxx, pxy, pxt, pyy, pyt, ptt, theta, *twist, dt, L, wheel_travel_variance
+    return _matrix(*evaluated(True, 'twist and time', _propagated, *operands))
+
+
+def covariance_entries(name: str, covariance: ArrayLike) -> tuple[Any, ...]:
+    """Return the entries xx, xy, xt, yy, yt, tt of covariances of a pose, shape (..., 3, 3).
+
+    Raises:
+        ValueError: The shape is another one, an entry is not finite, or the matrix is not symmetric and
+            positive semidefinite up to rounding.
+    """
+    made = floats(name, covariance)
+    if made.shape[-2:] != (3, 3):
+        raise ValueError(f'{name} must have shape (..., 3, 3), got {made.shape}')
+    rows = components(name, made.reshape(*made.shape[:-2], 9), 9)
+    if made.ndim == 2:
+        valid: Any = min(_margins(max(map(abs, rows)), *rows)) >= -ROUNDING
+    else:
+        largest = np.abs(made).max(axis=(-2, -1), initial=0.0)
+        valid = np.minimum.reduce(_margins(largest, *rows)) >= -ROUNDING
+    if valid is not True and not np.all(valid):
+        index = tuple(np.argwhere(~np.asarray(valid))[0])
+        raise ValueError(
+            f'{name} must be symmetric and positive semidefinite, got {made[index].tolist()}'
+        )
+    xx, xy, xt, _, yy, yt, _, _, tt = rows
+    return xx, xy, xt, yy, yt, tt
+
+
+def _margins(
+    largest: Any,
+    xx: Any,
+    xy: Any,
+    xt: Any,
+    yx: Any,
+    yy: Any,
+    yt: Any,
+    tx: Any,
+    ty: Any,
+    tt: Any,
+) -> tuple[Any, ...]:
+    """Compute what must not be negative: all principal minors, and minus the asymmetry.
+
+    They are relative to the largest entry, which keeps products from overflow.
+    """
+    scale = largest + (largest == 0.0)
+    a, b, c, d, e, f = xx / scale, xy / scale, xt / scale, yy / scale, yt / scale, tt / scale
+    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+    return (
+        *(a, d, f, a * d - b * b, a * f - c * c, d * f - e * e, determinant),
+        *(-abs(yx / scale - b), -abs(tx / scale - c), -abs(ty / scale - e)),
+    )
+
+
+def _propagated(
+    pxx: Any,
+    pxy: Any,
+    pxt: Any,
+    pyy: Any,
+    pyt: Any,
+    ptt: Any,
+    theta: Any,
+    v: Any,
+    omega: Any,
+    dt: Any,
+    L: Any,
+    wheel_travel_variance: Any,
+) -> tuple[Any, ...]:
     turn, way = omega * dt, v * dt
     c, s = cos(theta + turn), sin(theta + turn)
     # The displacement, seen from the end of the arc, then in the world.
     along, across = way * sinc(turn), -way * sinc(turn / 2.0) * sin(turn / 2.0)
     dx, dy = c * along - s * across, s * along + c * across
-    # Phi P Phi^T, written out for Phi = [[1, 0, -dy], [0, 1, dx], [0, 0, 1]].
-    shape = np.shape(covariance)[:-2]
-    pxx, pxy, pxt, _, pyy, pyt, _, _, ptt = components(
-        'covariance', np.reshape(covariance, (*shape, 9)), 9
-    )
-    # The noise, turned from the end's frame into the world.
+    # The noise, rotated from the frame at the end into the world.
     xx, xy, xt, yy, yt, tt = _noise_at_end(v, omega, dt, L, wheel_travel_variance)
+    # Phi P Phi^T, written out for Phi = [[1, 0, -dy], [0, 1, dx], [0, 0, 1]].
     end_xx = pxx - 2.0 * dy * pxt + dy * dy * ptt + c * c * xx - 2.0 * c * s * xy + s * s * yy
     end_xy = pxy - dy * pyt + dx * pxt - dx * dy * ptt + c * s * (xx - yy) + (c * c - s * s) * xy
     end_xt = pxt - dy * ptt + c * xt - s * yt
     end_yy = pyy + 2.0 * dx * pyt + dx * dx * ptt + s * s * xx + 2.0 * c * s * xy + c * c * yy
     end_yt = pyt + dx * ptt + s * xt + c * yt
     end_tt = ptt + tt
-    return _matrix(
-        end_xx, end_xy, end_xt, end_xy, end_yy, end_yt, end_xt, end_yt, end_tt
-    )  # fmt: skip
+    return end_xx, end_xy, end_xt, end_xy, end_yy, end_yt, end_xt, end_yt, end_tt
 
 
-def _wheel_variances(v: Any, omega: Any, L: float, wheel_travel_variance: float) -> tuple[Any, Any]:
+def _wheel_variances(v: Any, omega: Any, L: Any, wheel_travel_variance: Any) -> tuple[Any, Any]:
     """Give how fast the variance of the right and of the left wheel's travel grows (m^2/s)."""
     half = omega * L / 2.0
     return wheel_travel_variance * abs(v + half), wheel_travel_variance * abs(v - half)
 
 
-def _noise_at_end(v: Any, omega: Any, dt: Any, L: float, wheel_travel_variance: float) -> Any:
+def _noise_at_end(v: Any, omega: Any, dt: Any, L: Any, wheel_travel_variance: Any) -> Any:
     """Integrate `g W g^T` over an arc, in the body frame at its end; entries xx, xy, xt, yy, yt, tt.
 
     With phi = omega (T - s) the turn that is left, the columns of g are `[cos phi, -sin phi, 0]` and

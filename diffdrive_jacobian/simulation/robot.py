@@ -13,14 +13,29 @@ Source: MATH.md, "Motion of a virtual robot".
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.control.saturation import VelocityLimits, saturate
+from diffdrive_jacobian.kinematics._checks import (
+    array,
+    instance,
+    nanoseconds,
+    not_negative,
+    number,
+    positive,
+    read_only,
+)
+from diffdrive_jacobian.kinematics._elementary import components, operand
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
 from diffdrive_jacobian.kinematics.se2 import integrate
-from diffdrive_jacobian.simulation.odometry_noise import propagate_covariance, twist_covariance
+from diffdrive_jacobian.simulation.odometry_noise import (
+    covariance_entries,
+    propagate_checked,
+    twist_covariance_checked,
+)
 
 NANOSECONDS = 1_000_000_000
 STANDSTILL = (0.0, 0.0)
@@ -28,7 +43,12 @@ STANDSTILL = (0.0, 0.0)
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RobotModel:
-    """What does not change while the robot drives."""
+    """Parameters of a robot.
+
+    Raises:
+        ValueError: A length is not positive and finite, the variance or the timeout is negative, the
+            timeout is not an integer, or the limits are not those of one robot.
+    """
 
     wheel_radius: float = 0.033
     """r (m)."""
@@ -37,19 +57,49 @@ class RobotModel:
     limits: VelocityLimits = field(default_factory=VelocityLimits)
     """What the drives can do; none: the ideal unicycle."""
     command_timeout: int = 0
-    """How long a command is held (ns); 0: for ever."""
+    """Time for which a command is held (ns); 0: without end."""
     wheel_travel_variance: float = 1e-5
-    """k, variance of each wheel's travel per way (m)."""
+    """k, variance of each wheel's travel per distance travelled (m)."""
 
-    def limited(self, command: tuple[float, float]) -> tuple[float, float]:
-        """Hold a command `(v, omega)` to the limits, keeping its curvature."""
-        v, omega = saturate(*command, self.limits, self.wheel_radius, self.wheel_separation)
-        return float(v), float(omega)
+    def __post_init__(self) -> None:
+        """Check every value."""
+        for name, check in _CHECKS.items():
+            object.__setattr__(self, name, number(name, getattr(self, name), check))
+        instance('limits', self.limits, VelocityLimits)
+        if not self.limits.alike:
+            raise ValueError(f'limits must be numbers for one robot, got {self.limits}')
+        timeout = nanoseconds('command_timeout', self.command_timeout)
+        if timeout < 0:
+            raise ValueError(f'command_timeout must be zero or positive (ns), got {timeout}')
+        object.__setattr__(self, 'command_timeout', timeout)
+
+    def limited(self, command: ArrayLike) -> tuple[float, float]:
+        """Saturate a command `(v, omega)`, shape (2,), keeping its curvature.
+
+        Raises:
+            ValueError: It has another shape or is not finite.
+        """
+        v, omega = saturate(
+            *_pair('command', command), self.limits, self.wheel_radius, self.wheel_separation
+        )
+        return v, omega
+
+
+_CHECKS = {
+    'wheel_radius': positive,
+    'wheel_separation': positive,
+    'wheel_travel_variance': not_negative,
+}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Robot:
-    """A robot at an instant. Every method returns a new one; none looks at a clock."""
+    """A robot at a time. Every method returns a new one; none reads a clock.
+
+    Raises:
+        ValueError: A value is of another class or shape or not finite, the covariance is not symmetric
+            and positive semidefinite, or a time is not an integer.
+    """
 
     model: RobotModel
     stamp: int
@@ -66,6 +116,27 @@ class Robot:
     """The twist that is driven: the command within the limits."""
     commanded_at: int | None = None
     """When the command took effect (ns); None: none that moves."""
+
+    def __post_init__(self) -> None:
+        """Check every value. The methods below construct their results without these checks."""
+        instance('model', self.model, RobotModel)
+        pose = array('pose', self.pose, 3)
+        if pose.ndim != 1:
+            raise ValueError(f'pose must have shape (3,), got {pose.shape}')
+        if np.ndim(self.covariance) != 2:
+            raise ValueError(f'covariance must have shape (3, 3), got {np.shape(self.covariance)}')
+        covariance_entries('covariance', self.covariance)
+        values: dict[str, Any] = {
+            'stamp': nanoseconds('stamp', self.stamp),
+            'pose': read_only(pose),
+            'covariance': read_only(self.covariance),
+        }
+        for name in ('wheel_angles', 'command', 'twist'):
+            values[name] = _pair(name, getattr(self, name))
+        if self.commanded_at is not None:
+            values['commanded_at'] = nanoseconds('commanded_at', self.commanded_at)
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
 
     @property
     def expiry(self) -> int | None:
@@ -84,56 +155,90 @@ class Robot:
         return omega_R, omega_L
 
     def twist_covariance(self, interval: float) -> NDArray[np.float64]:
-        """Give the covariance of the twist as measured over an interval (s), shape (2, 2)."""
+        """Compute the covariance of the twist as measured over an interval (s), shape (2, 2).
+
+        Raises:
+            ValueError: The interval is not positive and finite, or the result overflows.
+        """
         model = self.model
-        return twist_covariance(
+        interval = operand('interval', interval, positive)
+        if type(interval) is not float:
+            raise ValueError(f'interval must be a single number, got shape {np.shape(interval)}')
+        return twist_covariance_checked(
             self.twist, model.wheel_separation, model.wheel_travel_variance, interval
         )
 
     def at(self, stamp: int) -> Robot:
-        """Advance to an instant, through the timeout if it strikes on the way.
+        """Advance to a time, through the timeout if it expires before.
+
+        Args:
+            stamp: The time (ns).
 
         Raises:
-            ValueError: The instant is earlier than this state.
+            ValueError: The time is earlier than this state, is not an integer, or so late that the
+                motion overflows.
         """
+        stamp = nanoseconds('stamp', stamp)
         if stamp < self.stamp:
-            raise ValueError(f'cannot go back from {self.stamp} ns to {stamp} ns')
+            raise ValueError(f'stamp cannot go back from {self.stamp} ns to {stamp} ns')
         expiry = self.expiry
         if expiry is None or expiry > stamp:
             return self._moved(stamp)
+        there = self._moved(expiry)
+        return _robot(
+            there.model, stamp, there.pose, there.covariance, there.wheel_angles, STANDSTILL, STANDSTILL
+        )
+
+    def commanded(self, command: ArrayLike, stamp: int) -> Robot:
+        """Apply a command from a time on, within the limits.
+
+        Args:
+            command: `[v, omega]`, shape (2,) (m/s, rad/s).
+            stamp: The time (ns).
+
+        Raises:
+            ValueError: The command has another shape or is not finite; or as `at`.
+        """
+        v, omega = _pair('command', command)
+        here, model = self.at(stamp), self.model
+        return _robot(
+            model,
+            here.stamp,
+            here.pose,
+            here.covariance,
+            here.wheel_angles,
+            (v, omega),
+            saturate(v, omega, model.limits, model.wheel_radius, model.wheel_separation),
+            None if v == omega == 0.0 else here.stamp,
+        )
+
+    def placed(self, pose: ArrayLike, covariance: ArrayLike, stamp: int) -> Robot:
+        """Restart at a pose; the command and the wheel angles go on.
+
+        Args:
+            pose: `[x, y, theta]`, shape (3,) (m, m, rad).
+            covariance: Its covariance, shape (3, 3).
+            stamp: The time (ns).
+
+        Raises:
+            ValueError: The pose or the covariance is invalid, as in the constructor; or as `at`.
+        """
         return replace(
-            self._moved(expiry),
-            command=STANDSTILL,
-            twist=STANDSTILL,
-            commanded_at=None,
-            stamp=stamp,
+            self.at(stamp),
+            pose=array('pose', pose, 3),
+            covariance=array('covariance', covariance, 3, 3),
         )
-
-    def commanded(self, command: tuple[float, float], stamp: int) -> Robot:
-        """Take a command `(v, omega)` at an instant, within the limits."""
-        here = self.at(stamp)
-        # Written out: dataclasses.replace takes three times as long, and this runs for every message.
-        return Robot(
-            model=here.model,
-            stamp=stamp,
-            pose=here.pose,
-            covariance=here.covariance,
-            wheel_angles=here.wheel_angles,
-            command=command,
-            twist=here.model.limited(command),
-            commanded_at=None if command == STANDSTILL else stamp,
-        )
-
-    def placed(self, pose: NDArray[np.float64], covariance: NDArray[np.float64], stamp: int) -> Robot:
-        """Begin anew at a pose; the command and the wheel angles go on."""
-        return replace(self.at(stamp), pose=pose, covariance=covariance)
 
     def remodelled(self, model: RobotModel, stamp: int, *, wheels_commanded: bool = False) -> Robot:
-        """Go on with another model: the running command is held to the new limits and timeout.
+        """Go on with another model: its limits and timeout apply to the running command.
 
         With `wheels_commanded` the command was one of wheel speeds: on other wheels these stay, and
         the twist changes.
+
+        Raises:
+            ValueError: The model is of another class; or as `at`.
         """
+        instance('model', model, RobotModel)
         here = self.at(stamp)
         command = here.command
         if wheels_commanded:
@@ -142,30 +247,67 @@ class Robot:
         return replace(here, model=model, command=command, twist=model.limited(command))
 
     def restarted(self, stamp: int) -> Robot:
-        """Stand still in the same place on another time line, where old instants mean nothing."""
+        """Stand still in the same place on another time line, where earlier times mean nothing.
+
+        Raises:
+            ValueError: The time is not an integer (ns).
+        """
         return replace(self, stamp=stamp, command=STANDSTILL, twist=STANDSTILL, commanded_at=None)
 
     def _moved(self, stamp: int) -> Robot:
         dt = (stamp - self.stamp) / NANOSECONDS
-        if dt == 0.0 or self.twist == STANDSTILL:
-            return replace(self, stamp=stamp)
-        model = self.model
-        (right, left), (omega_R, omega_L) = self.wheel_angles, self.wheel_speeds
-        # Written out, as in `commanded`.
-        return Robot(
-            model=model,
-            stamp=stamp,
-            pose=integrate(self.pose, self.twist, dt),
-            covariance=propagate_covariance(
-                self.covariance,
-                self.pose,
+        model, pose, covariance, angles = self.model, self.pose, self.covariance, self.wheel_angles
+        if dt != 0.0 and self.twist != STANDSTILL:
+            (right, left), (omega_R, omega_L) = angles, self.wheel_speeds
+            angles = _pair('wheel_angles', (right + omega_R * dt, left + omega_L * dt))
+            covariance = propagate_checked(
+                covariance,
+                float(pose[2]),
                 self.twist,
                 dt,
                 model.wheel_separation,
                 model.wheel_travel_variance,
-            ),
-            wheel_angles=(right + omega_R * dt, left + omega_L * dt),
-            command=self.command,
-            twist=self.twist,
-            commanded_at=self.commanded_at,
+            )
+            pose = integrate(pose, self.twist, dt)
+            pose.flags.writeable = covariance.flags.writeable = False
+        return _robot(
+            model, stamp, pose, covariance, angles, self.command, self.twist, self.commanded_at
         )
+
+
+_set = object.__setattr__
+
+
+def _robot(
+    model: RobotModel,
+    stamp: int,
+    pose: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    wheel_angles: tuple[float, float],
+    command: tuple[float, float],
+    twist: tuple[float, float],
+    commanded_at: int | None = None,
+) -> Robot:
+    """Construct a robot from values that were checked before: this runs for every message."""
+    robot = object.__new__(Robot)
+    _set(robot, 'model', model)
+    _set(robot, 'stamp', stamp)
+    _set(robot, 'pose', pose)
+    _set(robot, 'covariance', covariance)
+    _set(robot, 'wheel_angles', wheel_angles)
+    _set(robot, 'command', command)
+    _set(robot, 'twist', twist)
+    _set(robot, 'commanded_at', commanded_at)
+    return robot
+
+
+def _pair(name: str, value: ArrayLike) -> tuple[float, float]:
+    """Return two finite numbers as a tuple of floats.
+
+    Raises:
+        ValueError: It is something else.
+    """
+    first, second = components(name, value, 2)
+    if type(first) is not float:
+        raise ValueError(f'{name} must have shape (2,), got {np.shape(value)}')
+    return first, second

@@ -35,6 +35,21 @@ def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     return own, ros
 
 
+def parse(parser: argparse.ArgumentParser, own: Sequence[str]) -> argparse.Namespace:
+    """Parse a tool's own arguments; say where ROS arguments belong if there are some among them."""
+    options, unknown = parser.parse_known_args(own)
+    if unknown:
+        hint = ''
+        if any(word in _ROS_OPTIONS or ':=' in word for word in unknown):
+            hint = f' ({ROS_HINT})'
+        parser.error(f'unrecognized arguments: {" ".join(word.strip() for word in unknown)}{hint}')
+    return options
+
+
+ROS_HINT = 'ROS arguments come after --ros-args, as in --ros-args -p NAME:=VALUE'
+_ROS_OPTIONS = ('-p', '--param', '-r', '--remap', '--log-level', '--enclave', '-e')
+
+
 def _is_number(text: str) -> bool:
     # Python reads more as a number than people write on a command line.
     if '_' in text or not text.isascii():
@@ -50,8 +65,34 @@ def number(text: str) -> float:
     """Read a finite number."""
     text = text.strip()
     if not _is_number(text) or not math.isfinite(float(text)):
-        raise argparse.ArgumentTypeError(f'must be a finite number, got {text!r}')
+        hint = f' ({ROS_HINT})' if ':=' in text else ''
+        raise argparse.ArgumentTypeError(f'must be a finite number, got {text!r}{hint}')
     return float(text)
+
+
+def heading(text: str) -> float:
+    """Read a heading (rad); what is more than a turn is taken for degrees and refused."""
+    value = number(text)
+    if abs(value) > math.tau:
+        raise argparse.ArgumentTypeError(
+            f'must be in radians, at most 2 pi either way, got {text.strip()!r} '
+            f'({value:g} degrees are {math.radians(value):.6g} rad)'
+        )
+    return value
+
+
+def bag_folder(text: str) -> str:
+    """Read the name of a bag, which becomes a folder; that of a picture or a table is refused."""
+    stem, ending = os.path.splitext(text.rstrip('/'))
+    if ending.lower() in _FILE_ENDINGS:
+        raise argparse.ArgumentTypeError(
+            f'must name a bag, which is a folder, got {text!r}, the name of a file; '
+            f'did you mean {stem!r}?'
+        )
+    return text
+
+
+_FILE_ENDINGS = ('.png', '.svg', '.pdf', '.jpg', '.jpeg', '.csv', '.txt', '.yaml', '.yml')
 
 
 def coordinate(text: str) -> float:
@@ -128,6 +169,11 @@ def with_params_file(ros: list[str], options: argparse.Namespace) -> list[str]:
     if options.params_file is None:
         return ros
     return ['--ros-args', '--params-file', options.params_file, '--', *ros]
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun: `1 topic`, `2 topics`."""
+    return f'{number} {noun}' if number == 1 else f'{number} {noun}s'
 
 
 def complain(program: str, message: object, code: int = USER_ERROR) -> int:

@@ -41,6 +41,7 @@ from diffdrive_jacobian.ros.node import THROTTLE
 from diffdrive_jacobian.ros.runner import Runner, UserError, closed_world, ros_context, running
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools._params_file import warn_of_unused_files
 from diffdrive_jacobian.tools._progress import Drive
 from diffdrive_jacobian.tools._recording import begin_recording
 
@@ -168,6 +169,7 @@ def drive(
     timeout: float,
     parameters: Mapping[str, Any],
     recording: Recording | None = None,
+    ros: Sequence[str] = (),
 ) -> Outcome:
     """Drive to goals `[x, y, theta]`, shape (n, 3), in order, with all three nodes in this process.
 
@@ -178,6 +180,7 @@ def drive(
         timeout: How long it may take (s).
         parameters: Of go_to_goal, by name; they go before those of the ROS arguments.
         recording: What is recorded to; None: nothing is.
+        ros: The ROS arguments, to warn of parameter files that concern none of the nodes.
 
     Raises:
         UserError: A node cannot run with the parameters given.
@@ -185,11 +188,13 @@ def drive(
     context = runner.context
     wheels = Parameter('command_interface', value='wheels')
     robot = runner.add(lambda: VirtualRobot(context=context, parameter_overrides=[wheels]))
-    runner.add(lambda: WheelBridge(context=context))
+    bridge = runner.add(lambda: WheelBridge(context=context))
     overrides = [Parameter(name, value=value) for name, value in parameters.items()]
     controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=overrides))
     names = robot.parameters.left_wheel_name, robot.parameters.right_wheel_name
     observer = runner.add(lambda: Observer(goals, controller.arrival, names, context))
+    nodes: tuple[Node, ...] = (robot, bridge, controller, observer)
+    warn_of_unused_files(PROGRAM, ros, [node.get_fully_qualified_name() for node in nodes])
     discover = _recorder(runner, recording)
     begun = runner.seconds()
     with Drive(runner.seconds) as progress:
@@ -257,7 +262,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
     own, ros = _cli.split_arguments(arguments)
     parser = _parser()
-    options = parser.parse_args(own)
+    options = _cli.parse(parser, own)
     if len(options.coordinates) % 2:
         parser.error(f'coordinates come in pairs X Y, got {len(options.coordinates)} of them')
     if options.lockstep and options.open:
@@ -283,6 +288,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                 timeout=options.timeout,
                 parameters=_parameters(options),
                 recording=recording,
+                ros=ros,
             )
     except UserError as error:
         if recording is not None:
@@ -431,7 +437,7 @@ def _parser() -> argparse.ArgumentParser:
         '--tolerance', type=_cli.tolerance, help='distance that counts as arrived (m); 0.02'
     )
     parser.add_argument(
-        '--heading', type=_cli.number, help='heading to take at the last goal (rad); else any will do'
+        '--heading', type=_cli.heading, help='heading at the last goal (rad) (default: any)'
     )
     parser.add_argument(
         '--controller', choices=CONTROLLERS, help='law of the controller; go_to_goal, unless a file says'
@@ -441,6 +447,7 @@ def _parser() -> argparse.ArgumentParser:
         '-o',
         '--output',
         metavar='BAG',
+        type=_cli.bag_folder,
         help='where the run is recorded, as a rosbag2 bag, and drawn, as BAG.png; drive_DATE-TIME',
     )
     parser.add_argument('--no-record', action='store_true', help='neither record nor draw')

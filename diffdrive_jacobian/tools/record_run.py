@@ -102,7 +102,8 @@ class Status:
         rate = (recorder.messages - self._messages) / elapsed
         self._shown, self._messages = now, recorder.messages
         line = (
-            f'{recorder.messages} messages of {len(recorder.topics)} topics, {rate:.0f} per second, '
+            f'{_cli.counted(recorder.messages, "message")} of '
+            f'{_cli.counted(len(recorder.topics), "topic")}, {rate:.0f} per second, '
             f'{self._recording.journal.size / 1e6:.1f} MB, {now - self._recording.started:.0f} s'
         )
         if lost := sum(self._recording.lost.values()):
@@ -121,7 +122,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
     own, ros = _cli.split_arguments(arguments)
     parser = _parser()
-    options = parser.parse_args(own)
+    options = _cli.parse(parser, own)
     topics = tuple(options.topics)
     selection = Selection(
         topics=topics or (() if options.regex else RUN_TOPICS),
@@ -155,7 +156,10 @@ def describe(bag: Path, summary: Summary, *, complete: bool = True) -> str:
     topics = ', '.join(f'{topic} {count}' for topic, count in sorted(summary.topics.items()) if count)
     seconds = (summary.end - summary.start) / 1e9
     lost = f'; {sum(summary.lost.values())} lost' if summary.lost else ''
-    return f'{bag} is {what}: {summary.messages} messages in {seconds:.1f} s ({topics}){lost}'
+    return (
+        f'{bag} is {what}: {_cli.counted(summary.messages, "message")} in {seconds:.1f} s '
+        f'({topics}){lost}'
+    )
 
 
 def _pattern(text: str) -> str:
@@ -180,7 +184,13 @@ def _parser() -> argparse.ArgumentParser:
         nargs='*',
         help=f'topics; else those of a run: {", ".join(RUN_TOPICS)}',
     )
-    parser.add_argument('-o', '--output', metavar='BAG', help='the directory to write; run_DATE-TIME')
+    parser.add_argument(
+        '-o',
+        '--output',
+        metavar='BAG',
+        type=_cli.bag_folder,
+        help='the directory to write; run_DATE-TIME',
+    )
     parser.add_argument(
         '-s', '--storage', choices=sorted(STORAGES), default='mcap', help='file format; %(default)s'
     )

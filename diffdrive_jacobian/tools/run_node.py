@@ -18,6 +18,7 @@ from diffdrive_jacobian.ros.parameters import NodeParameters, specifications
 from diffdrive_jacobian.ros.runner import UserError, ros_context, running
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools._params_file import warn_of_unused_files
 
 NODES: dict[str, tuple[str, type[NodeParameters]]] = {
     'virtual_robot': ('VirtualRobot', VirtualRobotParameters),
@@ -39,13 +40,15 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
     # Only the one that runs, for each costs time at the start.
     make = getattr(importlib.import_module(f'diffdrive_jacobian.nodes.{name}'), class_name)
     own, ros = _cli.split_arguments(arguments)
-    ros = _cli.with_params_file(ros, _parser(name, make, parameters).parse_args(own))
+    options = _cli.parse(_parser(name, make, parameters), own)
+    ros = _cli.with_params_file(ros, options)
     try:
         with (
             ros_context([name, *ros]) as context,
             running(context, closed_world=False) as runner,
         ):
-            runner.add(lambda: make(context=context))
+            node = runner.add(lambda: make(context=context))
+            warn_of_unused_files(name, ros, [node.get_fully_qualified_name()])
             runner.spin(lambda: signals.count > 0)
     except UserError as error:
         return _cli.complain(name, error)

@@ -274,7 +274,7 @@ def _parser() -> argparse.ArgumentParser:
     _cli.add_wait_matching(parser, 'goal_pose has', 'one without it')
     parser.add_argument(
         '--heading',
-        type=_cli.number,
+        type=_cli.heading,
         default=0.0,
         help='heading at the goal (rad), 0 without it; counts if the controller has use_goal_heading',
     )
