@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 
-from diffdrive_jacobian.bags.definitions import UnknownTypeError, definition
+from diffdrive_jacobian.bags.definitions import UnknownTypeError, definition, message_class
 from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
 from diffdrive_jacobian.bags.qos import to_fields, to_hear_all
 from diffdrive_jacobian.ros.parameters import ParameterError
@@ -215,16 +214,3 @@ def _profiles(publishers: list[Any]) -> tuple[dict[str, Any], ...]:
         if fields not in profiles:
             profiles.append(fields)
     return tuple(profiles)
-
-
-def message_class(name: str) -> Any:
-    """Give the Python class of a message type, `package/msg/Name`.
-
-    Raises:
-        UnknownTypeError: It is not installed.
-    """
-    package, _, message = name.split('/')
-    try:
-        return getattr(importlib.import_module(f'{package}.msg'), message)
-    except (ImportError, AttributeError) as error:
-        raise UnknownTypeError(f'the Python code of {name} is not installed') from error

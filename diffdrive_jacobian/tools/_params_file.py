@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
-
+from diffdrive_jacobian.bags.bounded_yaml import YAML_ERRORS, load_yaml
 from diffdrive_jacobian.ros.runner import UserError
+from diffdrive_jacobian.text import printable
 
 
 def robot_parameters(path: str) -> dict[str, Any]:
@@ -18,14 +17,14 @@ def robot_parameters(path: str) -> dict[str, Any]:
         UserError: The file is none of that kind.
     """
     try:
-        content = YAML(typ='safe').load(Path(path))
+        content = load_yaml(Path(path))
         values: dict[str, Any] = {}
         for key, section in content.items():
             if key.rstrip('/').split('/')[-1] in ('virtual_robot', '**'):
                 values.update(_flat(section['ros__parameters'], ''))
-    except (OSError, UnicodeError, YAMLError, AttributeError, KeyError, TypeError) as error:
+    except (OSError, AttributeError, KeyError, TypeError, *YAML_ERRORS) as error:
         raise UserError(
-            f'--params-file must be a file of ROS parameters, got {path}: {_in_one_line(error)}'
+            f'--params-file must be a file of ROS parameters, got {path}: {_on_one_line(error)}'
         ) from error
     return values
 
@@ -40,5 +39,5 @@ def _flat(section: dict[str, Any], prefix: str) -> dict[str, Any]:
     return flat
 
 
-def _in_one_line(error: Exception) -> str:
-    return ' '.join(str(error).split())
+def _on_one_line(error: Exception) -> str:
+    return printable(' '.join(str(error).split()), 200)

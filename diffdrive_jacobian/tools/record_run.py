@@ -14,6 +14,7 @@ from diffdrive_jacobian.bags.recorder import RUN_TOPICS, Recorder, Selection
 from diffdrive_jacobian.bags.recording import Recording
 from diffdrive_jacobian.ros.runner import UserError, ros_context, running
 from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._recording import begin_recording
 
@@ -128,7 +129,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     except OSError as error:
         return _cli.complain(PROGRAM, error)
     bag = recording.bag
-    print(f'recording to {bag}; Ctrl-C ends it', flush=True)
+    print(f'recording to {printable(bag, PATH_LIMIT)}; Ctrl-C ends it', flush=True)
     try:
         summary = record(recording, selection, ros, signals, max_duration=options.max_duration)
     except UserError as error:
@@ -149,12 +150,14 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
 
 
 def describe(bag: Path, summary: Summary) -> str:
-    """Say in a line what a bag holds."""
+    """Return a line about what a bag holds."""
+    name = printable(bag, PATH_LIMIT)
     if summary.start is None or summary.end is None:
-        return f'{bag} is complete and empty: no message came'
-    topics = ', '.join(f'{topic} {count}' for topic, count in sorted(summary.topics.items()) if count)
+        return f'{name} is complete and empty: no message came'
+    counts = sorted(summary.topics.items())
+    topics = ', '.join(f'{printable(topic)} {count}' for topic, count in counts if count)
     seconds = (summary.end - summary.start) / 1e9
-    return f'{bag} is complete: {summary.messages} messages in {seconds:.1f} s ({topics})'
+    return f'{name} is complete: {summary.messages} messages in {seconds:.1f} s ({topics})'
 
 
 def _pattern(text: str) -> str:
