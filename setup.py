@@ -35,7 +35,16 @@ setup(
         (f'share/{PACKAGE}/config', sorted(glob('config/*.yaml'))),
     ],
     python_requires='>=3.10',
-    install_requires=['numpy>=1.24', 'rich>=12', 'rosbags>=0.11.9,<0.12', 'ruamel.yaml>=0.17'],
+    install_requires=[
+        'numpy>=1.24',
+        'rich>=12',
+        'rosbags>=0.11.9,<0.12',
+        'ruamel.yaml>=0.17',
+        # rosbags brings these, too; the tools import them themselves.
+        'apsw',
+        'backports.zstd; python_version<"3.14"',
+        'lz4',
+    ],
     # rclpy is not required here: a ROS installation brings its own, under another name than PyPI's.
     extras_require={
         'jazzy': [

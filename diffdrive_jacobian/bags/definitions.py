@@ -1,18 +1,29 @@
-"""What a message type means, as the installed message packages say it.
+"""Message types of the installed packages: their definitions and their Python classes.
 
 A bag stores the full definition of each type, so that it can be read where the type is not installed.
+
+Names of types come from bags and from other processes. A package is imported only if its name is a valid
+one, the first module of that name on the import path lies in an installation prefix, and the share
+directory of the same prefix holds the .msg file. All of that is checked without importing anything.
 """
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import json
 import re
 from dataclasses import dataclass
 from functools import cache
+from importlib.machinery import PathFinder
 from pathlib import Path
+from typing import Any
+
+from diffdrive_jacobian.text import printable
 
 DELIMITER = '=' * 80
+_NAME = re.compile(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9_]*)')
+_LIBRARIES = (('lib',), ('lib64',), ('local', 'lib'), ('Lib',))
+"""Where the Python packages of a prefix are, relative to it."""
 _FIELD = re.compile(r'^\s*([A-Za-z]\w*(?:/[A-Za-z]\w*)?)(?:<=\d+)?(?:\[[^]]*\])?\s+[A-Za-z]\w*')
 _PRIMITIVE = re.compile(r'bool|byte|char|float(32|64)|u?int(8|16|32|64)|w?string')
 
@@ -43,19 +54,38 @@ def definition(name: str) -> Definition:
     Raises:
         UnknownTypeError: No installed package defines it.
     """
-    package, interface, message = _split(name)
-    if interface != 'msg':
-        raise UnknownTypeError(f'only messages can be recorded, got {name!r}')
+    package, message = _split(name)
     described = json.loads(_file(package, message, '.json').read_text(encoding='utf-8'))
     hashes = {one['type_name']: one['hash_string'] for one in described['type_hashes']}
     return Definition(name=name, text=_full_text(package, message, set()), type_hash=hashes[name])
 
 
-def _split(name: str) -> tuple[str, str, str]:
-    parts = name.split('/')
-    if len(parts) != 3 or not all(parts):
-        raise UnknownTypeError(f'a message type must be named package/msg/Name, got {name!r}')
-    return parts[0], parts[1], parts[2]
+@cache
+def message_class(name: str) -> Any:
+    """Return the Python class of a message type.
+
+    Args:
+        name: `package/msg/Name`.
+
+    Raises:
+        UnknownTypeError: No installed package defines it, or its Python code is not installed.
+    """
+    package, message = _split(name)
+    _file(package, message, '.msg')
+    try:
+        return getattr(importlib.import_module(f'{package}.msg'), message)
+    except (ImportError, AttributeError) as error:
+        raise UnknownTypeError(f'the Python code of {name} is not installed') from error
+
+
+def _split(name: str) -> tuple[str, str]:
+    """Return package and message of a valid name of a message type."""
+    match = _NAME.fullmatch(name)
+    if match is None:
+        raise UnknownTypeError(
+            f'a message type must be named package/msg/Name, got {printable(repr(name))}'
+        )
+    return match[1], match[2]
 
 
 def _full_text(package: str, message: str, seen: set[tuple[str, str]]) -> str:
@@ -82,14 +112,26 @@ def _dependencies(package: str, text: str) -> set[tuple[str, str]]:
 
 
 def _file(package: str, message: str, ending: str) -> Path:
-    """Find a file of an interface package: it lies in the share directory beside its Python code."""
-    try:
-        spec = importlib.util.find_spec(package)
-    except (ImportError, ValueError):
-        spec = None
-    if spec is not None and spec.origin is not None:
-        for parent in Path(spec.origin).parents:
-            path = parent / 'share' / package / 'msg' / f'{message}{ending}'
-            if path.is_file():
-                return path
+    """Return a file of an interface package: it is in the prefix in which its Python code is, too."""
+    for prefix in _prefixes(package):
+        path = prefix / 'share' / package / 'msg' / f'{message}{ending}'
+        if path.is_file():
+            return path
     raise UnknownTypeError(f'no installed package defines {package}/msg/{message}')
+
+
+def _prefixes(package: str) -> list[Path]:
+    """Return the installation prefixes that the module which `import` would find may belong to."""
+    # For a name without dots this imports nothing, not even a parent.
+    spec = PathFinder.find_spec(package)
+    if spec is None or spec.origin is None:
+        return []
+    library = Path(spec.origin).parent.parent
+    # With an empty entry in PYTHONPATH whatever lies beside a bag would be found.
+    if not library.is_absolute() or library.resolve() == Path.cwd():
+        return []
+    return [
+        prefix
+        for prefix in library.parents
+        if any(library.relative_to(prefix).parts[: len(one)] == one for one in _LIBRARIES)
+    ]

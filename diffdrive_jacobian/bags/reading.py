@@ -18,8 +18,9 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
 from diffdrive_jacobian.bags.bounded_reader import BoundedReader
+from diffdrive_jacobian.bags.definitions import message_class
 from diffdrive_jacobian.bags.limits import TooLargeError
-from diffdrive_jacobian.bags.recorder import PARAMETERS, message_class
+from diffdrive_jacobian.bags.recorder import PARAMETERS
 from diffdrive_jacobian.ros.messages import (
     MessageError,
     from_joint_state,
@@ -27,14 +28,21 @@ from diffdrive_jacobian.ros.messages import (
     from_time,
     from_twist,
 )
-from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.text import PATH_LIMIT, printable
 
 WHEELS = ('left_wheel_joint', 'right_wheel_joint')
 """Joints that are taken for wheels where no parameters tell their names: left, right."""
 
 
 class BagError(Exception):
-    """A bag cannot be read, or lacks what is needed; the message says which and what."""
+    """A bag cannot be read, or lacks what is needed; the message says which and what.
+
+    The message is safe to print, though names in it may come from the bag.
+    """
+
+    def __init__(self, message: str) -> None:
+        """Escape control characters in the message."""
+        super().__init__(printable(message, PATH_LIMIT))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -158,7 +166,8 @@ def custom_data(reader: Reader) -> dict[str, str]:
     custom = reader.storage.metadata.custom or {}
     if not isinstance(custom, dict) or not all(isinstance(text, str) for text in custom.values()):
         raise BagError(
-            f'{reader.path} is damaged: its custom_data must be texts by name, got {custom!r}'
+            f'{reader.path} is damaged: its custom_data must be texts by name, '
+            f'got {printable(repr(custom))}'
         )
     return custom
 

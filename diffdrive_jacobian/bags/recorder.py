@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 import time
@@ -18,7 +17,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
-from diffdrive_jacobian.bags.definitions import UnknownTypeError, definition
+from diffdrive_jacobian.bags.definitions import UnknownTypeError, definition, message_class
 from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
 from diffdrive_jacobian.bags.missed import MissedMessages
 from diffdrive_jacobian.bags.parameter_query import ParameterQuery
@@ -306,16 +305,3 @@ def _profiles(publishers: list[Any]) -> tuple[dict[str, Any], ...]:
         if fields not in profiles:
             profiles.append(fields)
     return tuple(profiles)
-
-
-def message_class(name: str) -> Any:
-    """Give the Python class of a message type, `package/msg/Name`.
-
-    Raises:
-        UnknownTypeError: It is not installed.
-    """
-    package, _, message = name.split('/')
-    try:
-        return getattr(importlib.import_module(f'{package}.msg'), message)
-    except (ImportError, AttributeError) as error:
-        raise UnknownTypeError(f'the Python code of {name} is not installed') from error

@@ -1,32 +1,93 @@
-"""Signals that only count: the one who runs the loop decides what they mean.
+"""Signals that are only counted: the code that runs the loop decides what they mean.
 
 This module imports nothing slow, so that an entry point can catch signals before it loads rclpy.
 """
 
 from __future__ import annotations
 
+import os
 import signal
+import threading
+import time
+from collections.abc import Callable
 from types import FrameType
 
 CAUGHT = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+TOGETHER = 0.1
+"""Signals this soon after the first are the same request, as from a terminal and a parent (s)."""
+GRACE = 2.0
+"""How long a process may go on after a second request without reading `count` (s)."""
+MAX_GRACE = 10.0
+"""How long it may go on after a second request in any case (s)."""
 
 
 class Signals:
-    """Counts SIGINT, SIGTERM and SIGHUP in the place of their ending the process."""
+    """Counts SIGINT, SIGTERM and SIGHUP, which end the process otherwise."""
+
+    _read = 0.0
+    _ignored = False
 
     def __init__(self) -> None:
-        """Nothing was caught yet."""
-        self.count = 0
+        """Start with no signal."""
+        self._count = 0
+
+    @property
+    def count(self) -> int:
+        """Number of signals caught so far."""
+        self._read = time.monotonic()
+        return self._count
+
+    @count.setter
+    def count(self, value: int) -> None:
+        self._count = value
 
     def catch(self) -> None:
-        """Count from here on."""
+        """Count signals from now on."""
         for number in CAUGHT:
             signal.signal(number, self._on_signal)
 
     def ignore(self) -> None:
-        """Let no signal disturb the interpreter while it exits."""
+        """Ignore signals from now on, so that none disturbs the interpreter while it exits."""
+        self._ignored = True
         for number in CAUGHT:
             signal.signal(number, signal.SIG_IGN)
 
+    def exit_on_second(self, end: Callable[[], object]) -> None:
+        """End the process on a second request to end, whatever its main thread does then.
+
+        A process that still reads `count` reacts to signals by itself, and has `MAX_GRACE` to end. A
+        process that does not, since it is in a long calculation or waits for something, has `GRACE`. A
+        thread watches over this, for Python runs signal handlers only between instructions of the main
+        thread. Code that holds Python's interpreter lock delays it.
+
+        Args:
+            end: Ends the process (`os._exit`); called from the thread.
+        """
+        reader, writer = os.pipe()
+        os.set_blocking(writer, False)
+        signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+        # What was caught before is not in the pipe.
+        watch = threading.Thread(
+            target=self._watch, args=(reader, self._count > 0, end), name='signals', daemon=True
+        )
+        watch.start()
+
+    def _watch(self, reader: int, requested: bool, end: Callable[[], object]) -> None:
+        first = time.monotonic() if requested else None
+        while True:
+            if os.read(reader, 1)[0] not in CAUGHT:
+                continue
+            now = time.monotonic()
+            if first is None:
+                first = now
+            elif now - first >= TOGETHER:
+                break
+        while not self._ignored:
+            left = min(max(now, self._read) + GRACE, now + MAX_GRACE) - time.monotonic()
+            if left <= 0.0:
+                end()
+                return
+            time.sleep(min(left, 0.1))
+
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self.count += 1
+        self._count += 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
@@ -10,19 +9,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
-from ruamel.yaml.events import (
-    CollectionEndEvent,
-    CollectionStartEvent,
-    MappingStartEvent,
-    ScalarEvent,
-)
-
+from diffdrive_jacobian.bags.bounded_yaml import YAML_ERRORS, load_yaml
 from diffdrive_jacobian.ros.runner import UserError
-
-MAX_SIZE = 1_000_000
-"""Larger files are not parsed for the names of nodes (bytes)."""
+from diffdrive_jacobian.text import printable
 
 
 def robot_parameters(path: str) -> dict[str, Any]:
@@ -32,14 +21,14 @@ def robot_parameters(path: str) -> dict[str, Any]:
         UserError: The file is none of that kind.
     """
     try:
-        content = YAML(typ='safe').load(Path(path))
+        content = load_yaml(Path(path))
         values: dict[str, Any] = {}
         for key, section in content.items():
             if key.rstrip('/').split('/')[-1] in ('virtual_robot', '**'):
                 values.update(_flat(section['ros__parameters'], ''))
-    except (OSError, UnicodeError, YAMLError, AttributeError, KeyError, TypeError) as error:
+    except (OSError, AttributeError, KeyError, TypeError, *YAML_ERRORS) as error:
         raise UserError(
-            f'--params-file must be a file of ROS parameters, got {path}: {_in_one_line(error)}'
+            f'--params-file must be a file of ROS parameters, got {path}: {_on_one_line(error)}'
         ) from error
     return values
 
@@ -65,43 +54,20 @@ def warn_of_unused_files(program: str, ros: Sequence[str], nodes: Sequence[str])
 
 
 def node_names(path: str) -> list[str]:
-    """Read the names of nodes, with wildcards, for which a file has parameters.
-
-    Only the structure of the file is parsed and no alias is expanded. Files that rcl does not read
-    either, and those larger than MAX_SIZE, give no names.
-    """
+    """Read the names of nodes, with wildcards, that have parameters in a file; none if it is invalid."""
     try:
-        if os.path.getsize(path) > MAX_SIZE:
-            return []
-        names = dict.fromkeys(_node_names(Path(path).read_text()))
-    except (OSError, UnicodeError, YAMLError):
+        content = load_yaml(Path(path))
+    except (OSError, *YAML_ERRORS):
         return []
-    return list(names)
+    return list(dict.fromkeys(_node_names(content, '')))
 
 
-def _node_names(text: str) -> Iterator[str]:
-    # Of each collection that is open: its key in the collection around it, the key whose value comes
-    # next, and whether it is a mapping.
-    outer: list[str | None] = []
-    key: str | None = None
-    mapping = False
-    stack: list[tuple[str | None, bool]] = []
-    for event in YAML(typ='safe', pure=True).parse(text):
-        if isinstance(event, CollectionStartEvent):
-            stack.append((key, mapping))
-            outer.append(key)
-            key, mapping = None, isinstance(event, MappingStartEvent)
-        elif isinstance(event, CollectionEndEvent):
-            _, mapping = stack.pop()
-            outer.pop()
-            key = None
-        elif isinstance(event, ScalarEvent) and mapping and key is None:
-            key = str(event.value)
-            if key == 'ros__parameters':
-                names = [name.strip('/') for name in outer if name is not None]
-                yield '/' + '/'.join(names)
+def _node_names(section: Any, prefix: str) -> Iterator[str]:
+    for key, value in section.items() if isinstance(section, dict) else ():
+        if key == 'ros__parameters':
+            yield prefix
         else:
-            key = None
+            yield from _node_names(value, f'{prefix}/{str(key).strip("/")}')
 
 
 def concerns(name: str, node: str) -> bool:
@@ -123,5 +89,5 @@ def _flat(section: dict[str, Any], prefix: str) -> dict[str, Any]:
     return flat
 
 
-def _in_one_line(error: Exception) -> str:
-    return ' '.join(str(error).split())
+def _on_one_line(error: Exception) -> str:
+    return printable(' '.join(str(error).split()), 200)

@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import importlib
 import os
+import select
 import sys
+from functools import partial
 
 from diffdrive_jacobian.ros.signals import Signals
 
+INTERRUPTED = 130
 
-def _run(module: str, function: str, *arguments: str) -> int:
+
+def _run_tool(module: str) -> int:
+    """Run a tool; a second signal ends it even if it does not react."""
+    return _run(module, 'main', watched=True)
+
+
+def _run(module: str, function: str, *arguments: str, watched: bool = False) -> int:
     signals = Signals()
     signals.catch()
     for name in ('stdout', 'stderr'):
@@ -18,6 +27,8 @@ def _run(module: str, function: str, *arguments: str) -> int:
             setattr(sys, name, open(os.devnull, 'w'))  # noqa: SIM115
     try:
         run = getattr(importlib.import_module(f'diffdrive_jacobian.tools.{module}'), function)
+        if watched:
+            signals.exit_on_second(partial(_exit, module))
         code: int = run(*arguments, sys.argv[1:], signals)
         sys.stdout.flush()
     except BrokenPipeError:
@@ -30,6 +41,16 @@ def _run(module: str, function: str, *arguments: str) -> int:
     finally:
         signals.ignore()
     return code
+
+
+def _exit(program: str) -> None:
+    """End the process without clean-up, and report that."""
+    line = f'{program}: ended by a second signal, before it could finish\n'
+    error = sys.stderr.fileno()
+    # Whoever should read it may have stopped reading.
+    if select.select([], [error], [], 0.0)[1]:
+        os.write(error, line.encode())
+    os._exit(INTERRUPTED)
 
 
 def virtual_robot() -> int:
@@ -49,34 +70,34 @@ def wheel_bridge() -> int:
 
 def drive_to() -> int:
     """Run the tool drive_to."""
-    return _run('drive_to', 'main')
+    return _run_tool('drive_to')
 
 
 def send_goal() -> int:
     """Run the tool send_goal."""
-    return _run('send_goal', 'main')
+    return _run_tool('send_goal')
 
 
 def record_run() -> int:
     """Run the tool record_run."""
-    return _run('record_run', 'main')
+    return _run_tool('record_run')
 
 
 def replay_run() -> int:
     """Run the tool replay_run."""
-    return _run('replay_run', 'main')
+    return _run_tool('replay_run')
 
 
 def recover_run() -> int:
     """Run the tool recover_run."""
-    return _run('recover_run', 'main')
+    return _run_tool('recover_run')
 
 
 def plot_run() -> int:
     """Run the tool plot_run."""
-    return _run('plot_run', 'main')
+    return _run_tool('plot_run')
 
 
 def sweep_gains() -> int:
     """Run the tool sweep_gains."""
-    return _run('sweep_gains', 'main')
+    return _run_tool('sweep_gains')

@@ -15,6 +15,7 @@ from diffdrive_jacobian.bags.recorder import RUN_TOPICS, Recorder, Selection
 from diffdrive_jacobian.bags.recording import Recording, RecordingError
 from diffdrive_jacobian.ros.runner import UserError, ros_context, running
 from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._recording import begin_recording
 
@@ -134,7 +135,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     except OSError as error:
         return _cli.complain(PROGRAM, error)
     bag = recording.bag
-    print(f'recording to {bag}; Ctrl-C ends it', flush=True)
+    print(f'recording to {printable(bag, PATH_LIMIT)}; Ctrl-C ends it', flush=True)
     try:
         summary = record(recording, selection, ros, signals, max_duration=options.max_duration)
     except UserError as error:
@@ -150,16 +151,14 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
 
 def describe(bag: Path, summary: Summary, *, complete: bool = True) -> str:
     """Return a line about what a bag holds."""
-    what = 'complete' if complete else 'incomplete'
+    what = f'{printable(bag, PATH_LIMIT)} is {"complete" if complete else "incomplete"}'
     if summary.start is None or summary.end is None:
-        return f'{bag} is {what} and empty: no message came'
-    topics = ', '.join(f'{topic} {count}' for topic, count in sorted(summary.topics.items()) if count)
+        return f'{what} and empty: no message came'
+    counts = sorted(summary.topics.items())
+    topics = ', '.join(f'{printable(topic)} {count}' for topic, count in counts if count)
     seconds = (summary.end - summary.start) / 1e9
     lost = f'; {sum(summary.lost.values())} lost' if summary.lost else ''
-    return (
-        f'{bag} is {what}: {_cli.counted(summary.messages, "message")} in {seconds:.1f} s '
-        f'({topics}){lost}'
-    )
+    return f'{what}: {_cli.counted(summary.messages, "message")} in {seconds:.1f} s ({topics}){lost}'
 
 
 def _pattern(text: str) -> str:

@@ -22,20 +22,20 @@ from diffdrive_jacobian.bags.journal import (
 from diffdrive_jacobian.bags.recording import JOURNAL, journal_of
 from diffdrive_jacobian.bags.remains import NotABagError, Remains
 from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools.record_run import describe
 
-if sys.version_info >= (3, 14):
-    pass
-else:
-    pass
-
 PROGRAM = 'recover_run'
 RECOVERED = '_recovered'
+MAX_LOSSES = 50
+"""How many losses are listed."""
+MAX_LINE = 400
+"""How long the line of each may be."""
 
 
 class NothingToSaveError(Exception):
-    """There is nothing to be made a bag of."""
+    """There is nothing to make a bag of; the arguments are the reason, and what could not be read."""
 
 
 class InterruptedByUserError(Exception):
@@ -92,7 +92,7 @@ def recover(what: Path, output: Path | None, storage: str | None, signals: Signa
         if whole and not losses:
             raise NothingToSaveError(f'{what} is complete: nothing to recover')
         if not kinds[Message]:
-            raise NothingToSaveError('\n'.join([f'{what} holds no message that can be saved', *losses]))
+            raise NothingToSaveError(f'{what} holds no message that can be saved', *losses)
         summary = build_bag(lambda: islice(records(), kinds.total()), target, storage or remains.storage)
         return Report(target, summary, losses, left_out)
 
@@ -114,21 +114,29 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         print(f'{PROGRAM}: interrupted: no bag was made', file=sys.stderr)
         return _cli.INTERRUPTED
     except NothingToSaveError as error:
-        print(f'{PROGRAM}: {error}', file=sys.stderr)
+        reason, *losses = error.args
+        print(f'{PROGRAM}: {printable(reason, PATH_LIMIT)}', *_listed(losses), sep='\n', file=sys.stderr)
         return _cli.FAILED
     except (NotABagError, JournalError, FileExistsError) as error:
-        return _cli.complain(PROGRAM, error)
+        return _cli.complain(PROGRAM, printable(error, PATH_LIMIT))
     except (OSError, sqlite3.Error) as error:
-        print(f'{PROGRAM}: error: no bag was made: {error}', file=sys.stderr)
+        print(f'{PROGRAM}: error: no bag was made: {printable(error, PATH_LIMIT)}', file=sys.stderr)
         return (
             _cli.USER_ERROR
             if isinstance(error, PermissionError | FileNotFoundError | NotADirectoryError)
             else _cli.FAILED
         )
     print(describe(report.bag, report.summary))
-    for line in report.lost or ['nothing was lost that could be seen']:
-        print(f'lost: {line}' if report.lost else line)
+    print(*_listed(report.lost, 'lost: ') or ['nothing was lost that could be seen'], sep='\n')
     return _cli.FAILED if report.left_out else _cli.DONE
+
+
+def _listed(losses: Sequence[str], prefix: str = '') -> list[str]:
+    """Return one line for each loss, of a large number only the first."""
+    lines = [prefix + printable(one, MAX_LINE) for one in losses[:MAX_LOSSES]]
+    if len(losses) > MAX_LOSSES:
+        lines.append(f'{prefix}... and {len(losses) - MAX_LOSSES} more')
+    return lines
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -1,0 +1,115 @@
+"""A second signal ends a process that does not react, and no other."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from diffdrive_jacobian.ros import signals as module
+from diffdrive_jacobian.ros.signals import Signals
+
+HUNG = """
+import os, sys, threading
+from diffdrive_jacobian.ros import signals
+from diffdrive_jacobian.tools.entry_points import _exit
+signals.TOGETHER, signals.GRACE = float(sys.argv[1]), 0.1
+caught = signals.Signals()
+caught.catch()
+caught.exit_on_second(lambda: _exit('tool'))
+lock = threading.Lock()
+lock.acquire()
+print('hangs', flush=True)
+lock.acquire()
+"""
+
+
+def start(together):
+    child = subprocess.Popen(
+        [sys.executable, '-c', HUNG, str(together)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert child.stdout.readline() == 'hangs\n'
+    return child
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_ends_a_process_that_hangs(number):
+    child = start(0.0)
+    timer = threading.Timer(60.0, child.kill)
+    timer.start()
+    # Equal signals that are pending together come as one.
+    while child.poll() is None:
+        child.send_signal(number)
+        threading.Event().wait(0.01)
+    timer.cancel()
+    assert child.returncode == 130
+    assert child.communicate()[1] == 'tool: ended by a second signal, before it could finish\n'
+
+
+class Watched:
+    """A watch without a process: signals are bytes in a pipe."""
+
+    def __init__(self, monkeypatch, *, together=0.0, grace=0.0, max_grace=60.0):
+        for name, value in (('TOGETHER', together), ('GRACE', grace), ('MAX_GRACE', max_grace)):
+            monkeypatch.setattr(module, name, value)
+        self.signals = Signals()
+        self.ended = threading.Event()
+        self._reader, self._writer = os.pipe()
+        self._thread = threading.Thread(
+            target=self.signals._watch, args=(self._reader, False, self.ended.set), daemon=True
+        )
+        self._thread.start()
+
+    def send(self, *numbers):
+        os.write(self._writer, bytes(numbers))
+
+    def until_ended(self):
+        self._thread.join(60.0)
+        assert not self._thread.is_alive()
+
+
+def test_another_kind_of_signal_is_no_request(monkeypatch):
+    watched = Watched(monkeypatch)
+    watched.send(signal.SIGINT)
+    watched.send(signal.SIGUSR2, signal.SIGCHLD)
+    assert not watched.ended.wait(0.05)
+    watched.send(signal.SIGTERM)
+    watched.until_ended()
+    assert watched.ended.is_set()
+
+
+def test_signals_to_the_whole_group_are_one_request(monkeypatch):
+    watched = Watched(monkeypatch, together=60.0)
+    watched.send(signal.SIGINT, signal.SIGTERM)
+    watched.send(signal.SIGINT)
+    assert not watched.ended.wait(0.05)
+
+
+def test_a_process_that_reads_the_count_is_given_time(monkeypatch):
+    watched = Watched(monkeypatch, grace=60.0, max_grace=0.2)
+    watched.send(signal.SIGINT)
+    watched.send(signal.SIGINT)
+    while not watched.ended.is_set():
+        assert watched.signals.count == 0
+    watched.until_ended()
+
+
+def test_a_process_that_exits_by_itself_is_not_ended(monkeypatch):
+    handlers = {number: signal.getsignal(number) for number in module.CAUGHT}
+    try:
+        watched = Watched(monkeypatch, grace=0.2)
+        watched.send(signal.SIGINT)
+        watched.send(signal.SIGINT)
+        watched.signals.ignore()
+        watched.until_ended()
+        assert not watched.ended.is_set()
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
