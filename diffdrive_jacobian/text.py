@@ -1,0 +1,33 @@
+"""Text of unknown origin, such as a topic name in a bag, made safe to print."""
+
+from __future__ import annotations
+
+PATH_LIMIT = 4096
+"""Length that every path of Linux has room in: a `limit` for paths."""
+_ELLIPSIS = '...'
+
+
+def printable(text: object, limit: int = 80) -> str:
+    r"""Return text in which a terminal finds nothing to obey, cut to a length.
+
+    Control characters (terminal escapes, newlines), invisible and bidirectional formatting characters
+    and surrogates are replaced by their Python escapes, such as ``\x1b``. All other text, non-ASCII
+    letters included, stays as it is.
+
+    Args:
+        text: Any object; its `str` is used.
+        limit: Maximum length of the result, at least 3. Longer text ends in ``...``.
+    """
+    text = str(text)
+    # No character becomes shorter, so what is beyond the limit cannot be part of the result.
+    escaped = [one if one.isprintable() else _escape(one) for one in text[: limit + 1]]
+    if sum(map(len, escaped)) <= limit:
+        return ''.join(escaped)
+    room = limit - len(_ELLIPSIS)
+    while sum(map(len, escaped)) > room:
+        escaped.pop()
+    return ''.join(escaped) + _ELLIPSIS
+
+
+def _escape(character: str) -> str:
+    return character.encode('unicode_escape').decode('ascii')
