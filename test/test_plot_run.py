@@ -580,7 +580,6 @@ def test_draw_checks_by_itself(bag, tmp_path):
         _figure.draw([run, empty], tmp_path / 'a.png')
 
 
-@pytest.mark.skipif(not REAL.exists(), reason='the recorded bag is not here')
 def test_a_bag_of_another_robot_is_drawn(tmp_path):
     bag = shutil.copytree(REAL, tmp_path / 'bag')
     assert plot(bag, '--csv', tmp_path / 'a.csv') == 0

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diffdrive_jacobian.bags.lines import commanded, limits, line, measured
-from diffdrive_jacobian.bags.reading import Run
+from diffdrive_jacobian.bags.run import Run
 from diffdrive_jacobian.bags.trace import Array, Trace, tolerance, trace
 
 if TYPE_CHECKING:

@@ -12,7 +12,8 @@ import numpy as np
 from action_msgs.msg import GoalStatus
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.bags.reading import BagError, Run, Series
+from diffdrive_jacobian.bags.reading import BagError
+from diffdrive_jacobian.bags.run import Run, Series
 from diffdrive_jacobian.kinematics._elementary import wrapped
 from diffdrive_jacobian.nodes.parameters import GoToGoalParameters
 
@@ -167,7 +168,7 @@ def _driven_points(run: Run) -> Array:
     told = run.of_node('go_to_goal')
     if told.get('controller') != 'offset_point':
         return poses[:, :2]
-    d = float(told.get('offset', GoToGoalParameters().offset))
+    d = run.number_of_node('go_to_goal', 'offset', GoToGoalParameters().offset)
     return poses[:, :2] + d * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
 
 
@@ -180,4 +181,4 @@ def _statuses(run: Run, begin: int, end: int) -> tuple[Array, NDArray[np.int64]]
 def tolerance(run: Run) -> float:
     """Give the distance from a goal that counts as arrived (m)."""
     default = GoToGoalParameters().xy_goal_tolerance
-    return float(run.of_node('go_to_goal').get('xy_goal_tolerance', default))
+    return run.number_of_node('go_to_goal', 'xy_goal_tolerance', default)

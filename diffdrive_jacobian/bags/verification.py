@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.bags.reading import BagError, Run, Series
+from diffdrive_jacobian.bags.reading import BagError
+from diffdrive_jacobian.bags.run import Run, Series
 from diffdrive_jacobian.kinematics._elementary import wrapped
 from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
 from diffdrive_jacobian.nodes.parameters import VirtualRobotParameters
