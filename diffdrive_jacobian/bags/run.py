@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 NANOSECONDS = 1_000_000_000
+MAX_NUMBER = 1e6
+"""Largest magnitude of the numeric parameters of our nodes (m, m/s, rad/s)."""
 COLUMNS = {
     'odometry': ('x', 'y', 'theta', 'v', 'omega'),
     'cmd_vel': ('v', 'omega'),
@@ -111,10 +113,7 @@ class Run:
 
 
 def number(value: object) -> float:
-    """Return a recorded parameter as a number; NaN: it is none, or too large for a float."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
+    """Return a recorded parameter as a number; NaN: it is none, or beyond what the nodes accept."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= MAX_NUMBER:
         return math.nan
-    try:
-        return float(value)
-    except OverflowError:
-        return math.nan
+    return float(value)
