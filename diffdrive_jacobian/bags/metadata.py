@@ -77,7 +77,9 @@ def _check_topic(topic: dict[str, Any], index: int) -> None:
     where += '.topic_metadata'
     described = _mapping(_required(topic, 'topic_metadata', where[: -len('.topic_metadata')]), where)
     for key in ('name', 'type', 'serialization_format'):
-        _string(_required(described, key, where), f'{where}.{key}')
+        if not _string(_required(described, key, where), f'{where}.{key}'):
+            raise _wrong(f'{where}.{key}', 'text that is not empty', '')
+    _choice(described['serialization_format'], f'{where}.serialization_format', ['cdr'])
     _string(described.get('type_description_hash', ''), f'{where}.type_description_hash')
     try:
         parse_qos(described.get('offered_qos_profiles', []))
