@@ -142,8 +142,8 @@ class Remains:
                     yield channel
             elif record.channel not in ids:
                 strange['messages belong to no known topic'] += 1
-            elif not 0 <= record.stamp < 2**63:
-                strange['messages have no possible time'] += 1
+            elif not 0 <= record.stamp < 2**63 or _payload(record.data) is None:
+                strange['messages are no CDR, or have no possible time'] += 1
             elif (to := ids[record.channel][1]) is not None:
                 yield replace(record, channel=to)
 
@@ -331,14 +331,19 @@ def _described(topic: Topic) -> tuple[str, str]:
     Raises:
         UnknownTypeError: The file does not tell them, and no installed package does.
     """
-    if topic.definition and topic.type_hash:
-        return topic.definition, topic.type_hash
     try:
         installed = definition(topic.type_name)
+        if topic.type_hash == installed.type_hash:
+            # Its text may be damaged, or differ in comments.
+            return installed.text, installed.type_hash
+        if topic.definition and topic.type_hash:
+            return topic.definition, topic.type_hash
         if topic.definition in ('', installed.text) and topic.type_hash in ('', installed.type_hash):
             return installed.text, installed.type_hash
         reason = f'{topic.type_name} is installed in another version than it was recorded'
     except UnknownTypeError as error:
+        if topic.definition and topic.type_hash:
+            return topic.definition, topic.type_hash
         reason = str(error)
     if not topic.definition:
         raise UnknownTypeError(reason)
