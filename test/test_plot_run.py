@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 import shutil
 import sys
 from dataclasses import replace
@@ -23,7 +24,7 @@ from diffdrive_jacobian.bags.reading import BagError, read_run
 from diffdrive_jacobian.bags.trace import trace
 from diffdrive_jacobian.kinematics.se2 import integrate, wrap_angle
 from diffdrive_jacobian.ros.signals import Signals
-from diffdrive_jacobian.tools.plot_run import COLUMNS, main
+from diffdrive_jacobian.tools.plot_run import COLUMNS, _seconds, main
 
 RATE = 50
 PARAMETERS = {
@@ -331,6 +332,33 @@ def test_a_goal_that_was_replaced_is_followed_by_the_next(tmp_path):
     assert goals_of(run_of(tmp_path, extra, **STRAIGHT)) == [(0.0, 0), (1.0, 1)]
 
 
+def test_a_goal_that_is_only_passed_is_driven_to_until_the_end(tmp_path):
+    """It comes near the goal, drives on, and is placed elsewhere before the node reports success."""
+    states = [(10.0, '/goal_status', status(2)), (13.9, '/goal_status', status(4))]
+    for name, extra in (('node', states), ('other', [])):
+        placed = (12.0, '/start_pose', start(1.0, 0, 0, seconds=12.0))
+        sent = sample([(10.0, '/goal_pose', goal(0.5, 0)), placed, *extra], **STRAIGHT)
+        one = trace(read_run(write_bag(tmp_path / name, sent)))
+        assert one.breaks.tolist() == [100]
+        assert not np.isnan(one.distance).any()
+        assert drawn(by_label(figure([one.run]))[LABELS['distance']])[-1, 0] == one.time[-1]
+
+
+def test_a_goal_is_reached_when_the_node_says_so(tmp_path):
+    """Until then it has a direction, also after it was passed; from then on until a reset a distance."""
+    drives = [*drive(100, v=0.5, omega=0.0), *drive(100, v=-0.25, omega=0.0, begin=12.0)]
+    sent = [(at, topic, one) for at, topic, one in drives if topic == '/odom']
+    for index, (_, _, one) in enumerate(sent[100:]):
+        one.pose.pose.position.x = 1.0 - 0.25 * index / RATE
+    extra = [(10.0, '/goal_pose', goal(0.75, 0)), (10.0, '/goal_status', status(2))]
+    extra += [(13.0, '/goal_status', status(4)), (13.5, '/start_pose', start(0.625, 0, 0, seconds=13.5))]
+    run = read_run(write_bag(tmp_path / 'bag', sorted([*sent, *extra], key=lambda one: one[0])))
+    one = trace(run)
+    # Within 0.02 m of it again since 12.92 s.
+    assert np.flatnonzero(np.isnan(one.heading_error))[0] == 146
+    assert np.flatnonzero(np.isnan(one.distance)).tolist() == list(range(175, 200))
+
+
 # --- Time
 
 
@@ -422,13 +450,42 @@ def test_csv_holds_the_numbers_of_the_run(bag, tmp_path):
     assert header == list(COLUMNS)
     columns = dict(zip(header, rows.T, strict=True))
     assert rows[:, 0].tolist() == one.time.tolist()
-    assert rows[:, 1:6].tolist() == run.odometry.values.tolist()
-    np.testing.assert_array_equal(columns['distance_m'], one.distance)
-    np.testing.assert_array_equal(columns['heading_error_rad'], one.heading_error)
+    rounded = {'rtol': 0.0, 'atol': 5.1e-10}
+    np.testing.assert_allclose(rows[:, 1:6], run.odometry.values, **rounded)
+    np.testing.assert_allclose(columns['distance_m'], one.distance, **rounded)
+    np.testing.assert_allclose(columns['heading_error_rad'], one.heading_error, **rounded)
     assert columns['omega_right_radps'].tolist() == run.wheels.values[:, 0].tolist()
     assert columns['omega_left_radps'].tolist() == run.wheels.values[:, 1].tolist()
     held = [math.nan] * 25 + [0.5] * 75 + [0.25] * 100
     np.testing.assert_array_equal(columns['v_command_mps'], held)
+
+
+def test_csv_has_exact_times_and_no_artefacts_of_floats(tmp_path):
+    begin = 1_795_213_077
+    sent = [
+        (begin, '/odom', odom(57.303999999999995, 0.1 + 0.2, -1e-12, seconds=begin)),
+        (begin + 1, '/odom', odom(-999999.123456789, 1e-9, 0.0, seconds=begin)),
+    ]
+    sent[1][2].header.stamp.nanosec = 123_456_789
+    bag = write_bag(tmp_path / 'bag', sent)
+    assert plot(bag, '--csv', tmp_path / 'a.csv') == 0
+    _, first, second = (tmp_path / 'a.csv').read_text().splitlines()
+    assert first == '0,57.304,0.3,0,0,0,,,,,,'
+    assert second == '0.123456789,-999999.123456789,0.000000001,0,0,0,,,,,,'
+
+
+@pytest.mark.parametrize(
+    ('nanoseconds', 'text'),
+    [
+        (0, '0'),
+        (1, '0.000000001'),
+        (-1, '-0.000000001'),
+        (2**63 - 1, '9223372036.854775807'),
+        (5 * SECOND, '5'),
+    ],
+)
+def test_csv_times_are_exact(nanoseconds, text):
+    assert _seconds(nanoseconds) == text
 
 
 def test_csv_prefers_the_commands_that_were_applied(tmp_path):
@@ -455,6 +512,36 @@ def test_names_are_as_long_as_it_takes():
     assert names([Path('/a/run')]) == ['run']
     assert names([Path('/a/run'), Path('/b/walk')]) == ['run', 'walk']
     assert names([Path('/a/x/run'), Path('/b/x/run')]) == ['a/x/run', 'b/x/run']
+
+
+# --- Notes
+
+
+def noted(tmp_path, name, count=1):
+    sent = [
+        *sample(),
+        *((10.0 + index / 100, '/joint_command', joint_command(1e308, 0)) for index in range(count)),
+    ]
+    return write_bag(tmp_path / name, sorted(sent, key=lambda one: one[0]))
+
+
+def test_messages_that_were_skipped_are_reported_in_picture_and_terminal(tmp_path, capsys):
+    bag = noted(tmp_path, 'bag', 3)
+    note = '3 of 3 messages on /joint_command hold invalid or implausible values and were skipped'
+    assert plot(bag) == 0
+    assert capsys.readouterr() == (f'{tmp_path / "bag.png"}\n', f'plot_run: {bag}: {note}\n')
+    assert figure([read_run(bag)]).get_supxlabel() == note
+
+
+def test_notes_of_several_runs_name_them_and_are_not_too_many(tmp_path):
+    runs = [read_run(noted(tmp_path, f'r{index}$')) for index in range(6)]
+    lines = figure(runs).get_supxlabel().splitlines()
+    assert [one[:5] for one in lines[:3]] == [r'r0\$:', r'r1\$:', r'r2\$:']
+    assert lines[3:] == ['and 3 more notes']
+
+
+def test_without_notes_nothing_is_written_below(bag):
+    assert figure([read_run(bag)]).get_supxlabel() == ''
 
 
 # --- Mistakes
@@ -556,6 +643,21 @@ def test_the_numbers_of_several_runs_need_a_directory(bag, tmp_path, capsys):
     refuses(capsys, 2, 'need a directory')
 
 
+@pytest.mark.parametrize('output', ['x.txt', 'x.csv.gz', 'x.png'])
+def test_another_ending_of_the_numbers_is_told(bag, tmp_path, capsys, monkeypatch, output):
+    monkeypatch.chdir(tmp_path)
+    assert plot(bag, '--csv', output) == 2
+    refuses(capsys, 2, f'must end in .csv, got {output!r}')
+    assert os.listdir(tmp_path) == ['bag']
+
+
+def test_the_picture_cannot_be_a_directory(bag, tmp_path, capsys):
+    (tmp_path / 'x.png').mkdir()
+    for output in (f'{tmp_path}/x.png', f'{tmp_path}/new.png/'):
+        assert plot(bag, '-o', output) == 2
+        refuses(capsys, 2, 'the picture must be a file', output)
+
+
 def test_a_bag_cannot_be_given_twice(bag, capsys):
     assert plot(bag, f'{bag}/') == 2
     refuses(capsys, 2, 'once')
@@ -580,7 +682,6 @@ def test_draw_checks_by_itself(bag, tmp_path):
         _figure.draw([run, empty], tmp_path / 'a.png')
 
 
-@pytest.mark.skipif(not REAL.exists(), reason='the recorded bag is not here')
 def test_a_bag_of_another_robot_is_drawn(tmp_path):
     bag = shutil.copytree(REAL, tmp_path / 'bag')
     assert plot(bag, '--csv', tmp_path / 'a.csv') == 0

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diffdrive_jacobian.bags.lines import commanded, limits, line, measured
-from diffdrive_jacobian.bags.reading import Run
+from diffdrive_jacobian.bags.run import Run
 from diffdrive_jacobian.bags.trace import Array, Trace, tolerance, trace
 
 if TYPE_CHECKING:
@@ -34,6 +34,8 @@ LABEL = 40
 """A longer name of a bag is cut in the middle."""
 NUMBERED, MARKED = 12, 30
 """With more goals than that they bear no numbers; their changes are not marked over time."""
+NOTED = 4
+"""Lines of notes below the picture."""
 COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
 """Okabe and Ito's, those that stand out from white; the lines' styles tell runs apart as well."""
 STYLES: tuple[Any, ...] = ('-', (0, (5, 1.5)), '-.', (0, (1.2, 1)), (0, (7, 1.5, 1, 1.5, 1, 1.5)))
@@ -162,7 +164,21 @@ def figure(runs: Sequence[Run]) -> Figure:
         below = made.add_subplot(grid[-1, :])
         below.axis('off')
         below.legend(handles=_marks(traces), loc='center', ncol=6, borderaxespad=0.0)
+        if notes := _notes(runs, labels):
+            made.supxlabel(notes, fontsize=8.0, color=GREY)
     return made
+
+
+def _notes(runs: Sequence[Run], labels: Sequence[str]) -> str:
+    """Return what is wrong with the bags, one line each; of several runs with their names."""
+    lines = [
+        f'{f"{label}: " if len(runs) > 1 else ""}{note}'.replace('$', r'\$')
+        for run, label in zip(runs, labels, strict=True)
+        for note in run.notes
+    ]
+    if len(lines) > NOTED:
+        lines[NOTED - 1 :] = [f'and {len(lines) - NOTED + 1} more notes']
+    return '\n'.join(lines)
 
 
 def styled() -> Any:

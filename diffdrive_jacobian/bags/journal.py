@@ -17,11 +17,13 @@ import struct
 import tempfile
 import threading
 import zlib
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
+
+from diffdrive_jacobian.text import printable
 
 MAGIC = b'\x89ddjournal1\r\n\x1a\n'
 _HEAD = struct.Struct('<cII')
@@ -31,10 +33,19 @@ BLOCK = 8 << 20
 """What is written at once (bytes), about."""
 OVERHEAD = 250
 """Memory that a record takes besides its payload (bytes), about."""
+_TEXT_FIELDS: dict[str, type] = {'key': str, 'value': str}
+_CHANNEL_FIELDS: dict[str, type] = {
+    'id': int,
+    'topic': str,
+    'type_name': str,
+    'definition': str,
+    'type_hash': str,
+    'qos': list,
+}
 
 
 class JournalError(Exception):
-    """A file is no journal."""
+    """A file is no journal, or a record in it is invalid."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -210,14 +221,19 @@ def is_being_written(path: Path) -> bool:
     return False
 
 
-def read_journal(path: Path) -> Generator[Record, None, int]:
+def read_journal(path: Path, note: Callable[[str], None] | None = None) -> Generator[Record, None, int]:
     """Read a journal up to its end, or to what was cut off or damaged.
+
+    Args:
+        path: The journal.
+        note: Is told of each record whose content is invalid although its checksum is right; such a
+            record is left out. Without it, it is an error.
 
     Returns:
         The records; the generator's value is how many bytes at the end could not be read.
 
     Raises:
-        JournalError: The file is no journal.
+        JournalError: The file is no journal, or a record's content is invalid.
         OSError: It cannot be read.
     """
     with open(path, 'rb') as file:
@@ -225,13 +241,21 @@ def read_journal(path: Path) -> Generator[Record, None, int]:
         if file.read(len(MAGIC)) != MAGIC:
             raise JournalError(f'{path} is no journal of record_run')
         end = file.tell()
-        while (record := _read_record(file, size - end)) is not None:
-            end = file.tell()
+        while (raw := _read_record(file, size - end)) is not None:
+            begin, end = end, file.tell()
+            try:
+                record = _parsed(*raw)
+            except JournalError as error:
+                if note is None:
+                    raise JournalError(f'{path} is damaged at byte {begin}: {error}') from error
+                note(f'the record at byte {begin} is invalid: {error}')
+                continue
             yield record
         return size - end
 
 
-def _read_record(file: BinaryIO, left: int) -> Record | None:
+def _read_record(file: BinaryIO, left: int) -> tuple[bytes, bytes] | None:
+    """Return kind and payload of the next record; None: there is none, or it is damaged."""
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
         return None
@@ -244,10 +268,47 @@ def _read_record(file: BinaryIO, left: int) -> Record | None:
         return None
     if kind == _DATA and length < _MESSAGE.size:
         return None
+    return kind, payload
+
+
+def _parsed(kind: bytes, payload: bytes) -> Record:
+    """Return a record.
+
+    Raises:
+        JournalError: The payload is not what `JournalWriter` writes.
+    """
     if kind == _DATA:
         channel, stamp = _MESSAGE.unpack_from(payload)
         return Message(channel, stamp, payload[_MESSAGE.size :])
-    fields = json.loads(payload)
+    try:
+        content = json.loads(payload)
+    except (ValueError, RecursionError) as error:
+        raise JournalError(f'its content is not JSON: {printable(error)}') from error
     if kind == _TEXT:
-        return Text(**fields)
+        return Text(**_fields(content, _TEXT_FIELDS))
+    fields = _fields(content, _CHANNEL_FIELDS)
+    if not 0 <= fields['id'] < 2**16:
+        raise JournalError(f'id must be from 0 to {2**16 - 1}, got {printable(fields["id"])}')
+    for profile in fields['qos']:
+        if not isinstance(profile, dict) or not all(type(one) is int for one in profile.values()):
+            raise JournalError(f'qos must hold maps of integers, got {printable(repr(profile), 40)}')
     return Channel(**{**fields, 'qos': tuple(fields['qos'])})
+
+
+def _fields(content: object, types: dict[str, type]) -> dict[str, Any]:
+    """Return a JSON object that has just these fields.
+
+    Raises:
+        JournalError: It has not.
+    """
+    if not isinstance(content, dict) or content.keys() != types.keys():
+        got = printable(repr(content), 40)
+        raise JournalError(f'it must have the fields {", ".join(types)}, got {got}')
+    for name, kind in types.items():
+        value = content[name]
+        if type(value) is not kind:
+            got = printable(repr(value), 40)
+            raise JournalError(f'{name} must be of type {kind.__name__}, got {got}')
+        if isinstance(value, str) and any('\ud800' <= one <= '\udfff' for one in value):
+            raise JournalError(f'{name} must be valid Unicode, got {printable(repr(value), 40)}')
+    return content

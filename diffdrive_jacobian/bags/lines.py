@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from diffdrive_jacobian.bags.reading import Run, Series
+from diffdrive_jacobian.bags.run import Run, Series, number
 from diffdrive_jacobian.bags.trace import Array, Indices, Mask, Trace, seconds
 
 BUCKETS = 1500
@@ -58,8 +58,8 @@ def limits(one: Trace) -> dict[str, Array]:
     for time, run in _configurations(one.run):
         for name, (nodes, upper, lower) in _LIMITS.items():
             values = [run.of_node(node) for node in nodes]
-            most = [_number(one.get(upper)) for one in values]
-            least = [_number(one.get(lower)) for one in values]
+            most = [number(one.get(upper)) for one in values]
+            least = [number(one.get(lower)) for one in values]
             least = [-high if np.isnan(low) else low for low, high in zip(least, most, strict=True)]
             bounds = _tightest(max, least), _tightest(min, most)
             rows[name].append([[time, bound] for bound in bounds])
@@ -83,10 +83,6 @@ def _configurations(run: Run) -> Iterator[tuple[float, Run]]:
 
 def _tightest(choose: Callable[[list[float]], float], bounds: list[float]) -> float:
     return choose([bound for bound in bounds if not np.isnan(bound)] or [np.nan])
-
-
-def _number(value: object) -> float:
-    return float(value) if isinstance(value, (int, float)) else np.nan
 
 
 def _held(one: Trace, rows: Array) -> Array:

@@ -1,34 +1,40 @@
-"""A recorded run as NumPy arrays."""
+"""Reading of recorded runs."""
 
 from __future__ import annotations
 
-import json
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import shlex
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rclpy.parameter import parameter_value_to_python
-from rclpy.serialization import deserialize_message
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
 from diffdrive_jacobian.bags.bounded_reader import BoundedReader
+from diffdrive_jacobian.bags.decoding import UndecodableError, decode
 from diffdrive_jacobian.bags.definitions import message_class
 from diffdrive_jacobian.bags.limits import TooLargeError
-from diffdrive_jacobian.bags.recorder import PARAMETERS
-from diffdrive_jacobian.ros.messages import (
-    MessageError,
-    from_joint_state,
-    from_pose,
-    from_time,
-    from_twist,
+from diffdrive_jacobian.bags.metadata import (
+    DamagedError,
+    check_connections,
+    check_custom_data,
+    check_metadata,
+    parse_parameters,
 )
+from diffdrive_jacobian.bags.recorder import PARAMETERS
+from diffdrive_jacobian.bags.recording import journal_of
+from diffdrive_jacobian.bags.remains import is_recoverable
+from diffdrive_jacobian.bags.rows import PARAMETER_EVENTS, ROW_READERS, SERIES_TOPICS
+from diffdrive_jacobian.bags.run import COLUMNS, Run, Series
+from diffdrive_jacobian.ros.messages import MessageError
 from diffdrive_jacobian.text import PATH_LIMIT, printable
+
+__all__ = ['BagError', 'DamagedBagError', 'Run', 'Series', 'read_run']
 
 WHEELS = ('left_wheel_joint', 'right_wheel_joint')
 """Joints that are taken for wheels where no parameters tell their names: left, right."""
@@ -45,56 +51,36 @@ class BagError(Exception):
         super().__init__(printable(message, PATH_LIMIT))
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Series:
-    """What came on one topic, in the order in which it was recorded; n may be 0."""
+class DamagedBagError(BagError):
+    """A bag is damaged; the message also says how to save what can be read."""
 
-    received: NDArray[np.int64]
-    """When each message was recorded, shape (n,) (ns)."""
-    stamps: NDArray[np.int64]
-    """The messages' own stamps, where they have one, else as `received`, shape (n,) (ns)."""
-    values: NDArray[np.float64]
-    """One row for each, shape (n, k)."""
+    def __init__(self, path: Path, why: str) -> None:
+        """Set the message.
 
-    def __len__(self) -> int:
-        """Give n."""
-        return len(self.stamps)
+        Args:
+            path: The bag.
+            why: What is wrong with it.
+        """
+        super().__init__(f'{printable(path, PATH_LIMIT)} is damaged: {why}{_advice(path)}')
+        self.why = why
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Run:
-    """A run. All series are there; those whose topic was not recorded are empty."""
+def _advice(path: Path) -> str:
+    """Return the command that saves what is left of a bag; '': there is nothing."""
+    if not is_recoverable(path):
+        return ''
+    return f' ({_command(path)} saves what can be read)'
 
-    path: Path
-    odometry: Series
-    """`[x, y, theta, v, omega]` (m, m, rad, m/s, rad/s)."""
-    cmd_vel: Series
-    """`[v, omega]` as commanded (m/s, rad/s); Twist or TwistStamped."""
-    cmd_vel_out: Series
-    """`[v, omega]` as applied, each from its stamp on."""
-    start_pose: Series
-    """`[x, y, theta]` where the odometry began, each at its stamp."""
-    wheel_commands: Series
-    """`[omega_R, omega_L]` of joint_command (rad/s)."""
-    wheels: Series
-    """`[omega_R, omega_L]` of joint_states (rad/s)."""
-    goals: Series
-    """`[x, y, theta]` of each goal and waypoint."""
-    goal_status: Series
-    """`[status]`, the numbers of action_msgs/GoalStatus, stamped as the goal."""
-    parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """By the full name of the node, as of the beginning of the run."""
-    parameter_events: tuple[tuple[int, str, dict[str, Any]], ...] = ()
-    """What changed meanwhile: when it was recorded (ns), the node, the new values."""
 
-    def of_node(self, name: str) -> dict[str, Any]:
-        """Give the parameters of the node of that base name; {} if there is none or several."""
-        found = [values for node, values in self.parameters.items() if node.split('/')[-1] == name]
-        return found[0] if len(found) == 1 else {}
+def _command(path: Path) -> str:
+    return f'`recover_run {printable(shlex.quote(str(path)), PATH_LIMIT)}`'
 
 
 def read_run(path: str | Path, topics: Mapping[str, str] | None = None) -> Run:
     """Read a bag that `record_run` or `ros2 bag record` has written.
+
+    Messages that cannot be decoded, and those that the nodes drop, are skipped: `Run.skipped` counts
+    them and `Run.notes` describes them.
 
     Args:
         path: The bag's directory (or, of MCAP, its file).
@@ -107,31 +93,95 @@ def read_run(path: str | Path, topics: Mapping[str, str] | None = None) -> Run:
     """
     path = Path(path)
     rows: dict[str, list[tuple[int, int, list[float]]]] = defaultdict(list)
-    parameters: dict[str, dict[str, Any]] = {}
     events: list[tuple[int, str, dict[str, Any]]] = []
     with open_bag(path) as reader:
-        for key, text in custom_data(reader).items():
-            if key.startswith(PARAMETERS):
-                parameters[key.removeprefix(PARAMETERS)] = _parameters(path, key, text)
+        parameters = recorded_parameters(reader)
         names = _wheel_names(parameters)
         chosen = _choose(reader, dict(topics or {}))
         connections = [one for one in reader.connections if one.id in chosen]
-        for connection, received, data in messages(reader, connections):
+        tally = _Tally()
+        for connection, received, data in messages(reader, connections, tally.invalid):
             topic, kind = chosen[connection.id], connection.msgtype
-            message = _deserialized(path, connection, data)
-            if topic == _EVENTS[0]:
-                changes = [*message.new_parameters, *message.changed_parameters]
-                values = {one.name: parameter_value_to_python(one.value) for one in changes}
-                events.append((received, message.node, values))
-                continue
+            tally.read[connection.topic] += 1
             try:
-                read = list(_READERS[topic, kind](message, names))
+                message = decode(data, message_class(kind))
+                if topic == PARAMETER_EVENTS[0]:
+                    events.append((received, message.node, _changes(message)))
+                    continue
+                read = list(ROW_READERS[topic, kind](message, names))
+            except UndecodableError:
+                tally.undecodable[connection.topic] += 1
             except MessageError:
                 # The nodes drop it, too.
-                continue
-            rows[topic].extend((received, stamp or received, values) for stamp, values in read)
-    series = {name: _series(_in_order(rows, of), width) for name, (of, width) in _SERIES.items()}
-    return Run(path=path, parameters=parameters, parameter_events=tuple(events), **series)
+                tally.refused[connection.topic] += 1
+            else:
+                rows[topic].extend((received, stamp or received, values) for stamp, values in read)
+        notes = tally.notes(connections)
+    series = {
+        name: _series(_in_order(rows, SERIES_TOPICS[name]), columns) for name, columns in COLUMNS.items()
+    }
+    return Run(
+        path=path,
+        parameters=parameters,
+        parameter_events=tuple(events),
+        skipped=dict(tally.skipped),
+        notes=notes,
+        **series,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Tally:
+    """Counts of messages by the name of their topic in the bag."""
+
+    read: Counter[str] = field(default_factory=Counter)
+    invalid: Counter[str] = field(default_factory=Counter)
+    """Not even a time and bytes: counted by `messages`, not in `read`."""
+    undecodable: Counter[str] = field(default_factory=Counter)
+    refused: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def skipped(self) -> Counter[str]:
+        return self.invalid + self.undecodable + self.refused
+
+    def notes(self, connections: Sequence[Connection]) -> tuple[str, ...]:
+        """Describe what was skipped, and what is missing of what the bag says that it holds."""
+        found = self.read + self.invalid
+        promised: Counter[str] = Counter()
+        for connection in connections:
+            promised[connection.topic] += connection.msgcount
+        lines = []
+        for topic in sorted(promised):
+            for count, why in (
+                (self.invalid[topic] + self.undecodable[topic], 'cannot be decoded'),
+                (self.refused[topic], 'hold invalid or implausible values'),
+            ):
+                if count:
+                    of = f'{count} of {found[topic]} messages on {printable(topic)}'
+                    lines.append(f'{of} {why} and were skipped')
+            if found[topic] != promised[topic]:
+                lines.append(
+                    f'{found[topic]} messages on {printable(topic)} were found, '
+                    f'the bag should have {promised[topic]}'
+                )
+        return tuple(lines)
+
+
+def damage(path: Path) -> str:
+    """Read a bag completely; return what is wrong with it, '' if nothing is or it is no bag.
+
+    Messages that cannot be decoded are no damage: readers skip them.
+    """
+    try:
+        with open_bag(path) as reader:
+            recorded_parameters(reader)
+            invalid: Counter[str] = Counter()
+            found = sum(1 for _ in messages(reader, reader.connections, invalid)) + invalid.total()
+            if found != reader.message_count:
+                return f'it should have {reader.message_count} messages, {found} can be read'
+    except BagError as error:
+        return error.why if isinstance(error, DamagedBagError) else ''
+    return ''
 
 
 @contextmanager
@@ -142,40 +192,65 @@ def open_bag(path: Path) -> Iterator[Reader]:
         BagError: There is none, or it is damaged.
     """
     if not path.exists():
-        raise BagError(f'there is no bag {path}')
+        if (journal := journal_of(path)).is_file():
+            raise BagError(
+                f'there is no bag {printable(path, PATH_LIMIT)}, but the journal of an interrupted '
+                f'recording: {_command(journal)} makes the bag of it'
+            )
+        raise BagError(f'there is no bag {printable(path, PATH_LIMIT)}')
     if path.is_dir() and not (path / 'metadata.yaml').exists():
         what = 'an empty folder' if not any(path.iterdir()) else 'a folder without metadata.yaml'
-        raise BagError(f'{path} is {what}, not a bag (recover_run makes one from what a crash has left)')
+        raise BagError(f'{printable(path, PATH_LIMIT)} is {what}, not a bag{_advice(path)}')
     try:
+        if path.is_dir():
+            check_metadata(path / 'metadata.yaml')
         reader = BoundedReader(path)
         reader.open()
+    except TooLargeError as error:
+        raise BagError(f'{printable(path, PATH_LIMIT)} cannot be read: {error}') from error
+    except DamagedError as error:
+        raise DamagedBagError(path, str(error)) from error
     except Exception as error:  # whatever the parsers of a damaged file raise
-        raise BagError(f'{path} is not a bag that can be read: {_described(error)}') from error
+        raise DamagedBagError(path, f'it cannot be read: {printable(repr(error), 200)}') from error
     try:
+        _check_open(path, reader)
         yield reader
     finally:
         reader.close()
 
 
 def custom_data(reader: Reader) -> dict[str, str]:
-    """Give what the recorder noted down.
+    """Return what the recorder noted down."""
+    return check_custom_data(reader.storage.metadata.custom)
+
+
+def recorded_parameters(reader: Reader) -> dict[str, dict[str, Any]]:
+    """Return the parameters of the nodes at the beginning of a recording, by the nodes' full names.
 
     Raises:
-        BagError: It is damaged.
+        BagError: They are damaged.
     """
-    custom = reader.storage.metadata.custom or {}
-    if not isinstance(custom, dict) or not all(isinstance(text, str) for text in custom.values()):
-        raise BagError(
-            f'{reader.path} is damaged: its custom_data must be texts by name, '
-            f'got {printable(repr(custom))}'
-        )
-    return custom
+    entries = custom_data(reader).items()
+    try:
+        return {
+            key.removeprefix(PARAMETERS): parse_parameters(key, text)
+            for key, text in entries
+            if key.startswith(PARAMETERS)
+        }
+    except DamagedError as error:
+        raise DamagedBagError(Path(str(reader.path)), str(error)) from error
 
 
 def messages(
-    reader: Reader, connections: Sequence[Connection]
+    reader: Reader, connections: Sequence[Connection], invalid: Counter[str] | None = None
 ) -> Iterator[tuple[Connection, int, bytes]]:
-    """Give the messages of some connections in the order of their recording.
+    """Yield the messages of some connections in the order of their recording.
+
+    Args:
+        reader: An open bag.
+        connections: Which of its topics.
+        invalid: Is told, by topic, how many messages have no possible time or are not bytes, as they
+            may be in an SQLite file. They are left out.
 
     Raises:
         BagError: The bag is damaged.
@@ -185,104 +260,41 @@ def messages(
         return
     try:
         for connection, received, data in reader.messages(connections):
-            yield connection, received, bytes(data)
+            if (
+                isinstance(data, (bytes, memoryview))
+                and isinstance(received, int)
+                and 0 <= received < 2**63
+            ):
+                yield connection, received, bytes(data)
+            elif invalid is not None:
+                invalid[connection.topic] += 1
     except TooLargeError as error:
         raise BagError(f'{reader.path} cannot be read: {error}') from error
     except Exception as error:  # as above
-        raise BagError(f'{reader.path} is damaged: {_described(error)}') from error
+        raise DamagedBagError(Path(str(reader.path)), printable(repr(error), 200)) from error
 
 
-def _described(error: Exception) -> str:
-    """Return an error of a parser on one line; what it quotes of the bag is cut."""
-    text = str(error) if isinstance(error, TooLargeError) else repr(error)
-    return printable(text, 200)
-
-
-def _parameters(path: Path, key: str, text: str) -> dict[str, Any]:
+def _check_open(path: Path, reader: Reader) -> None:
+    storages = getattr(reader.storage, 'storages', [reader.storage])
+    stored = [connection for storage in storages for connection in storage.connections]
     try:
-        values = json.loads(text)
-    except ValueError as error:
-        raise BagError(f'{path} is damaged: the {key} are no JSON: {error}') from error
-    if not isinstance(values, dict):
-        raise BagError(f'{path} is damaged: the {key} must be names and values, got {text[:40]!r}')
-    return values
+        check_custom_data(reader.storage.metadata.custom)
+        check_connections(reader.connections, stored)
+    except DamagedError as error:
+        raise DamagedBagError(path, str(error)) from error
 
 
-def _deserialized(path: Path, connection: Connection, data: bytes) -> Any:
+def _changes(event: Any) -> dict[str, Any]:
+    """Return the new values of a parameter event.
+
+    Raises:
+        UndecodableError: A value is of an unknown type.
+    """
+    changes = [*event.new_parameters, *event.changed_parameters]
     try:
-        return deserialize_message(data, message_class(connection.msgtype))
-    except (RuntimeError, ValueError, AssertionError) as error:
-        raise BagError(
-            f'{path} is damaged: a message on {connection.topic} is no {connection.msgtype}'
-        ) from error
-
-
-# --- From messages to numbers
-
-Rows = Iterator[tuple[int, list[float]]]
-"""Stamp (ns; 0: none) and values."""
-
-
-def _twist(message: Any, _: tuple[str, str]) -> Rows:
-    yield 0, list(from_twist(message))
-
-
-def _twist_stamped(message: Any, _: tuple[str, str]) -> Rows:
-    yield from_time(message.header.stamp), list(from_twist(message.twist))
-
-
-def _odometry(message: Any, _: tuple[str, str]) -> Rows:
-    pose, twist = from_pose(message.pose.pose), from_twist(message.twist.twist)
-    yield from_time(message.header.stamp), [*pose.tolist(), *twist]
-
-
-def _pose(message: Any, _: tuple[str, str]) -> Rows:
-    yield from_time(message.header.stamp), from_pose(message.pose).tolist()
-
-
-def _pose_with_covariance(message: Any, _: tuple[str, str]) -> Rows:
-    yield from_time(message.header.stamp), from_pose(message.pose.pose).tolist()
-
-
-def _goals(message: Any, _: tuple[str, str]) -> Rows:
-    stamp = from_time(message.header.stamp)
-    for goal in message.goals:
-        yield stamp, from_pose(goal.pose).tolist()
-
-
-def _status(message: Any, _: tuple[str, str]) -> Rows:
-    yield from_time(message.goal_info.stamp), [float(message.status)]
-
-
-def _joints(message: Any, names: tuple[str, str]) -> Rows:
-    yield from_time(message.header.stamp), list(from_joint_state(message, names))
-
-
-_READERS: dict[tuple[str, str], Callable[[Any, tuple[str, str]], Rows]] = {
-    ('cmd_vel', 'geometry_msgs/msg/Twist'): _twist,
-    ('cmd_vel', 'geometry_msgs/msg/TwistStamped'): _twist_stamped,
-    ('cmd_vel_out', 'geometry_msgs/msg/TwistStamped'): _twist_stamped,
-    ('odom', 'nav_msgs/msg/Odometry'): _odometry,
-    ('start_pose', 'geometry_msgs/msg/PoseWithCovarianceStamped'): _pose_with_covariance,
-    ('goal_pose', 'geometry_msgs/msg/PoseStamped'): _pose,
-    ('goals', 'nav_msgs/msg/Goals'): _goals,
-    ('goal_status', 'action_msgs/msg/GoalStatus'): _status,
-    ('joint_command', 'sensor_msgs/msg/JointState'): _joints,
-    ('joint_states', 'sensor_msgs/msg/JointState'): _joints,
-}
-"""Topic and type to what reads it."""
-_EVENTS = ('parameter_events', 'rcl_interfaces/msg/ParameterEvent')
-_SERIES = {
-    'odometry': (('odom',), 5),
-    'cmd_vel': (('cmd_vel',), 2),
-    'cmd_vel_out': (('cmd_vel_out',), 2),
-    'start_pose': (('start_pose',), 3),
-    'wheel_commands': (('joint_command',), 2),
-    'wheels': (('joint_states',), 2),
-    'goals': (('goal_pose', 'goals'), 3),
-    'goal_status': (('goal_status',), 1),
-}
-"""Field of `Run` to its topics and how many values a row has."""
+        return {one.name: parameter_value_to_python(one.value) for one in changes}
+    except RuntimeError as error:
+        raise UndecodableError(str(error)) from error
 
 
 def _choose(reader: Reader, given: dict[str, str]) -> dict[int, str]:
@@ -292,11 +304,11 @@ def _choose(reader: Reader, given: dict[str, str]) -> dict[int, str]:
         BagError: A topic that was named is not there, is of another type, or has several candidates.
     """
     chosen: dict[int, str] = {}
-    usual = {name for name, _ in _READERS} | {_EVENTS[0]}
+    usual = {name for name, _ in ROW_READERS} | {PARAMETER_EVENTS[0]}
     if unknown := sorted(set(given) - usual):
         raise BagError(f'topics must be among {", ".join(sorted(usual))}, got {unknown[0]!r}')
     for name in usual:
-        types = {kind for topic, kind in (*_READERS, _EVENTS) if topic == name}
+        types = {kind for topic, kind in (*ROW_READERS, PARAMETER_EVENTS) if topic == name}
         candidates = [
             connection
             for connection in reader.connections
@@ -326,8 +338,9 @@ def base_name(topic: str) -> str:
 
 def _wheel_names(parameters: dict[str, dict[str, Any]]) -> tuple[str, str]:
     for values in parameters.values():
-        if 'left_wheel_name' in values and 'right_wheel_name' in values:
-            return values['left_wheel_name'], values['right_wheel_name']
+        left, right = values.get('left_wheel_name'), values.get('right_wheel_name')
+        if isinstance(left, str) and isinstance(right, str):
+            return left, right
     return WHEELS
 
 
@@ -336,9 +349,10 @@ def _in_order(rows: dict[str, list[Any]], topics: tuple[str, ...]) -> list[Any]:
     return sorted((row for topic in topics for row in rows[topic]), key=lambda row: row[0])
 
 
-def _series(rows: list[tuple[int, int, list[float]]], width: int) -> Series:
+def _series(rows: list[tuple[int, int, list[float]]], columns: tuple[str, ...]) -> Series:
     return Series(
         received=np.array([row[0] for row in rows], dtype=np.int64),
         stamps=np.array([row[1] for row in rows], dtype=np.int64),
-        values=np.array([row[2] for row in rows], dtype=np.float64).reshape(len(rows), width),
+        values=np.array([row[2] for row in rows], dtype=np.float64).reshape(len(rows), len(columns)),
+        columns=columns,
     )

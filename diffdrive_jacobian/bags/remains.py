@@ -9,6 +9,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Generator, Iterator
 from contextlib import closing, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,9 @@ from diffdrive_jacobian.bags.limits import (
     unpack_file,
     unpack_message,
 )
-from diffdrive_jacobian.bags.qos import NANOSECONDS
+from diffdrive_jacobian.bags.metadata import DamagedError, parse_parameters
+from diffdrive_jacobian.bags.qos import NANOSECONDS, to_rosbags
+from diffdrive_jacobian.bags.recorder import PARAMETERS
 from diffdrive_jacobian.bags.recording import JOURNAL, journal_of
 from diffdrive_jacobian.bags.salvage import (
     MCAP_MAGIC,
@@ -102,7 +105,8 @@ class Remains:
             if unread := (yield from self._of_journal()):
                 self.lost.append(f'{self.path.name} breaks off: its last {unread} bytes hold no record')
             return
-        yield from _custom_data(self._metadata)
+        for text in _custom_data(self._metadata):
+            yield from self._text(text)
         channels: dict[tuple[str, str], Channel] = {}
         for name, source in self._sources:
             yield from self._of_file(name, source, channels)
@@ -110,15 +114,69 @@ class Remains:
             self.lost.append(f'metadata.yaml tells of {self.promised} messages, {self._seen} were found')
 
     def _of_journal(self) -> Generator[Record, None, int]:
-        records = read_journal(self.path)
+        invalid: list[str] = []
+        budget = Budget(self.path.stat().st_size)
+        records = read_journal(self.path, invalid.append)
+        channels: dict[tuple[str, str], Channel] = {}
+        ids: dict[int, tuple[tuple[str, str], int | None]] = {}
+        strange: Counter[str] = Counter()
         while True:
             try:
                 record = next(records)
             except StopIteration as end:
+                if invalid:
+                    strange[f'records are invalid, the first: {invalid[0]}'] = len(invalid)
+                self.lost += [f'{self.path.name}: {count} {what}' for what, count in strange.items()]
                 return int(end.value)
-            if isinstance(record, Text) and record.key == 'storage' and record.value in STORAGES:
-                self.storage = record.value
-            yield record
+            if isinstance(record, Text):
+                if record.key == 'storage' and record.value in STORAGES:
+                    self.storage = record.value
+                yield from self._text(record)
+            elif isinstance(record, Channel):
+                key = record.topic, record.type_name
+                if ids.setdefault(record.id, (key, None))[0] != key:
+                    strange['descriptions of a topic have the number of another one'] += 1
+                elif (channel := self._of_journal_channel(record, channels)) is not None:
+                    ids[record.id] = key, channel.id
+                    yield channel
+            elif record.channel not in ids:
+                strange['messages belong to no known topic'] += 1
+            elif not 0 <= record.stamp < 2**63 or _payload(record.data, budget) is None:
+                strange['messages are no CDR, or have no possible time'] += 1
+            elif (to := ids[record.channel][1]) is not None:
+                yield replace(record, channel=to)
+
+    def _of_journal_channel(
+        self, channel: Channel, channels: dict[tuple[str, str], Channel]
+    ) -> Channel | None:
+        """Return a topic as it is to be written, with all profiles so far; None: it is left out."""
+        topic = Topic(
+            channel.id,
+            channel.topic,
+            channel.type_name,
+            'cdr',
+            '',
+            channel.type_hash,
+            channel.definition,
+        )
+        known = self._channel(topic, channels)
+        if known is None:
+            return None
+        profiles = [one for one in channel.qos if _is_profile(one) and one not in known.qos]
+        key = channel.topic, channel.type_name
+        channels[key] = replace(known, qos=(*known.qos, *profiles))
+        return channels[key]
+
+    def _text(self, text: Text) -> Iterator[Text]:
+        """Yield custom data, unless no reader would accept it."""
+        try:
+            if text.key.startswith(PARAMETERS):
+                parse_parameters(text.key, text.value)
+        except DamagedError as error:
+            if (loss := f'{error}: left out') not in self.lost:
+                self.lost.append(loss)
+            return
+        yield text
 
     def _of_file(
         self, name: str, source: Path, channels: dict[tuple[str, str], Channel]
@@ -132,7 +190,8 @@ class Remains:
                 if isinstance(one, str):
                     metadata, problem = _metadata(one)
                     self.lost += [f'{name}: {problem}'] if problem else []
-                    yield from _custom_data(metadata)
+                    for text in _custom_data(metadata):
+                        yield from self._text(text)
                     continue
                 if isinstance(one, Topic):
                     new = (one.name, one.type_name) not in channels
@@ -157,6 +216,8 @@ class Remains:
         key = topic.name, topic.type_name
         if key not in channels and topic.name not in self.left_out:
             try:
+                if not topic.name or not topic.type_name:
+                    raise UnknownTypeError('it has no name or no type')
                 if topic.encoding != 'cdr':
                     raise UnknownTypeError(f'its messages are {topic.encoding!r}, only cdr can be saved')
                 text, type_hash = _described(topic)
@@ -172,6 +233,15 @@ class Remains:
                 qos=_qos(topic.qos),
             )
         return channels.get(key)
+
+
+def is_recoverable(path: Path) -> bool:
+    """Return whether a file or a folder holds something that may be left of a bag."""
+    try:
+        _files(path)
+    except (NotABagError, OSError):
+        return False
+    return True
 
 
 def _files(path: Path) -> list[Path]:
@@ -271,14 +341,19 @@ def _described(topic: Topic) -> tuple[str, str]:
     Raises:
         UnknownTypeError: The file does not tell them, and no installed package does.
     """
-    if topic.definition and topic.type_hash:
-        return topic.definition, topic.type_hash
     try:
         installed = definition(topic.type_name)
+        if topic.type_hash == installed.type_hash:
+            # Its text may be damaged, or differ in comments.
+            return installed.text, installed.type_hash
+        if topic.definition and topic.type_hash:
+            return topic.definition, topic.type_hash
         if topic.definition in ('', installed.text) and topic.type_hash in ('', installed.type_hash):
             return installed.text, installed.type_hash
         reason = f'{topic.type_name} is installed in another version than it was recorded'
     except UnknownTypeError as error:
+        if topic.definition and topic.type_hash:
+            return topic.definition, topic.type_hash
         reason = str(error)
     if not topic.definition:
         raise UnknownTypeError(reason)
@@ -308,6 +383,15 @@ def _qos(text: str) -> tuple[dict[str, Any], ...]:
         )
     except (ReaderError, LookupError, TypeError, ValueError, AttributeError, *YAML_ERRORS):
         return ()
+
+
+def _is_profile(fields: dict[str, Any]) -> bool:
+    """Return whether a bag can hold a profile of a journal."""
+    try:
+        to_rosbags(fields)
+    except (KeyError, ValueError):
+        return False
+    return all(0 <= value < 2**63 for value in fields.values())
 
 
 def _nanoseconds(time: QosTime) -> int:

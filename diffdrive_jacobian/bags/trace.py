@@ -12,7 +12,8 @@ import numpy as np
 from action_msgs.msg import GoalStatus
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.bags.reading import BagError, Run, Series
+from diffdrive_jacobian.bags.reading import BagError
+from diffdrive_jacobian.bags.run import Run, Series
 from diffdrive_jacobian.kinematics._elementary import wrapped
 from diffdrive_jacobian.nodes.parameters import GoToGoalParameters
 
@@ -49,7 +50,9 @@ def trace(run: Run) -> Trace:
     aborted (`goal_status`). Of several waypoints the next one counts from the first odometry within
     xy_goal_tolerance of go_to_goal (0.02 m if that was not recorded), as the node has it; if none is,
     though the node says that it succeeded or nothing is known of it, from the closest approach.
-    A reached goal keeps its distance until the odometry begins anew, but has no direction.
+    The last goal is reached when the node reports success, or, if `goal_status` was not recorded, at
+    the first odometry within the tolerance. A reached goal has no direction. Its distance continues
+    until the odometry is reset, or, without `goal_status`, reset while the robot is at the goal.
 
     Raises:
         BagError: There is no odometry.
@@ -112,7 +115,7 @@ def _breaks(run: Run) -> Indices:
 
 
 def _progress(run: Run, breaks: Indices) -> tuple[Indices, NDArray[np.bool_]]:
-    """Say of each odometry which goal it is on the way to, -1 for none, and whether that is reached."""
+    """Return for each odometry which goal is driven to, -1 for none, and whether it is reached."""
     seen, places = run.odometry.received, _driven_points(run)
     goal, reached = np.full(len(seen), -1), np.zeros(len(seen), dtype=bool)
     known = len(run.goal_status) > 0 or bool(run.of_node('go_to_goal'))
@@ -120,28 +123,55 @@ def _progress(run: Run, breaks: Indices) -> tuple[Indices, NDArray[np.bool_]]:
     for index, route in enumerate(routes):
         begun = run.goals.received[route.start]
         until = run.goals.received[routes[index + 1].start] if index + 1 < len(routes) else _NEVER
-        states, instants = _statuses(run, begun, until)
+        states, times = _statuses(run, begun, until)
         here, end = np.searchsorted(seen, [begun, until]).tolist()
         stop = end
         if len(states) and states[-1] in (GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED):
-            stop = min(stop, int(np.searchsorted(seen, instants[-1], side='right')))
-        succeeded = instants[states == GoalStatus.STATUS_SUCCEEDED]
-        for target in route:
+            stop = min(stop, int(np.searchsorted(seen, times[-1], side='right')))
+        succeeded = times[states == GoalStatus.STATUS_SUCCEEDED]
+        for target in route[:-1]:
             goal[here:stop] = target
-            distance = np.hypot(*(places[here:stop] - run.goals.values[target, :2]).T)
-            within = np.flatnonzero(distance <= tolerance(run) + 1e-12)
-            if len(within):
-                here += int(within[0])
-            elif target == route[-1] and len(succeeded):
-                here = max(here, int(np.searchsorted(seen, succeeded[-1])))
-            elif target != route[-1] and len(distance) and (len(succeeded) or not known):
-                here += int(np.argmin(distance))
+            within = _within(run, places[here:stop], target)
+            if within.any():
+                here += int(np.argmax(within))
+            elif len(within) and (len(succeeded) or not known):
+                here += int(np.argmin(_distances(run, places[here:stop], target)))
             else:
                 break
         else:
-            stop = min([stop, *breaks[breaks > here]])
+            last, begin = route[-1], here
+            goal[begin:stop] = last
+            within = _within(run, places[begin:stop], last)
+            if len(succeeded):
+                here += _arrival(within, int(np.searchsorted(seen, succeeded[-1])) - begin)
+            elif within.any() and not len(states):
+                here += int(np.argmax(within))
+            else:
+                # The node still drives to it, even if the robot was near it once.
+                continue
+            over = breaks[(breaks > here) & (breaks <= stop)]
+            if not len(succeeded):
+                # A robot that had left the goal again only passed it.
+                over = over[within[over - 1 - begin]]
+            stop = min([stop, *over.tolist()])
             goal[stop:end], reached[here:stop] = -1, True
     return goal, reached
+
+
+def _distances(run: Run, places: Array, target: int) -> Array:
+    """Return the distance of each place from a goal, shape (n,) (m)."""
+    return np.asarray(np.hypot(*(places - run.goals.values[target, :2]).T), dtype=np.float64)
+
+
+def _within(run: Run, places: Array, target: int) -> Mask:
+    """Return for each place whether it counts as arrived at a goal, shape (n,)."""
+    return np.asarray(_distances(run, places, target) <= tolerance(run) + 1e-12)
+
+
+def _arrival(within: Mask, success: int) -> int:
+    """Return since which place the robot was at the goal when the node reported success there."""
+    outside = np.flatnonzero(~within[: success + 1])
+    return min(int(outside[-1]) + 1 if len(outside) else 0, success)
 
 
 def _routes(run: Run) -> list[range]:
@@ -167,7 +197,7 @@ def _driven_points(run: Run) -> Array:
     told = run.of_node('go_to_goal')
     if told.get('controller') != 'offset_point':
         return poses[:, :2]
-    d = float(told.get('offset', GoToGoalParameters().offset))
+    d = run.number_of_node('go_to_goal', 'offset', GoToGoalParameters().offset)
     return poses[:, :2] + d * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
 
 
@@ -180,4 +210,4 @@ def _statuses(run: Run, begin: int, end: int) -> tuple[Array, NDArray[np.int64]]
 def tolerance(run: Run) -> float:
     """Give the distance from a goal that counts as arrived (m)."""
     default = GoToGoalParameters().xy_goal_tolerance
-    return float(run.of_node('go_to_goal').get('xy_goal_tolerance', default))
+    return run.number_of_node('go_to_goal', 'xy_goal_tolerance', default)

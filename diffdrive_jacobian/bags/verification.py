@@ -18,10 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.bags.reading import BagError, Run, Series
+from diffdrive_jacobian.bags.reading import BagError
+from diffdrive_jacobian.bags.run import Run, Series
 from diffdrive_jacobian.kinematics._elementary import wrapped
 from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
 from diffdrive_jacobian.nodes.parameters import VirtualRobotParameters
+from diffdrive_jacobian.ros.messages import MessageError, plausible_twist
 from diffdrive_jacobian.ros.parameters import from_ros
 from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot, RobotModel
 
@@ -44,6 +46,8 @@ class Verification:
     """Differences of the position, shape (n,) (m)."""
     headings: NDArray[np.float64]
     """Differences of the heading, not negative, shape (n,) (rad)."""
+    notes: tuple[str, ...] = ()
+    """What is wrong with the bag although it could be read, such as messages that were skipped."""
 
     @property
     def allowed(self) -> float:
@@ -111,6 +115,7 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
         seconds=np.array(seconds),
         distances=np.hypot(difference[:, 0], difference[:, 1]),
         headings=np.abs(wrapped(difference[:, 2])),
+        notes=run.notes,
     )
 
 
@@ -223,7 +228,12 @@ def _commanded(run: Run, given: Mapping[str, Any] | None) -> tuple[str, str, lis
                 parameters.model(), received, wheels_commanded=source == 'joint_command'
             )
         else:
-            robot = robot.commanded(_twist(parameters, source, event), received)
+            try:
+                twist = _twist(parameters, source, event)
+            except MessageError:
+                # The node drops it, too.
+                continue
+            robot = robot.commanded(twist, received)
         anchors.append(_Anchor(robot, received))
     return source, 'odometry', [anchors]
 
@@ -235,4 +245,4 @@ def _twist(
     if source == 'cmd_vel':
         return first, second
     v, omega = wheel_to_body(first, second, parameters.wheel_radius, parameters.wheel_separation)
-    return float(v), float(omega)
+    return plausible_twist(float(v), float(omega))

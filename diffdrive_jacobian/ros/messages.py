@@ -32,6 +32,9 @@ MAX_SPEED = 1e3
 """Twists beyond this are not plausible (m/s, rad/s)."""
 MAX_POSITION = 1e6
 """Positions beyond this are not plausible (m)."""
+MAX_WHEEL_SPEED = 1e6
+"""Wheel speeds beyond this are not plausible (rad/s): the rim of the smallest wheel that the nodes
+accept, 1e-3 m, then exceeds `MAX_SPEED`."""
 
 # x, y and yaw, and forward and yaw, in the row-major 6x6 covariances of ROS.
 _PLANAR = np.array([6 * row + column for row in (0, 1, 5) for column in (0, 1, 5)])
@@ -253,7 +256,7 @@ def from_joint_state(message: JointState, names: tuple[str, str]) -> tuple[float
     """Read `(omega_R, omega_L)` of the joints `names`, which are left, right.
 
     Raises:
-        MessageError: A joint is missing, has no velocity, or one that is not finite.
+        MessageError: A joint is missing, has no velocity, or one that is not finite or not plausible.
     """
     if len(message.velocity) != len(message.name):
         raise MessageError(
@@ -268,4 +271,8 @@ def from_joint_state(message: JointState, names: tuple[str, str]) -> tuple[float
     left, right = (speeds[name] for name in names)
     if not (math.isfinite(left) and math.isfinite(right)):
         raise MessageError(f'wheel speeds must be finite, got left {left}, right {right}')
+    if max(abs(left), abs(right)) > MAX_WHEEL_SPEED:
+        raise MessageError(
+            f'wheel speeds must be within {MAX_WHEEL_SPEED:g} rad/s, got left {left:g}, right {right:g}'
+        )
     return right, left

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import io
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ from diffdrive_jacobian.bags.figure import FORMATS, create, draw, names
 from diffdrive_jacobian.bags.reading import BagError, Run, Series, read_run
 from diffdrive_jacobian.bags.trace import Trace, seconds, trace
 from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli
 
 PROGRAM = 'plot_run'
@@ -38,6 +40,8 @@ COLUMNS = (
     *('omega_right_radps', 'omega_left_radps'),
 )
 """Of a CSV file."""
+DECIMALS = 9
+"""Decimal places of the values in a CSV file; its times are exact to the nanosecond."""
 
 
 class UsageError(Exception):
@@ -93,8 +97,24 @@ def _clocks(one: Trace, series: Series) -> tuple[NDArray[np.float64], NDArray[np
     return (one.run.odometry.received - begin) / 1e9, (series.received - begin) / 1e9
 
 
+def _seconds(nanoseconds: int) -> str:
+    """Return a time as an exact decimal number (s)."""
+    sign, (whole, rest) = '-' * (nanoseconds < 0), divmod(abs(nanoseconds), 1_000_000_000)
+    return f'{sign}{whole}.{rest:09d}'.rstrip('0').rstrip('.')
+
+
+def _decimal(value: float) -> str:
+    """Return a number rounded to `DECIMALS` places; '': NaN."""
+    if math.isnan(value):
+        return ''
+    text = f'{value:.{DECIMALS}f}'.rstrip('0').rstrip('.')
+    return '0' if text == '-0' else text
+
+
 def write_csv(run: Run, path: Path) -> None:
     """Write a run into a new CSV file with a header line; what is not known stays empty.
+
+    Times are exact, values are rounded to `DECIMALS` places.
 
     Raises:
         BagError: The run has no odometry.
@@ -104,8 +124,9 @@ def write_csv(run: Run, path: Path) -> None:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator='\n')
     writer.writerow(COLUMNS)
-    for row in table(run).tolist():
-        writer.writerow(['' if value != value else repr(value) for value in row])
+    stamps = (run.odometry.stamps - run.odometry.stamps[0]).tolist()
+    for stamp, (_, *values) in zip(stamps, table(run).tolist(), strict=True):
+        writer.writerow([_seconds(stamp), *map(_decimal, values)])
     create(path, text.getvalue().encode())
 
 
@@ -123,6 +144,8 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             runs.append(read_run(bag, dict(options.topics)))
             # Before the others are read, which takes a while.
             trace(runs[-1])
+            for note in runs[-1].notes:
+                print(f'{PROGRAM}: {printable(bag, PATH_LIMIT)}: {note}', file=sys.stderr)
             if signals.count:
                 return _interrupted()
         return _write(runs, picture, tables, signals)
@@ -167,6 +190,10 @@ def _picture(output: str | None, bags: Sequence[Path]) -> Path:
     """
     name = '_and_'.join(bag.resolve().name for bag in bags)
     path = bags[0].resolve().parent / f'{name}.png' if output is None else Path(output)
+    if output is not None and (output.endswith('/') or path.is_dir()):
+        raise UsageError(
+            f'the picture must be a file (.{", .".join(FORMATS)}), got a directory: {output!r}'
+        )
     if path.suffix.lower().removeprefix('.') not in FORMATS:
         raise UsageError(f'the picture must end in .{", .".join(FORMATS)}, got {output!r}')
     return _new(path)
@@ -179,11 +206,16 @@ def _tables(output: str, bags: Sequence[Path]) -> list[Path]:
         UsageError: They cannot be.
     """
     path = Path(output)
-    if path.is_dir() or output.endswith('/') or path.suffix.lower() != '.csv':
+    if path.is_dir() or output.endswith('/') or not path.suffix:
         if path.exists() and not path.is_dir():
             raise UsageError(f'{path} exists already; a file for the numbers ends in .csv')
         labels = (name.replace('/', '_') for name in names(bags))
         return [_new(path / f'{label}.csv') for label in labels]
+    if path.suffix.lower() != '.csv':
+        raise UsageError(
+            f'the file for the numbers must end in .csv, got {output!r} (a directory exists '
+            'already, has a name without an ending, or is given with / at its end)'
+        )
     if len(bags) > 1:
         raise UsageError(f'the numbers of {len(bags)} runs need a directory, got {output!r}')
     return [_new(path)]
@@ -222,7 +254,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--csv',
         metavar='FILE_OR_DIR',
-        help='write the numbers, too: FILE.csv, or in the directory BAG.csv for each bag',
+        help='write the numbers, too: FILE.csv, or in the directory BAG.csv for each bag; times are '
+        f'exact, values rounded to {DECIMALS} decimal places',
     )
     parser.add_argument(
         '--topic',

@@ -7,18 +7,21 @@ import sqlite3
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 from diffdrive_jacobian.bags.building import STORAGES, Summary, build_bag
+from diffdrive_jacobian.bags.decoding import DecodingCheck
 from diffdrive_jacobian.bags.journal import (
+    Channel,
     JournalError,
     Message,
     Record,
     is_being_written,
 )
+from diffdrive_jacobian.bags.reading import damage
 from diffdrive_jacobian.bags.recording import JOURNAL, journal_of
 from diffdrive_jacobian.bags.remains import NotABagError, Remains
 from diffdrive_jacobian.ros.signals import Signals
@@ -47,10 +50,14 @@ class Report(NamedTuple):
 
     bag: Path
     summary: Summary
+    damaged: str
+    """Why readers refuse the old one, in words; '': they do not, or it has no metadata.yaml."""
     lost: list[str]
     """What could not be read, in words."""
     left_out: bool
     """Whether these are topics, too, that could be read and not be written."""
+    undecodable: list[str]
+    """Messages that were saved although no reader can decode them, and topics not checked, in words."""
 
 
 def recover(what: Path, output: Path | None, storage: str | None, signals: Signals) -> Report:
@@ -86,15 +93,31 @@ def recover(what: Path, output: Path | None, storage: str | None, signals: Signa
                 yield record
 
         # It may still grow: what counts is what was there now.
-        kinds = Counter(type(record) for record in records())
+        kinds, decoding = _survey(records())
         losses, left_out = remains.losses, bool(remains.left_out)
+        damaged = '' if remains.kind == 'journal' else damage(what)
         whole = remains.promised == kinds[Message] or (what.suffix == '.mcap' and what.is_file())
-        if whole and not losses:
-            raise NothingToSaveError(f'{what} is complete: nothing to recover')
+        if whole and not losses and not damaged:
+            complete = f'{what} is complete: nothing to recover'
+            raise NothingToSaveError('; '.join([complete, *decoding.undecodable]))
         if not kinds[Message]:
             raise NothingToSaveError(f'{what} holds no message that can be saved', *losses)
         summary = build_bag(lambda: islice(records(), kinds.total()), target, storage or remains.storage)
-        return Report(target, summary, losses, left_out)
+        return Report(target, summary, damaged, losses, left_out, decoding.undecodable)
+
+
+def _survey(records: Iterable[Record]) -> tuple[Counter[type[Record]], DecodingCheck]:
+    """Count the records by their kind, and the messages that cannot be decoded."""
+    kinds: Counter[type[Record]] = Counter()
+    channels: dict[int, Channel] = {}
+    decoding = DecodingCheck()
+    for record in records:
+        kinds[type(record)] += 1
+        if isinstance(record, Channel):
+            channels[record.id] = record
+        elif isinstance(record, Message):
+            decoding.add(channels[record.channel], record.data)
+    return kinds, decoding
 
 
 def _beside(what: Path, kind: str) -> Path:
@@ -127,7 +150,11 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             else _cli.FAILED
         )
     print(describe(report.bag, report.summary))
+    if report.damaged:
+        print(f'damaged: {report.damaged}')
     print(*_listed(report.lost, 'lost: ') or ['nothing was lost that could be seen'], sep='\n')
+    for line in _listed(report.undecodable, 'saved as recorded: '):
+        print(line)
     return _cli.FAILED if report.left_out else _cli.DONE
 
 

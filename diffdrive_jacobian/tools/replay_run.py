@@ -183,7 +183,8 @@ def report(verification: Verification, tolerance: float, yaw_tolerance: float) -
     """Say how far the robot driven again and the odometry are apart."""
     lines = [
         f'{len(verification.seconds)} odometry messages, commands from {verification.source}, '
-        f'begun at the first {verification.start}'
+        f'begun at the first {verification.start}',
+        *(f'note: {note}' for note in verification.notes),
     ]
     for name, unit, values, allowed in (
         ('position', 'm', verification.distances, tolerance),

@@ -1,0 +1,213 @@
+"""Validation of what a bag says about itself: metadata.yaml, recorded parameters, topics.
+
+rosbags takes these values as they are. They are checked once, before anything else uses them, so that
+each tool finds the same bags damaged and names the same key.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from rosbags.interfaces import Connection, ConnectionExtRosbag2
+from rosbags.rosbag2 import ReaderError
+from ruamel.yaml.error import YAMLError
+
+from diffdrive_jacobian.bags.bounded_reader import parse_bounded_qos
+from diffdrive_jacobian.bags.bounded_yaml import YAML_ERRORS, load_yaml
+from diffdrive_jacobian.bags.building import STORAGES
+from diffdrive_jacobian.bags.limits import TooLargeError
+from diffdrive_jacobian.text import printable
+
+LATEST_VERSION = 9
+"""Of metadata.yaml, that rosbags reads."""
+ROOT = 'rosbag2_bagfile_information'
+INVALID = (ReaderError, YAMLError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
+"""What rosbags and the YAML parser raise on values of another kind than they expect."""
+_COMPRESSIONS = ('', 'none', 'file', 'message', 'storage')
+_INT64 = 2**63
+
+
+class DamagedError(ValueError):
+    """A value in a bag is invalid; the message says which, what it is, and what is allowed."""
+
+
+def check_metadata(source: Path | str) -> None:
+    """Check the content of metadata.yaml.
+
+    Args:
+        source: The file, or its text.
+
+    Raises:
+        OSError: The file cannot be read.
+        DamagedError: It is not YAML of moderate size, or one of its values is invalid.
+    """
+    try:
+        found = load_yaml(source)
+    except TooLargeError as error:
+        raise DamagedError(f'metadata.yaml is too large: {error}') from error
+    except YAML_ERRORS as error:
+        raise DamagedError(f'metadata.yaml is not valid YAML: {printable(error, 120)}') from error
+    whole = _mapping(found, '')
+    root = _mapping(_required(whole, ROOT, ''), ROOT)
+    _integer(_required(root, 'version', ''), 'version', 1, LATEST_VERSION)
+    _choice(_required(root, 'storage_identifier', ''), 'storage_identifier', sorted(STORAGES))
+    paths = _sequence(_required(root, 'relative_file_paths', ''), 'relative_file_paths')
+    for index, path in enumerate(paths):
+        where = f'relative_file_paths[{index}]'
+        if not _string(path, where) or '\0' in path:
+            raise _wrong(where, 'the name of a file', path)
+    count = _integer(_required(root, 'message_count', ''), 'message_count', 0, _INT64 - 1)
+    for key, name in (('duration', 'nanoseconds'), ('starting_time', 'nanoseconds_since_epoch')):
+        value = _required(_mapping(_required(root, key, ''), key), name, key)
+        # Of a bag without messages, the writers differ.
+        _integer(value, f'{key}.{name}', 0 if count else -_INT64, _INT64 - 1)
+    topics = _sequence(_required(root, 'topics_with_message_count', ''), 'topics_with_message_count')
+    for index, topic in enumerate(topics):
+        _check_topic(_mapping(topic, f'topics_with_message_count[{index}]'), index)
+    if 'compression_mode' in root:
+        mode = _string(root['compression_mode'], 'compression_mode')
+        _choice(mode.lower(), 'compression_mode', _COMPRESSIONS)
+    for key in ('compression_format', 'ros_distro'):
+        if root.get(key) is not None:
+            _string(root[key], key)
+    for index, file in enumerate(_sequence(root.get('files', []), 'files')):
+        _mapping(file, f'files[{index}]')
+    check_custom_data(root.get('custom_data'))
+
+
+def _check_topic(topic: dict[str, Any], index: int) -> None:
+    where = f'topics_with_message_count[{index}]'
+    count = _required(topic, 'message_count', where)
+    _integer(count, f'{where}.message_count', 0, _INT64 - 1)
+    where += '.topic_metadata'
+    described = _mapping(_required(topic, 'topic_metadata', where[: -len('.topic_metadata')]), where)
+    for key in ('name', 'type', 'serialization_format'):
+        if not _string(_required(described, key, where), f'{where}.{key}'):
+            raise _wrong(f'{where}.{key}', 'text that is not empty', '')
+    _choice(described['serialization_format'], f'{where}.serialization_format', ['cdr'])
+    _string(described.get('type_description_hash', ''), f'{where}.type_description_hash')
+    try:
+        parse_bounded_qos(described.get('offered_qos_profiles', []))
+    except (*INVALID, RecursionError) as error:
+        key = f'{where}.offered_qos_profiles'
+        raise _wrong(key, 'a list of QoS profiles', described['offered_qos_profiles']) from error
+
+
+def check_custom_data(custom: object) -> dict[str, str]:
+    """Return custom data, {} for None.
+
+    Raises:
+        DamagedError: It is not a map of texts.
+    """
+    custom = {} if custom is None else custom
+    if not isinstance(custom, dict) or not all(isinstance(one, str) for one in _flat(custom)):
+        raise _wrong('custom_data', 'a map of texts', custom)
+    return custom
+
+
+def parse_parameters(key: str, text: str) -> dict[str, Any]:
+    """Return the parameters of a node from an entry of the custom data.
+
+    Args:
+        key: The entry's key.
+        text: Its value.
+
+    Raises:
+        DamagedError: It is not a JSON object.
+    """
+    try:
+        values = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise DamagedError(f'the {printable(key)} are not JSON: {printable(error)}') from error
+    if not isinstance(values, dict):
+        raise DamagedError(
+            f'the {printable(key)} must be a JSON object, got {printable(repr(text), 40)}'
+        )
+    return values
+
+
+def check_connections(described: Iterable[Connection], stored: Iterable[Connection]) -> None:
+    """Check the topics of an open bag.
+
+    rosbags reads a message only if metadata.yaml describes its topic exactly as the data file does, and
+    passes over all others without a word.
+
+    Args:
+        described: The bag's topics, as metadata.yaml has them.
+        stored: The topics of the data files. Of a bag that is a single file, the same.
+
+    Raises:
+        DamagedError: A topic's name or type is not text, or a topic with messages is not described.
+    """
+    described, stored = list(described), list(stored)
+    for connection in [*described, *stored]:
+        for what, value in (('name', connection.topic), ('type', connection.msgtype)):
+            if not isinstance(value, str) or not value:
+                raise DamagedError(f'the {what} of a topic must be text, got {printable(repr(value))}')
+        if not isinstance(connection.ext, ConnectionExtRosbag2):
+            raise DamagedError(f'{printable(connection.topic)} is not a topic of ROS 2')
+    for connection in stored:
+        if connection.msgcount and not any(_alike(connection, one) for one in described):
+            raise DamagedError(
+                f'metadata.yaml does not describe the topic {printable(connection.topic)} of '
+                f'{printable(connection.msgtype)} as the data file does '
+                '(name, type, type hash, QoS, serialization)'
+            )
+
+
+def _alike(stored: Connection, described: Connection) -> bool:
+    """Return whether rosbags takes two topics for the same."""
+    if (stored.topic, stored.msgtype, stored.ext) != (described.topic, described.msgtype, described.ext):
+        return False
+    return not stored.digest or not described.digest or stored.digest == described.digest
+
+
+# --- Values by their kind
+
+
+def _required(mapping: dict[str, Any], key: str, where: str) -> Any:
+    if key not in mapping:
+        raise DamagedError(f'metadata.yaml lacks {f"{where}.{key}" if where else key}')
+    return mapping[key]
+
+
+def _wrong(where: str, allowed: str, got: object) -> DamagedError:
+    return DamagedError(
+        f'metadata.yaml: {where or "its content"} must be {allowed}, got {printable(repr(got), 40)}'
+    )
+
+
+def _mapping(value: object, where: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise _wrong(where, 'a map', value)
+    return value
+
+
+def _sequence(value: object, where: str) -> list[Any]:
+    if not isinstance(value, list):
+        raise _wrong(where, 'a list', value)
+    return value
+
+
+def _string(value: object, where: str) -> str:
+    if not isinstance(value, str):
+        raise _wrong(where, 'text', value)
+    return value
+
+
+def _choice(value: object, where: str, choices: Sequence[str]) -> None:
+    if value not in choices:
+        raise _wrong(where, f'one of {", ".join(repr(one) for one in choices)}', value)
+
+
+def _integer(value: object, where: str, low: int, high: int) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+        raise _wrong(where, f'an integer from {low} to {high}', value)
+    return value
+
+
+def _flat(mapping: dict[Any, Any]) -> list[Any]:
+    return [*mapping.keys(), *mapping.values()]

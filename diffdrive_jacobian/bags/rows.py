@@ -1,0 +1,79 @@
+"""Conversion of the messages of a run to rows of numbers, as the nodes read them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from diffdrive_jacobian.ros.messages import (
+    from_joint_state,
+    from_pose,
+    from_time,
+    from_twist,
+)
+
+Rows = Iterator[tuple[int, list[float]]]
+"""Stamp (ns; 0: none) and values."""
+
+
+def _twist(message: Any, _: tuple[str, str]) -> Rows:
+    yield 0, list(from_twist(message))
+
+
+def _twist_stamped(message: Any, _: tuple[str, str]) -> Rows:
+    yield from_time(message.header.stamp), list(from_twist(message.twist))
+
+
+def _odometry(message: Any, _: tuple[str, str]) -> Rows:
+    pose, twist = from_pose(message.pose.pose), from_twist(message.twist.twist)
+    yield from_time(message.header.stamp), [*pose.tolist(), *twist]
+
+
+def _pose(message: Any, _: tuple[str, str]) -> Rows:
+    yield from_time(message.header.stamp), from_pose(message.pose).tolist()
+
+
+def _pose_with_covariance(message: Any, _: tuple[str, str]) -> Rows:
+    yield from_time(message.header.stamp), from_pose(message.pose.pose).tolist()
+
+
+def _goals(message: Any, _: tuple[str, str]) -> Rows:
+    stamp = from_time(message.header.stamp)
+    for goal in message.goals:
+        yield stamp, from_pose(goal.pose).tolist()
+
+
+def _status(message: Any, _: tuple[str, str]) -> Rows:
+    yield from_time(message.goal_info.stamp), [float(message.status)]
+
+
+def _joints(message: Any, names: tuple[str, str]) -> Rows:
+    yield from_time(message.header.stamp), list(from_joint_state(message, names))
+
+
+ROW_READERS: dict[tuple[str, str], Callable[[Any, tuple[str, str]], Rows]] = {
+    ('cmd_vel', 'geometry_msgs/msg/Twist'): _twist,
+    ('cmd_vel', 'geometry_msgs/msg/TwistStamped'): _twist_stamped,
+    ('cmd_vel_out', 'geometry_msgs/msg/TwistStamped'): _twist_stamped,
+    ('odom', 'nav_msgs/msg/Odometry'): _odometry,
+    ('start_pose', 'geometry_msgs/msg/PoseWithCovarianceStamped'): _pose_with_covariance,
+    ('goal_pose', 'geometry_msgs/msg/PoseStamped'): _pose,
+    ('goals', 'nav_msgs/msg/Goals'): _goals,
+    ('goal_status', 'action_msgs/msg/GoalStatus'): _status,
+    ('joint_command', 'sensor_msgs/msg/JointState'): _joints,
+    ('joint_states', 'sensor_msgs/msg/JointState'): _joints,
+}
+"""Topic's base name and type to the function that reads a message, given the names of the left and the
+right wheel joint. The functions raise MessageError for messages that the nodes drop."""
+PARAMETER_EVENTS = ('parameter_events', 'rcl_interfaces/msg/ParameterEvent')
+SERIES_TOPICS = {
+    'odometry': ('odom',),
+    'cmd_vel': ('cmd_vel',),
+    'cmd_vel_out': ('cmd_vel_out',),
+    'start_pose': ('start_pose',),
+    'wheel_commands': ('joint_command',),
+    'wheels': ('joint_states',),
+    'goals': ('goal_pose', 'goals'),
+    'goal_status': ('goal_status',),
+}
+"""Field of `Run` to its topics."""
