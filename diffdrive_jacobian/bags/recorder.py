@@ -15,7 +15,7 @@ from typing import Any, Protocol
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.subscription import Subscription
 
 from diffdrive_jacobian.bags.definitions import UnknownTypeError, definition
@@ -218,9 +218,11 @@ class Recorder(Node):  # type: ignore[misc]
         callback = partial(self._on_informed, topic)
         # A callable with two arguments is given the information that comes with a message.
         create = partial(self.create_subscription, message, topic, callback, profile, raw=True)
+        # What a publisher overwrites while it sends its old messages to us would be reported as lost.
+        latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        on_lost = None if latched else partial(self._on_lost, topic)
         try:
-            events = SubscriptionEventCallbacks(message_lost=partial(self._on_lost, topic))
-            subscription = create(event_callbacks=events)
+            subscription = create(event_callbacks=SubscriptionEventCallbacks(message_lost=on_lost))
         except UnsupportedEventTypeError:
             subscription = create()
         self._subscriptions_by_topic[topic] = subscription
