@@ -14,7 +14,7 @@ from typing import Any, Protocol
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.subscription import Subscription
 
 from diffdrive_jacobian.bags.definitions import UnknownTypeError, definition, message_class
@@ -44,7 +44,9 @@ DEPTH = 4000
 BURST = 0.01
 """How long the waiting messages of a topic are taken before other topics have their turn (s)."""
 DRAIN_PATIENCE = 3.0
-"""How long it may take to collect what waits at the end (s)."""
+"""How long it may take to collect at the end what was sent before (s)."""
+IN_TRANSIT = 0.1
+"""After so long without such a message none is expected any more (s)."""
 PARAMETERS = 'parameters of '
 """Before a node's name, the key of the custom data that holds its parameters as JSON."""
 
@@ -110,6 +112,8 @@ class Recorder(Node):  # type: ignore[misc]
         self._stamped = with_info and not self.get_parameter('use_sim_time').value
         self._missed: dict[str, MissedMessages] = {}
         self._reported: Counter[str] = Counter()
+        self._end: int | None = None
+        self._drain_deadline = self._last_added = 0.0
         self.messages = 0
         """How many were received."""
 
@@ -137,22 +141,26 @@ class Recorder(Node):  # type: ignore[misc]
             query.advance()
         self._report_missed()
 
-    def drain(self) -> None:
-        """Collect what the middleware received before this call and nobody has handled.
+    def end(self) -> None:
+        """Record from now on only what was sent or received before; spin until `drained`.
 
-        For a recorder `with_info`, while its executor does not spin.
+        For a recorder `with_info`.
         """
-        end, deadline = time.time_ns(), time.monotonic() + DRAIN_PATIENCE
-        for topic, subscription in self._subscriptions_by_topic.items():
-            if not self._take(topic, subscription, deadline, received_before=end):
-                self.get_logger().error(f'not all of {topic} could be collected at the end')
+        self._end = time.time_ns()
+        self._last_added = time.monotonic()
+        self._drain_deadline = self._last_added + DRAIN_PATIENCE
+
+    def drained(self) -> bool:
+        """Whether everything that was sent before `end` has arrived, as far as that can be known."""
         self._report_missed()
+        now = time.monotonic()
+        return now - self._last_added > IN_TRANSIT or now > self._drain_deadline
 
     def _report_missed(self) -> None:
         for topic in self._channels:
-            # Where messages are numbered, that counts what was overwritten in the middleware, too.
-            missed = self._missed[topic].count or self._reported[topic]
-            if missed:
+            # The numbers show what was overwritten while it waited, but not what was lost before the
+            # first message; the middleware's count shows the latter, but not the former.
+            if missed := max(self._missed[topic].count, self._reported[topic]):
                 self._sink.set_missed(topic, missed)
 
     def _resolved(self, topic: str) -> str:
@@ -209,9 +217,11 @@ class Recorder(Node):  # type: ignore[misc]
         callback = partial(self._on_informed, topic)
         # A callable with two arguments is given the information that comes with a message.
         create = partial(self.create_subscription, message, topic, callback, profile, raw=True)
+        # What a publisher overwrites while it sends its old messages to us would be reported as lost.
+        latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        on_lost = None if latched else partial(self._on_lost, topic)
         try:
-            events = SubscriptionEventCallbacks(message_lost=partial(self._on_lost, topic))
-            subscription = create(event_callbacks=events)
+            subscription = create(event_callbacks=SubscriptionEventCallbacks(message_lost=on_lost))
         except UnsupportedEventTypeError:
             subscription = create()
         self._subscriptions_by_topic[topic] = subscription
@@ -241,27 +251,20 @@ class Recorder(Node):  # type: ignore[misc]
     def _on_informed(self, topic: str, data: bytes, info: dict[str, int]) -> None:
         self._takers[topic](data, info)
         # The executor takes one message at a time, at many times the cost: a burst would overflow.
-        self._take(topic, self._subscriptions_by_topic[topic], time.monotonic() + BURST)
-
-    def _take(
-        self,
-        topic: str,
-        subscription: Subscription,
-        deadline: float,
-        received_before: int | None = None,
-    ) -> bool:
-        """Record what waits on a topic. Return whether that was done before a deadline."""
-        record = self._takers[topic]
+        subscription, end = self._subscriptions_by_topic[topic], time.monotonic() + BURST
         with subscription.handle:
-            while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
-                record(*taken)
-                if received_before is not None and taken[1]['received_timestamp'] > received_before:
+            while time.monotonic() < end:
+                taken = subscription.handle.take_message(subscription.msg_type, True)
+                if taken is None:
                     break
-                if time.monotonic() > deadline:
-                    return False
-        return True
+                self._takers[topic](*taken)
 
     def _record(self, channel: int, missed: MissedMessages, data: bytes, info: dict[str, int]) -> None:
+        if self._end is not None:
+            # Clocks of other machines may be ahead, so either time will do.
+            if min(info['received_timestamp'], info['source_timestamp'] or self._end + 1) > self._end:
+                return
+            self._last_added = time.monotonic()
         number = info['publication_sequence_number']
         # None: the middleware does not number them.
         if number is not None:

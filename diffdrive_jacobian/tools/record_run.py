@@ -79,8 +79,11 @@ def _receive(
             late = max_duration is not None and now - recording.started >= max_duration
             return bool(signals.count or late or recording.error)
 
-        if runner.spin(over):
-            recorder.drain()
+        if runner.spin(over) and recording.error is None:
+            recorder.end()
+            # A second signal does not wait.
+            before = signals.count
+            runner.spin(lambda: recorder.drained() or signals.count > before)
     status.end()
 
 
