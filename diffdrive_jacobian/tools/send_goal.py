@@ -5,33 +5,25 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
-from numpy.typing import NDArray
-from rclpy.context import Context
-from rclpy.duration import Duration
-from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
-from std_srvs.srv import Trigger
 
-from diffdrive_jacobian.ros import messages
-from diffdrive_jacobian.ros.messages import MessageError
+from diffdrive_jacobian.ros.goal_sender import GoalSender, loss
+from diffdrive_jacobian.ros.liveness import Liveness
 from diffdrive_jacobian.ros.runner import Runner, UserError, ros_context, running
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._progress import Drive
+from diffdrive_jacobian.tools._waiting import Waiting
 
 PROGRAM = 'send_goal'
 ANSWER_PATIENCE = 5.0
 """How long the controller may take to say whether it accepts, or that it canceled (s)."""
 
 LOOK_PERIOD = 1.0
-"""How often the tool looks whether the controller is still there (s)."""
+"""Time between two looks at the publishers of goal_status (s)."""
 
 ENDS = {
     GoalStatus.STATUS_SUCCEEDED: 'arrived',
@@ -40,110 +32,17 @@ ENDS = {
 }
 
 
-class Sender(Node):  # type: ignore[misc]
-    """Sends one goal and follows what becomes of it."""
+def follow(sender: GoalSender, runner: Runner, signals: Signals, options: argparse.Namespace) -> int:
+    """Send the goal once a controller is there, and wait for the end; return the exit code."""
+    waiting = Waiting()
 
-    def __init__(
-        self, goal: NDArray[np.float64], frame: str, context: Context, readers: int = 1
-    ) -> None:
-        """Prepare to send a goal `[x, y, theta]`, shape (3,), to so many readers."""
-        super().__init__('send_goal', context=context, start_parameter_services=False)
-        self.goal = goal
-        self.status = GoalStatus.STATUS_UNKNOWN
-        self.pose: NDArray[np.float64] | None = None
-        self.seen = time.monotonic()
-        """When odometry came last, or the watch for it began (s, monotonic)."""
-        self._frame = frame
-        self._readers = readers
-        self._message: PoseStamped | None = None
-        self._publisher = self.create_publisher(PoseStamped, 'goal_pose', 10)
-        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.create_subscription(GoalStatus, 'goal_status', self._on_status, latched)
-        self.create_subscription(Odometry, 'odom', self._on_odometry, 10)
-        self._cancel = self.create_client(Trigger, 'cancel_goal')
+    def ready() -> bool:
+        obstacle = sender.obstacle()
+        if obstacle is not None:
+            waiting.show(obstacle)
+        return obstacle is None
 
-    @property
-    def distance(self) -> float:
-        """The distance to the goal (m); infinite before the first odometry."""
-        if self.pose is None:
-            return math.inf
-        return math.hypot(self.goal[0] - self.pose[0], self.goal[1] - self.pose[1])
-
-    def controllers(self) -> set[bytes]:
-        """Tell who publishes goal_status: others than controllers read goal_pose, too."""
-        topic = self.resolve_topic_name('goal_status')
-        return {bytes(info.endpoint_gid) for info in self.get_publishers_info_by_topic(topic)}
-
-    def obstacle(self) -> str | None:
-        """Say what is missing before a goal can be sent; None: nothing."""
-        if self.get_clock().now().nanoseconds == 0:
-            return 'use_sim_time is true, but nothing came on /clock'
-        readers = [
-            reader
-            for reader in self.get_subscriptions_info_by_topic(self.resolve_topic_name('goal_pose'))
-            # One that wants to hear what was latched is never matched with us.
-            if reader.qos_profile.durability != DurabilityPolicy.TRANSIENT_LOCAL
-        ]
-        tellers = self.get_publishers_info_by_topic(self.resolve_topic_name('goal_status'))
-        found = self._publisher.get_subscription_count()
-        if readers and found < self._readers:
-            topic = self.resolve_topic_name('goal_pose')
-            return f'{topic} has {found} readers, not the {self._readers} that are to be waited for'
-        matched = found >= len(readers)
-        if not (matched and _nodes(readers) & _nodes(tellers)):
-            return (
-                f'nobody reads {self.resolve_topic_name("goal_pose")} and publishes '
-                f'{self.resolve_topic_name("goal_status")}; is go_to_goal running, in the same '
-                'namespace and the same ROS_DOMAIN_ID?'
-            )
-        return None
-
-    def confirmed(self) -> bool:
-        """Wait until the readers have the goal."""
-        arrived: bool = self._publisher.wait_for_all_acked(Duration(seconds=ANSWER_PATIENCE))
-        return arrived
-
-    def send(self) -> None:
-        """Publish the goal; its stamp tells it from older ones."""
-        message = PoseStamped()
-        message.header.stamp, message.header.frame_id = (
-            self.get_clock().now().to_msg(),
-            self._frame,
-        )
-        messages.set_pose(message.pose, self.goal)
-        self._message = message
-        self._publisher.publish(message)
-        self.seen = time.monotonic()
-
-    def cancel(self) -> None:
-        """Ask the controller to let go of the goal."""
-        self._cancel.call_async(Trigger.Request())
-
-    def _on_status(self, message: GoalStatus) -> None:
-        # The status of an older goal is latched and comes first.
-        if self._message is not None and message.goal_info.stamp == self._message.header.stamp:
-            self.status = message.status
-
-    def _on_odometry(self, message: Odometry) -> None:
-        try:
-            self.pose = messages.from_pose(message.pose.pose)
-            self.seen = time.monotonic()
-        except MessageError as error:
-            self.get_logger().warning(f'odometry dropped: {error}', throttle_duration_sec=2.0)
-
-
-def _nodes(endpoints: Iterable[Any]) -> set[tuple[str, str]]:
-    """Tell which nodes endpoints belong to; the name of a node may be found out later."""
-    return {
-        (endpoint.node_namespace, endpoint.node_name)
-        for endpoint in endpoints
-        if not endpoint.node_name.startswith('_')
-    }
-
-
-def follow(sender: Sender, runner: Runner, signals: Signals, options: argparse.Namespace) -> int:
-    """Send the goal once a controller is there, and wait for the end; gives the exit code."""
-    if not _spin(runner, signals, options.wait, lambda: sender.obstacle() is None):
+    if not _spin(runner, signals, options.wait, ready):
         if signals.count:
             print('interrupted: nothing was sent')
             return _cli.INTERRUPTED
@@ -154,7 +53,7 @@ def follow(sender: Sender, runner: Runner, signals: Signals, options: argparse.N
     x, y, _ = sender.goal
     topic = sender.resolve_topic_name('goal_pose')
     if options.no_wait:
-        if not sender.confirmed():
+        if not sender.confirmed(ANSWER_PATIENCE):
             print(f'sent, but its readers on {topic} have not confirmed it')
             return _cli.FAILED
         print(f'sent: goal ({x:g}, {y:g}) on {topic}')
@@ -167,13 +66,15 @@ def follow(sender: Sender, runner: Runner, signals: Signals, options: argparse.N
             f'{sender.resolve_topic_name("goal_status")} within {ANSWER_PATIENCE:g} s'
         )
         return _cli.FAILED
-    ended = _watch(sender, runner, signals, options.timeout, controllers)
+    lost = _watch(sender, runner, signals, options.timeout, controllers)
     where = '' if sender.pose is None else f', {sender.distance:.3f} m from the goal'
     if sender.status in ENDS:
         print(f'{ENDS[sender.status]}{where}{_hint(sender.status)}')
         return _cli.DONE if sender.status == GoalStatus.STATUS_SUCCEEDED else _cli.FAILED
-    if ended:
-        print(f'lost: the controller is gone{where}')
+    if lost is not None:
+        # One that only hangs reads it when it goes on: nobody watches over the goal any longer.
+        sender.cancel()
+        print(f'lost: {lost}{where}')
         return _cli.FAILED
     if not signals.count:
         print(f'not arrived within --timeout {options.timeout:g} s{where}')
@@ -182,16 +83,27 @@ def follow(sender: Sender, runner: Runner, signals: Signals, options: argparse.N
 
 
 def _watch(
-    sender: Sender, runner: Runner, signals: Signals, timeout: float, controllers: set[bytes]
-) -> bool:
-    """Show the drive until the goal ends or its controllers are gone; False: time out or a signal."""
+    sender: GoalSender,
+    runner: Runner,
+    signals: Signals,
+    timeout: float,
+    controllers: Mapping[bytes, str],
+) -> str | None:
+    """Show the drive until the goal has ended, the controller is lost, a timeout (s) or a signal.
+
+    Returns:
+        Why the controller is lost; None: it is not.
+    """
     x, y, _ = sender.goal
     looked = time.monotonic()
     said = False
+    lost: str | None = None
+    present = controllers
+    liveness = Liveness(sender, sorted(set(controllers.values()) - {''}))
     with Drive() as progress:
 
         def over() -> bool:
-            nonlocal looked, said
+            nonlocal looked, said, lost, present
             now = time.monotonic()
             blind = now - sender.seen > ANSWER_PATIENCE
             if blind and not said:
@@ -202,13 +114,13 @@ def _watch(
                 progress.show(f'goal ({x:g}, {y:g})', sender.distance)
             if sender.status in ENDS:
                 return True
-            if now - looked < LOOK_PERIOD:
-                return False
-            looked = now
-            # A controller that was started anew knows nothing of the goal.
-            return not controllers & sender.controllers()
+            if now - looked >= LOOK_PERIOD:
+                looked, present = now, sender.controllers()
+            lost = loss(controllers, present, liveness.silence())
+            return lost is not None
 
-        return _spin(runner, signals, timeout, over)
+        _spin(runner, signals, timeout, over)
+    return lost
 
 
 def _hint(status: int) -> str:
@@ -219,7 +131,7 @@ def _hint(status: int) -> str:
     return ''
 
 
-def _cancel(sender: Sender, runner: Runner, signals: Signals, code: int) -> int:
+def _cancel(sender: GoalSender, runner: Runner, signals: Signals, code: int) -> int:
     """Take the goal back; another signal ends the wait."""
     sender.cancel()
     before = signals.count
@@ -256,7 +168,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             ros_context([PROGRAM, *ros]) as context,
             running(context, closed_world=False) as runner,
         ):
-            sender = runner.add(lambda: Sender(goal, options.frame, context, options.readers))
+            sender = runner.add(lambda: GoalSender(goal, options.frame, context, options.readers or 1))
             return follow(sender, runner, signals, options)
     except UserError as error:
         return _cli.complain(PROGRAM, error)
@@ -285,7 +197,7 @@ def _parser() -> argparse.ArgumentParser:
         '--wait',
         type=_cli.positive,
         default=10.0,
-        help='wait so long for a controller (s); %(default)s',
+        help='wait up to this time for a controller and for the readers of -w (s) (default: 10.0)',
     )
     parser.add_argument(
         '--timeout',
