@@ -20,12 +20,9 @@ from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 
+from diffdrive_jacobian.ros.plausibility import MAX_POSITION as MAX_POSITION
+from diffdrive_jacobian.ros.plausibility import MAX_SPEED as MAX_SPEED
 from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot
-
-MAX_SPEED = 1e3
-"""Twists beyond this are not plausible (m/s, rad/s)."""
-MAX_POSITION = 1e6
-"""Positions beyond this are not plausible (m)."""
 
 # x, y and yaw, and forward and yaw, in the row-major 6x6 covariances of ROS.
 _PLANAR = np.array([6 * row + column for row in (0, 1, 5) for column in (0, 1, 5)])

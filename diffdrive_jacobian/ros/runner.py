@@ -23,6 +23,7 @@ from rclpy.node import Node
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.signals import SignalHandlerOptions
 
+from diffdrive_jacobian.ros.errors import UserError as UserError
 from diffdrive_jacobian.ros.node import ParameterizedNode
 from diffdrive_jacobian.ros.parameters import ParameterError, report_unknown
 
@@ -32,10 +33,6 @@ MAX_DOMAIN_ID = 232
 """Beyond it a domain's ports do not exist."""
 LOOK_PERIOD = 0.1
 """How long the loop may wait before it looks at its condition again (s)."""
-
-
-class UserError(Exception):
-    """A mistake of the one who started the process; the message says which."""
 
 
 @contextmanager

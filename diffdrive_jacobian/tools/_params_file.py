@@ -8,7 +8,7 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from diffdrive_jacobian.ros.runner import UserError
+from diffdrive_jacobian.ros.errors import UserError
 
 
 def robot_parameters(path: str) -> dict[str, Any]:
