@@ -15,7 +15,7 @@ import diffdrive_jacobian
 PACKAGE = diffdrive_jacobian.__name__
 HOUSE = Path(diffdrive_jacobian.__file__).parent
 # From the ground up: each layer may import itself and what stands before it.
-LAYERS = ('kinematics', 'control', 'simulation', 'ros', 'nodes', 'bags', 'testing', 'tools')
+LAYERS = ('kinematics', 'control', 'simulation', 'plots', 'ros', 'nodes', 'bags', 'testing', 'tools')
 PURE = LAYERS[:3]
 # Modules beside the layers, and the layers they may import.
 DOORS = {'__init__': (), 'text': ()}

@@ -132,6 +132,17 @@ def test_a_second_ctrl_c_ends_the_wait_for_a_controller_that_hangs(world):
     drive.controller.signal(signal.SIGKILL)
 
 
+def test_a_controller_that_was_killed_is_noticed_within_seconds(world):
+    drive = Drive(world)
+    sender = drive.send(*FAR)
+    drive.controller.signal(signal.SIGKILL)
+    # DDS takes it for alive for 20 s.
+    assert sender.exit(10.0) == 1
+    assert drive.harness.peer.count_publishers('goal_status') == 1
+    assert sender.last_line.startswith('lost: the controller /go_to_goal has not answered for 3 s')
+    assert sender.stderr == ''
+
+
 def test_another_reader_of_goals_is_no_controller(world):
     from geometry_msgs.msg import PoseStamped
 
@@ -213,4 +224,4 @@ def test_help_lists_every_parameter(capsys, name):
         run_node.run_node(name, ['--help'], Signals())
     assert end.value.code == 0
     lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
-    assert set(specifications(run_node.NODES[name][1])) <= set(lines)
+    assert set(specifications(run_node.NODES[name].parameters)) <= set(lines)

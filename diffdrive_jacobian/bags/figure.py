@@ -19,15 +19,16 @@ import numpy as np
 from diffdrive_jacobian.bags.lines import commanded, limits, line, measured
 from diffdrive_jacobian.bags.run import Run
 from diffdrive_jacobian.bags.trace import Array, Trace, tolerance, trace
+from diffdrive_jacobian.plots.output_files import FORMATS, create
+from diffdrive_jacobian.plots.style import DPI, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-FORMATS = ('png', 'svg', 'pdf')
-SIZE, DPI = (11.0, 7.0), 130
-"""Of the picture (inches, dots per inch)."""
+SIZE = (11.0, 7.0)
+"""Of the picture (inches)."""
 ARROWS = 14
 """Headings along a path."""
 LABEL = 40
@@ -58,17 +59,6 @@ _ARROW: Any = {
     'headlength': 5.0,
     'headaxislength': 4.5,
 }
-_STYLE: Any = {
-    'font.size': 9.5,
-    'axes.spines.top': False,
-    'axes.spines.right': False,
-    'axes.grid': True,
-    'grid.color': '#e4e4e4',
-    'axes.axisbelow': True,
-    'legend.frameon': False,
-    'figure.constrained_layout.w_pad': 0.1,
-    'figure.constrained_layout.h_pad': 0.08,
-}
 
 
 def draw(runs: Sequence[Run], path: Path) -> None:
@@ -98,22 +88,6 @@ def draw(runs: Sequence[Run], path: Path) -> None:
         warnings.filterwarnings('ignore', message='constrained_layout not applied')
         figure(runs).savefig(drawn, format=ending, dpi=DPI)
     create(path, drawn.getvalue())
-
-
-def create(path: Path, data: bytes) -> None:
-    """Write a new file, whole or not at all.
-
-    Raises:
-        FileExistsError: It exists; it stays as it is.
-        OSError: It cannot be written.
-    """
-    with open(path, 'xb') as file:
-        try:
-            file.write(data)
-            file.flush()
-        except BaseException:
-            path.unlink()
-            raise
 
 
 def names(paths: Sequence[Path]) -> list[str]:
@@ -179,15 +153,6 @@ def _notes(runs: Sequence[Run], labels: Sequence[str]) -> str:
     if len(lines) > NOTED:
         lines[NOTED - 1 :] = [f'and {len(lines) - NOTED + 1} more notes']
     return '\n'.join(lines)
-
-
-def styled() -> Any:
-    """Draw in our style, whatever the user has configured; a context manager."""
-    import matplotlib
-
-    # Not the backend, which nothing here needs: it would stay changed.
-    style: Any = {name: value for name, value in matplotlib.rcParamsDefault.items() if name != 'backend'}
-    return matplotlib.rc_context({**style, **_STYLE})
 
 
 def _panels(made: Figure, grid: Any, quantities: Sequence[str], columns: int) -> dict[str, Axes]:

@@ -23,18 +23,13 @@ from numpy.typing import NDArray
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
+from diffdrive_jacobian.ros.plausibility import MAX_POSITION as MAX_POSITION
+from diffdrive_jacobian.ros.plausibility import MAX_SPEED as MAX_SPEED
+from diffdrive_jacobian.ros.plausibility import MAX_WHEEL_SPEED as MAX_WHEEL_SPEED
 from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot
 from diffdrive_jacobian.text import printable
 
 T = TypeVar('T')
-
-MAX_SPEED = 1e3
-"""Twists beyond this are not plausible (m/s, rad/s)."""
-MAX_POSITION = 1e6
-"""Positions beyond this are not plausible (m)."""
-MAX_WHEEL_SPEED = 1e6
-"""Wheel speeds beyond this are not plausible (rad/s): the rim of the smallest wheel that the nodes
-accept, 1e-3 m, then exceeds `MAX_SPEED`."""
 
 # x, y and yaw, and forward and yaw, in the row-major 6x6 covariances of ROS.
 _PLANAR = np.array([6 * row + column for row in (0, 1, 5) for column in (0, 1, 5)])

@@ -16,16 +16,13 @@ import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
-from rclpy.node import Node
-from rclpy.parameter import Parameter
+if TYPE_CHECKING:
+    # Not at run time: tools that need no ROS read parameters, too.
+    from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+    from rclpy.node import Node
+    from rclpy.parameter import Parameter
 
 from diffdrive_jacobian.text import printable
 
@@ -179,6 +176,8 @@ def _default(parameters: type[NodeParameters], field: str) -> Any:
 
 def descriptor(specification: _Specification, default: Any) -> ParameterDescriptor:
     """Write a specification as the descriptor that ROS tools show."""
+    from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+
     made = ParameterDescriptor(
         description=specification.description,
         read_only=specification.read_only,
@@ -248,6 +247,8 @@ def from_ros(parameters: type[P], values: Mapping[str, Any]) -> P:
 
 def accept_integers(parameters: type[NodeParameters], changes: list[Parameter]) -> list[Parameter]:
     """Turn integers into doubles where doubles are declared: the callback before parameters are set."""
+    from rclpy.parameter import Parameter
+
     return [
         Parameter(change.name, value=_as_declared(parameters, change.name, change.value))
         if change.type_ == Parameter.Type.INTEGER
@@ -272,6 +273,8 @@ def changed(parameters: P, changes: Iterable[Parameter]) -> P:
 
 def judge(parameters: NodeParameters, changes: Iterable[Parameter]) -> SetParametersResult:
     """Say whether changes lead to a valid set: the callback while parameters are set."""
+    from rcl_interfaces.msg import SetParametersResult
+
     try:
         changed(parameters, changes)
     except ParameterError as error:

@@ -24,6 +24,7 @@ from rclpy.node import Node
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.signals import SignalHandlerOptions
 
+from diffdrive_jacobian.ros.errors import UserError as UserError
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.node import ParameterizedNode
 from diffdrive_jacobian.ros.parameters import ParameterError, report_unknown
@@ -37,10 +38,6 @@ MAX_NAME_LENGTH = 247
 """Longest name of a topic or service, with its leading slash, that Fast DDS can have (characters)."""
 LOOK_PERIOD = 0.1
 """How long the loop may wait before it looks at its condition again (s)."""
-
-
-class UserError(Exception):
-    """A mistake of the one who started the process; the message says which."""
 
 
 @contextmanager

@@ -9,8 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from diffdrive_jacobian.bags.bounded_yaml import YAML_ERRORS, load_yaml
-from diffdrive_jacobian.ros.runner import UserError
+from diffdrive_jacobian.ros.errors import UserError
 from diffdrive_jacobian.text import printable
 
 
@@ -20,6 +19,9 @@ def robot_parameters(path: str) -> dict[str, Any]:
     Raises:
         UserError: The file is none of that kind.
     """
+    # ruamel.yaml is slow to import, and a node needs it only for a file.
+    from diffdrive_jacobian.bags.bounded_yaml import YAML_ERRORS, load_yaml
+
     try:
         content = load_yaml(Path(path))
         values: dict[str, Any] = {}
@@ -55,6 +57,8 @@ def warn_of_unused_files(program: str, ros: Sequence[str], nodes: Sequence[str])
 
 def node_names(path: str) -> list[str]:
     """Read the names of nodes, with wildcards, that have parameters in a file; none if it is invalid."""
+    from diffdrive_jacobian.bags.bounded_yaml import YAML_ERRORS, load_yaml
+
     try:
         content = load_yaml(Path(path))
     except (OSError, *YAML_ERRORS):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from diffdrive_jacobian.bags.figure import DPI, styled
+from diffdrive_jacobian.plots.style import DPI, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,6 +11,11 @@ from functools import partial
 from diffdrive_jacobian.ros.signals import Signals
 
 INTERRUPTED = 130
+ROS_MODULES = (
+    *('rclpy', 'action_msgs', 'builtin_interfaces', 'geometry_msgs', 'nav_msgs', 'rcl_interfaces'),
+    *('rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs', 'unique_identifier_msgs'),
+)
+"""Modules that come with a ROS installation, or with the extra `jazzy`."""
 
 
 def _run_tool(module: str) -> int:
@@ -19,6 +24,7 @@ def _run_tool(module: str) -> int:
 
 
 def _run(module: str, function: str, *arguments: str, watched: bool = False) -> int:
+    program = arguments[0] if arguments else module
     signals = Signals()
     signals.catch()
     for name in ('stdout', 'stderr'):
@@ -35,8 +41,18 @@ def _run(module: str, function: str, *arguments: str, watched: bool = False) -> 
         # Who read our output went away (as `head` does): nobody is left to tell.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
+    except ModuleNotFoundError as error:
+        if error.name not in ROS_MODULES:
+            raise
+        print(
+            f'{program}: error: ROS 2 is not available, there is no Python module {error.name}: source '
+            'the setup file of a ROS 2 Jazzy installation (. /opt/ros/jazzy/setup.bash), or call '
+            "pip install '.[jazzy]' in a clone of diffdrive_jacobian",
+            file=sys.stderr,
+        )
+        code = 1
     except OSError as error:
-        print(f'{function}: error: {error}', file=sys.stderr)
+        print(f'{program}: error: {error}', file=sys.stderr)
         code = 1
     finally:
         signals.ignore()

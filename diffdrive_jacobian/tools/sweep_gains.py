@@ -22,12 +22,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.bags.figure import FORMATS, create
 from diffdrive_jacobian.control import Arrival, go_to_goal, go_to_pose
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.nodes.parameters import VirtualRobotParameters
+from diffdrive_jacobian.plots.output_files import FORMATS, create
+from diffdrive_jacobian.ros.errors import UserError
 from diffdrive_jacobian.ros.parameters import from_ros
-from diffdrive_jacobian.ros.runner import UserError
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.simulation import RobotModel, closed_loops
 from diffdrive_jacobian.simulation._batch import Law, Outcomes
