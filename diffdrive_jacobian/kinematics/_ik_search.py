@@ -27,7 +27,9 @@ SECOND_ORDER_AFTER = 10
 STALLED_AFTER = 30
 """Steps in a row without a lower error after which a method that lets the error grow is restarted."""
 AGREEING = 3
-"""Searches that end at the same least error, after which a target is taken for unreachable."""
+"""Searches that end at the same least error, after which a target is taken for unreachable.
+
+Not with limits: these leave local minima, in which many searches may end before one finds the target."""
 SAME = 1e-6
 """Relative difference up to which two errors are the same."""
 NUDGE = 0.1
@@ -138,9 +140,9 @@ class Search:
         ended = np.linalg.norm(by, axis=-1) <= least
         taken = finite & (change < 0.0) if self._descends() else finite
         if self.method == 'levenberg_marquardt':
-            # A decrease that rounding would hide is none.
+            # A decrease that rounding would hide is none; cut off at limits, a step may lead uphill.
             predicted = slope + still.factor * np.einsum('kn,kn->k', by, by)
-            ended |= ~taken & (predicted <= 4.0 * EPS * still.error**2)
+            ended |= ~taken & (slope >= 0.0) & (predicted <= 4.0 * EPS * still.error**2)
         still.factor[:] = self._adapted(still, by, slope, change, taken)
         if again is not None and restarting:
             taken, ended = taken | (again & finite), ended & ~again
@@ -158,7 +160,10 @@ class Search:
 
     def _record(self, still: _Open, found: Outcome) -> None:
         """Keep the best joints of each target."""
-        best = still.error < found.error[still.which]
+        # Another search has to be better by more than rounding, so that rounding does not choose.
+        other = found.start[still.which] != found.restarts[still.which]
+        margin = np.where(other & (still.error > self.tolerance), 1.0 - SAME, 1.0)
+        best = still.error < margin * found.error[still.which]
         which = still.which[best]
         found.q[which], found.error[which] = still.q[best], still.error[best]
         found.start[which] = found.restarts[which]
@@ -176,7 +181,8 @@ class Search:
         found.agreeing[which] = np.where(lower, 1, found.agreeing[which] + same)
         found.level[which] = np.where(lower, error, level)
         allowed = found.restarts[still.which] < self.restarts
-        allowed &= found.agreeing[still.which] < AGREEING
+        if self.task.limits is None:
+            allowed &= found.agreeing[still.which] < AGREEING
         # A function that fails once would fail again.
         return np.asarray(allowed & np.isfinite(still.J).all(axis=(1, 2)))
 
@@ -265,7 +271,8 @@ class Search:
             best = np.where(bend > 0.0, slope / bend, np.inf)
             return still.factor * np.clip(RELAXED * best, 0.1, np.where(taken, 4.0, 0.5))
         # Lower where the error fell as predicted, higher where a step is rejected.
-        gain = -change / (slope + still.factor * np.einsum('kn,kn->k', by, by))
+        predicted = slope + still.factor * np.einsum('kn,kn->k', by, by)
+        gain = np.where(predicted > 0.0, -change / predicted, 0.5)
         lowered = still.factor * np.maximum(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
         # Less would drown in the rounding of J^T M J, and would take long to raise.
         least = EPS * np.einsum('kmn,kmn->k', still.J, still.J)
