@@ -1,9 +1,8 @@
 """Iterations of numeric inverse kinematics over a batch: steps, damping, limits, restarts.
 
-`inverse_kinematics.solve` checks the arguments and describes the methods. Here each target is a row of
-`_Open` while it is searched for, and a row of `Outcome` throughout. All rows advance together: in each
-iteration forward is called once, for one step of every open row or for the start of its next search.
-Rows do not influence each other: all use the same restart points.
+Each target is a row of `Outcome`, and of `_Open` while it is searched for. All rows advance together: in
+each iteration forward is called once, for a step of every open row or the start of its next search. Rows
+do not influence each other: all use the same restart points.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from diffdrive_jacobian.kinematics._ik_task import EPS, Flags, Floats, Integers, Task
+from diffdrive_jacobian.kinematics._ik_task import EPS, Flags, Floats, Integers, Task, norm
 from diffdrive_jacobian.kinematics.inverse_velocity import damped_least_squares
 
 STATIONARY = {'newton': 1e-6, 'transpose': 1e-6, 'levenberg_marquardt': 1e-7}
@@ -27,7 +26,9 @@ SECOND_ORDER_AFTER = 10
 STALLED_AFTER = 30
 """Steps in a row without a lower error after which a method that lets the error grow is restarted."""
 AGREEING = 3
-"""Searches that end at the same least error, after which a target is taken for unreachable."""
+"""Searches that end at the same least error, after which a target is taken for unreachable.
+
+Not with limits: these leave local minima, in which many searches may end before one finds the target."""
 SAME = 1e-6
 """Relative difference up to which two errors are the same."""
 NUDGE = 0.1
@@ -104,49 +105,54 @@ class Search:
         still = still.keep(np.isfinite(error) & (error > self.tolerance))
         ended = np.zeros(len(still.which), dtype=np.bool_)
         self._differentiate(still, ~ended)
-        for _ in range(max_iterations):
+        for count in range(max_iterations):
             J, gradient = self._free(still)
             ended |= ~self._movable(still, J, gradient)
             again = None
             if ended.any():
                 again = ended & self._may_restart(still, ended, found)
                 kept = again | ~ended
-                still, again, J, gradient = still.keep(kept), again[kept], J[kept], gradient[kept]
+                still, J, gradient = still.keep(kept), J[kept], gradient[kept]
+                again = again[kept] if again.any() else None
             if not len(still.which):
                 break
-            still, ended = self._advance(still, found, J, gradient, again)
+            still, ended = self._advance(still, found, J, gradient, again, count)
         return found
 
     def _advance(
-        self, still: _Open, found: Outcome, J: Floats, gradient: Floats, again: Flags | None
+        self, still: _Open, found: Outcome, J: Floats, gradient: Floats, again: Flags | None, count: int
     ) -> tuple[_Open, Flags]:
         """Try a step for every row, or restart it; return the open rows, and whose search ended."""
-        tried = still.q + self._step(still, found, J, gradient)
+        tried = still.q + self._step(still, found, J, gradient, count)
         if self.task.limits is not None:
             tried = np.clip(tried, *self.task.limits)
         # A step that overflows is not taken.
-        tried = np.where(np.isfinite(tried).all(axis=-1, keepdims=True), tried, still.q)
-        restarting = again is not None and bool(again.any())
-        if again is not None and restarting:
+        if not np.isfinite(tried).all():
+            tried = np.where(np.isfinite(tried).all(axis=-1, keepdims=True), tried, still.q)
+        if again is not None:
             tried[again] = self._restart(still, found, again)
         e, error = self.task.errors(tried, still.which)
         by = tried - still.q
         change = (error - still.error) * (error + still.error)
-        slope = np.einsum('kn,kn->k', by, gradient)
+        slope, length = np.einsum('kn,kn->k', by, gradient), norm(by)
         finite = np.isfinite(error)
-        least = np.maximum(EPS * np.linalg.norm(still.q, axis=-1), self.step_tolerance)
-        ended = np.linalg.norm(by, axis=-1) <= least
+        ended = length <= np.maximum(EPS * norm(still.q), self.step_tolerance)
         taken = finite & (change < 0.0) if self._descends() else finite
         if self.method == 'levenberg_marquardt':
-            # A decrease that rounding would hide is none.
-            predicted = slope + still.factor * np.einsum('kn,kn->k', by, by)
-            ended |= ~taken & (predicted <= 4.0 * EPS * still.error**2)
-        still.factor[:] = self._adapted(still, by, slope, change, taken)
-        if again is not None and restarting:
+            predicted = slope + still.factor * length**2
+            # A decrease that rounding would hide is none; cut off at limits, a step may lead uphill.
+            ended |= ~taken & (slope >= 0.0) & (predicted <= 4.0 * EPS * still.error**2)
+            still.factor[:] = self._damped(still, predicted, change, taken)
+        elif self._descends():
+            still.factor[:] = self._stretched(still, slope, change, taken)
+        if again is not None:
             taken, ended = taken | (again & finite), ended & ~again
             still.factor[again] = self._first_factor()
-        for values, new in (still.q, tried), (still.e, e), (still.error, error):
-            values[taken] = new[taken]
+        if taken.all():
+            still = still._replace(q=tried, e=e, error=error)
+        else:
+            for values, new in (still.q, tried), (still.e, e), (still.error, error):
+                values[taken] = new[taken]
         found.iterations[still.which] += 1
         self._record(still, found)
         if not self._descends():
@@ -158,7 +164,12 @@ class Search:
 
     def _record(self, still: _Open, found: Outcome) -> None:
         """Keep the best joints of each target."""
-        best = still.error < found.error[still.which]
+        bound = found.error[still.which]
+        if self._starts is not None:
+            # Another search has to be better by more than rounding, so that rounding does not choose.
+            other = found.start[still.which] != found.restarts[still.which]
+            bound = np.where(other & (still.error > self.tolerance), (1.0 - SAME) * bound, bound)
+        best = still.error < bound
         which = still.which[best]
         found.q[which], found.error[which] = still.q[best], still.error[best]
         found.start[which] = found.restarts[which]
@@ -176,7 +187,8 @@ class Search:
         found.agreeing[which] = np.where(lower, 1, found.agreeing[which] + same)
         found.level[which] = np.where(lower, error, level)
         allowed = found.restarts[still.which] < self.restarts
-        allowed &= found.agreeing[still.which] < AGREEING
+        if self.task.limits is None:
+            allowed &= found.agreeing[still.which] < AGREEING
         # A function that fails once would fail again.
         return np.asarray(allowed & np.isfinite(still.J).all(axis=(1, 2)))
 
@@ -208,23 +220,21 @@ class Search:
 
     def _descends(self) -> bool:
         """Return whether steps that raise the error are rejected."""
-        return self.method == 'levenberg_marquardt' or (
-            self.method == 'transpose' and self.alpha is None
-        )
+        return self.method != 'newton' and self.alpha is None
 
     def _first_factor(self) -> float:
         return {'newton': 0.0, 'transpose': RELAXED, 'levenberg_marquardt': self.damping}[self.method]
 
-    def _step(self, still: _Open, found: Outcome, J: Floats, gradient: Floats) -> Floats:
+    def _step(self, still: _Open, found: Outcome, J: Floats, gradient: Floats, count: int) -> Floats:
         if self.method == 'transpose':
             if self.alpha is not None:
                 return self.alpha * gradient
             along = np.einsum('kmn,kn->km', J, gradient)
-            linear = np.linalg.norm(gradient, axis=-1) / np.linalg.norm(along, axis=-1)
+            linear = norm(gradient) / norm(along)
             return np.asarray(gradient * (still.factor * linear**2)[:, np.newaxis])
         # With lambda zero it is the pseudo-inverse's.
         step = damped_least_squares(J, still.e, np.sqrt(still.factor))
-        if self.method == 'levenberg_marquardt':
+        if self.method == 'levenberg_marquardt' and count >= SECOND_ORDER_AFTER:
             late = found.iterations[still.which] - found.begun[still.which] >= SECOND_ORDER_AFTER
             if late.any():
                 some = _Open._make(values[late] for values in still)._replace(J=J[late])
@@ -255,22 +265,20 @@ class Search:
         along /= np.abs(values) + still.factor[good][:, np.newaxis]
         step[np.flatnonzero(late)[good]] = np.einsum('kij,kj->ki', vectors, along)
 
-    def _adapted(self, still: _Open, by: Floats, slope: Floats, change: Floats, taken: Flags) -> Floats:
-        """Return the factors for the next step from what this one did to `e^T M e`."""
-        if self.method == 'newton' or self.alpha is not None:
-            return still.factor
-        if self.method == 'transpose':
-            # As far as would have been best by the parabola through this step's slope and end.
-            bend = change + 2.0 * slope
-            best = np.where(bend > 0.0, slope / bend, np.inf)
-            return still.factor * np.clip(RELAXED * best, 0.1, np.where(taken, 4.0, 0.5))
-        # Lower where the error fell as predicted, higher where a step is rejected.
-        gain = -change / (slope + still.factor * np.einsum('kn,kn->k', by, by))
+    def _stretched(self, still: _Open, slope: Floats, change: Floats, taken: Flags) -> Floats:
+        """Return the line search's factors for the next step from what this one did to `e^T M e`."""
+        # As far as would have been best by the parabola through this step's slope and end.
+        bend = change + 2.0 * slope
+        best = np.where(bend > 0.0, slope / bend, np.inf)
+        return np.asarray(still.factor * np.clip(RELAXED * best, 0.1, np.where(taken, 4.0, 0.5)))
+
+    def _damped(self, still: _Open, predicted: Floats, change: Floats, taken: Flags) -> Floats:
+        """Return lambda for the next step, lower where the error fell as predicted."""
+        gain = np.where(predicted > 0.0, -change / predicted, 0.5)
         lowered = still.factor * np.maximum(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
         # Less would drown in the rounding of J^T M J, and would take long to raise.
         least = EPS * np.einsum('kmn,kmn->k', still.J, still.J)
-        changed = np.where(taken, lowered, 4.0 * still.factor)
-        return np.asarray(np.fmax(changed, least))
+        return np.asarray(np.fmax(np.where(taken, lowered, 4.0 * still.factor), least))
 
     def _free(self, still: _Open) -> tuple[Floats, Floats]:
         """Return J and `J^T M e`, zero for joints at a limit that would have to go beyond it."""
@@ -284,7 +292,7 @@ class Search:
     def _movable(self, still: _Open, J: Floats, gradient: Floats) -> Flags:
         """Return where a joint lowers the error to first order; nowhere if a Jacobian is not finite."""
         # Joint by joint, so that their units do not matter.
-        most = np.linalg.norm(J, axis=1) * still.error[:, np.newaxis]
+        most = np.sqrt(np.einsum('kmn,kmn->kn', J, J)) * still.error[:, np.newaxis]
         movable: Flags = (np.abs(gradient) > STATIONARY[self.method] * most).any(axis=-1)
         return movable & np.isfinite(J).all(axis=(1, 2))
 

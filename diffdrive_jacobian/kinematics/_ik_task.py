@@ -46,10 +46,19 @@ class Task:
             # A copy, as the function may write to its argument.
             pose = _returned('forward', self.forward(q.copy()), target.shape, q)
             good = np.isfinite(pose).all(axis=-1)
-            if good.any():
+            if good.all():
+                e[:] = self._differences(target, pose, q)
+            elif good.any():
                 e[good] = self._differences(target[good], pose[good], q[good])
-        e = e[:, self.rows] * self.roots
-        return e, np.linalg.norm(e, axis=-1)
+        e = self._weighted(e)
+        return e, norm(e)
+
+    def _weighted(self, values: Floats) -> Floats:
+        """Return what counts of errors, shape (k, m), or Jacobians, shape (k, m, n)."""
+        if not self.rows.all():
+            values = values[:, self.rows]
+        # A product is a copy, too: the caller's functions may use their memory again.
+        return values * self.roots.reshape(-1, *[1] * (values.ndim - 2))
 
     def _differences(self, target: Floats, pose: Floats, q: Floats) -> Floats:
         return _returned('difference', self.difference(target, pose), pose.shape, q)
@@ -61,7 +70,7 @@ class Task:
             jacobian = self._central_differences(q, shape)
         else:
             jacobian = _returned('jacobian', self.jacobian(q.copy()), shape, q)
-        return np.asarray(jacobian[:, self.rows] * self.roots[:, np.newaxis])
+        return self._weighted(jacobian)
 
     def _central_differences(self, q: Floats, shape: tuple[int, ...]) -> Floats:
         """Return Jacobians from forward alone, NaN where it is not finite near q."""
@@ -89,6 +98,12 @@ class Task:
         own = np.eye(q.shape[-1], dtype=np.bool_)
         ends = np.stack([up, down], axis=1)[:, :, np.newaxis]
         return np.where(own, ends, q[:, np.newaxis, np.newaxis]), up - down
+
+
+def norm(vectors: Floats) -> Floats:
+    """Return the lengths of vectors, shape (k, n)."""
+    # Several times as fast as numpy.linalg.norm with an axis.
+    return np.asarray(np.sqrt(np.einsum('kn,kn->k', vectors, vectors)))
 
 
 def _returned(name: str, value: Any, shape: tuple[int, ...], q: Floats) -> Floats:

@@ -107,10 +107,11 @@ def solve(
     could not take a single step, a tenth of the way from there. All targets use the same restart points.
 
     A target is given up after `max_iterations` steps over all its searches, after `restarts` restarts,
-    when three searches ended at the same lowest error (then that is taken for the nearest reachable
-    point), and when a function returns something that is not finite. `levenberg_marquardt`, and
-    `transpose` without alpha, never let the error grow within a search, and end at the nearest reachable
-    point if the steps suffice. The result is the best q of all searches.
+    when a function returns something that is not finite, and, without limits, when three searches ended
+    at the same lowest error: that is taken for the distance of the nearest reachable point. (Limits
+    leave local minima, in which many searches end alike.) `levenberg_marquardt`, and `transpose` without
+    alpha, never let the error grow within a search, and end at a point without a nearer one around it if
+    the steps suffice. The result is the best q of all searches.
 
     Args:
         forward: Maps joints of shape (k, n) to what they reach, shape (k, m). Called only for the
