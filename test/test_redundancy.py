@@ -222,6 +222,19 @@ def test_damping_is_chosen_robot_by_robot():
         np.testing.assert_allclose(together[i], alone, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize('damping', [0.0, 0.1])
+def test_tasks_of_one_robot_and_of_many_broadcast(damping):
+    rng = np.random.default_rng(14)
+    many = rng.normal(size=(5, 1, 2, 4)), rng.normal(size=(3, 2))
+    one = rng.normal(size=(1, 4)), rng.normal(size=1)
+    for order in ((many, one), (one, many), (one, many, one)):
+        together = iv.prioritized(order, damping)
+        assert together.shape == (5, 3, 4)
+        for i, j in np.ndindex(5, 3):
+            tasks = [(J[i, 0], x_dot[j]) if J.ndim > 2 else (J, x_dot) for J, x_dot in order]
+            np.testing.assert_allclose(together[i, j], iv.prioritized(tasks, damping), atol=1e-10)
+
+
 # --- Limits
 
 
