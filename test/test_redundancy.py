@@ -297,6 +297,18 @@ def test_weighted_solutions_are_those_of_lagrange(m, n):
     np.testing.assert_allclose(found, times(damped, x_dot), **close)
 
 
+def test_bounds_hold_in_the_weighted_norm():
+    rng = np.random.default_rng(15)
+    J, _, damping = nearly_singular(rng, 2, 4)
+    weights = 10.0 ** rng.uniform(-1.0, 1.0, (COUNT, 4))
+    wish, x_dot = rng.normal(size=(COUNT, 4)), rng.normal(size=(COUNT, 2))
+    leak = norm(times(J, iv.redundant(J, np.zeros(2), wish, damping, weights=weights)))
+    largest = norm(np.sqrt(weights) * wish)
+    assert np.all(leak <= iv.FILTER * damping / 4.0 * largest + 1e-11)
+    q_dot = np.sqrt(weights) * iv.damped_least_squares(J, x_dot, damping, weights=weights)
+    assert np.all(norm(q_dot) <= norm(x_dot) / (2.0 * damping) * (1.0 + 1e-9))
+
+
 def test_equal_weights_change_nothing_and_a_heavy_joint_rests():
     rng = np.random.default_rng(12)
     J, x_dot, wish = rng.normal(size=(2, 4)), rng.normal(size=2), rng.normal(size=4)

@@ -65,7 +65,7 @@ def agree(**values: Any) -> None:
 
 
 def alike(*values: Any) -> tuple[Any, ...]:
-    """Give floats as they are, and arrays in the shape to which they broadcast."""
+    """Return floats as they are, and arrays in the shape to which they broadcast."""
     if set(map(type, values)) == {float} or len({np.shape(value) for value in values}) == 1:
         return values
     return tuple(map(np.array, np.broadcast_arrays(*values)))
