@@ -222,6 +222,19 @@ def test_damping_is_chosen_robot_by_robot():
         np.testing.assert_allclose(together[i], alone, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize('damping', [0.0, 0.1])
+def test_tasks_of_one_robot_and_of_many_broadcast(damping):
+    rng = np.random.default_rng(14)
+    many = rng.normal(size=(5, 1, 2, 4)), rng.normal(size=(3, 2))
+    one = rng.normal(size=(1, 4)), rng.normal(size=1)
+    for order in ((many, one), (one, many), (one, many, one)):
+        together = iv.prioritized(order, damping)
+        assert together.shape == (5, 3, 4)
+        for i, j in np.ndindex(5, 3):
+            tasks = [(J[i, 0], x_dot[j]) if J.ndim > 2 else (J, x_dot) for J, x_dot in order]
+            np.testing.assert_allclose(together[i, j], iv.prioritized(tasks, damping), atol=1e-10)
+
+
 # --- Limits
 
 
@@ -282,6 +295,18 @@ def test_weighted_solutions_are_those_of_lagrange(m, n):
     damped = np.linalg.solve(np.swapaxes(J, 1, 2) @ J + 0.3**2 * W, np.swapaxes(J, 1, 2))
     found = iv.damped_least_squares(J, x_dot, 0.3, weights=weights)
     np.testing.assert_allclose(found, times(damped, x_dot), **close)
+
+
+def test_bounds_hold_in_the_weighted_norm():
+    rng = np.random.default_rng(15)
+    J, _, damping = nearly_singular(rng, 2, 4)
+    weights = 10.0 ** rng.uniform(-1.0, 1.0, (COUNT, 4))
+    wish, x_dot = rng.normal(size=(COUNT, 4)), rng.normal(size=(COUNT, 2))
+    leak = norm(times(J, iv.redundant(J, np.zeros(2), wish, damping, weights=weights)))
+    largest = norm(np.sqrt(weights) * wish)
+    assert np.all(leak <= iv.FILTER * damping / 4.0 * largest + 1e-11)
+    q_dot = np.sqrt(weights) * iv.damped_least_squares(J, x_dot, damping, weights=weights)
+    assert np.all(norm(q_dot) <= norm(x_dot) / (2.0 * damping) * (1.0 + 1e-9))
 
 
 def test_equal_weights_change_nothing_and_a_heavy_joint_rests():

@@ -1,4 +1,4 @@
-"""The adjugate of 2x2 matrices, and the refusal of singular ones."""
+"""The adjugate of 2x2 matrices, and the error for singular ones."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ Array = NDArray[np.float64]
 
 
 def adjugate(J: Array) -> Array:
-    """Give `[[d, -b], [-c, a]]` of `[[a, b], [c, d]]`, shape (..., 2, 2)."""
-    made = np.empty_like(J)
-    made[..., 0, 0], made[..., 1, 1] = J[..., 1, 1], J[..., 0, 0]
-    made[..., 0, 1], made[..., 1, 0] = -J[..., 0, 1], -J[..., 1, 0]
-    return made
+    """Return `[[d, -b], [-c, a]]` of `[[a, b], [c, d]]`, shape (..., 2, 2)."""
+    adjugates = np.empty_like(J)
+    adjugates[..., 0, 0], adjugates[..., 1, 1] = J[..., 1, 1], J[..., 0, 0]
+    adjugates[..., 0, 1], adjugates[..., 1, 0] = -J[..., 0, 1], -J[..., 1, 0]
+    return adjugates
 
 
 def refuse_singular(determinant: Array, singular: NDArray[np.bool_]) -> None:

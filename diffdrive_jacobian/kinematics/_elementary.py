@@ -107,7 +107,7 @@ def evaluated(
 
 
 def alike(*values: Any) -> tuple[Any, ...]:
-    """Give floats as they are, and arrays in the shape to which they broadcast."""
+    """Return floats as they are, and arrays in the shape to which they broadcast."""
     if set(map(type, values)) == {float} or len({np.shape(value) for value in values}) == 1:
         return values
     return tuple(map(np.array, np.broadcast_arrays(*values)))

@@ -46,25 +46,27 @@ def removal(value: Any, damping: Any, least: Any) -> Any:
     return where(damped, filtered, where(value > least, 1.0, 0.0))
 
 
-def gains(values: Array, damping: Array, least: Array) -> Array:
+def gains(values: Array, damping: Array, least: Any) -> Array:
     """Compute g(s) of singular values, shape (..., k), with damping and least of shape (...)."""
     return _each(gain, values, damping, least)
 
 
-def removals(values: Array, damping: Array, least: Array) -> Array:
+def removals(values: Array, damping: Array, least: Any) -> Array:
     """Compute f(s) of singular values, shape (..., k), with damping and least of shape (...)."""
     return _each(removal, values, damping, least)
 
 
-def negligible(values: Array, shape: tuple[int, ...]) -> Array:
-    """Return up to which value singular values count as zero without damping, shape (...)."""
-    return np.asarray(np.maximum(CUTOFF * max(shape[-2:]) * values[..., 0], TINY))
+def negligible(norm: Any, relative: float) -> Any:
+    """Return up to which value singular values count as zero without damping, a float or shape (...)."""
+    if np.ndim(norm) == 0:
+        return max(relative * float(norm), TINY)
+    return np.maximum(relative * norm, TINY)
 
 
 def pseudoinverse(J: Array) -> Array:
     """Compute J^+, shape (..., n, m)."""
     left, values, right = np.linalg.svd(J, full_matrices=False)
-    kept = values > negligible(values, J.shape)[..., np.newaxis]
+    kept = values > np.asarray(_least(values, J.shape))[..., np.newaxis]
     inverses = kept / np.where(kept, values, 1.0)
     inverse: Array = (
         np.swapaxes(right, -1, -2) * inverses[..., np.newaxis, :] @ np.swapaxes(left, -1, -2)
@@ -75,7 +77,7 @@ def pseudoinverse(J: Array) -> Array:
 def null_space_projector(J: Array, damping: Array) -> Array:
     """Compute N with damping of shape (...), shape (..., n, n)."""
     _, values, right = np.linalg.svd(J, full_matrices=False)
-    return projector(right, removals(values, damping, negligible(values, J.shape)))
+    return projector(right, removals(values, damping, _least(values, J.shape)))
 
 
 def projector(right: Array, removed: Array) -> Array:
@@ -128,11 +130,16 @@ def manipulability(J: Array) -> Array:
     return w
 
 
-def _each(function: Any, values: Array, damping: Array, least: Array) -> Array:
+def _least(values: Array, shape: tuple[int, ...]) -> Any:
+    return negligible(values[..., 0], CUTOFF * max(shape[-2:]))
+
+
+def _each(function: Any, values: Array, damping: Array, least: Any) -> Array:
     """Apply a function to each singular value, of a single Jacobian as a float, which is faster."""
-    if values.ndim == 1 and damping.ndim == least.ndim == 0:
-        factor, zero = float(damping), float(least)
-        return np.array([function(value, factor, zero) for value in values.tolist()])
+    if values.ndim == 1 and type(least) is float and damping.ndim == 0:
+        factor = float(damping)
+        return np.array([function(value, factor, least) for value in values.tolist()])
+    least = np.asarray(least)
     with np.errstate(all='ignore'):
         computed: Array = function(values, damping[..., np.newaxis], least[..., np.newaxis])
     return computed
@@ -172,11 +179,13 @@ def _scaled(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None) -> Ar
 
 
 def _by_svd(
-    J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None, tiny: Array | float = 0.0
+    J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None, tiny: Array | None = None
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Compute joint velocities, and where neither overflow nor underflow can have spoilt them."""
     left, values, right = np.linalg.svd(J, full_matrices=False)
-    least = np.maximum(negligible(values, J.shape), tiny)
+    least = _least(values, J.shape)
+    if tiny is not None:
+        least = np.maximum(least, tiny)
     along = gains(values, damping, least) * (x_dot[..., np.newaxis, :] @ left)[..., 0, :]
     if q_dot_0 is not None:
         secondary = (right @ q_dot_0[..., np.newaxis])[..., 0]

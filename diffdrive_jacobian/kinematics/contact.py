@@ -1,6 +1,6 @@
-"""A wheel as a contact: where a point of its rim is, and how it moves.
+"""A wheel as a contact: position and velocity of a point of its rim.
 
-State: `q = [x, phi]`, the way of the wheel's centre (m) and the angle by which the wheel has turned
+State: `q = [x, phi]`, the position of the wheel's centre (m) and the angle by which the wheel has turned
 (rad). The wheel, of radius r, stands upright on the ground at height 0, so its centre is at height r.
 
 A wheel that rolls does not slip: the point that touches the ground, at phi = pi, has no velocity. So
@@ -26,10 +26,10 @@ AT_GROUND = np.pi
 
 
 def wheel_contact_position(x: ArrayLike, phi: ArrayLike, r: ArrayLike) -> NDArray[np.float64]:
-    """Give the position of a point of the rim: `[x + r sin(phi), r + r cos(phi), 0]` (C).
+    """Return the position of a point of the rim: `[x + r sin(phi), r + r cos(phi), 0]` (C).
 
     Args:
-        x: Way of the centre, shape (...) (m).
+        x: Position of the centre, shape (...) (m).
         phi: Angle of the point, 0 on top, shape (...) (rad).
         r: Wheel radius, shape (...) (m).
 
@@ -69,7 +69,7 @@ def wheel_contact_jacobian(phi: ArrayLike, r: ArrayLike) -> NDArray[np.float64]:
 
 
 def rolling_direction(r: ArrayLike) -> NDArray[np.float64]:
-    """Give the velocity with which a wheel rolls: `[r, 1]` spans the null space at the ground (C).
+    """Return the velocity of a rolling wheel: `[r, 1]` spans the null space at the ground (C).
 
     Args:
         r: Wheel radius, shape (...) (m).
@@ -86,8 +86,8 @@ def rolling_direction(r: ArrayLike) -> NDArray[np.float64]:
 
 
 def _checked(*, r: Any, **coordinates: Any) -> list[NDArray[np.float64]]:
-    made = {name: array(name, value) for name, value in coordinates.items()}
-    made['r'] = floats('r', r)
-    positive('r', made['r'])
-    leading(**{name: value.shape for name, value in made.items()})
-    return list(made.values())
+    checked = {name: array(name, value) for name, value in coordinates.items()}
+    checked['r'] = floats('r', r)
+    positive('r', checked['r'])
+    leading(**{name: value.shape for name, value in checked.items()})
+    return list(checked.values())

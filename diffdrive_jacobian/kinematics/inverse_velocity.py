@@ -194,7 +194,8 @@ def null_space_projector(
     scaled, roots = weighted(J, weights)
     leading(J=scaled.shape[:-2], damping=factor.shape)
     projector = _singular_values.null_space_projector(scaled, factor)
-    return projector * roots[..., np.newaxis, :] / roots[..., np.newaxis]
+    oblique: Array = projector * roots[..., np.newaxis, :] / roots[..., np.newaxis]
+    return oblique
 
 
 def redundant(

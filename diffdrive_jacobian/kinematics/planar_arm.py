@@ -36,20 +36,20 @@ class PlanarArm:
 
     def __init__(self, lengths: ArrayLike) -> None:
         """Take the lengths of the links, shape (n,), n >= 1 (m)."""
-        made = array('lengths', lengths, 'n').copy()
-        if made.ndim != 1:
-            raise ValueError(f'lengths must have shape (n,), got {made.shape}')
-        positive('lengths', made)
-        made.flags.writeable = False
-        object.__setattr__(self, 'lengths', made)
+        checked = array('lengths', lengths, 'n').copy()
+        if checked.ndim != 1:
+            raise ValueError(f'lengths must have shape (n,), got {checked.shape}')
+        positive('lengths', checked)
+        checked.flags.writeable = False
+        object.__setattr__(self, 'lengths', checked)
 
     @property
     def joints(self) -> int:
-        """How many joints it has, n."""
+        """Number of joints, n."""
         return len(self.lengths)
 
     def joint_positions(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Give where the base, every further joint and the tip are.
+        """Return the positions of the base, of every further joint and of the tip.
 
         Args:
             q: Joint angles, shape (..., n) (rad).
@@ -64,7 +64,7 @@ class PlanarArm:
         return positions
 
     def forward_kinematics(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Give the pose of the tip (A, D): `x = sum l_i cos(q_1 + ... + q_i)`, y with the sine.
+        """Return the pose of the tip (A, D): `x = sum l_i cos(q_1 + ... + q_i)`, y with the sine.
 
         Args:
             q: Joint angles, shape (..., n) (rad).
@@ -94,7 +94,7 @@ class PlanarArm:
         """
         angles = np.cumsum(self._angles(q), axis=-1)
         jacobian = np.ones((*angles.shape[:-1], 3 if heading else 2, self.joints))
-        # From the tip back to the base: what stands beyond a joint is what it turns. Joint by joint, for
+        # From the tip back to the base: a joint turns the part beyond it. Joint by joint, for
         # loops over the short last axis take longer.
         along: Any = 0.0
         across: Any = 0.0
@@ -105,7 +105,7 @@ class PlanarArm:
         return jacobian
 
     def determinant(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Give the determinant of the Jacobian of two links: `l1 l2 sin(q_2)` (A).
+        """Return the determinant of the Jacobian of two links: `l1 l2 sin(q_2)` (A).
 
         Args:
             q: Joint angles, shape (..., 2) (rad).
@@ -121,7 +121,7 @@ class PlanarArm:
         return determinant
 
     def singular_configurations(self, q_1: ArrayLike = 0.0) -> NDArray[np.float64]:
-        """Give where two links lose a direction: stretched, q_2 = 0, and folded, q_2 = pi (A).
+        """Return the singular configurations of two links: stretched, q_2 = 0, and folded, q_2 = pi (A).
 
         Args:
             q_1: Angle of the first joint, which does not matter, shape (...) (rad).
@@ -140,7 +140,7 @@ class PlanarArm:
         return configurations
 
     def inverse_velocity(self, q: ArrayLike, x_dot: ArrayLike) -> NDArray[np.float64]:
-        """Give the joint velocities of two links that move the tip as told, by the adjugate (A, 3.2.1).
+        """Return joint velocities of two links for a velocity of the tip, by the adjugate (A, 3.2.1).
 
         Args:
             q: Joint angles, shape (..., 2) (rad).
@@ -157,14 +157,14 @@ class PlanarArm:
         q, x_dot = self._angles(q), array('x_dot', x_dot, 2)
         leading(q=q.shape[:-1], x_dot=x_dot.shape[:-1])
         determinant = self.determinant(q)
-        # Known better than from the entries of J; what is left is the rounding of q_2 itself.
+        # More accurate than from the entries of J: only the rounding of q_2 itself remains.
         blur = 4.0 * np.finfo(np.float64).eps * np.maximum(1.0, np.abs(q[..., 1]))
         refuse_singular(determinant, np.abs(determinant) <= blur * self.lengths.prod())
         turned: NDArray[np.float64] = (adjugate(self.jacobian(q)) @ x_dot[..., np.newaxis])[..., 0]
         return turned / determinant[..., np.newaxis]
 
     def joint_torques(self, q: ArrayLike, wrench: ArrayLike) -> NDArray[np.float64]:
-        """Give the torques that hold a wrench at the tip: `tau = J^T W` (D, 5).
+        """Return the joint torques of a wrench at the tip: `tau = J^T W` (D, 5).
 
         Args:
             q: Joint angles, shape (..., n) (rad).
@@ -183,12 +183,12 @@ class PlanarArm:
         return torques
 
     def integrate(self, q: ArrayLike, q_dot: ArrayLike, dt: ArrayLike) -> NDArray[np.float64]:
-        """Hold joint velocities for a time: `q + q_dot dt` (D, 4.1).
+        """Return the joint angles after a time at constant velocity: `q + q_dot dt` (D, 4.1).
 
         Args:
             q: Joint angles at the start, shape (..., n) (rad).
             q_dot: Joint velocities, shape (..., n) (rad/s).
-            dt: Time for which they are held, shape (...) (s).
+            dt: Duration, shape (...) (s).
 
         Returns:
             Joint angles at the end, shape (..., n) (rad); not wrapped, for a joint may have turned.

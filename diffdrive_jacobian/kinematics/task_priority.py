@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._checks import array, floats, leading, number, positive
-from diffdrive_jacobian.kinematics._singular_values import TINY, gains, projector, removals
+from diffdrive_jacobian.kinematics._singular_values import gains, negligible, projector, removals
 from diffdrive_jacobian.kinematics._task_checks import checked_damping, checked_task, weighted
 
 Array = NDArray[np.float64]
@@ -84,7 +84,7 @@ def prioritized(
     for k, (J, x_dot) in enumerate(pairs):
         left, values, right = np.linalg.svd(J @ free if k else J, full_matrices=False)
         norm = np.linalg.norm(J, ord=2, axis=(-2, -1)) if k else values[..., 0]
-        least = np.maximum(cutoff * norm, TINY)
+        least = negligible(norm, cutoff)
         missing = x_dot - (J @ q_dot[..., np.newaxis])[..., 0] if k else x_dot
         along = gains(values, factor, least) * (missing[..., np.newaxis, :] @ left)[..., 0, :]
         step = np.swapaxes(right, -1, -2) @ along[..., np.newaxis]
