@@ -114,7 +114,12 @@ class StraightLine:
     def __post_init__(self) -> None:
         """Check everything, and copy it."""
         start = array('start', self.start, 'm')
-        end, speed = array('end', self.end, start.shape[-1]), floats('speed', self.speed)
+        end, speed = array('end', self.end, 'm'), floats('speed', self.speed)
+        if start.shape[-1] != end.shape[-1]:
+            raise ValueError(
+                'start and end must have the same number of coordinates, '
+                f'got {start.shape[-1]} and {end.shape[-1]}'
+            )
         positive('speed', speed)
         leading(start=start.shape[:-1], end=end.shape[:-1], speed=speed.shape)
         with np.errstate(over='ignore'):

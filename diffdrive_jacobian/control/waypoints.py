@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.go_to_goal import turn_in_place
-from diffdrive_jacobian.kinematics._checks import array, boolean, function, instance, read_only
+from diffdrive_jacobian.kinematics._checks import (
+    array,
+    boolean,
+    function,
+    instance,
+    read_only,
+    short,
+)
 from diffdrive_jacobian.kinematics._elementary import components, operand
 
 Law = Callable[[NDArray[np.float64], NDArray[np.float64]], tuple[Any, Any]]
@@ -42,9 +49,9 @@ class Waypoints:
         object.__setattr__(self, 'poses', read_only(poses))
         index = self.index
         if isinstance(index, bool) or not isinstance(index, int | np.integer):
-            raise ValueError(f'index must be an integer, got {index!r:.60}')
+            raise ValueError(f'index must be an integer, got {short(index)}')
         if not 0 <= index < len(poses):
-            raise ValueError(f'index must be in 0 to {len(poses) - 1}, got {index}')
+            raise ValueError(f'index must be in 0 to {len(poses) - 1}, got {short(index)}')
         object.__setattr__(self, 'index', int(index))
         object.__setattr__(self, 'turning', boolean('turning', self.turning))
 

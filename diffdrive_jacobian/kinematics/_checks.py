@@ -87,7 +87,7 @@ def floats(name: str, value: Any) -> NDArray[np.float64]:
         return array.astype(np.float64, copy=False)
     except (OverflowError, TypeError, ValueError) as error:
         raise ValueError(
-            f'{name} must be an array of real numbers, got {_short(value)} ({error})'
+            f'{name} must be an array of real numbers, got {short(value)} ({error})'
         ) from error
 
 
@@ -135,10 +135,10 @@ def nanoseconds(name: str, value: Any) -> int:
             value = operator.index(value)
         except TypeError:
             raise ValueError(
-                f'{name} must be an integer number of nanoseconds (ns), got {_short(value)}'
+                f'{name} must be an integer number of nanoseconds (ns), got {short(value)}'
             ) from None
     if not -MAX_NANOSECONDS <= value <= MAX_NANOSECONDS:
-        raise ValueError(f'{name} must fit into 64 bits (ns), got {_short(value)}')
+        raise ValueError(f'{name} must fit into 64 bits (ns), got {short(value)}')
     return int(value)
 
 
@@ -149,7 +149,7 @@ def boolean(name: str, value: Any) -> bool:
         ValueError: It is something else.
     """
     if not isinstance(value, bool | np.bool_):
-        raise ValueError(f'{name} must be True or False, got {_short(value)}')
+        raise ValueError(f'{name} must be True or False, got {short(value)}')
     return bool(value)
 
 
@@ -160,7 +160,7 @@ def instance(name: str, value: Any, wanted: type) -> None:
         ValueError: It is of another one.
     """
     if not isinstance(value, wanted):
-        raise ValueError(f'{name} must be of class {wanted.__name__}, got {_short(value)}')
+        raise ValueError(f'{name} must be of class {wanted.__name__}, got {short(value)}')
 
 
 def function(name: str, value: Any) -> None:
@@ -170,7 +170,7 @@ def function(name: str, value: Any) -> None:
         ValueError: It cannot be called.
     """
     if not callable(value):
-        raise ValueError(f'{name} must be a function, got {_short(value)}')
+        raise ValueError(f'{name} must be a function, got {short(value)}')
 
 
 def read_only(value: Any) -> NDArray[np.float64]:
@@ -213,7 +213,7 @@ def leading(**shapes: tuple[int, ...]) -> tuple[int, ...]:
         ) from None
 
 
-def _short(value: Any) -> str:
+def short(value: Any) -> str:
     """Return how a value is written, in at most 60 characters."""
     try:
         got = str(value) if not isinstance(value, str) else repr(value)

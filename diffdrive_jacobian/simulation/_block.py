@@ -59,10 +59,11 @@ class Block:
         # Summed up: |v|, v^2, omega^2; the farthest way beyond the goal.
         self.sums: Array = np.zeros((3, count))
         self.beyond: Array = np.zeros(count)
-        way = batch.goals[:, :2] - batch.starts[:, :2]
-        length = np.hypot(*way.T)
-        self.along: Array = np.array((way / np.where(length > 0.0, length, 1.0)[:, np.newaxis]).T)
-        self.too_far: Array = (length + LOST) ** 2
+        with np.errstate(over='ignore', invalid='ignore'):
+            way = batch.goals[:, :2] - batch.starts[:, :2]
+            length = np.hypot(*way.T)
+            self.along: Array = np.array((way / np.where(length > 0.0, length, 1.0)[:, np.newaxis]).T)
+            self.too_far: Array = (length + LOST) ** 2
 
     def drive(
         self, keep: Keep | None, on_step: Callable[[], object] | None = None
@@ -100,13 +101,13 @@ class Block:
         """Tell who has arrived, and whom the law has driven away."""
         batch, arrival = self.batch, self.batch.arrival
         goal = batch.goals.T
-        self.dx, self.dy = goal[0] - self.x, goal[1] - self.y
-        dx, dy, offset = self.dx, self.dy, arrival.offset
-        beyond = self.along[0] * dx + self.along[1] * dy
-        np.maximum(self.beyond, -beyond, out=self.beyond)
-        if type(offset) is not float or offset != 0.0:
-            dx, dy = dx - offset * self.c, dy - offset * self.s
-        with np.errstate(over='ignore'):
+        with np.errstate(over='ignore', invalid='ignore'):
+            self.dx, self.dy = goal[0] - self.x, goal[1] - self.y
+            dx, dy, offset = self.dx, self.dy, arrival.offset
+            beyond = self.along[0] * dx + self.along[1] * dy
+            np.maximum(self.beyond, -beyond, out=self.beyond)
+            if type(offset) is not float or offset != 0.0:
+                dx, dy = dx - offset * self.c, dy - offset * self.s
             squared = dx * dx + dy * dy
         there = squared <= arrival.xy_tolerance * arrival.xy_tolerance
         if arrival.use_heading:
@@ -156,22 +157,24 @@ class Block:
         """Hold a twist until the next sample: the chord of the arc along its middle heading, as in
         `se2.integrate`, the heading turned by half the turn before it and half after it.
         """
-        self.sums[0] += np.abs(v)
-        self.sums[1] += v * v
-        self.sums[2] += omega * omega
         dt = 1.0 / self.batch.rate
-        half = omega * (0.5 * dt)
-        # A tiny angle in the place of zero gives a chord as long as the arc.
-        hole = (half == 0.0) * 1e-20
-        c_half, s_half = np.cos(half), np.sin(half)
-        c, s = self.c * c_half - self.s * s_half, self.s * c_half + self.c * s_half
-        chord = v * dt * ((s_half + hole) / (half + hole))
-        self.x = self.x + chord * c
-        self.y = self.y + chord * s
-        self.c, self.s = c * c_half - s * s_half, s * c_half + c * s_half
-        self.theta = self.theta + omega * dt
-        if np.max(self.theta) > np.pi or np.min(self.theta) <= -np.pi:
-            self.theta = wrapped(self.theta)
+        # What overflows is found at the end.
+        with np.errstate(over='ignore', invalid='ignore'):
+            self.sums[0] += np.abs(v)
+            self.sums[1] += v * v
+            self.sums[2] += omega * omega
+            half = omega * (0.5 * dt)
+            # A tiny angle in the place of zero gives a chord as long as the arc.
+            hole = (half == 0.0) * 1e-20
+            c_half, s_half = np.cos(half), np.sin(half)
+            c, s = self.c * c_half - self.s * s_half, self.s * c_half + self.c * s_half
+            chord = v * dt * ((s_half + hole) / (half + hole))
+            self.x = self.x + chord * c
+            self.y = self.y + chord * s
+            self.c, self.s = c * c_half - s * s_half, s * c_half + c * s_half
+            self.theta = self.theta + omega * dt
+            if np.max(self.theta) > np.pi or np.min(self.theta) <= -np.pi:
+                self.theta = wrapped(self.theta)
 
     def _poses(self, which: Mask) -> Array:
         return np.column_stack([self.x[which], self.y[which], self.theta[which]])
@@ -180,18 +183,28 @@ class Block:
         """Sum up those who are done."""
         batch = self.batch
         which = np.flatnonzero(done)
-        dt = 1.0 / batch.rate
-        path, squares_v, squares_omega = self.sums[:, which] * dt
-        r, L = (value if isinstance(value, float) else value[which] for value in (batch.r, batch.L))
-        return self.rows[which], Outcomes(
-            arrived[which],
-            np.where(arrived[which], step * dt, np.nan),
-            path,
+        r, L = (
+            np.float64(value) if isinstance(value, float) else value[which]
+            for value in (batch.r, batch.L)
+        )
+        with np.errstate(all='ignore'):
+            path, squares_v, squares_omega = self.sums[:, which] / batch.rate
             # Both wheels: (v + omega L/2)^2 + (v - omega L/2)^2, over r^2.
-            2.0 * (squares_v + squares_omega * (L / 2.0) ** 2) / r**2,
+            effort = 2.0 * (squares_v + squares_omega * (L / 2.0) ** 2) / r**2
+        outcomes = Outcomes(
+            arrived[which],
+            np.where(arrived[which], step / batch.rate, np.nan),
+            path,
+            effort,
             self.beyond[which],
             self._poses(done),
         )
+        if not all(np.isfinite(values).all() for values in (path, effort, *outcomes[4:])):
+            raise ValueError(
+                'starts, goals, gains, rate, limits, r and L must give finite outcomes, '
+                'but they overflow'
+            )
+        return self.rows[which], outcomes
 
     def _keep(self, keep: Keep, step: int, ended: Mask, v: Array | None, omega: Array | None) -> None:
         keep(step, self.rows[ended], self._poses(ended), None, None)

@@ -85,7 +85,8 @@ def closed_loops(
         The outcomes. A law that drives a robot away has not arrived; nothing is raised.
 
     Raises:
-        ValueError: An argument has a wrong shape or value, or the law gives something that does not fit.
+        ValueError: An argument has a wrong shape or value, the law returns something that does not fit,
+            or an outcome overflows.
     """
     batch = Batch.of(law, starts, goals, gains, rate, duration, arrival, turning_gain, limits, r, L)
     if progress is not None:
@@ -147,8 +148,11 @@ def _drive(
 ) -> Outcomes:
     """Drive a batch, block by block."""
     if steered(batch.law) is not None:
-        # It checks its arguments; on their way the robots ask only for what it gives.
-        batch.law(batch.starts, batch.goals, *batch.gains)
+        # The laws of this package check their arguments, but not what `steered` evaluates.
+        try:
+            batch.law(batch.starts, batch.goals, *batch.gains)
+        except ValueError as error:
+            raise ValueError(f'law cannot take the starts, goals and gains: {error}') from error
     count = batch.size
     found = Outcomes(
         np.zeros(count, dtype=np.bool_),

@@ -69,7 +69,7 @@ def twist_covariance(
 def _twist_covariance(v: Any, omega: Any, L: Any, k: Any, interval: Any) -> tuple[Any, ...]:
     right, left = _wheel_variances(v, omega, L, k)
     cross = (right - left) / (2.0 * L * interval)
-    return (right + left) / (4.0 * interval), cross, cross, (right + left) / (L**2 * interval)
+    return (right + left) / (4.0 * interval), cross, cross, (right + left) / (L * L * interval)
 
 
 def twist_covariance_checked(
@@ -241,7 +241,7 @@ def _noise_at_end(v: Any, omega: Any, dt: Any, L: Any, wheel_travel_variance: An
     vv, vw, ww = (
         (right + left) / 4.0 * dt,
         (right - left) / (2.0 * L) * dt,
-        (right + left) / L**2 * dt,
+        (right + left) / (L * L) * dt,
     )
     turn, way = omega * dt, v * dt
     whole, half = sinc(turn), sinc(turn / 2.0)
@@ -250,12 +250,12 @@ def _noise_at_end(v: Any, omega: Any, dt: Any, L: Any, wheel_travel_variance: An
     return (
         vv * (1.0 + whole * cosine) / 2.0
         + vw * way * turn * 2.0 * (2.0 * twice - once)
-        + ww * way**2 * 2.0 * (once - twice),
+        + ww * (way * way) * 2.0 * (once - twice),
         -vv * turn * whole**2 / 2.0
         + vw * way * half**2 * cosine / 2.0
-        + ww * way**2 * turn * half**4 / 8.0,
+        + ww * (way * way) * turn * half**4 / 8.0,
         vw * whole + ww * way * turn * once,
-        2.0 * twice * (vv * turn**2 - 2.0 * vw * way * turn + ww * way**2),
+        2.0 * twice * (vv * (turn * turn) - 2.0 * vw * way * turn + ww * (way * way)),
         -vw * turn / 2.0 * half**2 + ww * way * half**2 / 2.0,
         ww,
     )

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from diffdrive_jacobian.control.saturation import VelocityLimits, saturate
 from diffdrive_jacobian.kinematics._checks import (
     array,
+    floats,
     instance,
     nanoseconds,
     not_negative,
@@ -123,13 +124,14 @@ class Robot:
         pose = array('pose', self.pose, 3)
         if pose.ndim != 1:
             raise ValueError(f'pose must have shape (3,), got {pose.shape}')
-        if np.ndim(self.covariance) != 2:
-            raise ValueError(f'covariance must have shape (3, 3), got {np.shape(self.covariance)}')
-        covariance_entries('covariance', self.covariance)
+        covariance = floats('covariance', self.covariance)
+        if covariance.ndim != 2:
+            raise ValueError(f'covariance must have shape (3, 3), got {covariance.shape}')
+        covariance_entries('covariance', covariance)
         values: dict[str, Any] = {
             'stamp': nanoseconds('stamp', self.stamp),
             'pose': read_only(pose),
-            'covariance': read_only(self.covariance),
+            'covariance': read_only(covariance),
         }
         for name in ('wheel_angles', 'command', 'twist'):
             values[name] = _pair(name, getattr(self, name))
