@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sqlite3
 import struct
-import zlib
 from pathlib import Path
 
 import lz4.frame
@@ -216,7 +215,6 @@ HOSTILE_SCHEMAS = {
         """DROP TABLE topics; CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL,
             type TEXT AS (hex(zeroblob(400000000))), serialization_format TEXT NOT NULL,
             offered_qos_profiles TEXT NOT NULL)""",
-        "INSERT INTO topics VALUES (1, '/odom', 'cdr', '')",
         MESSAGES,
         "INSERT INTO messages VALUES (1, 1, 1, X'0001000000000000')",
     ),
@@ -251,7 +249,3 @@ def merging_laughs(levels: int = 25) -> str:
 
 
 CYCLE = 'a: &a\n  b: *a\n'
-
-
-def zeros_crc(size: int) -> int:
-    return zlib.crc32(bytes(size))
