@@ -71,8 +71,10 @@ def chunk(compression: str, packed: bytes, size: int, checksum: int = 0) -> byte
     return record(6, head + struct.pack('<Q', len(packed)) + packed)
 
 
-def topic_records(name='/odom', type_name='nav_msgs/msg/Odometry', qos='') -> bytes:
-    schema = struct.pack('<H', 1) + text(type_name) + text('ros2msg') + text('int32 x\n')
+def topic_records(
+    name='/odom', type_name='nav_msgs/msg/Odometry', qos='', definition='int32 x\n'
+) -> bytes:
+    schema = struct.pack('<H', 1) + text(type_name) + text('ros2msg') + text(definition)
     extra = text('offered_qos_profiles') + text(qos)
     channel = struct.pack('<HH', 1, 1) + text(name) + text('cdr') + text(extra)
     return record(3, schema) + record(4, channel)
