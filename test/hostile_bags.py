@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sqlite3
 import struct
-import zlib
 from pathlib import Path
 
 import lz4.frame
@@ -72,8 +71,10 @@ def chunk(compression: str, packed: bytes, size: int, checksum: int = 0) -> byte
     return record(6, head + struct.pack('<Q', len(packed)) + packed)
 
 
-def topic_records(name='/odom', type_name='nav_msgs/msg/Odometry', qos='') -> bytes:
-    schema = struct.pack('<H', 1) + text(type_name) + text('ros2msg') + text('int32 x\n')
+def topic_records(
+    name='/odom', type_name='nav_msgs/msg/Odometry', qos='', definition='int32 x\n'
+) -> bytes:
+    schema = struct.pack('<H', 1) + text(type_name) + text('ros2msg') + text(definition)
     extra = text('offered_qos_profiles') + text(qos)
     channel = struct.pack('<HH', 1, 1) + text(name) + text('cdr') + text(extra)
     return record(3, schema) + record(4, channel)
@@ -216,7 +217,6 @@ HOSTILE_SCHEMAS = {
         """DROP TABLE topics; CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL,
             type TEXT AS (hex(zeroblob(400000000))), serialization_format TEXT NOT NULL,
             offered_qos_profiles TEXT NOT NULL)""",
-        "INSERT INTO topics VALUES (1, '/odom', 'cdr', '')",
         MESSAGES,
         "INSERT INTO messages VALUES (1, 1, 1, X'0001000000000000')",
     ),
@@ -251,7 +251,3 @@ def merging_laughs(levels: int = 25) -> str:
 
 
 CYCLE = 'a: &a\n  b: *a\n'
-
-
-def zeros_crc(size: int) -> int:
-    return zlib.crc32(bytes(size))

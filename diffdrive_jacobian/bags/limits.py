@@ -21,7 +21,7 @@ MAX_RECORD = 1 << 27
 """Size of the largest message, chunk or other record that is read (bytes, unpacked)."""
 MAX_OVERLAP = 1 << 29
 """How much the chunks that are open at the same time may unpack to (bytes)."""
-FREE = 1 << 30
+FREE = 1 << 28
 """How much every file may unpack to (bytes)."""
 MAX_RATIO = 1000
 """How many times its size a larger file may unpack to."""

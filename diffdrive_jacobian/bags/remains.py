@@ -40,17 +40,14 @@ from diffdrive_jacobian.bags.metadata import DamagedError, parse_parameters
 from diffdrive_jacobian.bags.qos import NANOSECONDS, to_rosbags
 from diffdrive_jacobian.bags.recorder import PARAMETERS
 from diffdrive_jacobian.bags.recording import JOURNAL, journal_of
-from diffdrive_jacobian.bags.salvage import (
-    MCAP_MAGIC,
-    SQLITE_MAGIC,
-    Topic,
-    read_mcap,
-    read_sqlite,
-)
+from diffdrive_jacobian.bags.salvage import MCAP_MAGIC, Topic, read_mcap
+from diffdrive_jacobian.bags.salvage_sqlite import SQLITE_MAGIC, read_sqlite
 
 KINDS = {'.mcap': 'mcap', '.db3': 'sqlite3', JOURNAL: 'journal'}
 READERS = {'mcap': read_mcap, 'sqlite3': read_sqlite}
 ZSTD, ZSTD_MAGIC = '.zstd', b'\x28\xb5\x2f\xfd'
+MAX_DEFINITION = 200_000
+"""Length of the longest definition of a type that is parsed; those of ROS have less than a tenth."""
 LAST_ENCAPSULATION = 0x0B
 """Of CDR, in the second byte of a message; the first one is 0."""
 MAGICS = {MCAP_MAGIC: 'mcap', SQLITE_MAGIC: 'sqlite3', MAGIC: 'journal'}
@@ -357,6 +354,11 @@ def _described(topic: Topic) -> tuple[str, str]:
         reason = str(error)
     if not topic.definition:
         raise UnknownTypeError(reason)
+    if len(topic.definition) > MAX_DEFINITION:
+        raise UnknownTypeError(
+            f'{reason}, and its definition has {len(topic.definition)} characters; at most '
+            f'{MAX_DEFINITION} are parsed'
+        )
     try:
         store = get_typestore(Stores.EMPTY)
         store.register(get_types_from_msg(topic.definition, topic.type_name))

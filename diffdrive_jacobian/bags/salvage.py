@@ -1,8 +1,6 @@
-"""What is left of a broken bag: every message that can be read whole, and none that cannot.
+"""What is left of a broken MCAP file: every message that can be read whole, and none that cannot.
 
-MCAP (mcap.dev/spec) is read record by record up to the cut, chunks that were cut off included. SQLite
-(sqlite.org/fileformat2.html) is read by its leaf pages: the tree above them may be missing or stale, and
-so rows come to light, too, that were written, but never committed.
+MCAP (mcap.dev/spec) is read record by record up to the cut, chunks that were cut off included.
 """
 
 from __future__ import annotations
@@ -11,7 +9,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator
 from io import BytesIO
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 from diffdrive_jacobian.bags.journal import Message
 from diffdrive_jacobian.bags.limits import (
@@ -44,8 +42,6 @@ class Topic(NamedTuple):
 Found = Topic | Message | str
 """A text is what metadata.yaml holds, too."""
 
-
-# --- MCAP
 
 MCAP_MAGIC = b'\x89MCAP0\r\n'
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0C
@@ -181,149 +177,3 @@ def _read_record(opcode: int, payload: bytes, schemas: Schemas) -> Iterator[Foun
         yield Topic(number, name, type_name, encoding, qos, type_hash, definition)
     elif opcode == _METADATA and cursor.text() == 'rosbag2':
         yield cursor.texts().get('serialized_metadata', '')
-
-
-# --- SQLite
-
-SQLITE_MAGIC = b'SQLite format 3\0'
-_LEAF = 0x0D
-_WIDTHS = (0, 1, 2, 3, 4, 6, 8, 8, 0, 0)  # of the serial types below 10
-_MAX_COLUMNS = 32
-_COPIES = 4
-"""How many times the size of a database its rows may be in all: pages have older copies sometimes."""
-
-
-class _Pages:
-    """An SQLite file as pages, numbered from 1, and the rows that those hold."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self.bytes = file.seek(0, 2)
-        file.seek(0)
-        head = file.read(100).ljust(100, b'\0')
-        self.size = {1: 65536}.get(size := int.from_bytes(head[16:18], 'big'), size)
-        self.valid = head.startswith(SQLITE_MAGIC) and self.size in [2**n for n in range(9, 17)]
-        self.usable = self.size - head[20]
-        self.count = self.bytes // self.size if self.valid else 0
-        self._budget = Budget(self.bytes, ratio=_COPIES)
-        # How many there were at the last commit, if that is known.
-        self.committed = int.from_bytes(head[28:32], 'big') if head[24:28] == head[92:96] else 0
-
-    def page(self, number: int) -> bytes:
-        self._file.seek((number - 1) * self.size)
-        return self._file.read(self.size)
-
-    def rows(self, number: int) -> Iterator[tuple[int, list[Any] | None]]:
-        """Give the rows of a leaf page of a table: number and values, None if they cannot be read."""
-        page, start = self.page(number), 100 if number == 1 else 0
-        if page[start] != _LEAF:
-            return
-        count = int.from_bytes(page[start + 3 : start + 5], 'big')
-        # A row takes six bytes at least.
-        for index in range(min(count, self.size // 6)):
-            row, at = 0, start + 8 + 2 * index
-            try:
-                length, at = _varint(page, int.from_bytes(page[at : at + 2], 'big'))
-                row, at = _varint(page, at)
-                yield row, _values(self._payload(page, at, length))
-            except (ValueError, IndexError):
-                yield row, None
-
-    def _payload(self, page: bytes, at: int, length: int) -> bytes:
-        """Give what a cell holds; what has no room in its page is in a chain of others."""
-        most, least = self.usable - 35, (self.usable - 12) * 32 // 255 - 23
-        local = length
-        if length > most:
-            local = least + (length - least) % (self.usable - 4)
-            local = local if local <= most else least
-        check_record(length, 'a row')
-        self._budget.spend(length)
-        parts = [page[at : at + local]]
-        missing = length - len(parts[0])
-        following = page[at + local : at + local + 4] if local < length else b''
-        seen: set[int] = set()
-        while missing > 0 and len(parts[0]) == local:
-            number = int.from_bytes(following, 'big')
-            if not 1 < number <= self.count or number in seen:
-                raise ValueError('the chain breaks off or goes in a circle')
-            seen.add(number)
-            more = self.page(number)
-            # Of a commit that never came, pages may be there without their content.
-            if number > self.committed and not any(more):
-                raise ValueError('a page of the chain was never written')
-            parts.append(more[4 : min(self.usable, 4 + missing)])
-            missing -= len(parts[-1])
-            following = more[:4]
-        if missing or any(following):
-            raise ValueError(f'{length} bytes expected, {missing} are missing')
-        return b''.join(parts)
-
-
-def _varint(data: bytes, at: int) -> tuple[int, int]:
-    value = 0
-    for place in range(at, at + 8):
-        value = value << 7 | data[place] & 0x7F
-        if data[place] < 0x80:
-            return value, place + 1
-    return value << 8 | data[at + 8], at + 9
-
-
-def _values(record: bytes) -> list[Any]:
-    """Read a row; ValueError or IndexError: it is none."""
-    body, at = _varint(record, 0)
-    place = body
-    values: list[Any] = []
-    while at < body:
-        kind, at = _varint(record, at)
-        if kind in (10, 11) or len(values) == _MAX_COLUMNS:
-            raise ValueError(f'no serial type, or too many columns: {kind}')
-        width = _WIDTHS[kind] if kind < 10 else (kind - 12) // 2
-        raw, place = record[place : place + width], place + width
-        if kind >= 12:
-            values.append(raw.decode() if kind % 2 else raw)
-        else:
-            number = kind - 8 if kind >= 8 else int.from_bytes(raw, 'big', signed=True)
-            values.append(number if kind not in (0, 7) else None)
-    if (at, place) != (body, len(record)):
-        raise ValueError(f'a row of {place} bytes expected, got {len(record)}')
-    return values
-
-
-def read_sqlite(file: BinaryIO, note: Note) -> Iterator[Found]:
-    """Read what an SQLite file of rosbag2 holds, committed or not; the rows in their order."""
-    pages = _Pages(file)
-    if not pages.valid:
-        note(f'its {pages.bytes} bytes do not begin as an SQLite database does')
-        return
-    topics: dict[int, list[Any]] = {}
-    definitions: dict[str, str] = {}
-    starts: list[tuple[int, int]] = []
-    for number in range(1, pages.count + 1):
-        for row, values in pages.rows(number):
-            if not values or values[0] is not None:
-                continue
-            kinds = [type(value) for value in values[1:]]
-            if kinds == [int, int, bytes]:
-                starts.append((row, number))
-                break
-            if kinds == [int, str]:
-                yield values[2]
-            elif set(kinds) == {str} and values[1].startswith('/'):
-                topics[row] = values[1:]
-            elif kinds == [str] * 4:
-                definitions[values[1]] = values[3]
-    for row, values in topics.items():
-        name, kind, encoding, qos, type_hash = [*values, '', ''][:5]
-        yield Topic(row, name, kind, encoding, qos, type_hash, definitions.get(kind, ''))
-    last = read = 0
-    starts.sort()
-    for (_, number), (limit, _) in zip(starts, [*starts, (2**63, 0)][1:], strict=True):
-        for row, values in pages.rows(number):
-            # Pages have older copies sometimes.
-            if values and last < row < limit:
-                yield Message(*values[1:])
-                last, read = row, read + 1
-    if last > read:
-        note(f'{last - read} of its first {last} messages cannot be read')
-    if missing := max(pages.committed * pages.size - pages.bytes, pages.bytes % pages.size):
-        note(f'it breaks off: {missing} bytes are missing or hold no whole page')
