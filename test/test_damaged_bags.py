@@ -9,7 +9,7 @@ import sqlite3
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
-from ros_messages import joint_command, twist_stamped
+from ros_messages import goal, joint_command, twist_stamped
 from ruamel.yaml import YAML
 from test_reading import SECOND, odom, start, write_bag
 
@@ -304,9 +304,13 @@ def test_parameters_of_another_kind_do_not_end_the_plot(tmp_path, capsys, value)
     names = ('xy_goal_tolerance', 'offset', 'linear.x.max_velocity', 'max_wheel_velocity')
     names += ('controller', 'left_wheel_name', 'right_wheel_name')
     nodes = ('/go_to_goal', '/virtual_robot', '/wheel_bridge')
-    bag = make_bag(tmp_path / 'bag', 'mcap', {node: dict.fromkeys(names, value) for node in nodes})
-    code, _, err = run(capsys, 'plot_run', bag)
-    assert (code, err) == (0, '')
+    sent = [(1.0, '/goal_pose', goal(1.0, 0.5)), (1.0, '/joint_states', joint_command(1, 2))]
+    sent += [(1.1 + i / 50, '/odom', odom(i / 50, 0, 0, seconds=1.1 + i / 50)) for i in range(COUNT)]
+    parameters = {node: dict.fromkeys(names, value) for node in nodes}
+    parameters['/go_to_goal'] |= {'controller': 'offset_point'}
+    bag = write_bag(tmp_path / 'bag', sent, parameters=parameters)
+    assert run(capsys, 'plot_run', bag)[0] == 0
+    assert len(read_run(bag).wheels) == (value != 'x')
 
 
 # --- Messages that cannot be decoded
