@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import errno
 import math
+import os
 import re
 import signal
+import threading
+from functools import partial
 
 import pytest
 from processes import open_world
 
-from diffdrive_jacobian.bags import read_run
+from diffdrive_jacobian.bags import journal, read_run
 from diffdrive_jacobian.bags.trace import trace
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.parameters import CONTROLLERS
 from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.testing import Lockstep
+from diffdrive_jacobian.testing import runner as testing_runner
 from diffdrive_jacobian.tools import drive_to
 
 QUICK = ('--ros-args', '-p', 'kp:=12.0', '-p', 'kv:=3.0')
@@ -115,6 +122,51 @@ def test_timeout_is_of_simulated_time(capsys):
     line = last_line(capsys)
     assert line.startswith('not arrived (--timeout 3 s was too short): ')
     assert line.endswith('after 3.0 s of simulated time')
+
+
+def test_a_full_disk_is_reported(tmp_path, capsys, monkeypatch):
+    """A drive that arrives, but of which only a part is recorded, is not done."""
+    write, written = os.write, []
+
+    def limited(descriptor, data):
+        if threading.current_thread().name == 'journal':
+            if sum(written) > 20_000:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            written.append(len(data))
+        return write(descriptor, data)
+
+    monkeypatch.setattr(journal.os, 'write', limited)
+    assert drive_to.main(['1', '1', '--lockstep', '--no-plot', '-o', 'bag', *QUICK], Signals()) == 1
+    said = capsys.readouterr()
+    assert 'drive_to: error: the recording broke off: No space left on device' in said.err
+    assert said.out.splitlines()[-1] == 'recorded in part: bag'
+    assert (tmp_path / 'bag.journal').exists()
+
+
+def test_a_stuck_callback_fails_and_the_recording_is_kept(tmp_path, capsys, monkeypatch):
+    """That run is the one to look at."""
+    on_odometry = GoToGoal._on_odometry
+
+    def stuck(self, *args):
+        on_odometry(self, *args)
+        while self.get_clock().now().nanoseconds > 2_000_000_000:
+            pass
+
+    monkeypatch.setattr(GoToGoal, '_on_odometry', stuck)
+    monkeypatch.setattr(testing_runner, 'Lockstep', partial(Lockstep, patience=0.5))
+    assert drive_to.main(['1', '1', '--lockstep', '--no-plot', '-o', 'bag'], Signals()) == 1
+    said = capsys.readouterr()
+    assert said.err.startswith('drive_to: error: ')
+    assert '/go_to_goal' in said.err
+    assert said.out.splitlines()[-1] == 'recorded: bag'
+    assert len(read_run(tmp_path / 'bag').odometry) >= 50
+
+
+def test_a_bug_keeps_the_recording(tmp_path, monkeypatch):
+    monkeypatch.setattr(drive_to.Drive, 'show', lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        drive_to.main(['1', '1', '--lockstep', '--no-plot', '-o', 'bag'], Signals())
+    assert (tmp_path / 'bag').is_dir()
 
 
 @pytest.mark.parametrize(

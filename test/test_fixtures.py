@@ -170,3 +170,78 @@ def test_run_of_a_failed_test_is_kept_and_of_others_is_not(run, pytester):
     assert f'\n{bag}\n{bag}.png\n' in text
     assert bag.with_suffix('.png').read_bytes().startswith(b'\x89PNG')
     assert not list(pytester.path.glob('kept/*/run.journal'))
+
+
+KEPT_TWICE = """
+    def test_kept_by_hand(lockstep, robot_at, recorded_run):
+        robot_at()
+        lockstep.run_for(1.0)
+        first = recorded_run.keep()
+        lockstep.run_for(1.0)
+        assert recorded_run.keep() == first
+        assert False, first
+
+    def test_of_the_same_session(lockstep):
+        pass
+"""
+
+
+def test_a_run_that_was_kept_by_hand_is_kept_once(run, pytester):
+    result = run(KEPT_TWICE, '--basetemp=kept')
+    result.assert_outcomes(failed=1, passed=1)
+    (bag,) = pytester.path.glob('kept/*/run')
+    assert f'\n{bag}\n{bag}.png\n' in result.stdout.str()
+    assert len(read_run(bag).odometry) == 51
+
+
+FULL_DISK = """
+    import errno, os
+    from diffdrive_jacobian.bags.journal import JournalWriter
+    from diffdrive_jacobian.bags.recording import RecordingError
+
+    @pytest.fixture
+    def full_disk(lockstep, recorded_run, monkeypatch):
+        def write(*_):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        monkeypatch.setattr(JournalWriter, 'flush', write)
+
+    def test_fails(lockstep, robot_at, recorded_run, full_disk):
+        robot_at()
+        lockstep.run_for(1.0)
+        assert False
+
+    def test_keeps(lockstep, robot_at, recorded_run, full_disk):
+        robot_at()
+        lockstep.run_for(1.0)
+        with pytest.raises(RecordingError, match='No space left on device'):
+            recorded_run.keep()
+        with pytest.raises(RecordingError, match='No space left on device'):
+            recorded_run.keep()
+"""
+
+
+def test_a_recording_on_a_full_disk_is_reported_and_the_session_goes_on(run):
+    result = run(FULL_DISK)
+    result.assert_outcomes(failed=1, passed=1)
+    text = result.stdout.str()
+    assert 'the recording broke off: No space left on device' in text
+    assert 'INTERNALERROR' not in text
+
+
+def test_no_hook_raises(run):
+    result = run("""
+    def broken():
+        raise KeyError('of a bug')
+
+    def test_fails(lockstep, recorded_run, monkeypatch):
+        monkeypatch.setattr(lockstep, 'report', broken)
+        monkeypatch.setattr(recorded_run, 'keep', broken)
+        assert False
+
+    def test_of_the_same_session(lockstep):
+        pass
+    """)
+    result.assert_outcomes(failed=1, passed=1)
+    text = result.stdout.str()
+    assert text.count("not available: KeyError('of a bug')") == 2
+    assert 'INTERNALERROR' not in text

@@ -11,7 +11,7 @@ from rclpy.node import Node
 
 from diffdrive_jacobian.ros.node import ParameterizedNode
 from diffdrive_jacobian.ros.parameters import report_unknown
-from diffdrive_jacobian.ros.runner import UserError, made
+from diffdrive_jacobian.ros.runner import made
 from diffdrive_jacobian.testing.lockstep import Lockstep
 
 N = TypeVar('N', bound=Node)
@@ -46,13 +46,10 @@ class LockstepRunner:
         """Make a node and add it.
 
         Raises:
-            UserError: The name, the parameters or the QoS that its user gave cannot be, or its user had
-                it run on wall time.
-            LockstepError: Simulated time cannot pass.
+            UserError: The name, the parameters or the QoS that its user gave cannot be.
+            LockstepError: Its user had it run on wall time.
         """
         node = made(make)
-        if not node.get_parameter('use_sim_time').value:
-            raise UserError('in simulated time the parameter use_sim_time must be true for all nodes')
         self._nodes.append(node)
         return self._world.add(node)
 

@@ -1,0 +1,59 @@
+"""Messages that never came, counted by the numbers of those that did."""
+
+from __future__ import annotations
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from diffdrive_jacobian.bags.missed import MissedMessages
+
+
+def missed(numbers, publishers=1):
+    counter = MissedMessages(lambda: publishers)
+    for number in numbers:
+        counter.received(number)
+    return counter.count
+
+
+def test_gaps_of_one_publisher_are_counted():
+    assert missed([]) == 0
+    assert missed([1, 2, 3]) == 0
+    assert missed([7, 8, 12, 13, 20]) == 3 + 6
+
+
+def test_what_came_before_the_first_message_is_not_counted():
+    assert missed([1_000, 1_001]) == 0
+
+
+def test_a_publisher_that_is_restarted_loses_nothing():
+    assert missed([500, 501, 1, 2, 3, 5]) == 1
+    # Also when its numbers reach those of the one before.
+    assert missed([3, 4, *range(1, 5), 6, 7]) == 1
+
+
+def test_a_second_publisher_is_not_taken_for_a_gap():
+    assert missed([1, 2, 9_000, 3, 9_001, 4, 9_002], publishers=2) == 0
+
+
+def test_a_silent_publisher_hides_one_gap_at_most():
+    assert missed([1, 2, 5, 6, 9], publishers=2) == 2
+
+
+@settings(deadline=None)
+@given(
+    st.lists(st.integers(0, 50), min_size=1, max_size=4),
+    st.lists(st.tuples(st.integers(0, 3), st.booleans()), max_size=60),
+)
+def test_what_several_publishers_lost_adds_up(starts, events):
+    """Each event is a message of one of them that arrives or not; in the end each is heard again."""
+    last = [start + 1 for start in starts]
+    # The first messages must not continue each other's numbers.
+    numbers, lost = sorted(last, reverse=True), 0
+    for publisher, arrives in [*events, *((index, True) for index in range(len(starts)))]:
+        publisher %= len(starts)
+        last[publisher] += 1
+        if arrives:
+            numbers.append(last[publisher])
+        else:
+            lost += 1
+    assert missed(numbers, len(starts)) == lost

@@ -1,0 +1,379 @@
+"""Recordings: complete whatever their path and however slow the disk is, and else reported as partial."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import sqlite3
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+
+from diffdrive_jacobian.bags import building, journal
+from diffdrive_jacobian.bags.definitions import definition
+from diffdrive_jacobian.bags.journal import Channel, Message, read_journal
+from diffdrive_jacobian.bags.journal_thread import JournalThread
+from diffdrive_jacobian.bags.recording import LOST, Recording, RecordingError, journal_of
+from diffdrive_jacobian.bags.storage import BagReader
+from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.tools.recover_run import main as recover_run
+
+PATIENCE = 20.0
+STORAGES = ('mcap', 'sqlite3')
+STRANGE_NAMES = ('run#2', 'run?mode=memory', 'run%41', '%', 'file:x', ':memory:', 'a b', "it's", 'ü')
+
+
+def channel(topic='/cmd_vel'):
+    found = definition('geometry_msgs/msg/Twist')
+    return Channel(
+        id=len(topic),
+        topic=topic,
+        type_name=found.name,
+        definition=found.text,
+        type_hash=found.type_hash,
+    )
+
+
+def messages(count, size=40, topic='/cmd_vel'):
+    """Numbered messages."""
+    head = b'\0\1\0\0'
+    return [
+        Message(len(topic), 1_000 + index, head + index.to_bytes(size, 'little'))
+        for index in range(count)
+    ]
+
+
+def add_all(recording, *records):
+    for record in records:
+        recording.add(record)
+
+
+def content(bag):
+    """The messages of a bag in their order."""
+    reader = BagReader(bag)
+    reader.open()
+    try:
+        return [bytes(data) for _, _, data in reader.messages(reader.connections)]
+    finally:
+        reader.close()
+
+
+def custom_data(bag):
+    reader = BagReader(bag)
+    reader.open()
+    try:
+        return dict(reader.metadata.custom)
+    finally:
+        reader.close()
+
+
+def until(condition, what):
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline, f'not within {PATIENCE} s: {what}'
+        # Let the thread that writes have its turn.
+        os.sched_yield()
+
+
+@pytest.fixture
+def disk(monkeypatch):
+    """A disk for journals that can be stopped, and can fail."""
+
+    class Disk:
+        def __init__(self):
+            self.ready = threading.Event()
+            self.ready.set()
+            self.error = None
+            self.writes = 0
+
+    made, write = Disk(), os.write
+
+    def slow(descriptor, data):
+        if threading.current_thread().name != 'journal':
+            return write(descriptor, data)
+        made.writes += 1
+        made.ready.wait(PATIENCE)
+        if made.error is not None:
+            raise OSError(made.error, os.strerror(made.error))
+        return write(descriptor, data)
+
+    monkeypatch.setattr(journal.os, 'write', slow)
+    yield made
+    made.ready.set()
+
+
+# --- Paths
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+@pytest.mark.parametrize('name', STRANGE_NAMES)
+@pytest.mark.parametrize('inside', [True, False])
+def test_a_bag_can_have_any_path(tmp_path, monkeypatch, name, storage, inside):
+    folder = tmp_path / name if inside else tmp_path
+    folder.mkdir(exist_ok=True)
+    monkeypatch.chdir(folder)
+    bag = Path('run' if inside else name)
+    recording = Recording(bag, storage)
+    add_all(recording, channel(), *messages(20))
+    assert recording.finish().messages == 20
+    assert os.listdir(folder) == [str(bag)]
+    file = f'{bag}.{"mcap" if storage == "mcap" else "db3"}'
+    assert sorted(os.listdir(bag)) == sorted([file, 'metadata.yaml'])
+    described = YAML(typ='safe').load(bag / 'metadata.yaml')['rosbag2_bagfile_information']
+    assert described['relative_file_paths'] == [file]
+    assert content(bag) == [one.data for one in messages(20)]
+    if storage == 'sqlite3':
+        with sqlite3.connect(folder / bag / file) as database:
+            assert database.execute('SELECT count(*) FROM messages').fetchone() == (20,)
+        database.close()
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_a_bag_can_lie_behind_a_symbolic_link(tmp_path, storage):
+    (tmp_path / 'real#').mkdir()
+    (tmp_path / 'link?').symlink_to('real#')
+    recording = Recording(tmp_path / 'link?' / 'run', storage)
+    add_all(recording, channel(), *messages(3))
+    recording.finish()
+    assert len(content(tmp_path / 'real#' / 'run')) == 3
+
+
+def test_names_that_no_bag_can_have_are_refused_before_recording(tmp_path):
+    (tmp_path / 'dangling').symlink_to('nowhere')
+    with pytest.raises(FileExistsError):
+        Recording(tmp_path / 'dangling', 'mcap')
+    with pytest.raises(OSError, match='must be UTF-8'):
+        Recording(tmp_path / os.fsdecode(b'run\xff'), 'mcap')
+    assert os.listdir(tmp_path) == ['dangling']
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_the_journal_stays_if_the_bag_reads_back_otherwise(tmp_path, monkeypatch, storage):
+    write = building.BagWriter.write
+    skipped = messages(20)[7]
+
+    def lossy(self, connection, stamp, data):
+        write(self, connection, stamp, data[:-1] + b'!' if stamp == skipped.stamp else data)
+
+    monkeypatch.setattr(building.BagWriter, 'write', lossy)
+    recording = Recording(tmp_path / 'run', storage)
+    add_all(recording, channel(), *messages(20))
+    with pytest.raises(
+        RecordingError, match=r'what was read back .* recover_run .*run\.journal'
+    ) as caught:
+        recording.finish()
+    assert caught.value.summary is None
+    assert os.listdir(tmp_path) == ['run.journal']
+
+
+def test_a_folder_of_the_user_stays(tmp_path):
+    (tmp_path / '.run.building').mkdir()
+    (tmp_path / '.run.building' / 'thesis').write_text('precious')
+    recording = Recording(tmp_path / 'run', 'mcap')
+    add_all(recording, channel(), *messages(1))
+    recording.finish()
+    assert (tmp_path / '.run.building' / 'thesis').read_text() == 'precious'
+    assert sorted(os.listdir(tmp_path)) == ['.run.building', 'run']
+
+
+# --- A slow disk
+
+
+def test_a_disk_that_hesitates_loses_nothing_and_delays_nobody(tmp_path, disk):
+    recording = Recording(tmp_path / 'run', 'mcap')
+    disk.ready.clear()
+    add_all(recording, channel(), *messages(1))
+    until(lambda: disk.writes, 'the thread writes')
+    # All of these are taken while one write lasts.
+    add_all(recording, *messages(5_000))
+    assert recording.lost == {}
+    disk.ready.set()
+    assert recording.finish().messages == 5_001
+    assert len(content(tmp_path / 'run')) == 5_001
+
+
+def test_many_small_messages_are_few_writes(tmp_path, disk):
+    """Each may take a second, on a disk that is slow."""
+    recording = Recording(tmp_path / 'run', 'mcap')
+    disk.ready.clear()
+    add_all(recording, channel(), *messages(1))
+    until(lambda: disk.writes, 'the thread writes')
+    add_all(recording, *messages(20_000))
+    disk.ready.set()
+    recording.finish()
+    assert disk.writes <= 4
+
+
+def test_memory_is_bounded_by_bytes_and_what_is_dropped_is_counted(tmp_path, disk):
+    recording = Recording(tmp_path / 'run', 'mcap', capacity=10_000_000)
+    disk.ready.clear()
+    add_all(recording, channel(), *messages(1))
+    until(lambda: disk.writes, 'the thread writes')
+    for record in messages(30, size=1_000_000):
+        recording.add(record)
+        assert recording.journal.waiting <= 10_000_000
+    assert recording.lost == {'/cmd_vel': 21}
+    disk.ready.set()
+    with pytest.raises(RecordingError, match=r'21 came faster than the disk .*/cmd_vel 21') as caught:
+        recording.finish()
+    summary = caught.value.summary
+    assert (summary.messages, summary.lost) == (10, {'/cmd_vel': 21})
+    assert len(content(tmp_path / 'run')) == 10
+    assert json.loads(custom_data(tmp_path / 'run')[LOST]) == {'/cmd_vel': 21}
+    assert os.listdir(tmp_path) == ['run']
+
+
+def test_small_messages_are_bounded_too(tmp_path, disk):
+    recording = Recording(tmp_path / 'run', 'mcap', capacity=100_000)
+    disk.ready.clear()
+    add_all(recording, channel(), *messages(1))
+    until(lambda: disk.writes, 'the thread writes')
+    add_all(recording, *messages(1_000, size=2))
+    assert recording.lost['/cmd_vel'] > 500
+    disk.ready.set()
+    with pytest.raises(RecordingError) as caught:
+        recording.finish()
+    assert caught.value.summary.messages + caught.value.summary.lost['/cmd_vel'] == 1_001
+
+
+def test_a_message_larger_than_the_memory_is_taken_alone(tmp_path):
+    recording = Recording(tmp_path / 'run', 'mcap', capacity=1_000)
+    add_all(recording, channel())
+    until(lambda: recording.journal.waiting == 0, 'all is written')
+    add_all(recording, *messages(1, size=100_000))
+    assert recording.finish().messages == 1
+
+
+def test_a_lossless_recording_waits_for_the_disk(tmp_path, disk):
+    recording = Recording(tmp_path / 'run', 'mcap', lossless=True, capacity=2_000)
+    add_all(recording, channel())
+    disk.ready.clear()
+    release = threading.Timer(0.2, disk.ready.set)
+    release.start()
+    add_all(recording, *messages(500))
+    assert disk.ready.is_set()
+    assert recording.finish().messages == 500
+
+
+def test_losses_are_in_the_journal_while_it_is_recorded(tmp_path):
+    """A crash must not make them unknown."""
+    recording = Recording(tmp_path / 'run', 'mcap')
+    add_all(recording, channel(), *messages(1))
+    recording.set_missed('/cmd_vel', 12)
+    path = journal_of(tmp_path / 'run')
+    until(lambda: LOST.encode() in path.read_bytes(), 'they are noted')
+    with pytest.raises(RecordingError, match='12 never reached the recorder'):
+        recording.finish()
+    assert json.loads(custom_data(tmp_path / 'run')[LOST]) == {'/cmd_vel': 12}
+
+
+def test_records_are_written_without_anybody_asking(tmp_path):
+    recording = Recording(tmp_path / 'run', 'mcap')
+    add_all(recording, channel(), *messages(1))
+    until(
+        lambda: any(isinstance(one, Message) for one in read_journal(recording.journal.path)), 'written'
+    )
+    recording.discard()
+    assert os.listdir(tmp_path) == []
+
+
+def test_nothing_is_recorded_after_the_end(tmp_path):
+    recording = Recording(tmp_path / 'run', 'mcap')
+    add_all(recording, channel(), *messages(1))
+    recording.finish()
+    add_all(recording, *messages(1))
+    assert recording.lost == {}
+
+
+# --- Disks that fail, journals that go
+
+
+@pytest.mark.parametrize('lossless', [True, False])
+def test_a_full_disk_is_raised_by_finish(tmp_path, disk, lossless):
+    recording = Recording(tmp_path / 'run', 'mcap', lossless=lossless)
+    add_all(recording, channel(), *messages(10))
+    until(lambda: recording.journal.waiting == 0, 'these are written')
+    disk.error = errno.ENOSPC
+    add_all(recording, *messages(20))
+    until(lambda: recording.error is not None, 'the thread notices')
+    add_all(recording, *messages(5))
+    with pytest.raises(RecordingError, match='broke off: No space left on device') as caught:
+        recording.finish()
+    summary = caught.value.summary
+    assert (summary.messages, summary.lost) == (10, {'/cmd_vel': 25})
+    assert json.loads(custom_data(tmp_path / 'run')[LOST]) == {'/cmd_vel': 25}
+    assert journal_of(tmp_path / 'run').exists()
+
+
+def test_a_bag_that_cannot_be_written_is_raised_by_finish(tmp_path):
+    recording = Recording(tmp_path / 'run', 'mcap')
+    add_all(recording, channel(), *messages(10))
+    (tmp_path / 'run').write_text('somebody else came first')
+    with pytest.raises(
+        RecordingError, match=r'run exists already.*recover_run .*run\.journal'
+    ) as caught:
+        recording.finish()
+    assert caught.value.summary is None
+    assert (tmp_path / 'run').read_text() == 'somebody else came first'
+
+
+def _remove(folder):
+    journal_of(folder / 'run').unlink()
+
+
+def _replace(folder):
+    _remove(folder)
+    journal_of(folder / 'run').write_text('of somebody else')
+
+
+def _rename(folder):
+    journal_of(folder / 'run').rename(folder / 'elsewhere.journal')
+
+
+def _remove_folder(folder):
+    shutil.rmtree(folder)
+
+
+def _rename_folder(folder):
+    folder.rename(folder.with_name('other'))
+
+
+@pytest.mark.parametrize('change', [_remove, _replace, _rename, _remove_folder, _rename_folder])
+def test_a_journal_that_goes_is_noticed_and_saved(tmp_path, capsys, change):
+    folder = tmp_path / 'runs'
+    folder.mkdir()
+    recording = Recording(folder / 'run', 'mcap')
+    add_all(recording, channel(), *messages(50))
+    change(folder)
+    until(lambda: recording.error is not None, 'it is noticed')
+    with pytest.raises(RecordingError, match='was removed, renamed or replaced') as caught:
+        recording.finish()
+    assert caught.value.summary is None
+    saved = str(caught.value).split('What was recorded is in ')[1].split(': recover_run')[0]
+    assert recover_run([saved, '-o', str(tmp_path / 'new')], Signals()) == 0
+    assert content(tmp_path / 'new') == [one.data for one in messages(50)]
+    if change is _replace:
+        assert journal_of(folder / 'run').read_text() == 'of somebody else'
+
+
+def test_discarding_leaves_the_file_of_somebody_else(tmp_path):
+    recording = Recording(tmp_path / 'run', 'mcap')
+    _replace(tmp_path)
+    recording.discard()
+    assert journal_of(tmp_path / 'run').read_text() == 'of somebody else'
+
+
+def test_the_thread_syncs(tmp_path, monkeypatch):
+    synced, sync = [], os.fsync
+    monkeypatch.setattr(journal.os, 'fsync', lambda descriptor: synced.append(sync(descriptor)))
+    writer = journal.JournalWriter(tmp_path / 'x.journal')
+    thread = JournalThread(writer)
+    thread.add(messages(1)[0])
+    until(lambda: synced, 'it is synced')
+    thread.close()
+    writer.close()
