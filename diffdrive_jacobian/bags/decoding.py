@@ -7,9 +7,8 @@ from typing import Any
 
 from rclpy.serialization import deserialize_message
 
-from diffdrive_jacobian.bags.definitions import UnknownTypeError, definition
+from diffdrive_jacobian.bags.definitions import UnknownTypeError, definition, message_class
 from diffdrive_jacobian.bags.journal import Channel
-from diffdrive_jacobian.bags.recorder import message_class
 from diffdrive_jacobian.text import printable
 
 
