@@ -16,8 +16,8 @@ from ros_messages import goal, goals, joint_command, odometry, placement, stamp,
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from diffdrive_jacobian.nodes import go_to_goal
-from diffdrive_jacobian.nodes.go_to_goal import MAX_WAYPOINTS
+from diffdrive_jacobian.nodes.goal import MAX_WAYPOINTS
+from diffdrive_jacobian.nodes.parameters import GoToGoalParameters
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.ros import messages, node
@@ -171,10 +171,10 @@ def test_long_strings_are_refused_as_parameters(lockstep, add, name):
 
 def test_choices_that_are_too_long_are_quoted_in_short():
     with pytest.raises(ParameterError, match=r"got 'fff.*\.\.\.' \(1000000 characters\)") as caught:
-        go_to_goal.GoToGoalParameters(controller=MEGABYTE)
+        GoToGoalParameters(controller=MEGABYTE)
     assert len(str(caught.value)) < 300
     with pytest.raises(ParameterError) as caught:
-        go_to_goal.GoToGoalParameters(kp=MEGABYTE)
+        GoToGoalParameters(kp=MEGABYTE)
     assert len(str(caught.value)) < 300
 
 

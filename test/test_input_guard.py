@@ -16,6 +16,7 @@ from rcl_interfaces.srv import (
 )
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from ros_messages import odometry
 from rosgraph_msgs.msg import Clock
 
 from diffdrive_jacobian.control import Arrival
@@ -159,6 +160,19 @@ def sender(context):
 
 def plain(context):
     return Node('plain', context=context)
+
+
+def test_observer_drops_odometry_with_a_negative_stamp(capfd):
+    with ros_context(['test']) as context, running(context, closed_world=True) as runner:
+        node = runner.add(lambda: observer(context))
+        message = odometry(1.0, 2.0, 0.5)
+        message.header.stamp.sec = -1
+        node._on_odometry(message)
+        assert (node.pose, node.seen) == (None, 0)
+        assert 'odometry dropped: its stamp must have sec of at least 0' in capfd.readouterr().err
+        message.header.stamp.sec = 7
+        node._on_odometry(message)
+        assert node.seen == 7_000_000_000
 
 
 @pytest.mark.parametrize('isolated', [False, True])

@@ -70,11 +70,14 @@ def test_mistakes_of_the_user_are_named():
 
 
 LONG = {
-    'topic': (('-r', f'odom:={248 * "t"}'), 'at most 247 characters, got 248'),
-    'absolute topic': (('--remap', f'odom:=/{247 * "t"}'), 'at most 247 characters, got 248'),
-    'node': (('-r', f'__node:={300 * "n"}'), 'at most 247 characters, got 300'),
-    'namespace': (('-r', f'__ns:=/{247 * "n"}'), 'at most 247 characters, got 248'),
-    'service': (('-r', f'reset_odometry:={255 * "s"}'), 'at most 247 characters, got 255'),
+    'topic': (('-r', f'odom:={248 * "t"}'), 'with its leading slash, got 249'),
+    'absolute topic': (('--remap', f'odom:=/{247 * "t"}'), 'with its leading slash, got 248'),
+    'node': (('-r', f'__node:={300 * "n"}'), 'at most 247 characters with its leading slash, got 301'),
+    'namespace': (('-r', f'__ns:=/{247 * "n"}'), 'with its leading slash, got 248'),
+    'service': (
+        ('-r', f'reset_odometry:={255 * "s"}'),
+        'at most 247 characters with its leading slash, got 256',
+    ),
     'of one node': (('-r', f'virtual_robot:odom:={300 * "t"}'), "'virtual_robot:odom:=tttt"),
     # Each of these is short enough by itself.
     'node and its services': (('-r', f'__node:={240 * "n"}'), 'Invalid service name: topic length'),

@@ -166,3 +166,15 @@ def test_following_changes_no_value_in_place():
     waypoints.follow(np.array([1.0, 0.0, 0.0]), law, WITH_HEADING, GAIN)
     assert (waypoints.index, waypoints.turning) == (0, False)
     assert np.array_equal(waypoints.poses, poses)
+
+
+def test_resumed_waypoints_check_the_last_position_again():
+    turning = Waypoints(POSES, 2, turning=True)
+    resumed = turning.resumed()
+    assert (resumed.index, resumed.turning) == (2, False)
+    assert resumed.poses is POSES
+    there, away = POSES[2] - [0.0, 0.0, 1.0], POSES[2] + [1.0, 0.0, 0.0]
+    assert resumed.follow(there, refuses, WITH_HEADING, GAIN)[0].turning
+    assert not resumed.follow(away, law, WITH_HEADING, GAIN)[0].turning
+    driving = Waypoints(POSES, 1)
+    assert driving.resumed() is driving

@@ -2,37 +2,29 @@
 
 from __future__ import annotations
 
-import uuid
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from action_msgs.msg import GoalInfo, GoalStatus
-from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Goals, Odometry
 from std_srvs.srv import Trigger
-from unique_identifier_msgs.msg import UUID
 
 from diffdrive_jacobian.control import (
     Arrival,
-    Waypoints,
     go_to_goal,
     go_to_pose,
     offset_point,
     saturate,
 )
 from diffdrive_jacobian.control.waypoints import Law
+from diffdrive_jacobian.nodes.goal import MAX_WAYPOINTS, Goal, goal_info, read_goal
 from diffdrive_jacobian.nodes.parameters import GoToGoalParameters, nanoseconds
 from diffdrive_jacobian.ros import messages
 from diffdrive_jacobian.ros.messages import MessageError
 from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.text import printable
-
-MAX_WAYPOINTS = 10_000
-"""Most poses of a `goals` message that is converted: rclpy takes some 20 us for each."""
 
 LAWS: dict[str, Callable[[GoToGoalParameters], Law]] = {
     'go_to_goal': lambda gains: lambda pose, goal: go_to_goal(pose, goal[:2], gains.kp, gains.kv),
@@ -42,20 +34,6 @@ LAWS: dict[str, Callable[[GoToGoalParameters], Law]] = {
     'pose': lambda gains: lambda pose, goal: go_to_pose(pose, goal, gains.kp, gains.kv),
 }
 """Parameter `controller` to the law with its gains."""
-
-
-@dataclass(slots=True)
-class Goal:
-    """A goal that was accepted: what came in one message."""
-
-    info: GoalInfo
-    frame: str
-    """Frame of its poses; empty: the odometry's."""
-    waypoints: Waypoints
-    executing: bool = False
-    """Whether odometry has come for it."""
-    stale: bool = False
-    """Whether the robot was stopped for want of odometry."""
 
 
 class GoToGoal(ParameterizedNode[GoToGoalParameters]):
@@ -99,9 +77,9 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
     # --- Goals
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
-        info = _goal_info(message.header.stamp)
+        info = goal_info(message.header.stamp)
         try:
-            goal = Goal(info, *_read_goal(message.header.frame_id, [message]))
+            goal = Goal(info, *read_goal(message.header.frame_id, [message]))
             self._match_frames(goal)
         except MessageError as error:
             self._refuse(info, error)
@@ -114,12 +92,12 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         except MessageError as error:
             self.get_logger().warning(f'goals dropped: {error}', throttle_duration_sec=THROTTLE)
             return
-        info = _goal_info(stamp)
+        info = goal_info(stamp)
         try:
             if count > MAX_WAYPOINTS:
                 raise MessageError(f'goals must hold at most {MAX_WAYPOINTS} poses, got {count}')
             message = messages.deserialized(data, Goals)
-            goal = Goal(info, *_read_goal(message.header.frame_id, message.goals))
+            goal = Goal(info, *read_goal(message.header.frame_id, message.goals))
             self._match_frames(goal)
         except MessageError as error:
             self._refuse(info, error)
@@ -324,25 +302,3 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
                 f'kp {kp:g} is not larger than kv {kv:g}: the robot approaches faster than it turns '
                 'and spirals in; choose kp > kv',
             )
-
-
-def _goal_info(stamp: Time) -> GoalInfo:
-    """Return a new identity of a goal that has a stamp."""
-    return GoalInfo(goal_id=UUID(uuid=list(uuid.uuid4().bytes)), stamp=stamp)
-
-
-def _read_goal(frame: str, poses: Sequence[PoseStamped]) -> tuple[str, Waypoints]:
-    """Read the frame and the poses of a goal.
-
-    Raises:
-        MessageError: There is no pose, one is not valid, or they are given in several frames.
-    """
-    if not poses:
-        raise MessageError('goals must hold at least one pose, got none (to stop, call cancel_goal)')
-    frames = {pose.header.frame_id or frame for pose in poses}
-    if len(frames) > 1:
-        raise MessageError(
-            f'all poses must be given in one frame, got {messages.quoted(sorted(frames))}'
-        )
-    read = np.array([messages.from_pose(pose.pose) for pose in poses])
-    return frames.pop(), Waypoints(read)

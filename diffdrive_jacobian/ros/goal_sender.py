@@ -52,6 +52,8 @@ class GoalSender(Node):  # type: ignore[misc]
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.create_subscription(GoalStatus, 'goal_status', self._on_status, latched)
         self.create_subscription(Odometry, 'odom', self._on_odometry, 10)
+        # rclpy reports a name that is too long only here.
+        self.resolve_service_name('cancel_goal')
         self._cancel = self.create_client(Trigger, 'cancel_goal')
 
     @property

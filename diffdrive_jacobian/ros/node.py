@@ -32,6 +32,7 @@ from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.parameters import NodeParameters, ParameterError
 from diffdrive_jacobian.ros.rate_limit import RateLimit
+from diffdrive_jacobian.text import printable
 
 P = TypeVar('P', bound=NodeParameters)
 
@@ -220,13 +221,13 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
 
     def _report_mismatch(self, mismatch: tuple[str, str, str], other: Any, reading: bool) -> None:
         name, wanted, theirs = mismatch
-        who = f'{other.node_namespace.rstrip("/")}/{other.node_name}'
+        who = printable(f'{other.node_namespace.rstrip("/")}/{other.node_name}')
         they_do, we_do = ('publishes', 'reads') if reading else ('reads', 'publishes')
         hint = ''
         if 'Twist' in wanted and 'Twist' in theirs:
             hint = '; enable_stamped_cmd_vel chooses between Twist and TwistStamped'
         self.get_logger().error(
-            f'{who} {they_do} {theirs} on {name}, but this node {we_do} {wanted}: '
+            f'{who} {they_do} {printable(theirs)} on {name}, but this node {we_do} {wanted}: '
             f'nothing will arrive{hint}'
         )
 

@@ -110,10 +110,11 @@ def _check_name_length(rule: str) -> None:
         UserError: It is longer than a topic, a service, a node or a namespace can be.
     """
     name = rule.rpartition(':=')[2]
-    if len(name) + (not name.startswith('/')) > MAX_NAME_LENGTH:
+    length = len(name) + (not name.startswith('/'))
+    if length > MAX_NAME_LENGTH:
         raise UserError(
             f"ROS arguments: remap rule '{printable(rule)}' must give a name of at most "
-            f'{MAX_NAME_LENGTH} characters, got {len(name)}'
+            f'{MAX_NAME_LENGTH} characters with its leading slash, got {length}'
         )
 
 
@@ -166,8 +167,12 @@ def made(make: Callable[[], N]) -> N:
     except (ParameterError, ParameterException, InvalidQosOverridesError) as error:
         raise UserError(str(error)) from error
     except rclpy_implementation.RCLError as error:
-        # Names that only together are too long: rcl appends the place in its sources.
-        raise UserError(str(error).split(', at /')[0]) from error
+        # rcl appends the place in its sources.
+        reason = str(error).split(', at /')[0]
+        if 'length should not exceed' in reason:
+            # Each part was short enough, see _check_name_length.
+            reason += f'; a name with its namespace must have at most {MAX_NAME_LENGTH} characters'
+        raise UserError(reason) from error
 
 
 class Runner:

@@ -1,0 +1,56 @@
+"""A goal of the node go_to_goal, as it is read from a message."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from action_msgs.msg import GoalInfo
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped
+from unique_identifier_msgs.msg import UUID
+
+from diffdrive_jacobian.control import Waypoints
+from diffdrive_jacobian.ros import messages
+from diffdrive_jacobian.ros.messages import MessageError
+
+MAX_WAYPOINTS = 10_000
+"""Most poses of a `goals` message that is converted: rclpy takes some 20 us for each."""
+
+
+@dataclass(slots=True)
+class Goal:
+    """A goal that was accepted: what came in one message."""
+
+    info: GoalInfo
+    frame: str
+    """Frame of its poses; empty: the odometry's."""
+    waypoints: Waypoints
+    executing: bool = False
+    """Whether odometry has come for it."""
+    stale: bool = False
+    """Whether the robot was stopped for want of odometry."""
+
+
+def goal_info(stamp: Time) -> GoalInfo:
+    """Return a new identity of a goal that has a stamp."""
+    return GoalInfo(goal_id=UUID(uuid=list(uuid.uuid4().bytes)), stamp=stamp)
+
+
+def read_goal(frame: str, poses: Sequence[PoseStamped]) -> tuple[str, Waypoints]:
+    """Read the frame and the poses of a goal.
+
+    Raises:
+        MessageError: There is no pose, one is not valid, or they are given in several frames.
+    """
+    if not poses:
+        raise MessageError('goals must hold at least one pose, got none (to stop, call cancel_goal)')
+    frames = {pose.header.frame_id or frame for pose in poses}
+    if len(frames) > 1:
+        raise MessageError(
+            f'all poses must be given in one frame, got {messages.quoted(sorted(frames))}'
+        )
+    read = np.array([messages.from_pose(pose.pose) for pose in poses])
+    return frames.pop(), Waypoints(read)
