@@ -177,3 +177,18 @@ def test_a_length_that_is_not_positive_and_finite_is_named(name, bad):
     ]:
         with pytest.raises(ValueError, match=rf'^{name} must be positive and finite'):
             call(**lengths)
+
+
+def test_both_results_have_the_shape_of_all_arguments():
+    separations = np.array([[0.1], [0.2]])
+    for result in (
+        dd.wheel_to_body([1.0, 2.0], [3.0, 4.0], 0.033, separations),
+        dd.wheel_to_body(1.0, 2.0, 0.033, separations),
+        dd.body_to_wheel([1.0, 2.0], 3.0, 0.033, separations),
+    ):
+        first, second = result
+        assert first.shape == second.shape == np.broadcast_shapes(first.shape, (2, 1))
+    v, omega = dd.wheel_to_body([1.0, 2.0], [3.0, 4.0], 0.033, separations)
+    for i, j in np.ndindex(2, 2):
+        one = dd.wheel_to_body(1.0 + j, 3.0 + j, 0.033, float(separations[i, 0]))
+        assert (v[i, j], omega[i, j]) == one

@@ -204,3 +204,30 @@ def test_twenty_thousand_noisy_wheels_have_the_reported_covariances(v, omega, du
     expected = propagated(start, START, (v, omega), duration, k)
     assert_same_within_sampling_error(deviations, expected)
     assert_same_within_sampling_error(means - [v, omega], twist_covariance((v, omega), L, k, duration))
+
+
+@pytest.mark.parametrize(
+    ('changes', 'message'),
+    [
+        ({'dt': -1.0}, 'dt must be zero or positive'),
+        ({'dt': [1.0, -1.0]}, 'dt must be zero or positive'),
+        ({'wheel_travel_variance': -1e-5}, 'wheel_travel_variance must be zero or positive'),
+        ({'L': 0.0}, 'L must be positive'),
+        ({'covariance': -np.eye(3)}, 'covariance must be symmetric and positive semidefinite'),
+        ({'covariance': [np.eye(3), [[1, 2, 0], [2, 1, 0], [0, 0, 1]]]}, 'covariance must be symmetric'),
+        ({'covariance': [[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]}, 'covariance must be symmetric'),
+        ({'covariance': 0.9 * np.ones((3, 3)) - 0.5 * np.eye(3)}, 'covariance must be symmetric'),
+    ],
+)
+def test_nothing_that_gives_negative_variances_is_accepted(changes, message):
+    valid = {
+        'covariance': np.eye(3) * 1e-4,
+        'pose': np.zeros(3),
+        'twist': (0.2, 0.1),
+        'dt': 1.0,
+        'L': 0.16,
+        'wheel_travel_variance': 1e-5,
+    }
+    assert np.all(np.linalg.eigvalsh(propagate_covariance(**valid)) > 0.0)
+    with pytest.raises(ValueError, match=f'^{message}'):
+        propagate_covariance(**valid | changes)

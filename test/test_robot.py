@@ -130,6 +130,57 @@ def test_a_robot_cannot_go_back():
             call()
 
 
+@pytest.mark.parametrize('form', [tuple, list, np.array, lambda pair: np.array(pair, dtype=np.float32)])
+def test_a_command_is_the_same_in_every_form(form):
+    for command in ((0.0, 0.0), (0.25, -1.5), (-0.0, 0.0)):
+        expected = start().commanded(command, 0)
+        robot = start().commanded(form(command), 0)
+        assert drive(robot) == drive(expected)
+        assert type(robot.command) is type(robot.twist) is tuple
+        assert all(type(part) is float for part in (*robot.command, *robot.twist))
+    assert start().commanded([0, 0], 0).expiry is None
+
+
+@pytest.mark.parametrize('seconds', [0.5, 1.0, np.float64(2.0), '1', None, True])
+def test_seconds_are_not_taken_for_nanoseconds(seconds):
+    robot = start()
+    for call in (
+        lambda: robot.at(seconds),
+        lambda: robot.commanded((0.1, 0.0), seconds),
+        lambda: robot.placed(START, COVARIANCE, seconds),
+        lambda: robot.remodelled(HELD, seconds),
+        lambda: robot.restarted(seconds),
+        lambda: Robot(model=MODEL, stamp=seconds, pose=START),
+    ):
+        with pytest.raises(
+            ValueError, match=r'^stamp must be an integer number of nanoseconds \(ns\), got'
+        ):
+            call()
+    with pytest.raises(ValueError, match=r'^command_timeout must be an integer number of nanoseconds'):
+        RobotModel(command_timeout=seconds)
+    assert robot.at(np.int64(5)).stamp == 5
+
+
+def test_a_robot_does_not_change_with_the_arrays_it_was_given():
+    pose, covariance = START.copy(), COVARIANCE.copy()
+    robot = Robot(model=HELD, stamp=0, pose=pose, covariance=covariance)
+    driven_robot = robot.commanded((0.2, 0.1), 0).at(SECOND)
+    placed = robot.placed(pose, covariance, 0)
+    before = [state(one) for one in (robot, driven_robot, placed)]
+    pose[:], covariance[:] = 7.0, 7.0
+    for one in (robot, driven_robot, placed):
+        for array in (one.pose, one.covariance):
+            with pytest.raises(ValueError, match='read-only'):
+                array[0] = 7.0
+    assert [state(one) for one in (robot, driven_robot, placed)] == before
+
+
+@pytest.mark.parametrize('name', ['wheel_radius', 'wheel_separation', 'wheel_travel_variance'])
+def test_a_model_with_a_negative_size_is_refused(name):
+    with pytest.raises(ValueError, match=rf'^{name} must be '):
+        RobotModel(**{name: -1e-5})
+
+
 # --- Twist, wheels
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from diffdrive_jacobian.control import VelocityLimits, saturate
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
@@ -163,3 +165,45 @@ def test_a_limit_on_the_wrong_side_of_zero_is_named(name, bad, allowed):
 def test_a_robot_without_dimensions_is_refused_where_wheels_count(r, separation, name):
     with pytest.raises(ValueError, match=rf'^{name} must be positive and finite'):
         saturate(1.0, 1.0, VelocityLimits(max_wheel_speed=1.0), r, separation)
+
+
+SPEEDS = st.floats(allow_nan=False, allow_infinity=False)
+SIZES = st.floats(min_value=5e-324, allow_nan=False, allow_infinity=False)
+
+
+@given(v=SPEEDS, omega=SPEEDS, r=SIZES, separation=SIZES, wheels=SIZES, body=st.none() | SIZES)
+@settings(max_examples=1000, deadline=None)
+def test_no_wheel_is_faster_than_its_limit_by_a_single_bit(v, omega, r, separation, wheels, body):
+    limits = VelocityLimits(max_wheel_speed=wheels)
+    if body is not None:
+        limits = VelocityLimits(max_v=body, min_omega=-body, max_wheel_speed=wheels)
+    limited = saturate(v, omega, limits, r, separation)
+    assert max(map(abs, body_to_wheel(*limited, r, separation))) <= wheels
+    assert limits.min_v <= limited[0] <= limits.max_v
+    assert limits.min_omega <= limited[1] <= limits.max_omega
+    in_batch = saturate([v, 0.0], [omega, 0.0], limits, r, separation)
+    assert (in_batch[0][0], in_batch[1][0]) == limited
+
+
+def test_usual_wheels_are_never_faster_than_their_limit_by_a_single_bit():
+    rng = np.random.default_rng(9)
+    v, omega = rng.normal(0.0, 10.0, (2, 100_000))
+    limit = rng.uniform(0.1, 5.0, 100_000)
+    limited = saturate(v, omega, VelocityLimits(max_wheel_speed=limit), R, L)
+    assert np.all(fastest_wheel(*limited) <= limit)
+    # And not slower than a few units in the last place.
+    assert np.all((fastest_wheel(*limited) > limit * (1.0 - 1e-15)) | (limited[0] == v))
+
+
+@pytest.mark.parametrize('fast', [1e308, -1e308])
+def test_a_twist_whose_wheel_speeds_overflow_is_slowed_down_to_its_limit(fast):
+    v, omega = saturate(fast, 1e308, VelocityLimits(max_wheel_speed=1.0), 1.0, 16.0)
+    assert v / omega == np.sign(fast)
+    assert fastest_wheel_of(v, omega, 1.0, 16.0) == pytest.approx(1.0, rel=1e-15)
+    limits = VelocityLimits(max_wheel_speed=[1.0, np.inf])
+    v, omega = saturate(fast, 1e308, limits, 1.0, 16.0)
+    assert abs(v).tolist() == [pytest.approx(1.0 / 9.0), 1e308]
+
+
+def fastest_wheel_of(v, omega, r, separation):
+    return max(map(abs, body_to_wheel(v, omega, r, separation)))

@@ -217,6 +217,15 @@ def test_drive_to_arrives_with_nothing_but_defaults(drives):
         (('1', '1', '--timeout', 'inf'), "'inf'"),
         (('1', '1', '--params-file', 'nowhere.yaml'), "no such file: 'nowhere.yaml'"),
         (('1', '1', '--bogus'), '--bogus'),
+        (
+            ('1', '1', '--heading', '90'),
+            "must be in radians, at most 2 pi either way, got '90' (90 degrees",
+        ),
+        (('1', '1', '--heading', '-180'), '(-180 degrees are -3.14159 rad)'),
+        (('1', '1', '-o', 'x.png'), "must name a bag, which is a folder, got 'x.png'"),
+        (('1', '1', '-o', 'runs/x.CSV'), "did you mean 'runs/x'?"),
+        (('1', '1', '-p', 'kp:=1'), 'ROS arguments come after --ros-args'),
+        (('1', '1', 'kp:=1'), 'ROS arguments come after --ros-args'),
     ],
     ids=lambda value: ' '.join(value) if isinstance(value, tuple) else '',
 )
@@ -230,6 +239,47 @@ def test_drive_to_says_what_it_cannot_take(capsys, arguments, words):
     line = capsys.readouterr().err.splitlines()[-1]
     assert line.startswith('drive_to: error: ')
     assert words in line
+
+
+@pytest.mark.parametrize('lockstep', [(), ('--lockstep',)], ids=['real time', 'lockstep'])
+@pytest.mark.parametrize('late', ['--open', '-o', 'x'])
+def test_options_after_the_ros_arguments_are_refused_with_a_hint(capsys, late, lockstep):
+    from diffdrive_jacobian.ros.signals import Signals
+    from diffdrive_jacobian.tools import drive_to
+
+    arguments = ('1', '1', '--no-record', *lockstep, '--ros-args', '-p', 'kp:=2.0', late)
+    assert drive_to.main(arguments, Signals()) == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith(f"drive_to: error: unknown ROS arguments: ['{late}']")
+    assert 'come before --ros-args' in line
+
+
+@pytest.mark.parametrize('arguments', [('-p', 'kp:=1'), ('kp:=1',), ('-r', '__ns:=/a')])
+def test_ros_arguments_of_a_node_without_the_flag_get_a_hint(capsys, arguments):
+    from diffdrive_jacobian.ros.signals import Signals
+    from diffdrive_jacobian.tools import run_node
+
+    with pytest.raises(SystemExit) as end:
+        run_node.run_node('virtual_robot', arguments, Signals())
+    assert end.value.code == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith('virtual_robot: error: unrecognized arguments: ')
+    assert 'ROS arguments come after --ros-args' in line
+
+
+@pytest.mark.parametrize('name', ['run.png', 'run.svg/', 'a/run.PDF', 'run.csv', 'run.txt', 'run.yaml'])
+def test_a_bag_is_not_named_like_a_file(name):
+    import argparse
+
+    with pytest.raises(argparse.ArgumentTypeError, match='must name a bag, which is a folder'):
+        _cli.bag_folder(name)
+    for usual in ('run', 'run.2', 'runs.png/run', 'run_2026_01_01-10_00_00', '.png'):
+        assert _cli.bag_folder(usual) == usual
+
+
+def test_numbers_agree_with_their_nouns():
+    counted = [_cli.counted(number, 'topic') for number in (0, 1, 2)]
+    assert counted == ['0 topics', '1 topic', '2 topics']
 
 
 ROS = ['--ros-args', '-p', 'x:=-1', '-r', '__ns:=/a']

@@ -172,9 +172,33 @@ def test_resumed_waypoints_check_the_last_position_again():
     turning = Waypoints(POSES, 2, turning=True)
     resumed = turning.resumed()
     assert (resumed.index, resumed.turning) == (2, False)
-    assert resumed.poses is POSES
+    assert resumed.poses is turning.poses
     there, away = POSES[2] - [0.0, 0.0, 1.0], POSES[2] + [1.0, 0.0, 0.0]
     assert resumed.follow(there, refuses, WITH_HEADING, GAIN)[0].turning
     assert not resumed.follow(away, law, WITH_HEADING, GAIN)[0].turning
     driving = Waypoints(POSES, 1)
     assert driving.resumed() is driving
+
+
+def test_waypoints_are_checked_and_do_not_change_with_the_array_they_were_given():
+    for bad in (None, np.zeros((0, 3)), np.zeros(3), np.zeros((1, 2)), [[np.nan, 0.0, 0.0]]):
+        with pytest.raises(ValueError, match=r'^poses must '):
+            Waypoints(bad)
+    for bad in (-1, 3, 1.0, None, True):
+        with pytest.raises(ValueError, match=r'^index must be '):
+            Waypoints(POSES, bad)
+    poses = POSES.copy()
+    waypoints = Waypoints(poses)
+    poses[:] = 7.0
+    assert np.array_equal(waypoints.poses, POSES)
+    for here in (waypoints, waypoints.follow(POSES[0], law, POSITIONS_ONLY, GAIN)[0]):
+        with pytest.raises(ValueError, match='read-only'):
+            here.poses[0] = 7.0
+
+
+def test_passing_waypoints_copies_none_of_them():
+    """Else a message with 300,000 poses in one place would block for minutes."""
+    waypoints = Waypoints(np.zeros((300, 3)))
+    passed, command = waypoints.follow(np.zeros(3), refuses, POSITIONS_ONLY, GAIN)
+    assert (passed.index, command) == (299, None)
+    assert passed.poses is waypoints.poses

@@ -48,8 +48,8 @@ def go_to_pose(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any, h: Any = Non
     like exp(-Kv t): for the heading to be there first, Kp should be above 2 Kv. A weight that is larger
     than it needs to be makes long ways round. Where the goal lies behind, the robot backs up while it
     turns to it, then drives on forwards; where it may not back up, it turns first. Sampled, Kp should be
-    below a quarter of the rate; with a weight h of your own also `Kv^2 h < Kp rate`, beyond which
-    heading and bearing oscillate ever more near the goal.
+    below a quarter of the rate; with a weight h of your own also `Kv^2 h < Kp rate`: from about twice
+    that on, heading and bearing oscillate ever more near the goal.
 
     Args:
         state: Pose of the robot, shape (..., 3).

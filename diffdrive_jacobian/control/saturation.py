@@ -193,7 +193,7 @@ def _scaled_down(
     least: Any = 1.0
     while _any(infinite := divisor == np.inf):
         factor = where(infinite, 2.0**-600, 1.0)
-        v, omega, least = v * factor, omega * factor, where(infinite, SMALLEST, least)
+        v, omega, least = v * factor, omega * factor, maximum(least * factor, SMALLEST)
         divisor = _excess(v, omega, limits, r, L, least)
     return v, omega, divisor
 

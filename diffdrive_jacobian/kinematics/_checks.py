@@ -216,7 +216,7 @@ def leading(**shapes: tuple[int, ...]) -> tuple[int, ...]:
 def short(value: Any) -> str:
     """Return how a value is written, in at most 60 characters."""
     try:
-        got = str(value) if not isinstance(value, str) else repr(value)
+        got = str(value)
     except ValueError:  # of an integer with thousands of digits
         got = f'an object of class {type(value).__name__}'
     return got if len(got) <= 60 else f'{got[:57]}...'
