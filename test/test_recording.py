@@ -1,4 +1,4 @@
-"""Recordings: complete whatever their path and however slow the disk is, and else reported as partial."""
+"""Recordings: complete whatever the path, however slow the disk, or else reported as partial."""
 
 from __future__ import annotations
 

@@ -1,0 +1,140 @@
+"""The recorder on the executor of record_run: it takes what waits, and counts what never came."""
+
+from __future__ import annotations
+
+import pytest
+from conftest import PATIENCE
+from geometry_msgs.msg import Twist
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+
+from diffdrive_jacobian.bags import recorder
+from diffdrive_jacobian.bags.journal import Message
+from diffdrive_jacobian.bags.recorder import Recorder, Selection
+
+DEPTH = 200
+"""Messages that may wait: fewer than the recorder allows."""
+
+
+class Sink:
+    """Keeps what is recorded."""
+
+    def __init__(self):
+        self.data = []
+        self.missed = {}
+
+    def add(self, record):
+        if isinstance(record, Message):
+            self.data.append(record.data)
+
+    def set_missed(self, topic, messages):
+        self.missed[topic] = messages
+
+
+class Setting:
+    """A publisher and a recorder in one context."""
+
+    def __init__(self, harness, **profile):
+        self.harness = harness
+        self.sink = Sink()
+        self.sent = []
+        publishers = QoSProfile(depth=10, **profile)
+        self.publishers = [harness.peer.create_publisher(Twist, 'cmd_vel', publishers) for _ in range(2)]
+        self.recorder = harness.add(
+            Recorder, selection=Selection(topics=('cmd_vel',)), sink=self.sink, with_info=True
+        )
+        self.harness.until(self.matched, 'the recorder is there', PATIENCE)
+
+    def matched(self):
+        self.recorder.discover()
+        return all(one.get_subscription_count() for one in self.publishers)
+
+    def send(self, count, publisher=0):
+        for _ in range(count):
+            message = Twist()
+            message.linear.x = float(len(self.sent))
+            self.sent.append(serialize_message(message))
+            self.publishers[publisher].publish(self.sent[-1])
+
+    def until_recorded(self, count):
+        self.harness.until(lambda: len(self.sink.data) >= count, f'{count} are recorded')
+
+    def until_drained(self):
+        self.recorder.end()
+        self.harness.until(self.recorder.drained, 'all is collected')
+
+
+@pytest.fixture
+def executor_kind():
+    return 'single'
+
+
+@pytest.fixture(autouse=True)
+def depth(monkeypatch):
+    monkeypatch.setattr(recorder, 'DEPTH', DEPTH)
+
+
+@pytest.fixture(params=list(ReliabilityPolicy)[1:3], ids=str)
+def setting(ros, executor_kind, request):
+    return Setting(ros, reliability=request.param)
+
+
+def test_what_was_overwritten_while_it_waited_is_counted(setting):
+    setting.send(1, publisher=0)
+    setting.send(1, publisher=1)
+    setting.until_recorded(2)
+    for count in (DEPTH + 700, DEPTH + 55):
+        # Nobody serves the recorder meanwhile.
+        setting.send(count - 20, publisher=0)
+        setting.send(20, publisher=1)
+        before = len(setting.sink.data)
+        setting.until_recorded(before + DEPTH)
+    setting.until_drained()
+    assert len(setting.sink.data) == 2 + 2 * DEPTH
+    assert setting.sink.missed == {'/cmd_vel': 755}
+
+
+def test_bursts_are_recorded_in_order(setting):
+    setting.send(DEPTH)
+    setting.until_recorded(DEPTH)
+    setting.until_drained()
+    assert setting.sink.data == setting.sent
+    assert setting.sink.missed == {}
+
+
+def test_what_waits_at_the_end_is_collected_and_what_comes_later_is_not(setting):
+    setting.send(DEPTH - 60)
+    setting.recorder.end()
+    setting.send(50)
+    setting.harness.until(setting.recorder.drained, 'all is collected')
+    assert setting.sink.data == setting.sent[: DEPTH - 60]
+    assert setting.sink.missed == {}
+
+
+def test_the_end_comes_although_somebody_goes_on(setting):
+    setting.recorder.end()
+
+    def drained():
+        setting.send(1)
+        return setting.recorder.drained()
+
+    setting.harness.until(drained, 'all is collected')
+    assert setting.sink.data == []
+
+
+def test_what_a_latched_topic_overwrote_before_is_not_missed(ros, executor_kind):
+    latched = QoSProfile(depth=3, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    publisher = ros.peer.create_publisher(Twist, 'cmd_vel', latched)
+    for _ in range(10):
+        publisher.publish(Twist())
+    sink = Sink()
+    made = ros.add(Recorder, selection=Selection(topics=('cmd_vel',)), sink=sink, with_info=True)
+
+    def recorded():
+        made.discover()
+        return len(sink.data) == 3
+
+    ros.until(recorded, 'the last ones are recorded')
+    made.end()
+    ros.until(made.drained, 'all is collected')
+    assert sink.missed == {}
