@@ -23,6 +23,7 @@ from diffdrive_jacobian.bags.lines import limits, line
 from diffdrive_jacobian.bags.reading import BagError, read_run
 from diffdrive_jacobian.bags.trace import trace
 from diffdrive_jacobian.kinematics.se2 import integrate, wrap_angle
+from diffdrive_jacobian.plots import output_files
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools.plot_run import COLUMNS, _seconds, main
 
@@ -582,7 +583,7 @@ def test_nothing_is_ever_overwritten(bag, tmp_path, capsys, option):
 
 def test_a_file_that_appears_meanwhile_is_not_overwritten(tmp_path):
     with pytest.raises(FileExistsError):
-        _figure.create(Path('/dev/null'), b'x')
+        output_files.create(Path('/dev/null'), b'x')
 
 
 @pytest.mark.parametrize('option', ['-o', '--csv'])
@@ -607,7 +608,7 @@ def test_a_file_that_cannot_be_finished_is_taken_away(bag, tmp_path, capsys, mon
         __exit__ = lambda self, *_: None  # noqa: E731
         write = full
 
-    monkeypatch.setattr(_figure, 'open', Full, raising=False)
+    monkeypatch.setattr(output_files, 'open', Full, raising=False)
     assert plot(bag, '-o', tmp_path / 'a.png') == 1
     refuses(capsys, 1, 'a.png cannot be written: No space left on device')
     assert not (tmp_path / 'a.png').exists()

@@ -150,6 +150,7 @@ def test_another_reader_of_goals_is_no_controller(world):
     sender = world.start('send_goal', '0', '0')
     # It waits, though its goal would be read.
     world.until_published('goal_pose')
+    sender.until_says('waiting: nobody reads /goal_pose and publishes /goal_status')
     drive = Drive(world, *FAST)
     assert (sender.exit(), sender.last_line[:7]) == (0, 'arrived')
     world.harness.until(lambda: len(recorded) == 1, 'the goal was sent once')
