@@ -19,8 +19,8 @@ from rosbags.rosbag2 import Reader
 
 from diffdrive_jacobian.bags.bounded_reader import BoundedReader
 from diffdrive_jacobian.bags.definitions import message_class
-from diffdrive_jacobian.bags.limits import TooLargeError
 from diffdrive_jacobian.bags.recorder import PARAMETERS
+from diffdrive_jacobian.bounded_yaml import TooLargeError
 from diffdrive_jacobian.ros.messages import (
     MessageError,
     from_joint_state,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from diffdrive_jacobian.bags.bounded_yaml import YAML_ERRORS, load_yaml
+from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, load_yaml
 from diffdrive_jacobian.ros.runner import UserError
 from diffdrive_jacobian.text import printable
 
