@@ -29,5 +29,13 @@ def printable(text: object, limit: int = 80) -> str:
     return ''.join(escaped) + _ELLIPSIS
 
 
+def format_size(size: int) -> str:
+    """Return a number of bytes in a readable unit, such as `12.9 GB`."""
+    for power, unit in ((9, 'GB'), (6, 'MB'), (3, 'kB')):
+        if size >= 10**power:
+            return f'{size / 10**power:.1f} {unit}'
+    return f'{size} bytes'
+
+
 def _escape(character: str) -> str:
     return character.encode('unicode_escape').decode('ascii')

@@ -31,11 +31,11 @@ from test_recover import make_messages, read_bag, recover, write_bag
 
 from diffdrive_jacobian.bags import limits
 from diffdrive_jacobian.bags.bounded_reader import BoundedReader, _SqliteReader
-from diffdrive_jacobian.bags.bounded_yaml import MAX_DEPTH, MAX_SIZE, load_yaml
-from diffdrive_jacobian.bags.limits import MAX_RECORD, TooLargeError
+from diffdrive_jacobian.bags.limits import MAX_RECORD
 from diffdrive_jacobian.bags.reading import BagError, open_bag, read_run
 from diffdrive_jacobian.bags.remains import _unpacked
 from diffdrive_jacobian.bags.salvage_sqlite import _Pages
+from diffdrive_jacobian.bounded_yaml import MAX_DEPTH, MAX_SIZE, TooLargeError, load_yaml
 from diffdrive_jacobian.ros.runner import UserError
 from diffdrive_jacobian.tools._params_file import robot_parameters
 

@@ -18,9 +18,9 @@ HOUSE = Path(diffdrive_jacobian.__file__).parent
 LAYERS = ('kinematics', 'control', 'simulation', 'plots', 'ros', 'nodes', 'bags', 'testing', 'tools')
 PURE = LAYERS[:3]
 # Modules beside the layers, and the layers they may import.
-DOORS = {'__init__': (), 'text': ()}
+DOORS = {'__init__': (), 'text': (), 'bounded_yaml': ('text',)}
 # Modules beside the layers that every layer may import.
-COMMON = ('text',)
+COMMON = ('text', 'bounded_yaml')
 
 LOAD = """
 import importlib, sys

@@ -23,18 +23,17 @@ from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from ruamel.yaml.error import YAMLError
 
-from diffdrive_jacobian.bags.bounded_yaml import check_yaml, load_yaml
 from diffdrive_jacobian.bags.limits import (
     MAX_OVERLAP,
     MAX_RECORD,
     Budget,
-    TooLargeError,
     check_record,
-    format_size,
     unpack,
     unpack_file,
     unpack_message,
 )
+from diffdrive_jacobian.bounded_yaml import TooLargeError, check_yaml, load_yaml
+from diffdrive_jacobian.text import format_size
 
 Messages = Generator[tuple[Connection, int, bytes], None, None]
 

@@ -12,6 +12,9 @@ from typing import BinaryIO
 
 from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 
+from diffdrive_jacobian.bounded_yaml import TooLargeError
+from diffdrive_jacobian.text import format_size
+
 if sys.version_info >= (3, 14):
     from compression import zstd
 else:
@@ -29,18 +32,6 @@ UNPACK_ERRORS = (ValueError, RuntimeError, EOFError, zstd.ZstdError)
 """What damaged or too large data leads to when it is unpacked."""
 _BLOCK = 1 << 20
 _MAX_FRAMES = 1000
-
-
-class TooLargeError(ValueError):
-    """A file asks for more memory than is allowed; the message gives both sizes."""
-
-
-def format_size(size: int) -> str:
-    """Return a number of bytes in a readable unit, such as `12.9 GB`."""
-    for power, unit in ((9, 'GB'), (6, 'MB'), (3, 'kB')):
-        if size >= 10**power:
-            return f'{size / 10**power:.1f} {unit}'
-    return f'{size} bytes'
 
 
 def check_record(size: int, what: str) -> None:

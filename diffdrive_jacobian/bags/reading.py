@@ -18,7 +18,6 @@ from rosbags.rosbag2 import Reader
 from diffdrive_jacobian.bags.bounded_reader import BoundedReader
 from diffdrive_jacobian.bags.decoding import UndecodableError, decode
 from diffdrive_jacobian.bags.definitions import message_class
-from diffdrive_jacobian.bags.limits import TooLargeError
 from diffdrive_jacobian.bags.metadata import (
     DamagedError,
     check_connections,
@@ -31,6 +30,7 @@ from diffdrive_jacobian.bags.recording import journal_of
 from diffdrive_jacobian.bags.remains import is_recoverable
 from diffdrive_jacobian.bags.rows import PARAMETER_EVENTS, ROW_READERS, SERIES_TOPICS
 from diffdrive_jacobian.bags.run import COLUMNS, Run, Series
+from diffdrive_jacobian.bounded_yaml import TooLargeError
 from diffdrive_jacobian.ros.messages import MessageError
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 

@@ -18,7 +18,6 @@ from rosbags.rosbag2 import ReaderError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from diffdrive_jacobian.bags.bounded_reader import parse_bounded_qos
-from diffdrive_jacobian.bags.bounded_yaml import YAML_ERRORS, load_yaml
 from diffdrive_jacobian.bags.building import STORAGES
 from diffdrive_jacobian.bags.definitions import UnknownTypeError, definition
 from diffdrive_jacobian.bags.journal import (
@@ -32,7 +31,6 @@ from diffdrive_jacobian.bags.journal import (
 from diffdrive_jacobian.bags.limits import (
     UNPACK_ERRORS,
     Budget,
-    TooLargeError,
     unpack_file,
     unpack_message,
 )
@@ -42,6 +40,7 @@ from diffdrive_jacobian.bags.recorder import PARAMETERS
 from diffdrive_jacobian.bags.recording import JOURNAL, journal_of
 from diffdrive_jacobian.bags.salvage import MCAP_MAGIC, Topic, read_mcap
 from diffdrive_jacobian.bags.salvage_sqlite import SQLITE_MAGIC, read_sqlite
+from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, TooLargeError, load_yaml
 
 KINDS = {'.mcap': 'mcap', '.db3': 'sqlite3', JOURNAL: 'journal'}
 READERS = {'mcap': read_mcap, 'sqlite3': read_sqlite}

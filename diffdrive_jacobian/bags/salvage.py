@@ -17,9 +17,9 @@ from diffdrive_jacobian.bags.limits import (
     UNPACK_ERRORS,
     Budget,
     check_record,
-    format_size,
     unpack,
 )
+from diffdrive_jacobian.text import format_size
 
 Schemas = dict[int, tuple[str, str]]
 """Numbers of types to their names and definitions."""

@@ -20,7 +20,7 @@ def robot_parameters(path: str) -> dict[str, Any]:
         UserError: The file is none of that kind.
     """
     # ruamel.yaml is slow to import, and a node needs it only for a file.
-    from diffdrive_jacobian.bags.bounded_yaml import YAML_ERRORS, load_yaml
+    from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, load_yaml
 
     try:
         content = load_yaml(Path(path))
@@ -57,7 +57,7 @@ def warn_of_unused_files(program: str, ros: Sequence[str], nodes: Sequence[str])
 
 def node_names(path: str) -> list[str]:
     """Read the names of nodes, with wildcards, that have parameters in a file; none if it is invalid."""
-    from diffdrive_jacobian.bags.bounded_yaml import YAML_ERRORS, load_yaml
+    from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, load_yaml
 
     try:
         content = load_yaml(Path(path))

@@ -20,7 +20,7 @@ from ruamel.yaml.events import (
     ScalarEvent,
 )
 
-from diffdrive_jacobian.bags.limits import TooLargeError, format_size
+from diffdrive_jacobian.text import format_size
 
 MAX_SIZE = 2_000_000
 """Characters of a text."""
@@ -33,6 +33,10 @@ MAX_NUMBER = 1000
 
 YAML_ERRORS = (YAMLError, ValueError, RecursionError, OverflowError)
 """What `load_yaml` raises. `TooLargeError` is a ValueError."""
+
+
+class TooLargeError(ValueError):
+    """A file asks for more memory or time than is allowed; the message gives the limit."""
 
 
 def load_yaml(source: Path | str) -> Any:
