@@ -294,7 +294,7 @@ class Search:
         # Joint by joint, so that their units do not matter.
         most = np.sqrt(np.einsum('kmn,kmn->kn', J, J)) * still.error[:, np.newaxis]
         movable: Flags = (np.abs(gradient) > STATIONARY[self.method] * most).any(axis=-1)
-        return movable & np.isfinite(J).all(axis=(1, 2))
+        return np.asarray(movable & np.isfinite(J).all(axis=(1, 2)))
 
     def _differentiate(self, still: _Open, where: Flags) -> None:
         """Write the Jacobians of these rows."""

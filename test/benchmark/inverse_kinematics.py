@@ -4,9 +4,10 @@ Planar arms of 2, 3 and 7 links, and one whose middle link is a thousandth as lo
 method, 20,000 targets each (with --quick 500), the same in every run. Reachable targets are what random
 joints, uniform in (-pi, pi], reach: as points, and with the heading where there are joints enough.
 Starts are drawn likewise. Unreachable ones are points up to a whole reach too far out, and points in
-the hole that an arm with one long link leaves. The nearest reachable point of these is known in closed form; it
-counts as reached if the error is within a thousandth of the arm's reach of the least one. The tolerance
-is 1e-6; all searches of a target have 500 steps together, and up to 20 restarts. Times are CPU times.
+the hole that an arm with one long link leaves. The nearest reachable point of these is known in closed
+form; it counts as reached if the error is within a thousandth of the arm's reach of the least one.
+The tolerance is 1e-6; all searches of a target have 500 steps together, and up to 20 restarts.
+Times are CPU times.
 
 --peers compares `levenberg_marquardt` with scipy.optimize.least_squares, Pinocchio and roboticstoolbox
 on the same reachable targets, with up to 20 restarts from random joints, too; each search of a peer has
