@@ -47,7 +47,7 @@ class Outcome:
     restarts: Integers
     start: Integers
     """The search that found q: 0 from q0, 1 from the first restart point."""
-    begun: Integers
+    began: Integers
     """Iterations before the present search."""
     lowered: Integers
     """Iterations when the error was last lowered."""
@@ -58,9 +58,9 @@ class Outcome:
     @classmethod
     def of(cls, q: Floats, error: Floats) -> Outcome:
         """Return the state before the first step."""
-        iterations, restarts, start, begun, lowered, agreeing = np.zeros((6, len(q)), dtype=np.int64)
+        iterations, restarts, start, began, lowered, agreeing = np.zeros((6, len(q)), dtype=np.int64)
         return cls(
-            q.copy(), error.copy(), iterations, restarts, start, begun, lowered, error.copy(), agreeing
+            q.copy(), error.copy(), iterations, restarts, start, began, lowered, error.copy(), agreeing
         )
 
 
@@ -180,8 +180,8 @@ class Search:
     def _may_restart(self, still: _Open, ended: Flags, found: Outcome) -> Flags:
         """Note at which errors searches ended; return which targets, shape (k,), are worth another."""
         which, error = still.which[ended], still.error[ended]
-        # A search without a single step may have begun at a saddle point: its error says nothing.
-        moved = found.iterations[which] > found.begun[which]
+        # A search without a single step may have began at a saddle point: its error says nothing.
+        moved = found.iterations[which] > found.began[which]
         level = found.level[which]
         lower, same = moved & (error < (1.0 - SAME) * level), moved & (error <= (1.0 + SAME) * level)
         found.agreeing[which] = np.where(lower, 1, found.agreeing[which] + same)
@@ -198,9 +198,9 @@ class Search:
             self._starts = self._sampled(still.q.shape[-1])
         which, q = still.which[again], still.q[again]
         starts = self._starts[found.restarts[which]]
-        moved = (found.iterations[which] > found.begun[which])[:, np.newaxis]
+        moved = (found.iterations[which] > found.began[which])[:, np.newaxis]
         found.restarts[which] += 1
-        found.begun[which] = found.lowered[which] = found.iterations[which] + 1
+        found.began[which] = found.lowered[which] = found.iterations[which] + 1
         # From a singular start a little aside is enough, and solutions near q0 are preferred.
         return np.where(moved, starts, q + NUDGE * (starts - q))
 
@@ -235,7 +235,7 @@ class Search:
         # With lambda zero it is the pseudo-inverse's.
         step = damped_least_squares(J, still.e, np.sqrt(still.factor))
         if self.method == 'levenberg_marquardt' and count >= SECOND_ORDER_AFTER:
-            late = found.iterations[still.which] - found.begun[still.which] >= SECOND_ORDER_AFTER
+            late = found.iterations[still.which] - found.began[still.which] >= SECOND_ORDER_AFTER
             if late.any():
                 some = _Open._make(values[late] for values in still)._replace(J=J[late])
                 self._second_order(step, late, some, gradient[late])
@@ -294,7 +294,7 @@ class Search:
         # Joint by joint, so that their units do not matter.
         most = np.sqrt(np.einsum('kmn,kmn->kn', J, J)) * still.error[:, np.newaxis]
         movable: Flags = (np.abs(gradient) > STATIONARY[self.method] * most).any(axis=-1)
-        return movable & np.isfinite(J).all(axis=(1, 2))
+        return np.asarray(movable & np.isfinite(J).all(axis=(1, 2)))
 
     def _differentiate(self, still: _Open, where: Flags) -> None:
         """Write the Jacobians of these rows."""
