@@ -16,7 +16,7 @@ from diffdrive_jacobian.control import Waypoints
 from diffdrive_jacobian.ros import messages
 from diffdrive_jacobian.ros.messages import MessageError
 
-MAX_WAYPOINTS = 10_000
+MAX_WAYPOINTS = 2_000
 """Most poses of a `goals` message that is converted: rclpy takes some 20 us for each."""
 
 
