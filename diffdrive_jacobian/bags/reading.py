@@ -198,6 +198,8 @@ def open_bag(path: Path) -> Iterator[Reader]:
                 f'recording: {_command(journal)} makes the bag of it'
             )
         raise BagError(f'there is no bag {printable(path, PATH_LIMIT)}')
+    if path.is_file() and not is_recoverable(path):
+        raise BagError(f'{printable(path, PATH_LIMIT)} is not a bag: it is neither MCAP nor SQLite')
     if path.is_dir() and not (path / 'metadata.yaml').exists():
         what = 'an empty folder' if not any(path.iterdir()) else 'a folder without metadata.yaml'
         raise BagError(f'{printable(path, PATH_LIMIT)} is {what}, not a bag{_advice(path)}')
