@@ -7,7 +7,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from diffdrive_jacobian.ros.runner import ros_context
-from diffdrive_jacobian.tools._params_file import concerns, node_names, warn_of_unused_files
+from diffdrive_jacobian.tools._unused_files import concerns, node_names, warn_of_unused_files
 
 NAMESPACES = ('', '/a', '/a/b')
 KEYS = (
