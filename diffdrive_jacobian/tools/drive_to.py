@@ -41,9 +41,9 @@ from diffdrive_jacobian.ros.node import THROTTLE
 from diffdrive_jacobian.ros.runner import Runner, UserError, closed_world, ros_context, running
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import _cli
-from diffdrive_jacobian.tools._params_file import warn_of_unused_files
 from diffdrive_jacobian.tools._progress import Drive
 from diffdrive_jacobian.tools._recording import begin_recording
+from diffdrive_jacobian.tools._unused_files import warn_of_unused_files
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.testing.runner import LockstepRunner

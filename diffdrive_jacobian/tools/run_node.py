@@ -18,7 +18,7 @@ from diffdrive_jacobian.ros.errors import UserError
 from diffdrive_jacobian.ros.parameters import NodeParameters, specifications
 from diffdrive_jacobian.ros.signals import Signals
 from diffdrive_jacobian.tools import _cli
-from diffdrive_jacobian.tools._params_file import warn_of_unused_files
+from diffdrive_jacobian.tools._unused_files import warn_of_unused_files
 
 
 class Program(NamedTuple):
