@@ -7,7 +7,8 @@ separation `L` in m. **Wheels stand right, left everywhere.**
     w --J_w--> u --S(theta)--> q_dot
 
 Everything broadcasts over leading axes. A radius or separation that is not positive and finite, an
-angle or speed that is not finite, and shapes that do not broadcast raise ValueError.
+angle or speed that is not finite, shapes that do not broadcast, and results that overflow raise
+ValueError, in single and in batched calls.
 
 Source: document A, equations (4)-(8); documents B and E; MATH.md, "Differential drive".
 """
