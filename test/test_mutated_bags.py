@@ -226,7 +226,7 @@ def test_mutated_records_of_journals(tmp_path):
     chance = random.Random('journal')
     path = tmp_path / 'run.journal'
     results = []
-    for number in range(150):
+    for number in range(80):
         records = [[kind, packed(kind, content)] for kind, content in journal_records()]
         for _ in range(chance.choice((1, 1, 2, 3))):
             index = chance.randrange(len(records))
