@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 
-from diffdrive_jacobian.bags import read_run
-from diffdrive_jacobian.bags.recorder import Recorder, Selection
-from diffdrive_jacobian.bags.recording import Recording
+from diffdrive_jacobian.reading import read_run
+from diffdrive_jacobian.recording.recorder import Recorder, Selection
+from diffdrive_jacobian.recording.recording import Recording
 
 
 class LockstepRecording:

@@ -10,7 +10,7 @@ from geometry_msgs.msg import Pose, PoseStamped, PoseWithCovarianceStamped, Twis
 from nav_msgs.msg import Goals, Odometry
 from sensor_msgs.msg import JointState
 
-from diffdrive_jacobian.ros.messages import from_pose, from_time, set_pose
+from diffdrive_jacobian.messages.conversion import from_pose, from_time, set_pose
 
 PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 WHEELS = ['left_wheel_joint', 'right_wheel_joint']

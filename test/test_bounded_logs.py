@@ -16,13 +16,14 @@ from ros_messages import goal, goals, joint_command, odometry, placement, stamp,
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
+from diffdrive_jacobian.messages import conversion as messages
+from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.goal import MAX_WAYPOINTS
-from diffdrive_jacobian.nodes.parameters import GoToGoalParameters
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.ros import messages, node
-from diffdrive_jacobian.ros.messages import MessageError
-from diffdrive_jacobian.ros.parameters import ParameterError
+from diffdrive_jacobian.parameters.declaration import ParameterError
+from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
+from diffdrive_jacobian.ros import node, serialization
 from diffdrive_jacobian.ros.rate_limit import RateLimit
 
 MEGABYTE = 1_000_000 * 'f'
@@ -200,17 +201,17 @@ def test_goals_with_too_many_poses_are_refused_unread(controller, monkeypatch, c
 def test_header_of_goals_is_read_without_the_poses(frame, count):
     message = goals(*[goal(1, 0, frame='x')] * count, frame=frame)
     message.header.stamp = stamp(-5_000_000_123)
-    assert messages.goals_header(serialize_message(message)) == (message.header.stamp, count)
-    assert messages.deserialized(serialize_message(message), Goals) == message
+    assert serialization.goals_header(serialize_message(message)) == (message.header.stamp, count)
+    assert serialization.deserialized(serialize_message(message), Goals) == message
 
 
 @pytest.mark.parametrize('length', range(24))
 def test_goals_that_are_cut_off_are_no_goals(length):
     data = serialize_message(goals(goal(1, 0)))[:length]
     with pytest.raises(MessageError, match='it is no Goals message'):
-        messages.goals_header(data)
+        serialization.goals_header(data)
     with pytest.raises(MessageError, match='it is no Goals message'):
-        messages.deserialized(data, Goals)
+        serialization.deserialized(data, Goals)
 
 
 @pytest.mark.parametrize(

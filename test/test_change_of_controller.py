@@ -11,8 +11,8 @@ from ros_messages import goal, pose_of
 
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
-from diffdrive_jacobian.nodes.parameters import CONTROLLERS
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.parameters.nodes import CONTROLLERS
 
 OFFSET, TOLERANCE = 0.3, 0.02
 HEADING = 3.0

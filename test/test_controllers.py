@@ -22,7 +22,7 @@ from ros_messages import goal, goals, pose_of, twists
 from diffdrive_jacobian.control import go_to_goal, go_to_pose, offset_point, turn_in_place
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
-from diffdrive_jacobian.ros.parameters import ParameterError
+from diffdrive_jacobian.parameters.declaration import ParameterError
 
 LAWS = {
     'go_to_goal': lambda pose, to, kp, kv, d: go_to_goal(pose, to[:2], kp, kv),

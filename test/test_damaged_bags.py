@@ -13,14 +13,12 @@ from ros_messages import goal, joint_command, twist_stamped
 from ruamel.yaml import YAML
 from test_reading import SECOND, odom, start, write_bag
 
-from diffdrive_jacobian.bags.building import build_bag
-from diffdrive_jacobian.bags.definitions import definition
-from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
+from diffdrive_jacobian.bags.bag_writer import build_bag
+from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, JournalWriter, Message, Text, journal_of
+from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.bags.metadata import DamagedError, check_metadata
-from diffdrive_jacobian.bags.reading import read_run
-from diffdrive_jacobian.bags.recorder import PARAMETERS
-from diffdrive_jacobian.bags.recording import journal_of
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.reading.reader import read_run
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import plot_run, recover_run, replay_run
 
 COUNT = 20

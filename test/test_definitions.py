@@ -7,7 +7,7 @@ import sys
 import pytest
 from std_msgs.msg import String
 
-from diffdrive_jacobian.bags.definitions import UnknownTypeError, definition, message_class
+from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
 
 INVALID = [
     '',

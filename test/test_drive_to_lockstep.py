@@ -13,13 +13,14 @@ from functools import partial
 import pytest
 from processes import open_world
 
-from diffdrive_jacobian.bags import journal, read_run
-from diffdrive_jacobian.bags.trace import trace
+from diffdrive_jacobian.bags import journal
+from diffdrive_jacobian.lockstep import runner as testing_runner
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
-from diffdrive_jacobian.nodes.parameters import CONTROLLERS
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.parameters.nodes import CONTROLLERS
+from diffdrive_jacobian.reading import read_run
+from diffdrive_jacobian.reading.trace import trace
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.testing import Lockstep
-from diffdrive_jacobian.testing import runner as testing_runner
 from diffdrive_jacobian.tools import drive_to
 
 QUICK = ('--ros-args', '-p', 'kp:=12.0', '-p', 'kv:=3.0')

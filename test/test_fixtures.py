@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from diffdrive_jacobian.bags import read_run
-from diffdrive_jacobian.bags.verification import verify
+from diffdrive_jacobian.reading import read_run
+from diffdrive_jacobian.reading.verification import verify
 
 SETTING = """
     import pytest
@@ -197,7 +197,7 @@ def test_a_run_that_was_kept_by_hand_is_kept_once(run, pytester):
 FULL_DISK = """
     import errno, os
     from diffdrive_jacobian.bags.journal import JournalWriter
-    from diffdrive_jacobian.bags.recording import RecordingError
+    from diffdrive_jacobian.recording.recording import RecordingError
 
     @pytest.fixture
     def full_disk(lockstep, recorded_run, monkeypatch):

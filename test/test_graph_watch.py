@@ -11,8 +11,8 @@ from rclpy.node import Node
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.ros import node as ros_node
-from diffdrive_jacobian.ros.parameters import ParameterError
 from diffdrive_jacobian.ros.runner import make_executor, ros_context
 
 

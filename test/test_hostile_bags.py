@@ -32,12 +32,12 @@ from test_recover import make_messages, read_bag, recover, write_bag
 from diffdrive_jacobian.bags import limits
 from diffdrive_jacobian.bags.bounded_reader import BoundedReader, _SqliteReader
 from diffdrive_jacobian.bags.limits import MAX_RECORD
-from diffdrive_jacobian.bags.reading import BagError, open_bag, read_run
-from diffdrive_jacobian.bags.remains import _unpacked
-from diffdrive_jacobian.bags.salvage_sqlite import _Pages
 from diffdrive_jacobian.bounded_yaml import MAX_DEPTH, MAX_SIZE, TooLargeError, load_yaml
+from diffdrive_jacobian.parameters.file import robot_parameters
+from diffdrive_jacobian.reading.reader import BagError, open_bag, read_run
+from diffdrive_jacobian.recovery.damaged_bag import _unpacked
+from diffdrive_jacobian.recovery.salvage_sqlite import _Pages
 from diffdrive_jacobian.ros.runner import UserError
-from diffdrive_jacobian.tools._params_file import robot_parameters
 
 GOOD = mcap(topic_records() + message(b'\0\1\0\0' + bytes(100)))
 HEADROOM = 700 * MIB

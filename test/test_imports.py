@@ -15,12 +15,22 @@ import diffdrive_jacobian
 PACKAGE = diffdrive_jacobian.__name__
 HOUSE = Path(diffdrive_jacobian.__file__).parent
 # From the ground up: each layer may import itself and what stands before it.
-LAYERS = ('kinematics', 'control', 'simulation', 'plots', 'ros', 'nodes', 'bags', 'testing', 'tools')
+LAYERS = (
+    *('kinematics', 'control', 'simulation', 'sweeps', 'messages', 'parameters', 'bags'),
+    *('recovery', 'reading'),
+    *('plots', 'ros', 'nodes', 'recording', 'replay', 'lockstep', 'testing', 'tools'),
+)
 PURE = LAYERS[:3]
 # Modules beside the layers, and the layers they may import.
-DOORS = {'__init__': (), 'text': (), 'bounded_yaml': ('text',)}
+DOORS = {
+    '__init__': (),
+    'text': (),
+    'bounded_yaml': ('text',),
+    'errors': (),
+    'signals': (),
+}
 # Modules beside the layers that every layer may import.
-COMMON = ('text', 'bounded_yaml')
+COMMON = ('text', 'bounded_yaml', 'errors', 'signals')
 
 LOAD = """
 import importlib, sys

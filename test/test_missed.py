@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from diffdrive_jacobian.bags.missed import MissedMessages
+from diffdrive_jacobian.recording.missed import MissedMessages
 
 
 def missed(numbers, publishers=1):

@@ -24,7 +24,7 @@ from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.kinematics import diff_drive, se2
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.ros.parameters import ParameterError
+from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.simulation import closed_loops
 
 COUNT = 10_000

@@ -13,10 +13,10 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 from recorded import LockstepRecording
 
-from diffdrive_jacobian.bags import parameter_query
-from diffdrive_jacobian.bags.parameter_query import ParameterQuery
-from diffdrive_jacobian.bags.recorder import PARAMETERS
+from diffdrive_jacobian.bags.journal import PARAMETERS
 from diffdrive_jacobian.bags.storage import BagReader
+from diffdrive_jacobian.recording import parameter_query
+from diffdrive_jacobian.recording.parameter_query import ParameterQuery
 
 VALUES = {f'parameter_{index}': ParameterValue(type=2, integer_value=index) for index in range(20)}
 

@@ -12,14 +12,15 @@ from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import Parameter
 
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
-from diffdrive_jacobian.nodes.parameters import (
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.parameters.declaration import ParameterError, specifications
+from diffdrive_jacobian.parameters.nodes import (
     GoToGoalParameters,
     VirtualRobotParameters,
     WheelBridgeParameters,
 )
-from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.ros.parameters import ParameterError, report_unknown, specifications
+from diffdrive_jacobian.ros.parameters import report_unknown
 from diffdrive_jacobian.ros.runner import ros_context
 
 NODES = {

@@ -9,7 +9,7 @@ import time
 import pytest
 from processes import Drive, open_world
 
-from diffdrive_jacobian.ros.parameters import specifications
+from diffdrive_jacobian.parameters.declaration import specifications
 
 NODES = ('virtual_robot', 'go_to_goal', 'wheel_bridge')
 FAST = ('--ros-args', '-p', 'kp:=8.0', '-p', 'kv:=4.0')
@@ -218,7 +218,7 @@ def test_an_integer_is_taken_for_a_double_and_an_unknown_parameter_is_named(worl
 
 @pytest.mark.parametrize('name', NODES)
 def test_help_lists_every_parameter(capsys, name):
-    from diffdrive_jacobian.ros.signals import Signals
+    from diffdrive_jacobian.signals import Signals
     from diffdrive_jacobian.tools import run_node
 
     with pytest.raises(SystemExit) as end:

@@ -21,12 +21,11 @@ from ros_messages import goal, goals, joint_command, odometry, placement, stamp,
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from diffdrive_jacobian.bags import run as run_module
-from diffdrive_jacobian.bags.building import build_bag
-from diffdrive_jacobian.bags.definitions import definition
-from diffdrive_jacobian.bags.journal import Channel, Message, Text
-from diffdrive_jacobian.bags.reading import BagError, Run, read_run
-from diffdrive_jacobian.bags.recorder import PARAMETERS
+from diffdrive_jacobian.bags.bag_writer import build_bag
+from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Text
+from diffdrive_jacobian.bags.message_definitions import definition
+from diffdrive_jacobian.reading import run as run_module
+from diffdrive_jacobian.reading.reader import BagError, Run, read_run
 
 SECOND = 1_000_000_000
 FIELDS = (

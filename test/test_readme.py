@@ -16,14 +16,14 @@ import pytest
 
 from diffdrive_jacobian import kinematics
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
-from diffdrive_jacobian.nodes.parameters import (
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.parameters.declaration import specifications
+from diffdrive_jacobian.parameters.nodes import (
     GoToGoalParameters,
     VirtualRobotParameters,
     WheelBridgeParameters,
 )
-from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.ros.parameters import specifications
 from diffdrive_jacobian.tools import (
     drive_to,
     entry_points,

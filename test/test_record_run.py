@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
 from diffdrive_jacobian.bags.journal import JournalWriter, Message, read_journal
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import record_run
 
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -8,9 +8,9 @@ from geometry_msgs.msg import Twist
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 
-from diffdrive_jacobian.bags import recorder
 from diffdrive_jacobian.bags.journal import Message
-from diffdrive_jacobian.bags.recorder import Recorder, Selection
+from diffdrive_jacobian.recording import recorder
+from diffdrive_jacobian.recording.recorder import Recorder, Selection
 
 DEPTH = 200
 """Messages that may wait: fewer than the recorder allows."""

@@ -14,13 +14,14 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from diffdrive_jacobian.bags import building, journal
-from diffdrive_jacobian.bags.definitions import definition
-from diffdrive_jacobian.bags.journal import Channel, Message, read_journal
-from diffdrive_jacobian.bags.journal_thread import JournalThread
-from diffdrive_jacobian.bags.recording import LOST, Recording, RecordingError, journal_of
+from diffdrive_jacobian.bags import bag_writer as building
+from diffdrive_jacobian.bags import journal
+from diffdrive_jacobian.bags.journal import Channel, Message, journal_of, read_journal
+from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.bags.storage import BagReader
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.recording.journal_thread import JournalThread
+from diffdrive_jacobian.recording.recording import LOST, Recording, RecordingError
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.recover_run import main as recover_run
 
 PATIENCE = 20.0

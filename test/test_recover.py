@@ -13,10 +13,9 @@ import pytest
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
-from diffdrive_jacobian.bags.definitions import definition
-from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
-from diffdrive_jacobian.bags.recording import journal_of
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text, journal_of
+from diffdrive_jacobian.bags.message_definitions import definition
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.recover_run import main
 
 TOPICS = {'/odom': 'nav_msgs/msg/Odometry', '/cmd_vel': 'geometry_msgs/msg/Twist'}

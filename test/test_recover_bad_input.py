@@ -8,7 +8,7 @@ import sqlite3
 import pytest
 from test_recover import PLUGINS, contents, make_messages, read_bag, recover, write_bag
 
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.recover_run import main
 
 

@@ -18,8 +18,7 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 from test_recover import read_bag, recover
 
-from diffdrive_jacobian.bags.journal import MAGIC, Message, read_journal
-from diffdrive_jacobian.bags.recording import journal_of
+from diffdrive_jacobian.bags.journal import MAGIC, Message, journal_of, read_journal
 
 STORAGES = ('mcap', 'sqlite3')
 ALLOWED_LOSS = 1.0

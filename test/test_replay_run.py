@@ -17,12 +17,12 @@ from ros_messages import goal, goals
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosgraph_msgs.msg import Clock
 
-from diffdrive_jacobian.bags.definitions import definition
-from diffdrive_jacobian.bags.lateness import Lateness
-from diffdrive_jacobian.bags.replayer import Replayer
+from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.replay.lateness import Lateness
+from diffdrive_jacobian.replay.replayer import Replayer
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.testing import Lockstep
 from diffdrive_jacobian.tools import replay_run
 

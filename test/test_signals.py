@@ -10,12 +10,12 @@ import threading
 
 import pytest
 
-from diffdrive_jacobian.ros import signals as module
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian import signals as module
+from diffdrive_jacobian.signals import Signals
 
 HUNG = """
 import os, sys, threading
-from diffdrive_jacobian.ros import signals
+from diffdrive_jacobian import signals
 from diffdrive_jacobian.tools.entry_points import _exit
 signals.TOGETHER, signals.GRACE = float(sys.argv[1]), 0.1
 caught = signals.Signals()

@@ -19,21 +19,15 @@ from processes import open_world
 
 from diffdrive_jacobian.control import Arrival, VelocityLimits, go_to_goal, go_to_pose
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.plots import sweep_figure as _sweep_figure
+from diffdrive_jacobian.plots.sweep_figure import BORDERS, TITLES, figure
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.simulation import RobotModel, closed_loops
 from diffdrive_jacobian.simulation import _block as block
-from diffdrive_jacobian.tools import _sweep_figure, sweep_gains
-from diffdrive_jacobian.tools._sweep_figure import BORDERS, TITLES, figure
-from diffdrive_jacobian.tools.sweep_gains import (
-    COLUMNS,
-    CONTROLLERS,
-    MEASURES,
-    Setup,
-    describe,
-    main,
-    sweep,
-    table,
-)
+from diffdrive_jacobian.sweeps import Setup, describe, sweep, table
+from diffdrive_jacobian.sweeps.sweep import COLUMNS, CONTROLLERS, MEASURES
+from diffdrive_jacobian.tools import sweep_gains
+from diffdrive_jacobian.tools.sweep_gains import main
 
 CONFIG = Path(__file__).parents[1] / 'config'
 SMALL = Setup(grid=5, starts=3, rate=20.0)

@@ -230,7 +230,7 @@ def test_drive_to_arrives_with_nothing_but_defaults(drives):
     ids=lambda value: ' '.join(value) if isinstance(value, tuple) else '',
 )
 def test_drive_to_says_what_it_cannot_take(capsys, arguments, words):
-    from diffdrive_jacobian.ros.signals import Signals
+    from diffdrive_jacobian.signals import Signals
     from diffdrive_jacobian.tools import drive_to
 
     with pytest.raises(SystemExit) as end:
@@ -244,7 +244,7 @@ def test_drive_to_says_what_it_cannot_take(capsys, arguments, words):
 @pytest.mark.parametrize('lockstep', [(), ('--lockstep',)], ids=['real time', 'lockstep'])
 @pytest.mark.parametrize('late', ['--open', '-o', 'x'])
 def test_options_after_the_ros_arguments_are_refused_with_a_hint(capsys, late, lockstep):
-    from diffdrive_jacobian.ros.signals import Signals
+    from diffdrive_jacobian.signals import Signals
     from diffdrive_jacobian.tools import drive_to
 
     arguments = ('1', '1', '--no-record', *lockstep, '--ros-args', '-p', 'kp:=2.0', late)
@@ -256,7 +256,7 @@ def test_options_after_the_ros_arguments_are_refused_with_a_hint(capsys, late, l
 
 @pytest.mark.parametrize('arguments', [('-p', 'kp:=1'), ('kp:=1',), ('-r', '__ns:=/a')])
 def test_ros_arguments_of_a_node_without_the_flag_get_a_hint(capsys, arguments):
-    from diffdrive_jacobian.ros.signals import Signals
+    from diffdrive_jacobian.signals import Signals
     from diffdrive_jacobian.tools import run_node
 
     with pytest.raises(SystemExit) as end:

@@ -14,11 +14,11 @@ from recorded import recorded
 from ros_messages import goal, goals, twist, twist_stamped
 from std_srvs.srv import Trigger
 
-from diffdrive_jacobian.bags import BagError, read_run
-from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.reading import BagError, read_run
+from diffdrive_jacobian.reading.verification import verify
 
 EXACT = 1e-9
 FOREIGN = Path(__file__).parent / 'bags' / 'turtlebot3_fake_sqlite'

@@ -22,8 +22,8 @@ from ros_messages import (
 
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
+from diffdrive_jacobian.messages.conversion import from_pose, from_time
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.ros.messages import from_pose, from_time
 from diffdrive_jacobian.testing import Lockstep
 
 TWISTS = [

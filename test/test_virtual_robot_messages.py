@@ -24,7 +24,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.kinematics import se2
-from diffdrive_jacobian.ros.messages import from_pose
+from diffdrive_jacobian.messages.conversion import from_pose
 
 # --- Commands
 

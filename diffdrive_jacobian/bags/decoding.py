@@ -7,8 +7,8 @@ from typing import Any
 
 from rclpy.serialization import deserialize_message
 
-from diffdrive_jacobian.bags.definitions import UnknownTypeError, definition, message_class
 from diffdrive_jacobian.bags.journal import Channel
+from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
 from diffdrive_jacobian.text import printable
 
 

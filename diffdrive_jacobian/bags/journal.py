@@ -25,6 +25,10 @@ from typing import Any, BinaryIO
 
 from diffdrive_jacobian.text import printable
 
+JOURNAL = '.journal'
+"""Ends the name of a journal; before it stands the name of the bag."""
+PARAMETERS = 'parameters of '
+"""Before a node's name, the key of the custom data that holds its parameters as JSON."""
 MAGIC = b'\x89ddjournal1\r\n\x1a\n'
 _HEAD = struct.Struct('<cII')
 _MESSAGE = struct.Struct('<Hq')
@@ -42,6 +46,11 @@ _CHANNEL_FIELDS: dict[str, type] = {
     'type_hash': str,
     'qos': list,
 }
+
+
+def journal_of(bag: Path) -> Path:
+    """Return the journal that lies beside a bag while it is recorded, and after a crash."""
+    return bag.with_name(bag.name + JOURNAL)
 
 
 class JournalError(Exception):

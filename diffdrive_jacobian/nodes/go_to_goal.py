@@ -18,10 +18,11 @@ from diffdrive_jacobian.control import (
     saturate,
 )
 from diffdrive_jacobian.control.waypoints import Law
+from diffdrive_jacobian.messages import conversion as messages
+from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.goal import MAX_WAYPOINTS, Goal, goal_info, read_goal
-from diffdrive_jacobian.nodes.parameters import GoToGoalParameters, nanoseconds
-from diffdrive_jacobian.ros import messages
-from diffdrive_jacobian.ros.messages import MessageError
+from diffdrive_jacobian.parameters.nodes import GoToGoalParameters, nanoseconds
+from diffdrive_jacobian.ros import serialization
 from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.text import printable
@@ -88,7 +89,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
 
     def _on_goals(self, data: bytes) -> None:
         try:
-            stamp, count = messages.goals_header(data)
+            stamp, count = serialization.goals_header(data)
         except MessageError as error:
             self.get_logger().warning(f'goals dropped: {error}', throttle_duration_sec=THROTTLE)
             return
@@ -96,7 +97,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         try:
             if count > MAX_WAYPOINTS:
                 raise MessageError(f'goals must hold at most {MAX_WAYPOINTS} poses, got {count}')
-            message = messages.deserialized(data, Goals)
+            message = serialization.deserialized(data, Goals)
             goal = Goal(info, *read_goal(message.header.frame_id, message.goals))
             self._match_frames(goal)
         except MessageError as error:

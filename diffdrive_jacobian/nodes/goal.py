@@ -13,8 +13,8 @@ from geometry_msgs.msg import PoseStamped
 from unique_identifier_msgs.msg import UUID
 
 from diffdrive_jacobian.control import Waypoints
-from diffdrive_jacobian.ros import messages
-from diffdrive_jacobian.ros.messages import MessageError
+from diffdrive_jacobian.messages import conversion as messages
+from diffdrive_jacobian.messages.conversion import MessageError
 
 MAX_WAYPOINTS = 2_000
 """Most poses of a `goals` message that is converted: rclpy takes some 20 us for each."""

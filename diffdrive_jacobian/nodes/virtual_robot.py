@@ -24,9 +24,9 @@ from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
-from diffdrive_jacobian.nodes.parameters import VirtualRobotParameters, nanoseconds
-from diffdrive_jacobian.ros import messages
-from diffdrive_jacobian.ros.messages import MessageError
+from diffdrive_jacobian.messages import conversion as messages
+from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters, nanoseconds
 from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot
 from diffdrive_jacobian.text import printable

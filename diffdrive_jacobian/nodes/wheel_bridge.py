@@ -10,9 +10,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
-from diffdrive_jacobian.nodes.parameters import WheelBridgeParameters, nanoseconds
-from diffdrive_jacobian.ros import messages
-from diffdrive_jacobian.ros.messages import MessageError
+from diffdrive_jacobian.messages import conversion as messages
+from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.parameters.nodes import WheelBridgeParameters, nanoseconds
 from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 

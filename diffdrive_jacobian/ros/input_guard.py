@@ -21,7 +21,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 
-from diffdrive_jacobian.ros.messages import MessageError, from_time
+from diffdrive_jacobian.messages.conversion import MessageError, from_time
 from diffdrive_jacobian.text import printable
 
 THROTTLE = 2.0

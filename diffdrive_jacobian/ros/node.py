@@ -27,10 +27,10 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 
+from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, changed
 from diffdrive_jacobian.ros import parameters as ros_parameters
 from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
 from diffdrive_jacobian.ros.input_guard import guard_inputs
-from diffdrive_jacobian.ros.parameters import NodeParameters, ParameterError
 from diffdrive_jacobian.ros.rate_limit import RateLimit
 from diffdrive_jacobian.text import printable
 
@@ -69,7 +69,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         super().__init__(name, **kwargs)
         try:
             self.parameters = ros_parameters.declare(self, parameters)
-        except ros_parameters.ParameterError:
+        except ParameterError:
             self.destroy_node()
             raise
         guard_inputs(self)
@@ -193,7 +193,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
 
     def _after_parameters(self, changes: list[Parameter]) -> None:
         previous = self.parameters
-        self.parameters = ros_parameters.changed(previous, changes)
+        self.parameters = changed(previous, changes)
         if self.parameters is not previous:
             self.parameters_changed(previous)
 

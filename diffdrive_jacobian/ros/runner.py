@@ -24,10 +24,11 @@ from rclpy.node import Node
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.signals import SignalHandlerOptions
 
-from diffdrive_jacobian.ros.errors import UserError as UserError
+from diffdrive_jacobian.errors import UserError as UserError
+from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.node import ParameterizedNode
-from diffdrive_jacobian.ros.parameters import ParameterError, report_unknown
+from diffdrive_jacobian.ros.parameters import report_unknown
 from diffdrive_jacobian.text import printable
 
 N = TypeVar('N', bound=Node)

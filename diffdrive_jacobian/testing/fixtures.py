@@ -15,13 +15,13 @@ from typing import Any
 import pytest
 from rclpy.parameter import Parameter
 
-from diffdrive_jacobian.bags import BagError, read_run
-from diffdrive_jacobian.bags.figure import draw
-from diffdrive_jacobian.bags.recorder import Recorder, Selection
-from diffdrive_jacobian.bags.recording import Recording, RecordingError
-from diffdrive_jacobian.nodes.parameters import VirtualRobotParameters
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.ros.parameters import specifications
+from diffdrive_jacobian.parameters.declaration import specifications
+from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
+from diffdrive_jacobian.plots.run_figure import draw
+from diffdrive_jacobian.reading import BagError, read_run
+from diffdrive_jacobian.recording.recorder import Recorder, Selection
+from diffdrive_jacobian.recording.recording import Recording, RecordingError
 from diffdrive_jacobian.testing import Lockstep, LockstepError
 
 

@@ -8,9 +8,9 @@ import os
 import sys
 from collections.abc import Sequence
 
-from diffdrive_jacobian.nodes.parameters import GoToGoalParameters
-from diffdrive_jacobian.ros.parameters import ParameterError
-from diffdrive_jacobian.ros.plausibility import MAX_POSITION
+from diffdrive_jacobian.messages.plausibility import MAX_POSITION
+from diffdrive_jacobian.parameters.declaration import ParameterError
+from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 
 DONE, FAILED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
 """Exit codes: done as asked, not done, a user's mistake, interrupted by a signal."""

@@ -11,7 +11,7 @@ from action_msgs.msg import GoalStatus
 from diffdrive_jacobian.ros.goal_sender import GoalSender, loss
 from diffdrive_jacobian.ros.liveness import Liveness
 from diffdrive_jacobian.ros.runner import Runner
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._progress import Drive
 from diffdrive_jacobian.tools._waiting import Waiting

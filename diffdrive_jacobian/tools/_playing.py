@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
-from diffdrive_jacobian.bags.reading import open_bag
-from diffdrive_jacobian.bags.replayer import Playback, Replayer
+from diffdrive_jacobian.reading.reader import open_bag
+from diffdrive_jacobian.replay.replayer import Playback, Replayer
 from diffdrive_jacobian.ros.heartbeats import fast_heartbeats
 from diffdrive_jacobian.ros.runner import Runner, ros_context, running
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._progress import Playing
 from diffdrive_jacobian.tools._waiting import Waiting

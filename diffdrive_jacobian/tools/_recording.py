@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from diffdrive_jacobian.bags.recording import Recording
+from diffdrive_jacobian.recording.recording import Recording
 
 
 def begin_recording(

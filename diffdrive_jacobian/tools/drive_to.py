@@ -26,27 +26,27 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 
-from diffdrive_jacobian.bags.figure import draw
-from diffdrive_jacobian.bags.reading import BagError, read_run
-from diffdrive_jacobian.bags.recorder import Recorder, Selection
-from diffdrive_jacobian.bags.recording import Recording, RecordingError
 from diffdrive_jacobian.control import Arrival
+from diffdrive_jacobian.messages import conversion as messages
+from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
-from diffdrive_jacobian.nodes.parameters import CONTROLLERS, nanoseconds
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.ros import messages
-from diffdrive_jacobian.ros.messages import MessageError
+from diffdrive_jacobian.parameters.nodes import CONTROLLERS, nanoseconds
+from diffdrive_jacobian.plots.run_figure import draw
+from diffdrive_jacobian.reading.reader import BagError, read_run
+from diffdrive_jacobian.recording.recorder import Recorder, Selection
+from diffdrive_jacobian.recording.recording import Recording, RecordingError
 from diffdrive_jacobian.ros.node import THROTTLE
 from diffdrive_jacobian.ros.runner import Runner, UserError, closed_world, ros_context, running
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._progress import Drive
 from diffdrive_jacobian.tools._recording import begin_recording
 from diffdrive_jacobian.tools._unused_files import warn_of_unused_files
 
 if TYPE_CHECKING:
-    from diffdrive_jacobian.testing.runner import LockstepRunner
+    from diffdrive_jacobian.lockstep.runner import LockstepRunner
 
 PROGRAM = 'drive_to'
 SETTLING = 0.1
@@ -376,8 +376,8 @@ def _lockstep(ros: list[str]) -> Iterator[LockstepRunner]:
         DriveError: A callback blocks, or simulated time could not pass for another reason.
     """
     # Not needed otherwise, and slow to import.
+    from diffdrive_jacobian.lockstep.runner import running_in_lockstep
     from diffdrive_jacobian.testing import LockstepError
-    from diffdrive_jacobian.testing.runner import running_in_lockstep
 
     with ExitStack() as stack:
         try:

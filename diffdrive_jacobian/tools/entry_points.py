@@ -8,7 +8,7 @@ import select
 import sys
 from functools import partial
 
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.signals import Signals
 
 INTERRUPTED = 130
 ROS_MODULES = (

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.bags.figure import draw, names
-from diffdrive_jacobian.bags.reading import BagError, Run, Series, read_run
-from diffdrive_jacobian.bags.trace import Trace, seconds, trace
 from diffdrive_jacobian.plots.output_files import FORMATS, create
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.plots.run_figure import draw, names
+from diffdrive_jacobian.reading.reader import BagError, Run, Series, read_run
+from diffdrive_jacobian.reading.trace import Trace, seconds, trace
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli
 

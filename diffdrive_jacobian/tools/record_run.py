@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from diffdrive_jacobian.bags.building import STORAGES, Summary
-from diffdrive_jacobian.bags.recorder import RUN_TOPICS, Recorder, Selection
-from diffdrive_jacobian.bags.recording import Recording, RecordingError
+from diffdrive_jacobian.bags.bag_writer import STORAGES, Summary
+from diffdrive_jacobian.recording.recorder import RUN_TOPICS, Recorder, Selection
+from diffdrive_jacobian.recording.recording import Recording, RecordingError
 from diffdrive_jacobian.ros.runner import UserError, ros_context, running
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._recording import begin_recording

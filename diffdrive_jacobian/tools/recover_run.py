@@ -12,19 +12,20 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from diffdrive_jacobian.bags.building import STORAGES, Summary, build_bag
+from diffdrive_jacobian.bags.bag_writer import STORAGES, Summary, build_bag
 from diffdrive_jacobian.bags.decoding import DecodingCheck
 from diffdrive_jacobian.bags.journal import (
+    JOURNAL,
     Channel,
     JournalError,
     Message,
     Record,
     is_being_written,
+    journal_of,
 )
-from diffdrive_jacobian.bags.reading import damage
-from diffdrive_jacobian.bags.recording import JOURNAL, journal_of
-from diffdrive_jacobian.bags.remains import NotABagError, Remains
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.reading.reader import damage
+from diffdrive_jacobian.recovery.damaged_bag import NotABagError, Remains
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools.record_run import describe

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diffdrive_jacobian.ros.errors import UserError
-from diffdrive_jacobian.ros.parameters import ParameterError
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.parameters.declaration import ParameterError
+from diffdrive_jacobian.parameters.file import robot_parameters
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli
-from diffdrive_jacobian.tools._params_file import robot_parameters
 
 if TYPE_CHECKING:
-    from diffdrive_jacobian.bags.verification import Verification
+    from diffdrive_jacobian.reading.verification import Verification
 
 PROGRAM = 'replay_run'
 MATCH_PATIENCE = 5.0
@@ -50,8 +50,8 @@ def report(verification: Verification, tolerance: float, yaw_tolerance: float) -
 
 
 def _verify(bag: Path, options: argparse.Namespace) -> int:
-    from diffdrive_jacobian.bags.reading import read_run
-    from diffdrive_jacobian.bags.verification import verify
+    from diffdrive_jacobian.reading.reader import read_run
+    from diffdrive_jacobian.reading.verification import verify
 
     parameters = None if options.params_file is None else robot_parameters(options.params_file)
     verification = verify(read_run(bag), parameters)
@@ -63,7 +63,7 @@ def _verify(bag: Path, options: argparse.Namespace) -> int:
 
 
 def _replay(bag: Path, options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> int:
-    from diffdrive_jacobian.bags.replayer import COMMANDED, TOLD, NothingToPlayError, Playback
+    from diffdrive_jacobian.replay.replayer import COMMANDED, TOLD, NothingToPlayError, Playback
     from diffdrive_jacobian.tools._playing import replay
 
     playback = Playback(
@@ -100,7 +100,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     if options.timeout is not None and options.readers is None:
         parser.error('--timeout is the time to wait for the readers of -w, which is missing')
     # Now, for --help needs no ROS.
-    from diffdrive_jacobian.bags.reading import BagError
+    from diffdrive_jacobian.reading.reader import BagError
 
     bag = Path(options.bag)
     try:

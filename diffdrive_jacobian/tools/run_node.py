@@ -9,14 +9,14 @@ from collections.abc import Sequence
 from dataclasses import fields
 from typing import NamedTuple
 
-from diffdrive_jacobian.nodes.parameters import (
+from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.parameters.declaration import NodeParameters, specifications
+from diffdrive_jacobian.parameters.nodes import (
     GoToGoalParameters,
     VirtualRobotParameters,
     WheelBridgeParameters,
 )
-from diffdrive_jacobian.ros.errors import UserError
-from diffdrive_jacobian.ros.parameters import NodeParameters, specifications
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._unused_files import warn_of_unused_files
 

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from diffdrive_jacobian.ros.errors import UserError
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli
 
 PROGRAM = 'send_goal'

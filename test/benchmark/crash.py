@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from processes import open_world
 from test_recover_crash import ALLOWED_LOSS, STORAGES, Control, crash
 
-from diffdrive_jacobian.ros.signals import Signals
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.recover_run import main as recover_run
 
 A_WORLD = 4

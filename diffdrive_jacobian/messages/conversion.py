@@ -11,25 +11,24 @@ raises MessageError, which says what was got and what is allowed.
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Iterable
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseWithCovariance, Twist, TwistStamped
-from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
-from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import JointState
 
-from diffdrive_jacobian.ros.plausibility import MAX_POSITION as MAX_POSITION
-from diffdrive_jacobian.ros.plausibility import MAX_SPEED as MAX_SPEED
-from diffdrive_jacobian.ros.plausibility import MAX_WHEEL_SPEED as MAX_WHEEL_SPEED
+if TYPE_CHECKING:
+    # Fields are read and written by name: the messages of rosbags serve as well as those of rclpy.
+    from builtin_interfaces.msg import Time
+    from geometry_msgs.msg import Pose, PoseWithCovariance, Twist, TwistStamped
+    from nav_msgs.msg import Odometry
+    from sensor_msgs.msg import JointState
+
+from diffdrive_jacobian.messages.plausibility import MAX_POSITION as MAX_POSITION
+from diffdrive_jacobian.messages.plausibility import MAX_SPEED as MAX_SPEED
+from diffdrive_jacobian.messages.plausibility import MAX_WHEEL_SPEED as MAX_WHEEL_SPEED
 from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot
 from diffdrive_jacobian.text import printable
-
-T = TypeVar('T')
 
 # x, y and yaw, and forward and yaw, in the row-major 6x6 covariances of ROS.
 _PLANAR = np.array([6 * row + column for row in (0, 1, 5) for column in (0, 1, 5)])
@@ -67,37 +66,6 @@ def from_time(stamp: Time) -> int:
             f'got sec {sec}, nanosec {nanosec}'
         )
     return sec * NANOSECONDS + nanosec
-
-
-def deserialized(data: bytes, message_type: type[T]) -> T:
-    """Return the message that serialized bytes hold.
-
-    Raises:
-        MessageError: They hold no such message.
-    """
-    try:
-        message: T = deserialize_message(data, message_type)
-    except RuntimeError as error:
-        raise MessageError(f'it is no {message_type.__name__} message') from error
-    return message
-
-
-def goals_header(data: bytes) -> tuple[Time, int]:
-    """Return the stamp and the number of poses of a serialized Goals message, and convert nothing else.
-
-    The layout is that of CDR: 4 bytes of encapsulation, of which the second is odd for little-endian;
-    the stamp, the frame as length and text, and the number of poses, aligned to 4 bytes.
-
-    Raises:
-        MessageError: The bytes are too short.
-    """
-    try:
-        order = '<' if data[1] & 1 else '>'
-        sec, nanosec, length = struct.unpack_from(f'{order}iII', data, 4)
-        (count,) = struct.unpack_from(f'{order}I', data, 16 + (length + 3) // 4 * 4)
-    except (IndexError, struct.error) as error:
-        raise MessageError('it is no Goals message') from error
-    return Time(sec=sec, nanosec=nanosec), count
 
 
 def from_twist(message: Twist) -> tuple[float, float]:

@@ -16,10 +16,10 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2
 from rosbags.rosbag2 import Reader
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from diffdrive_jacobian.bags.definitions import UnknownTypeError, message_class
-from diffdrive_jacobian.bags.lateness import Lateness
+from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, message_class
 from diffdrive_jacobian.bags.qos import to_offer_again
-from diffdrive_jacobian.bags.reading import BagError, base_name, messages
+from diffdrive_jacobian.reading.reader import BagError, base_name, messages
+from diffdrive_jacobian.replay.lateness import Lateness
 
 NANOSECONDS = 1_000_000_000
 DEPTH = 1000

@@ -17,7 +17,8 @@ from rosbags.rosbag2 import Reader
 
 from diffdrive_jacobian.bags.bounded_reader import BoundedReader
 from diffdrive_jacobian.bags.decoding import UndecodableError, decode
-from diffdrive_jacobian.bags.definitions import message_class
+from diffdrive_jacobian.bags.journal import PARAMETERS, journal_of
+from diffdrive_jacobian.bags.message_definitions import message_class
 from diffdrive_jacobian.bags.metadata import (
     DamagedError,
     check_connections,
@@ -25,13 +26,11 @@ from diffdrive_jacobian.bags.metadata import (
     check_metadata,
     parse_parameters,
 )
-from diffdrive_jacobian.bags.recorder import PARAMETERS
-from diffdrive_jacobian.bags.recording import journal_of
-from diffdrive_jacobian.bags.remains import is_recoverable
-from diffdrive_jacobian.bags.rows import PARAMETER_EVENTS, ROW_READERS, SERIES_TOPICS
-from diffdrive_jacobian.bags.run import COLUMNS, Run, Series
 from diffdrive_jacobian.bounded_yaml import TooLargeError
-from diffdrive_jacobian.ros.messages import MessageError
+from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.reading.rows import PARAMETER_EVENTS, ROW_READERS, SERIES_TOPICS
+from diffdrive_jacobian.reading.run import COLUMNS, Run, Series
+from diffdrive_jacobian.recovery.damaged_bag import is_recoverable
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 
 __all__ = ['BagError', 'DamagedBagError', 'Run', 'Series', 'read_run']

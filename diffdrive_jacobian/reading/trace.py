@@ -12,10 +12,10 @@ import numpy as np
 from action_msgs.msg import GoalStatus
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.bags.reading import BagError
-from diffdrive_jacobian.bags.run import Run, Series
 from diffdrive_jacobian.kinematics._elementary import wrapped
-from diffdrive_jacobian.nodes.parameters import GoToGoalParameters
+from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
+from diffdrive_jacobian.reading.reader import BagError
+from diffdrive_jacobian.reading.run import Run, Series
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from diffdrive_jacobian.control.saturation import VelocityLimits
-from diffdrive_jacobian.ros.parameters import NodeParameters, ParameterError, parameter
-from diffdrive_jacobian.ros.plausibility import MAX_POSITION, MAX_SPEED
+from diffdrive_jacobian.messages.plausibility import MAX_POSITION, MAX_SPEED
+from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, parameter
 from diffdrive_jacobian.simulation.robot import NANOSECONDS, RobotModel
 from diffdrive_jacobian.text import printable
 

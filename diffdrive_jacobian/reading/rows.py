@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from diffdrive_jacobian.ros.messages import (
+from diffdrive_jacobian.messages.conversion import (
     from_joint_state,
     from_pose,
     from_time,

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from diffdrive_jacobian.bags.run import Run, Series, number
-from diffdrive_jacobian.bags.trace import Array, Indices, Mask, Trace, seconds
+from diffdrive_jacobian.reading.run import Run, Series, number
+from diffdrive_jacobian.reading.trace import Array, Indices, Mask, Trace, seconds
 
 BUCKETS = 1500
 """A longer line shows the least and the greatest of so many stretches."""

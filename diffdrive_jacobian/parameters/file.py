@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, load_yaml
-from diffdrive_jacobian.ros.errors import UserError
+from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.text import printable
 
 

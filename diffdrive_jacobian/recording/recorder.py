@@ -17,12 +17,12 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.subscription import Subscription
 
-from diffdrive_jacobian.bags.definitions import UnknownTypeError, definition, message_class
-from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
-from diffdrive_jacobian.bags.missed import MissedMessages
-from diffdrive_jacobian.bags.parameter_query import ParameterQuery
+from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Record, Text
+from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
 from diffdrive_jacobian.bags.qos import to_fields, to_hear_all
-from diffdrive_jacobian.ros.parameters import ParameterError
+from diffdrive_jacobian.parameters.declaration import ParameterError
+from diffdrive_jacobian.recording.missed import MissedMessages
+from diffdrive_jacobian.recording.parameter_query import ParameterQuery
 
 RUN_TOPICS = (
     'cmd_vel',
@@ -47,8 +47,6 @@ DRAIN_PATIENCE = 3.0
 """How long it may take to collect at the end what was sent before (s)."""
 IN_TRANSIT = 0.1
 """After so long without such a message none is expected any more (s)."""
-PARAMETERS = 'parameters of '
-"""Before a node's name, the key of the custom data that holds its parameters as JSON."""
 
 
 class Sink(Protocol):

@@ -9,10 +9,10 @@ from typing import TypeVar
 from rclpy.context import Context
 from rclpy.node import Node
 
+from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.ros.node import ParameterizedNode
 from diffdrive_jacobian.ros.parameters import report_unknown
 from diffdrive_jacobian.ros.runner import made
-from diffdrive_jacobian.testing.lockstep import Lockstep
 
 N = TypeVar('N', bound=Node)
 

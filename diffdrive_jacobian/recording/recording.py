@@ -12,26 +12,20 @@ from itertools import count
 from pathlib import Path
 
 from diffdrive_jacobian import __version__
-from diffdrive_jacobian.bags.building import Summary, build_bag, check_target
+from diffdrive_jacobian.bags.bag_writer import Summary, build_bag, check_target
 from diffdrive_jacobian.bags.journal import (
     Channel,
     JournalWriter,
     Message,
     Record,
     Text,
+    journal_of,
     read_journal,
 )
-from diffdrive_jacobian.bags.journal_thread import CAPACITY, JournalThread
+from diffdrive_jacobian.recording.journal_thread import CAPACITY, JournalThread
 
-JOURNAL = '.journal'
-"""Ends the name of a journal; before it stands the name of the bag."""
 LOST = 'messages lost'
 """Key of the custom data with the number of messages that are known to be missing, by topic, as JSON."""
-
-
-def journal_of(bag: Path) -> Path:
-    """Return the journal that lies beside a bag while it is recorded, and after a crash."""
-    return bag.with_name(bag.name + JOURNAL)
 
 
 class RecordingError(Exception):

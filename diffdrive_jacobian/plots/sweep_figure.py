@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
     from numpy.typing import NDArray
 
-    from diffdrive_jacobian.tools.sweep_gains import Setup, Sweep
+    from diffdrive_jacobian.sweeps.sweep import Setup, Sweep
 
 SIZE = (13.0, 5.2)
 """Of the picture (inches)."""

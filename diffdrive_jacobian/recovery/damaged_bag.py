@@ -17,15 +17,17 @@ from rosbags.interfaces import QosTime
 from rosbags.rosbag2 import ReaderError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
+from diffdrive_jacobian.bags.bag_writer import STORAGES
 from diffdrive_jacobian.bags.bounded_reader import parse_bounded_qos
-from diffdrive_jacobian.bags.building import STORAGES
-from diffdrive_jacobian.bags.definitions import UnknownTypeError, definition
 from diffdrive_jacobian.bags.journal import (
+    JOURNAL,
     MAGIC,
+    PARAMETERS,
     Channel,
     Message,
     Record,
     Text,
+    journal_of,
     read_journal,
 )
 from diffdrive_jacobian.bags.limits import (
@@ -34,13 +36,12 @@ from diffdrive_jacobian.bags.limits import (
     unpack_file,
     unpack_message,
 )
+from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition
 from diffdrive_jacobian.bags.metadata import DamagedError, parse_parameters
 from diffdrive_jacobian.bags.qos import NANOSECONDS, to_rosbags
-from diffdrive_jacobian.bags.recorder import PARAMETERS
-from diffdrive_jacobian.bags.recording import JOURNAL, journal_of
-from diffdrive_jacobian.bags.salvage import MCAP_MAGIC, Topic, read_mcap
-from diffdrive_jacobian.bags.salvage_sqlite import SQLITE_MAGIC, read_sqlite
 from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, TooLargeError, load_yaml
+from diffdrive_jacobian.recovery.salvage_mcap import MCAP_MAGIC, Topic, read_mcap
+from diffdrive_jacobian.recovery.salvage_sqlite import SQLITE_MAGIC, read_sqlite
 
 KINDS = {'.mcap': 'mcap', '.db3': 'sqlite3', JOURNAL: 'journal'}
 READERS = {'mcap': read_mcap, 'sqlite3': read_sqlite}

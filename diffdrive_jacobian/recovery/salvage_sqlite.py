@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 
 from diffdrive_jacobian.bags.journal import Message
 from diffdrive_jacobian.bags.limits import Budget, check_record
-from diffdrive_jacobian.bags.salvage import Found, Note, Topic
+from diffdrive_jacobian.recovery.salvage_mcap import Found, Note, Topic
 
 SQLITE_MAGIC = b'SQLite format 3\0'
 _LEAF = 0x0D

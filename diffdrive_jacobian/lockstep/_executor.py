@@ -20,9 +20,9 @@ from rclpy.node import Node
 from rclpy.task import Task
 from rclpy.timer import Timer
 
+from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._served import Served, is_latched
 from diffdrive_jacobian.ros.runner import events_executor
-from diffdrive_jacobian.testing._errors import LockstepError
-from diffdrive_jacobian.testing._served import Served, is_latched
 
 LATCHED_PATIENCE = Duration(seconds=5.0)
 """How long a latched message may take to reach a late reader (s); it takes microseconds."""

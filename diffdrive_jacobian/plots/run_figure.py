@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from diffdrive_jacobian.bags.lines import commanded, limits, line, measured
-from diffdrive_jacobian.bags.run import Run
-from diffdrive_jacobian.bags.trace import Array, Trace, tolerance, trace
 from diffdrive_jacobian.plots.output_files import FORMATS, create
 from diffdrive_jacobian.plots.style import DPI, styled
+from diffdrive_jacobian.reading.run import Run
+from diffdrive_jacobian.reading.time_series import commanded, limits, line, measured
+from diffdrive_jacobian.reading.trace import Array, Trace, tolerance, trace
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

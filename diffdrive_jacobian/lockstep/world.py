@@ -19,11 +19,11 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
+from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
+from diffdrive_jacobian.lockstep._guard import Guard
+from diffdrive_jacobian.lockstep._simulated_time import SimulatedTime, nanoseconds
 from diffdrive_jacobian.ros.runner import UserError, closed_world, ros_context
-from diffdrive_jacobian.testing._errors import LockstepError
-from diffdrive_jacobian.testing._executor import QuiescentExecutor
-from diffdrive_jacobian.testing._guard import Guard
-from diffdrive_jacobian.testing._simulated_time import SimulatedTime, nanoseconds
 
 N = TypeVar('N', bound=Node)
 

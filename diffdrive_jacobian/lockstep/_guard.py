@@ -22,7 +22,7 @@ from typing import Any
 import rclpy
 from rclpy.node import Node
 
-from diffdrive_jacobian.testing import _executor
+from diffdrive_jacobian.lockstep import _executor
 
 SIGNAL = signal.SIGUSR2
 """Neither pytest nor its plugins use it; pytest-timeout uses SIGALRM."""

@@ -11,10 +11,10 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 
-from diffdrive_jacobian.testing._errors import LockstepError
-from diffdrive_jacobian.testing._executor import QuiescentExecutor
-from diffdrive_jacobian.testing._guard import Guard, Stuck
-from diffdrive_jacobian.testing._report import Traffic
+from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
+from diffdrive_jacobian.lockstep._guard import Guard, Stuck
+from diffdrive_jacobian.lockstep._report import Traffic
 
 NANOSECONDS = 1_000_000_000
 MAX_SECONDS = 2**31 - 1

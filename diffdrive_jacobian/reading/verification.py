@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.bags.reading import BagError
-from diffdrive_jacobian.bags.run import Run, Series
 from diffdrive_jacobian.kinematics._elementary import wrapped
 from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
-from diffdrive_jacobian.nodes.parameters import VirtualRobotParameters
-from diffdrive_jacobian.ros.messages import MessageError, plausible_twist
-from diffdrive_jacobian.ros.parameters import from_ros
+from diffdrive_jacobian.messages.conversion import MessageError, plausible_twist
+from diffdrive_jacobian.parameters.declaration import from_ros
+from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
+from diffdrive_jacobian.reading.reader import BagError
+from diffdrive_jacobian.reading.run import Run, Series
 from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot, RobotModel
 
 ROBOT = 'virtual_robot'

@@ -1,0 +1,1 @@
+"""ROS messages as numbers, checked; no ROS is imported."""

@@ -1,0 +1,1 @@
+"""Parameters of the nodes as checked dataclasses; no ROS is imported."""

@@ -1,0 +1,1 @@
+"""Recording of topics as rosbag2 bags, through a journal that survives a crash."""

@@ -1,0 +1,5 @@
+"""Sweeps of gains: thousands of closed loops at once."""
+
+from diffdrive_jacobian.sweeps.sweep import Setup, Sweep, describe, sweep, table
+
+__all__ = ['Setup', 'Sweep', 'describe', 'sweep', 'table']
