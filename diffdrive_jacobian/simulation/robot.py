@@ -12,7 +12,7 @@ Source: MATH.md, "Motion of a virtual robot".
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -225,10 +225,17 @@ class Robot:
         Raises:
             ValueError: The pose or the covariance is invalid, as in the constructor; or as `at`.
         """
-        return replace(
-            self.at(stamp),
-            pose=array('pose', pose, 3),
-            covariance=array('covariance', covariance, 3, 3),
+        here = self.at(stamp)
+        placed = Robot(model=self.model, stamp=here.stamp, pose=pose, covariance=covariance)  # type: ignore[arg-type]
+        return _robot(
+            here.model,
+            here.stamp,
+            placed.pose,
+            placed.covariance,
+            here.wheel_angles,
+            here.command,
+            here.twist,
+            here.commanded_at,
         )
 
     def remodelled(self, model: RobotModel, stamp: int, *, wheels_commanded: bool = False) -> Robot:
@@ -246,7 +253,16 @@ class Robot:
         if wheels_commanded:
             speeds = body_to_wheel(*command, self.model.wheel_radius, self.model.wheel_separation)
             command = wheel_to_body(*speeds, model.wheel_radius, model.wheel_separation)
-        return replace(here, model=model, command=command, twist=model.limited(command))
+        return _robot(
+            model,
+            here.stamp,
+            here.pose,
+            here.covariance,
+            here.wheel_angles,
+            command,
+            model.limited(command),
+            here.commanded_at,
+        )
 
     def restarted(self, stamp: int) -> Robot:
         """Stand still in the same place on another time line, where earlier times mean nothing.
@@ -254,7 +270,10 @@ class Robot:
         Raises:
             ValueError: The time is not an integer (ns).
         """
-        return replace(self, stamp=stamp, command=STANDSTILL, twist=STANDSTILL, commanded_at=None)
+        stamp = nanoseconds('stamp', stamp)
+        return _robot(
+            self.model, stamp, self.pose, self.covariance, self.wheel_angles, STANDSTILL, STANDSTILL
+        )
 
     def _moved(self, stamp: int) -> Robot:
         dt = (stamp - self.stamp) / NANOSECONDS
