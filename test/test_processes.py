@@ -150,7 +150,7 @@ def test_another_reader_of_goals_is_no_controller(world):
     sender = world.start('send_goal', '0', '0')
     # It waits, though its goal would be read.
     world.until_published('goal_pose')
-    sender.until_says('waiting: nobody reads /goal_pose and publishes /goal_status')
+    sender.until_says('waiting: no node is subscribed to /goal_pose and publishes /goal_status')
     drive = Drive(world, *FAST)
     assert (sender.exit(), sender.last_line[:7]) == (0, 'arrived')
     world.harness.until(lambda: len(recorded) == 1, 'the goal was sent once')
@@ -162,7 +162,9 @@ def test_another_reader_of_goals_is_no_controller(world):
 def test_send_goal_without_a_controller_says_so(world):
     sender = world.run('send_goal', '-1', '-1e-1', '--wait', '1', '--ros-args', '-r', '__ns:=/here')
     assert sender.exit() == 1
-    assert sender.last_line.startswith('not sent within 1 s: nobody reads /here/goal_pose and publishes')
+    assert sender.last_line.startswith(
+        'not sent within 1 s: no node is subscribed to /here/goal_pose and'
+    )
     assert sender.stderr == ''
 
 

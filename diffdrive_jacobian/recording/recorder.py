@@ -7,7 +7,7 @@ import re
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, Protocol
 
@@ -23,22 +23,8 @@ from diffdrive_jacobian.bags.qos import to_fields, to_hear_all
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.recording.missed import MissedMessages
 from diffdrive_jacobian.recording.parameter_query import ParameterQuery
+from diffdrive_jacobian.recording.selection import Selection as Selection
 
-RUN_TOPICS = (
-    'cmd_vel',
-    'cmd_vel_out',
-    'odom',
-    'start_pose',
-    'initialpose',
-    'goal_pose',
-    'goals',
-    'goal_status',
-    'joint_command',
-    'joint_states',
-    '/tf',
-    '/parameter_events',
-)
-"""What there is to know about a run."""
 DEPTH = 4000
 """How many messages of a topic may wait in the middleware."""
 BURST = 0.01
@@ -57,18 +43,6 @@ class Sink(Protocol):
 
     def set_missed(self, topic: str, messages: int) -> None:
         """Note how many messages of a topic are known never to have reached the recorder so far."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Selection:
-    """Which topics are recorded."""
-
-    topics: tuple[str, ...] = RUN_TOPICS
-    """Names, resolved by the recorder's namespace and remappings."""
-    everything: bool = False
-    """Every topic that is not hidden."""
-    pattern: str = ''
-    """Also topics in whose full name this regular expression is found."""
 
 
 class Recorder(Node):  # type: ignore[misc]

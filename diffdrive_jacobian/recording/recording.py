@@ -6,9 +6,8 @@ import json
 import time
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
-from datetime import datetime
-from itertools import count
 from pathlib import Path
 
 from diffdrive_jacobian import __version__
@@ -22,6 +21,7 @@ from diffdrive_jacobian.bags.journal import (
     journal_of,
     read_journal,
 )
+from diffdrive_jacobian.plots.output_files import names_by_time
 from diffdrive_jacobian.recording.journal_thread import CAPACITY, JournalThread
 
 LOST = 'messages lost'
@@ -94,18 +94,16 @@ class Recording:
 
     @classmethod
     def named_by_time(cls, prefix: str, storage: str, *, lossless: bool = False) -> Recording:
-        """Start one in the present directory, named `prefix_DATE-TIME`, or that and a number.
+        """Start a recording in the current directory, named `PREFIX_DATE-TIME`, or that and a number.
 
         Raises:
             OSError: It cannot be written there.
         """
-        name = f'{prefix}_{datetime.now():%Y_%m_%d-%H_%M_%S}'
-        for number in count(2):
-            try:
+        for name in names_by_time(prefix):
+            # Other processes may take the same name.
+            with suppress(FileExistsError):
                 return cls(Path(name), storage, lossless=lossless)
-            except FileExistsError:
-                name = f'{name.split("__")[0]}__{number}'
-        raise AssertionError('there is always another number')
+        raise AssertionError('there is always another name')
 
     @property
     def error(self) -> OSError | None:

@@ -23,10 +23,10 @@ from diffdrive_jacobian.replay.lateness import Lateness
 
 NANOSECONDS = 1_000_000_000
 DEPTH = 1000
-COMMANDED = ('cmd_vel',)
-"""What a robot was told."""
-TOLD = ('goal_pose', 'goals')
-"""What its controller was told."""
+COMMANDS = ('cmd_vel',)
+"""Topics of the commands to a robot."""
+GOALS = ('goal_pose', 'goals')
+"""Topics of the goals of its controller."""
 
 
 class NothingToPlayError(BagError):
@@ -37,7 +37,7 @@ class NothingToPlayError(BagError):
 class Playback:
     """What of a bag is played, and how."""
 
-    names: tuple[str, ...] | None = COMMANDED
+    names: tuple[str, ...] | None = COMMANDS
     """Base names of the topics; None: all."""
     topics: tuple[str, ...] = ()
     """Full names of the topics, in the place of `names`."""
