@@ -139,7 +139,7 @@ def test_a_full_disk_is_reported(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(journal.os, 'write', limited)
     assert drive_to.main(['1', '1', '--lockstep', '--no-plot', '-o', 'bag', *QUICK], Signals()) == 1
     said = capsys.readouterr()
-    assert 'drive_to: error: the recording broke off: No space left on device' in said.err
+    assert 'drive_to: error: the recording was aborted: No space left on device' in said.err
     assert said.out.splitlines()[-1] == 'recorded in part: bag'
     assert (tmp_path / 'bag.journal').exists()
 

@@ -143,6 +143,14 @@ def test_a_controller_that_was_killed_is_noticed_within_seconds(world):
     assert sender.stderr == ''
 
 
+def test_send_goal_reports_the_distance_of_the_point_that_is_driven(world):
+    """The point 0.5 m ahead of the axle is at the goal already."""
+    Drive(world, '--ros-args', '-p', 'controller:=offset_point', '-p', 'offset:=0.5')
+    sender = world.run('send_goal', '0.5', '0')
+    assert sender.exit() == 0
+    assert sender.last_line == 'arrived, 0.000 m from the goal'
+
+
 def test_another_reader_of_goals_is_no_controller(world):
     from geometry_msgs.msg import PoseStamped
 

@@ -267,6 +267,31 @@ def test_ros_arguments_of_a_node_without_the_flag_get_a_hint(capsys, arguments):
     assert 'ROS arguments come after --ros-args' in line
 
 
+@pytest.mark.parametrize(
+    ('tool', 'arguments', 'hint'),
+    [
+        ('send_goal', ('1', '1', '-p', 'x:=1'), 'ROS arguments come after --ros-args'),
+        ('send_goal', ('1', '1', '-r', '__ns:=/a'), 'ROS arguments come after --ros-args'),
+        ('replay_run', ('bag', '--log-level', 'debug'), 'ROS arguments come after --ros-args'),
+        ('replay_run', ('bag', '-p', 'x:=1'), 'ROS arguments come after --ros-args'),
+        ('record_run', ('--param', 'x:=1'), 'ROS arguments come after --ros-args'),
+        ('sweep_gains', ('-p', 'x:=1'), 'sweep_gains takes no ROS arguments'),
+        ('sweep_gains', ('--ros-args', '-p', 'x:=1'), 'sweep_gains takes no ROS arguments'),
+    ],
+)
+def test_ros_arguments_of_a_tool_without_the_flag_get_a_hint(capsys, tool, arguments, hint):
+    import importlib
+
+    from diffdrive_jacobian.signals import Signals
+
+    with pytest.raises(SystemExit) as end:
+        importlib.import_module(f'diffdrive_jacobian.tools.{tool}').main(arguments, Signals())
+    assert end.value.code == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith(f'{tool}: error: unrecognized arguments: ')
+    assert hint in line
+
+
 @pytest.mark.parametrize('name', ['run.png', 'run.svg/', 'a/run.PDF', 'run.csv', 'run.txt', 'run.yaml'])
 def test_a_bag_is_not_named_like_a_file(name):
     import argparse

@@ -157,9 +157,9 @@ def replay(
 
 def _warn(player: Replayer) -> None:
     """Log which topics have other publishers, and which have no subscription."""
-    for topic, others in player.rivals().items():
+    for topic, others in player.other_publishers().items():
         player.get_logger().warning(f'{", ".join(others)} also publishes on {topic}')
-    for topic in player.unheard:
+    for topic in player.unmatched:
         player.get_logger().warning(f'no node is subscribed to {topic} (-w 1 waits for one)')
 
 
