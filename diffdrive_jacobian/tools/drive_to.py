@@ -440,7 +440,10 @@ def _parser() -> argparse.ArgumentParser:
         '--heading', type=_cli.heading, help='heading at the last goal (rad) (default: any)'
     )
     parser.add_argument(
-        '--controller', choices=CONTROLLERS, help='law of the controller; go_to_goal, unless a file says'
+        '--controller',
+        choices=CONTROLLERS,
+        metavar='NAME',
+        help='controller: %(choices)s (default: go_to_goal, unless a file names another)',
     )
     _cli.add_params_file(parser)
     parser.add_argument(
