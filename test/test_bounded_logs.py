@@ -187,12 +187,10 @@ def test_goals_with_too_many_poses_are_refused_unread(controller, monkeypatch, c
     controller.at(0, 0)
     message = goals(*[goal(1, 0)] * (MAX_WAYPOINTS + 1), stamp=2)
     with monkeypatch.context() as patched:
-        patched.setattr(messages, 'deserialize_message', None)
+        patched.setattr(serialization, 'deserialize_message', None)
         controller.send(message)
-    assert (
-        f'goals must contain at most {MAX_WAYPOINTS} poses, got {MAX_WAYPOINTS + 1}'
-        in capfd.readouterr().err
-    )
+    words = f'goals must contain at most {MAX_WAYPOINTS} poses, got {MAX_WAYPOINTS + 1}'
+    assert words in capfd.readouterr().err
     assert controller.statuses[-2:] == [(2, ABORTED), (1, EXECUTING)]
     message.goals.pop()
     controller.send(message)

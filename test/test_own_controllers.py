@@ -7,13 +7,13 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import count
+from pathlib import Path
 
 import numpy as np
 import pytest
 from lockstep_nodes import ABORTED, SUCCEEDED, Controller, Topics, arrives, change, make
-from recorded import recorded
 from ros_messages import goal, twists
 
 from diffdrive_jacobian import control
@@ -32,6 +32,7 @@ from diffdrive_jacobian.simulation import closed_loops
 from diffdrive_jacobian.sweeps import Setup, sweep
 from diffdrive_jacobian.tools import sweep_gains
 
+PAGE = Path(__file__).parent.parent / 'doc' / 'controllers.md'
 SOURCE = '''
 import numpy as np
 from diffdrive_jacobian.control import Controller
@@ -345,23 +346,26 @@ def test_the_error_of_a_law_has_its_cause():
 # --- Bags
 
 
-def test_a_bag_with_an_unknown_controller_is_read_without_an_import(lockstep, tmp_path, site, install):
-    topics = Topics(lockstep)
-    controller = replace(BUILT_IN['offset_point'], name='unknown')
-    lockstep.add(make(VirtualRobot))
-    lockstep.add(GoToGoal(controller=controller))
-    with recorded(lockstep, tmp_path / 'bag') as recording:
-        lockstep.publish('goal_pose', goal(0.4, 0.0))
-        arrives(lockstep, topics)
-    assert recording.run.of_node('go_to_goal')['controller'] == 'unknown'
-    install('unknown', 'raise RuntimeError("must not be imported")')
-    read = trace(read_run(tmp_path / 'bag'))
-    # Its driven point is not known, so the distance is that of the axle centre.
-    assert read.distance[-1] == pytest.approx(0.1, abs=0.021)
-    ended = run(site, 'plot_run', tmp_path / 'bag')
-    assert ended.returncode == 0, ended.stderr
-    ended = run(site, 'replay_run', tmp_path / 'bag', '--verify')
-    assert ended.returncode == 0, ended.stderr
+def test_a_bag_is_read_without_the_import_of_its_controller(site, install, monkeypatch):
+    """First with a package whose import would raise, then without the package."""
+    module = install('driven')
+    arguments = ('0.4', '0.2', '--lockstep', '-o', 'bag', '--no-plot', '--controller', 'driven')
+    assert run(site, 'drive_to', *arguments).returncode == 0
+    (site / 'imported').unlink()
+    (site / f'{module}.py').write_text(
+        'from pathlib import Path\nPath(__file__).with_name("imported").touch()\nraise RuntimeError'
+    )
+    bag = site.parent / 'bag'
+    for path in (site, site / 'nowhere'):
+        monkeypatch.syspath_prepend(str(path))
+        read = trace(read_run(bag))
+        assert read.run.of_node('go_to_goal')['controller'] == 'driven'
+        # Its driven point is not known, so the distance is that of the axle centre.
+        expected = math.dist(read.run.odometry.values[-1, :2], (0.4, 0.2))
+        assert read.distance[-1] == pytest.approx(expected)
+        for program in (('plot_run', bag, '-o', f'{path.name}.png'), ('replay_run', bag, '--verify')):
+            ended = run(path, *program)
+            assert ended.returncode == 0, ended.stderr
     assert not (site / 'imported').exists()
 
 
@@ -451,6 +455,50 @@ def _in_body(poses, goals):
     difference = goals[:, 0] - poses[:, 0] + 1j * (goals[:, 1] - poses[:, 1])
     turned = difference * np.exp(-1j * poses[:, 2])
     return turned.real, turned.imag
+
+
+# --- The page on controllers
+
+
+def blocks(language):
+    """Return the code blocks of a language in the page, by the name of their file, else by number."""
+    found = re.findall(rf'```{language}\n(.*?)```', PAGE.read_text(), re.DOTALL)
+    names = [re.match(r'# (\w+)\.py\n', block) for block in found]
+    return {
+        name[1] if name else number: block
+        for number, (name, block) in enumerate(zip(names, found, strict=True))
+    }
+
+
+def test_the_example_is_given_in_python(pytester):
+    pytester.makeconftest("pytest_plugins = ['diffdrive_jacobian.testing.fixtures']")
+    pytester.makepyfile(**blocks('python'))
+    pytester.runpytest_subprocess('test_my_law.py').assert_outcomes(passed=1)
+    ended = pytester.runpython('sweep_my_law.py')
+    assert ended.ret == 0
+    ended.stdout.fnmatch_lines(['fastest: kp *', '[[]* *[]]'])
+    assert (pytester.path / 'my_law.png').read_bytes().startswith(b'\x89PNG')
+
+
+def test_the_example_is_installed(site):
+    (declared,) = blocks('toml').values()
+    group, entry = re.search(r'entry-points\."(.*?)"\]\n(.*)', declared).groups()
+    assert f"{group}': ['{entry.replace(chr(34), '')}']" in PAGE.read_text()
+    (site / 'my_law.py').write_text(blocks('python')['my_law'])
+    information = site / 'my_laws-1.0.dist-info'
+    information.mkdir()
+    (information / 'METADATA').write_text('Metadata-Version: 2.1\nName: my-laws\nVersion: 1.0\n')
+    (information / 'entry_points.txt').write_text(f'[{group}]\n{entry.replace(chr(34), "")}\n')
+    ended = run(site, 'drive_to', '0.2', '0', '--controller', 'my_law', '--lockstep', '--no-record')
+    assert ended.returncode == 0, ended.stderr
+    assert find_controller('my_law').summary == 'bounded speed'
+
+
+def test_every_field_is_described():
+    table = PAGE.read_text().split('## Fields')[1]
+    assert re.findall(r'^\| `(\w+)`', table, re.MULTILINE) == [
+        field.name for field in fields(control.Controller)
+    ]
 
 
 # --- The object

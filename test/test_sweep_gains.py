@@ -490,7 +490,7 @@ def test_it_says_which_gains_are_the_fastest():
         (('--kv', '1', '101'), 'got 1 101'),
         (('--kp', '3', '2'), 'got 3 2'),
         (('--kp', '2', '2'), 'got 2 2'),
-        (('--kp', '2', '2.0000000001'), 'that can be told apart'),
+        (('--kp', '2', '2.0000000001'), 'kp must have 59 different values, got'),
         (('--kp', 'nan', '2'), "--kp: must be a finite number, got 'nan'"),
         (('--kv', '1', 'inf'), "--kv: must be a finite number, got 'inf'"),
         (('--kp', '1'), '--kp: expected 2 arguments'),
