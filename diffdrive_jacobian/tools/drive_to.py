@@ -219,7 +219,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--controller',
         choices=CONTROLLERS,
-        help='control law (default: go_to_goal, unless a file sets it)',
+        metavar='NAME',
+        help='controller: %(choices)s (default: go_to_goal, unless a file names another)',
     )
     _cli.add_params_file(parser)
     parser.add_argument(

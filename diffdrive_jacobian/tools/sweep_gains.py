@@ -18,7 +18,7 @@ from diffdrive_jacobian.plots import sweep_figure
 from diffdrive_jacobian.plots.output_files import FORMATS, create, extension, free_stem, new_file
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.simulation import RobotModel
-from diffdrive_jacobian.sweeps.sweep import CONTROLLERS, Setup, Sweep, describe, sweep, table
+from diffdrive_jacobian.sweeps.sweep import Setup, Sweep, SweptControllers, describe, sweep, table
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._progress import Batch
 
@@ -209,9 +209,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         '--controller',
-        choices=sorted(CONTROLLERS),
+        choices=SweptControllers(),
+        metavar='NAME',
         default=usual.controller,
-        help='control law; pose also drives to the heading of the goal (default: %(default)s)',
+        help='controller with the gains kp and kv: %(choices)s (default: %(default)s)',
     )
     parser.add_argument(
         '--rate',
