@@ -228,7 +228,7 @@ def test_a_part_that_is_missing(tmp_path, capsys, messages):
     code, out, _ = recover(capsys, tmp_path / 'run')
     assert code == 0
     assert 'lost: run_1.mcap is missing' in out
-    assert 'lost: metadata.yaml tells of 70 messages, 50 were found' in out
+    assert 'lost: metadata.yaml counts 70 messages, 50 were found' in out
 
 
 def test_a_write_ahead_log(tmp_path, capsys, messages):
@@ -263,7 +263,7 @@ def test_a_journal(tmp_path, capsys, messages, storage, given):
     before = contents(tmp_path)
     code, out, err = recover(capsys, tmp_path / given)
     assert (code, err) == (0, '')
-    assert 'lost: run.journal breaks off: its last 3 bytes hold no record' in out
+    assert 'lost: run.journal is cut off: its last 3 bytes are not a record' in out
     assert read_bag(tmp_path / 'run') == messages
     assert (tmp_path / 'run' / ('run.mcap' if storage == 'mcap' else 'run.db3')).exists()
     assert contents(tmp_path) == before

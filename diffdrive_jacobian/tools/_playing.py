@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
-from diffdrive_jacobian.reading.reader import open_bag
+from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.replay.replayer import Playback, Replayer
 from diffdrive_jacobian.ros.heartbeats import fast_heartbeats
 from diffdrive_jacobian.ros.runner import Runner, ros_context, running

@@ -104,6 +104,11 @@ def replay_run() -> int:
     return _run_tool('replay_run')
 
 
+def verify_run() -> int:
+    """Run the tool verify_run."""
+    return _run_tool('verify_run')
+
+
 def recover_run() -> int:
     """Run the tool recover_run."""
     return _run_tool('recover_run')

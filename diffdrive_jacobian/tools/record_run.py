@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from pathlib import Path
 
 from diffdrive_jacobian.bags.bag_writer import STORAGES, Summary
 from diffdrive_jacobian.recording.recorder import RUN_TOPICS, Recorder, Selection
@@ -17,6 +16,7 @@ from diffdrive_jacobian.ros.runner import UserError, ros_context, running
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools._bags import describe
 from diffdrive_jacobian.tools._recording import begin_recording
 
 PROGRAM = 'record_run'
@@ -150,18 +150,6 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         return _cli.FAILED
     print(describe(bag, summary))
     return _cli.DONE
-
-
-def describe(bag: Path, summary: Summary, *, complete: bool = True) -> str:
-    """Return a line about what a bag holds."""
-    what = f'{printable(bag, PATH_LIMIT)} is {"complete" if complete else "incomplete"}'
-    if summary.start is None or summary.end is None:
-        return f'{what} and empty: no message came'
-    counts = sorted(summary.topics.items())
-    topics = ', '.join(f'{printable(topic)} {count}' for topic, count in counts if count)
-    seconds = (summary.end - summary.start) / 1e9
-    lost = f'; {sum(summary.lost.values())} lost' if summary.lost else ''
-    return f'{what}: {_cli.counted(summary.messages, "message")} in {seconds:.1f} s ({topics}){lost}'
 
 
 def _pattern(text: str) -> str:
