@@ -275,3 +275,28 @@ def test_an_empty_journal(tmp_path, capsys):
     assert (code, out) == (1, '')
     assert err == f'recover_run: {tmp_path}/run.journal holds no message that can be saved\n'
     assert os.listdir(tmp_path) == ['run.journal']
+
+
+def test_losses_that_the_recorder_noted_are_reported(tmp_path, capsys):
+    """They are in the custom data, and a bag with them is not one without losses."""
+    writer = JournalWriter(tmp_path / 'run.journal')
+    known = definition('geometry_msgs/msg/Twist')
+    writer.add(Text('messages lost', '{"/odom": 12}'))
+    writer.add(
+        Channel(
+            id=0,
+            topic='/cmd_vel',
+            type_name=known.name,
+            definition=known.text,
+            type_hash=known.type_hash,
+        )
+    )
+    writer.add(Message(0, START, b'\0\1\0\0' + bytes(48)))
+    writer.add(Text('messages lost', '{"/odom": 12, "/cmd_vel": 3}'))
+    writer.flush()
+    writer.close()
+    code, out, _ = recover(capsys, tmp_path / 'run.journal')
+    assert code == 0
+    assert 'lost: 3 messages on /cmd_vel while it was recorded\n' in out
+    assert 'lost: 12 messages on /odom while it was recorded\n' in out
+    assert 'no loss was found' not in out
