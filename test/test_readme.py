@@ -33,6 +33,7 @@ from diffdrive_jacobian.tools import (
     replay_run,
     send_goal,
     sweep_gains,
+    verify_run,
 )
 
 README = (Path(__file__).parent.parent / 'README.md').read_text()
@@ -137,7 +138,7 @@ def test_two_commands_of_one_line_each():
 
 @pytest.mark.parametrize(
     'tool',
-    [drive_to, send_goal, record_run, recover_run, replay_run, plot_run, sweep_gains],
+    [drive_to, send_goal, record_run, recover_run, replay_run, verify_run, plot_run, sweep_gains],
     ids=lambda one: one.PROGRAM,
 )
 def test_options_of_the_tools(tool):
