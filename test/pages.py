@@ -47,7 +47,7 @@ PARAMETERS: dict[str, type[NodeParameters]] = {
     'go_to_goal': GoToGoalParameters,
     'wheel_bridge': WheelBridgeParameters,
 }
-PATIENCE = 60.0
+PATIENCE = 240.0
 """How long a block may run, or a process beside it may take to print something (s)."""
 BLOCK = re.compile(
     r'(?P<notes>(?:^<!-- (?:test|output)[^\n]*-->\n+)*)^```(?P<language>\w*)\n(?P<code>.*?)^```$',
@@ -134,22 +134,34 @@ class Session:
         with ExitStack() as stack:
             for line in beside:
                 stack.enter_context(Background(line, self._directory, self._environment))
-            process = subprocess.run(
-                command,
-                cwd=self._directory,
-                env=self._environment,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-                timeout=PATIENCE,
-            )
+            output, code = self._completed(command, block)
         expected = int(block.notes.get('exit', 0))
-        assert process.returncode == expected, (
-            f'line {block.line}: exit code {process.returncode}, not {expected}:\n'
-            f'{block.code}\n{process.stdout}'
+        assert code == expected, (
+            f'line {block.line}: exit code {code}, not {expected}:\n{block.code}\n{output}'
         )
-        return process.stdout
+        return output
+
+    def _completed(self, command: list[str], block: Block) -> tuple[str, int]:
+        """Run a command to its end; return what it printed and its exit code."""
+        process = subprocess.Popen(
+            command,
+            cwd=self._directory,
+            env=self._environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+        try:
+            output, _ = process.communicate(timeout=PATIENCE)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            output, _ = process.communicate()
+            raise AssertionError(
+                f'line {block.line}: not within {PATIENCE} s:\n{block.code}\n{output}'
+            ) from None
+        return output, process.returncode
 
     def _edit(self, name: str, words: str, replacement: str) -> None:
         path = self._directory / name
