@@ -1,7 +1,7 @@
 """The pages of the documentation: their code blocks, how these are run, and what is generated in them.
 
-    python test/pages.py parameters    write the parameter tables of doc/nodes.md
-    python test/pages.py outputs       run the pages and write the outputs that they quote
+    python test/pages.py parameters            write the parameter tables of doc/nodes.md
+    python test/pages.py outputs [PAGE ...]    run pages and write the outputs that they quote
 
 A page is run from top to bottom in one empty directory. A `python` block is a program and a `bash` block a
 script. A block of any language whose first line is `# NAME.EXTENSION` is a file. HTML comments before a
@@ -300,9 +300,10 @@ def with_parameter_tables(text: str) -> str:
     return text
 
 
-def main(what: str) -> None:
+def main(what: str, names: list[str]) -> None:
     """Write what is generated into the pages."""
-    for name, path in PAGES.items():
+    for name in names or PAGES:
+        path = PAGES[name]
         text = path.read_text()
         new = text
         if what == 'parameters':
@@ -318,6 +319,6 @@ def main(what: str) -> None:
 
 
 if __name__ == '__main__':
-    if sys.argv[1:] not in (['parameters'], ['outputs']):
+    if sys.argv[1:2] not in (['parameters'], ['outputs']) or not {*sys.argv[2:]} <= {*PAGES}:
         sys.exit(__doc__)
-    main(sys.argv[1])
+    main(sys.argv[1], sys.argv[2:])

@@ -209,3 +209,13 @@ def test_links_lead_somewhere(name):
 def test_every_page_is_reached_from_the_index():
     linked = set(LINK.findall(TEXTS['doc/index.md']))
     assert {name.removeprefix('doc/') for name in PAGES if name.startswith('doc/')} - {'index.md'} <= linked
+
+
+def test_design_lists_every_package_and_files_that_exist():
+    text = TEXTS['doc/design.md']
+    package = ROOT / 'diffdrive_jacobian'
+    rows = section('doc/design.md', 'Packages').split('| package', 1)[1].split('\n\n', 1)[0]
+    listed = re.findall(r'^\| `(\w+)` \|', rows, re.MULTILINE)
+    assert set(listed) == {path.parent.name for path in package.glob('*/__init__.py')}
+    for file in re.findall(r'`([\w/]+\.(?:py|rst))`', text):
+        assert (package / file).exists() or (ROOT / file).exists(), file

@@ -1,0 +1,45 @@
+"""Write the API reference from the docstrings: `python doc/api.py [DIRECTORY]` (default: build/api).
+
+Needs pdoc: `pip install '.[jazzy,plot,test,doc]'`. Every warning is an error.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+import sys
+import typing
+import warnings
+from pathlib import Path
+
+import pdoc
+
+PACKAGE = 'diffdrive_jacobian'
+
+
+def resolve_named_tuples() -> None:
+    """Replace the annotations of named tuples, which are strings, by the types.
+
+    pdoc evaluates them in the namespace of `collections`, where their names are unknown.
+    """
+    package = importlib.import_module(PACKAGE)
+    for info in pkgutil.walk_packages(package.__path__, f'{PACKAGE}.'):
+        module = importlib.import_module(info.name)
+        for _, member in inspect.getmembers(module, inspect.isclass):
+            if hasattr(member, '_fields') and member.__module__ == info.name:
+                hints = typing.get_type_hints(member)
+                member.__new__.__annotations__ = {name: hints[name] for name in member._fields}
+
+
+def main(directory: Path) -> None:
+    """Write the pages."""
+    resolve_named_tuples()
+    warnings.simplefilter('error')
+    pdoc.render.configure(docformat='google', show_source=True)
+    pdoc.pdoc(PACKAGE, output_directory=directory)
+    print(directory / 'index.html')
+
+
+if __name__ == '__main__':
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else 'build/api'))
