@@ -3,9 +3,9 @@
     python test/pages.py parameters            write the parameter tables of doc/nodes.md
     python test/pages.py outputs [PAGE ...]    run pages and write the outputs that they quote
 
-A page is run from top to bottom in one empty directory. A `python` block is a program and a `bash` block a
-script. A block of any language whose first line is `# NAME.EXTENSION` is a file. HTML comments before a
-block say what differs:
+A page is run from top to bottom in one empty directory. A `python` block is a program and a `bash` block
+a script. A block of any language whose first line is `# NAME.EXTENSION` is a file. HTML comments before
+a block say what differs:
 
     <!-- test: skip, REASON -->          is not run; only the options of our tools in it are checked
     <!-- test: instead COMMAND -->       this command is run instead
@@ -41,7 +41,9 @@ from diffdrive_jacobian.parameters.nodes import (
 )
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = {str(path.relative_to(ROOT)): path for path in (ROOT / 'README.md', *sorted(ROOT.glob('doc/*.md')))}
+PAGES = {
+    str(path.relative_to(ROOT)): path for path in (ROOT / 'README.md', *sorted(ROOT.glob('doc/*.md')))
+}
 PARAMETERS: dict[str, type[NodeParameters]] = {
     'virtual_robot': VirtualRobotParameters,
     'go_to_goal': GoToGoalParameters,
@@ -237,7 +239,9 @@ def check_output(quoted: Block, printed: str) -> None:
     if quoted.notes['output'] == 'part':
         rest = iter(real)
         for line in lines:
-            assert line in rest, f'line {quoted.line}: not printed, or not in this order: {line}\n{printed}'
+            assert line in rest, (
+                f'line {quoted.line}: not printed, or not in this order: {line}\n{printed}'
+            )
         return
     if ELLIPSIS in lines:
         cut = lines.index(ELLIPSIS)
@@ -279,7 +283,9 @@ def parameter_table(parameters: type[NodeParameters]) -> str:
     rows = ['| parameter | default | allowed | |', '|---|---|---|---|']
     for name, (field, specification) in specifications(parameters).items():
         allowed = specification.allowed.removeprefix('in ').replace("'", '`')
-        rows.append(f'| `{name}` | {_written(values[field])} | {allowed} | {specification.description} |')
+        rows.append(
+            f'| `{name}` | {_written(values[field])} | {allowed} | {specification.description} |'
+        )
     return '\n'.join(rows)
 
 

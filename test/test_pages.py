@@ -95,7 +95,12 @@ def test_workflow_is_valid_yaml():
 
 def examples():
     """Return the table from the documents to the code: what each example says and must give."""
-    for row in TEXTS['doc/library.md'].split('| document | function |', 1)[1].split('\n\n', 1)[0].splitlines()[2:]:
+    for row in (
+        TEXTS['doc/library.md']
+        .split('| document | function |', 1)[1]
+        .split('\n\n', 1)[0]
+        .splitlines()[2:]
+    ):
         what, functions, _, example = (cell.strip() for cell in row.strip('|').split('|'))
         yield pytest.param(functions, *re.findall(r'`([^`]+)`', example), id=what)
 
@@ -178,7 +183,12 @@ def test_options_of_the_tools(tool):
 def test_options_in_blocks_that_are_not_run(name):
     for block in blocks(TEXTS[name]):
         for line in block.code.splitlines() if 'skip' in block.notes else ():
-            words = line.split('#')[0].replace('ros2 run diffdrive_jacobian', '').split('--ros-args')[0].split()
+            words = (
+                line.split('#')[0]
+                .replace('ros2 run diffdrive_jacobian', '')
+                .split('--ros-args')[0]
+                .split()
+            )
             if words and words[0] in TOOLS:
                 used = {word.split('=')[0] for word in words[1:] if re.match(r'--?[a-z]', word)}
                 assert used <= options_of(words[0]), line
@@ -208,7 +218,9 @@ def test_links_lead_somewhere(name):
 
 def test_every_page_is_reached_from_the_index():
     linked = set(LINK.findall(TEXTS['doc/index.md']))
-    assert {name.removeprefix('doc/') for name in PAGES if name.startswith('doc/')} - {'index.md'} <= linked
+    assert {name.removeprefix('doc/') for name in PAGES if name.startswith('doc/')} - {
+        'index.md'
+    } <= linked
 
 
 def test_design_lists_every_package_and_files_that_exist():
