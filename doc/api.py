@@ -12,10 +12,28 @@ import sys
 import typing
 import warnings
 from pathlib import Path
+from typing import Generic, TypeVar
 
+import numpy.typing
 import pdoc
 
 PACKAGE = 'diffdrive_jacobian'
+Scalar = TypeVar('Scalar', covariant=True)
+
+
+class ArrayLike:
+    """Stands for numpy.typing.ArrayLike, which is a union that fills a page."""
+
+
+class NDArray(Generic[Scalar]):
+    """Stands for numpy.typing.NDArray, which is written out as its parts otherwise."""
+
+
+def abbreviate_numpy_types() -> None:
+    """Have the types of NumPy written by their names. Call it before the package is imported."""
+    for replacement in (ArrayLike, NDArray):
+        replacement.__module__ = 'numpy.typing'
+        setattr(numpy.typing, replacement.__name__, replacement)
 
 
 def resolve_named_tuples() -> None:
@@ -34,6 +52,7 @@ def resolve_named_tuples() -> None:
 
 def main(directory: Path) -> None:
     """Write the pages."""
+    abbreviate_numpy_types()
     resolve_named_tuples()
     warnings.simplefilter('error')
     pdoc.render.configure(docformat='google', show_source=True)
