@@ -147,7 +147,7 @@ def test_starts_gains_robots_limits_and_offsets_broadcast():
             separation=separation[n],
         )
         assert_same(type(found)(*(field[i, j, m, n] for field in found)), one)
-    assert len(np.unique(found.effort)) > 20
+    assert len(np.unique(found.control_cost)) > 20
 
 
 @pytest.mark.parametrize('block', [1, 3])
@@ -218,7 +218,7 @@ def test_who_never_arrives_has_no_time_and_is_where_the_time_ran_out():
     np.testing.assert_allclose(found.pose[:, 0], [0.48, 1.0, 1.0])
     assert not found.pose[:, 1:].any()
     np.testing.assert_allclose(found.path_length, [0.48, 1.0, 1.0])
-    np.testing.assert_allclose(found.effort, 2.0 * (0.1 / R) ** 2 * np.array([4.8, 10.0, 10.0]))
+    np.testing.assert_allclose(found.control_cost, 2.0 * (0.1 / R) ** 2 * np.array([4.8, 10.0, 10.0]))
 
 
 @pytest.mark.parametrize(('duration', 'arrives'), [(0.96, False), (0.98, True), (1.0, True)])

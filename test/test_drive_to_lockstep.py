@@ -21,7 +21,7 @@ from diffdrive_jacobian.reading import read_run
 from diffdrive_jacobian.reading.trace import trace
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.testing import Lockstep
-from diffdrive_jacobian.tools import drive_to
+from diffdrive_jacobian.tools import _progress, drive_to
 
 QUICK = ('--ros-args', '-p', 'kp:=12.0', '-p', 'kv:=3.0')
 CRAWL = (
@@ -139,7 +139,7 @@ def test_a_full_disk_is_reported(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(journal.os, 'write', limited)
     assert drive_to.main(['1', '1', '--lockstep', '--no-plot', '-o', 'bag', *QUICK], Signals()) == 1
     said = capsys.readouterr()
-    assert 'drive_to: error: the recording broke off: No space left on device' in said.err
+    assert 'drive_to: error: the recording was aborted: No space left on device' in said.err
     assert said.out.splitlines()[-1] == 'recorded in part: bag'
     assert (tmp_path / 'bag.journal').exists()
 
@@ -164,7 +164,7 @@ def test_a_stuck_callback_fails_and_the_recording_is_kept(tmp_path, capsys, monk
 
 
 def test_a_bug_keeps_the_recording(tmp_path, monkeypatch):
-    monkeypatch.setattr(drive_to.Drive, 'show', lambda *_: 1 / 0)
+    monkeypatch.setattr(_progress.Drive, 'show', lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         drive_to.main(['1', '1', '--lockstep', '--no-plot', '-o', 'bag'], Signals())
     assert (tmp_path / 'bag').is_dir()
@@ -173,7 +173,7 @@ def test_a_bug_keeps_the_recording(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ('arguments', 'words'),
     [
-        (['--open'], '--lockstep cannot be open'),
+        (['--open'], '--lockstep and --open exclude each other'),
         (['--controller', 'pid'], "'go_to_goal', 'offset_point', 'pose'"),
         (['--heading', 'nan'], 'argument --heading: must be a finite number'),
         (['--ros-args', '-p', 'wheel_radius:=-1.0'], "parameter 'wheel_radius' must be in [0.001, 10]"),

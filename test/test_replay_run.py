@@ -97,7 +97,7 @@ def test_everything_remapped_with_a_clock_in_loops_until_interrupted(world, bag)
     times = np.array([one.clock.sec + 1e-9 * one.clock.nanosec for one in clock])
     begin = run.odometry.received[0] / 1e9
     assert begin - 0.1 <= times.min() < times.max() <= begin + LENGTH + 0.5
-    assert 'nobody listens on /odom' in child.stderr
+    assert 'no node is subscribed to /odom' in child.stderr
 
 
 def test_offset_leaves_the_beginning_out(world, bag):
@@ -133,7 +133,8 @@ def test_readers_that_do_not_acknowledge_are_reported(world, bag, capsys, monkey
     monkeypatch.setattr(Replayer, 'unacknowledged', lambda player: ['/cmd_vel'])
     assert play(bag[0], '-r', '50', '--wait-for-all-acked', '1') == 1
     assert capsys.readouterr().err.splitlines()[-1] == (
-        'replay_run: error: the readers of /cmd_vel have not acknowledged all messages within 0.001 s'
+        'replay_run: error: not all subscriptions to /cmd_vel have acknowledged all messages '
+        'within 0.001 s'
     )
 
 
@@ -153,7 +154,7 @@ def test_it_waits_for_as_many_readers_as_asked_for(world, bag):
     path, run = bag
     child = world.start('replay_run', str(path), '-w', '2', '-r', '4')
     received = [world.harness.listen(Twist, 'cmd_vel')]
-    child.until_says('waiting: /cmd_vel has 1 of 2 readers')
+    child.until_says('waiting: /cmd_vel has 1 of 2 subscriptions')
     received.append(world.harness.listen(Twist, 'cmd_vel'))
     world.harness.until(lambda: not child.running, 'it is played')
     assert child.exit() == 0
@@ -165,17 +166,19 @@ def test_it_waits_for_as_many_readers_as_asked_for(world, bag):
 def test_nothing_is_played_to_fewer_readers_than_asked_for(world, bag, capsys):
     assert play(bag[0], '-w', '2', '--timeout', '0.2') == 1
     out = capsys.readouterr().out
-    assert out == 'nothing was played: /cmd_vel has 0 of 2 readers after --timeout 0.2 s\n'
+    assert out == 'nothing was played: /cmd_vel has 0 of 2 subscriptions after --timeout 0.2 s\n'
     signals = Signals()
     signals.count = 1
     assert play(bag[0], '-w', '1', signals=signals) == 130
-    assert capsys.readouterr().out == 'interrupted: nothing was played, /cmd_vel has 0 of 1 readers\n'
+    assert (
+        capsys.readouterr().out == 'interrupted: nothing was played, /cmd_vel has 0 of 1 subscriptions\n'
+    )
 
 
 def test_a_missing_reader_is_reported_with_the_remedy(world, bag, capfd, monkeypatch):
     monkeypatch.setattr(replay_run, 'MATCH_PATIENCE', 0.1)
     assert play(bag[0], '-r', '50') == 0
-    assert 'nobody listens on /cmd_vel (-w 1 waits until somebody does)' in capfd.readouterr().err
+    assert 'no node is subscribed to /cmd_vel (-w 1 waits for one)' in capfd.readouterr().err
 
 
 def test_rival_is_named(world, bag):
@@ -307,7 +310,7 @@ def test_bag_of_others_is_verified_with_parameters_from_a_file(capsys, request, 
         (['BAG', '--topics', '/nothing'], 'has no topic /nothing; it has /cmd_vel'),
         (['BAG', '-m', 'nonsense'], 'must be OLD:=NEW'),
         (['BAG', '-w', '0'], 'must be a whole number of at least 1'),
-        (['BAG', '--timeout', '1'], '--timeout is the time to wait for the readers of -w'),
+        (['BAG', '--timeout', '1'], '--timeout needs -w'),
         (
             ['BAG', '--verify', '--params-file', 'file.txt'],
             'file of ROS parameters, got file.txt',

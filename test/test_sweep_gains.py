@@ -17,15 +17,15 @@ import numpy as np
 import pytest
 from processes import open_world
 
-from diffdrive_jacobian.control import Arrival, VelocityLimits, go_to_goal, go_to_pose
+from diffdrive_jacobian.control import Arrival, VelocityLimits, find_controller, go_to_goal, go_to_pose
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
+from diffdrive_jacobian.plots import output_files
 from diffdrive_jacobian.plots import sweep_figure as _sweep_figure
-from diffdrive_jacobian.plots.sweep_figure import BORDERS, TITLES, figure
+from diffdrive_jacobian.plots.sweep_figure import TITLES, figure
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.simulation import RobotModel, closed_loops
-from diffdrive_jacobian.simulation import _block as block
 from diffdrive_jacobian.sweeps import Setup, describe, sweep, table
-from diffdrive_jacobian.sweeps.sweep import COLUMNS, CONTROLLERS, MEASURES
+from diffdrive_jacobian.sweeps.sweep import COLUMNS, MEASURES, SweptControllers
 from diffdrive_jacobian.tools import sweep_gains
 from diffdrive_jacobian.tools.sweep_gains import main
 
@@ -106,7 +106,7 @@ def test_a_cell_is_what_single_loops_give(controller):
 
 
 def final_heading_error(kp, kv):
-    """Give e > 0 where sin(2e)/(2e) = kp/kv, or 0: MATH.md, "Control laws"."""
+    """Give e > 0 where sin(2e)/(2e) = kp/kv, or 0: doc/mathematics.md, "Control laws"."""
     low, high = 0.0, math.pi / 2.0
     if kp >= kv:
         return 0.0
@@ -116,14 +116,20 @@ def final_heading_error(kp, kv):
     return low
 
 
-@pytest.mark.parametrize('controller', CONTROLLERS)
-def test_the_fast_form_of_the_law_is_used_though_the_sweep_can_be_interrupted(monkeypatch, controller):
-    laws = []
-    known = block.steered
-    monkeypatch.setattr(block, 'steered', lambda law: laws.append((law, known(law))) or known(law))
-    sweep(replace(SMALL, grid=2, controller=controller), lambda done: None)
-    assert laws
-    assert all(law is CONTROLLERS[controller] and fast is not None for law, fast in laws)
+@pytest.mark.parametrize('name', SweptControllers())
+def test_the_fast_form_of_the_law_is_used(name):
+    """The law itself is called only to check that it accepts arrays and the gains."""
+    calls = []
+    controller = find_controller(name)
+
+    def counted(function, kind):
+        return lambda *arguments: calls.append(kind) or function(*arguments)
+
+    law, steer = counted(controller.law, 'law'), counted(controller.steer, 'steer')
+    other = replace(controller, name='counted', law=law, steer=steer)
+    sweep(replace(SMALL, grid=2, controller=other), lambda done: None)
+    assert calls.count('law') == 2
+    assert calls.count('steer') > 100
 
 
 def test_beyond_the_border_it_spirals_in_as_the_theory_says():
@@ -246,15 +252,15 @@ def test_names_that_are_taken_meanwhile_are_not_overwritten(folder, monkeypatch,
         return inner(*arguments)
 
     def taken_names():
-        now = f'{sweep_gains.datetime.now():%Y_%m_%d-%H_%M_%S}'
+        now = f'{output_files.datetime.now():%Y_%m_%d-%H_%M_%S}'
         return [f'sweep_{now}.png', f'sweep_{now}__2.csv']
 
-    class Still(sweep_gains.datetime):
+    class Still(output_files.datetime):
         @classmethod
         def now(cls):
             return cls(2026, 1, 2, 3, 4, 5)
 
-    monkeypatch.setattr(sweep_gains, 'datetime', Still)
+    monkeypatch.setattr(output_files, 'datetime', Still)
     monkeypatch.setattr(sweep_gains, 'sweep', slow)
     assert run(*QUICK) == 0
     assert {Path(name).read_text() for name in taken} == {'precious'}
@@ -402,10 +408,11 @@ def test_maps_show_the_means_with_units():
     assert 'not all starts arrived within 60 s' in legend(made)
 
 
-@pytest.mark.parametrize('controller', BORDERS)
-def test_the_border_is_drawn_in_every_map(controller):
+@pytest.mark.parametrize('controller', SweptControllers())
+def test_the_boundary_is_drawn_in_every_map(controller):
     made = figure(small()._replace(setup=replace(SMALL, controller=controller)))
-    factor, name, what = BORDERS[controller]
+    boundary = find_controller(controller).boundary
+    factor, name, what = boundary.ratio, boundary.equation, boundary.beyond
     assert name == {1.0: 'kp = kv', 2.0: 'kp = 2 kv'}[factor]
     assert f'{name}: {what}' in legend(made)
     for panel in maps(made).values():
@@ -484,7 +491,7 @@ def test_it_says_which_gains_are_the_fastest():
         (('--kv', '1', '101'), 'got 1 101'),
         (('--kp', '3', '2'), 'got 3 2'),
         (('--kp', '2', '2'), 'got 2 2'),
-        (('--kp', '2', '2.0000000001'), 'that can be told apart'),
+        (('--kp', '2', '2.0000000001'), 'kp must have 59 different values, got'),
         (('--kp', 'nan', '2'), "--kp: must be a finite number, got 'nan'"),
         (('--kv', '1', 'inf'), "--kv: must be a finite number, got 'inf'"),
         (('--kp', '1'), '--kp: expected 2 arguments'),
@@ -492,11 +499,11 @@ def test_it_says_which_gains_are_the_fastest():
         (('--grid', '2.5'), "--grid: must be a whole number below a billion, got '2.5'"),
         (('--grid', '٣'), "--grid: must be a whole number below a billion, got '٣'"),
         (('--grid', '-'), "--grid: must be a whole number below a billion, got '-'"),
-        (('--grid', '1000'), 'grid 1000 with 12 starts makes 12000000 closed loops; at most 1000000'),
+        (('--grid', '1000'), 'grid 1000 with 12 starts gives 12000000 closed loops; at most 1000000'),
         (('--grid', '9' * 99), '--grid: must be a whole number'),
         (('--starts', '0'), 'starts must be at least 1, got 0'),
         (('--starts', '-3'), 'starts must be at least 1, got -3'),
-        (('--duration', '1e9'), 'which may take an hour: choose a smaller grid'),
+        (('--duration', '1e9'), 'which may take an hour; choose a smaller grid'),
         (('--duration', '1e300', '--rate', '1e300'), 'which may take an hour'),
         (('--duration', '0'), "--duration: must be positive, got '0'"),
         (('--rate', '-50'), "--rate: must be positive, got '-50'"),
@@ -510,7 +517,7 @@ def test_it_says_which_gains_are_the_fastest():
         (('--params-file', 'nowhere.yaml'), "no such file: 'nowhere.yaml'"),
         (('-o', 'a.jpg'), "the picture must end in .png, .svg, .pdf, got 'a.jpg'"),
         (('-o', ''), "the picture must end in .png, .svg, .pdf, got ''"),
-        (('--csv', 'a.png'), "the numbers must end in .csv, got 'a.png'"),
+        (('--csv', 'a.png'), "the table must end in .csv, got 'a.png'"),
         (('everything',), 'unrecognized arguments: everything'),
         (('--ros-args', '-p', 'kp:=1'), 'unrecognized arguments: --ros-args -p kp:=1'),
     ],

@@ -219,10 +219,10 @@ def test_drive_to_arrives_with_nothing_but_defaults(drives):
         (('1', '1', '--bogus'), '--bogus'),
         (
             ('1', '1', '--heading', '90'),
-            "must be in radians, at most 2 pi either way, got '90' (90 degrees",
+            "must be in radians, from -2 pi to 2 pi, got '90' (90 degrees",
         ),
         (('1', '1', '--heading', '-180'), '(-180 degrees are -3.14159 rad)'),
-        (('1', '1', '-o', 'x.png'), "must name a bag, which is a folder, got 'x.png'"),
+        (('1', '1', '-o', 'x.png'), "must name a bag, which is a directory, got 'x.png'"),
         (('1', '1', '-o', 'runs/x.CSV'), "did you mean 'runs/x'?"),
         (('1', '1', '-p', 'kp:=1'), 'ROS arguments come after --ros-args'),
         (('1', '1', 'kp:=1'), 'ROS arguments come after --ros-args'),
@@ -267,11 +267,36 @@ def test_ros_arguments_of_a_node_without_the_flag_get_a_hint(capsys, arguments):
     assert 'ROS arguments come after --ros-args' in line
 
 
+@pytest.mark.parametrize(
+    ('tool', 'arguments', 'hint'),
+    [
+        ('send_goal', ('1', '1', '-p', 'x:=1'), 'ROS arguments come after --ros-args'),
+        ('send_goal', ('1', '1', '-r', '__ns:=/a'), 'ROS arguments come after --ros-args'),
+        ('replay_run', ('bag', '--log-level', 'debug'), 'ROS arguments come after --ros-args'),
+        ('replay_run', ('bag', '-p', 'x:=1'), 'ROS arguments come after --ros-args'),
+        ('record_run', ('--param', 'x:=1'), 'ROS arguments come after --ros-args'),
+        ('sweep_gains', ('-p', 'x:=1'), 'sweep_gains takes no ROS arguments'),
+        ('sweep_gains', ('--ros-args', '-p', 'x:=1'), 'sweep_gains takes no ROS arguments'),
+    ],
+)
+def test_ros_arguments_of_a_tool_without_the_flag_get_a_hint(capsys, tool, arguments, hint):
+    import importlib
+
+    from diffdrive_jacobian.signals import Signals
+
+    with pytest.raises(SystemExit) as end:
+        importlib.import_module(f'diffdrive_jacobian.tools.{tool}').main(arguments, Signals())
+    assert end.value.code == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith(f'{tool}: error: unrecognized arguments: ')
+    assert hint in line
+
+
 @pytest.mark.parametrize('name', ['run.png', 'run.svg/', 'a/run.PDF', 'run.csv', 'run.txt', 'run.yaml'])
 def test_a_bag_is_not_named_like_a_file(name):
     import argparse
 
-    with pytest.raises(argparse.ArgumentTypeError, match='must name a bag, which is a folder'):
+    with pytest.raises(argparse.ArgumentTypeError, match='must name a bag, which is a directory'):
         _cli.bag_folder(name)
     for usual in ('run', 'run.2', 'runs.png/run', 'run_2026_01_01-10_00_00', '.png'):
         assert _cli.bag_folder(usual) == usual

@@ -86,6 +86,6 @@ def test_a_file_that_concerns_no_node_is_reported_with_the_names(tmp_path, capsy
     assert capsys.readouterr().err == ''
     warn_of_unused_files('drive_to', ros, ['/virtual_robot', '/go_to_goal'])
     assert capsys.readouterr().err == (
-        f'drive_to: warning: --params-file {file} concerns none of the nodes: the file names '
-        '/robot1/virtual_robot; the nodes are /virtual_robot, /go_to_goal\n'
+        f'drive_to: warning: --params-file {file} has no parameters of these nodes: '
+        'it is for /robot1/virtual_robot, the nodes are /virtual_robot, /go_to_goal\n'
     )

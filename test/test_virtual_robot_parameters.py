@@ -7,7 +7,9 @@ import math
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from lockstep_nodes import SECOND, Topics, change, comes_after
+from nav_msgs.msg import Odometry
 from rclpy.parameter import Parameter
 from ros_messages import covariance_of, instants, pose_message, pose_of, twist, twists
 from std_srvs.srv import Trigger
@@ -215,3 +217,20 @@ def test_integers_are_taken_for_doubles_and_strangers_are_left_alone(driving):
     assert driving.robot.get_parameter('wheel_separation').value == 1.0
     driving.robot.declare_parameter('foreign', 3)
     assert driving.robot.set_parameters([Parameter('foreign', value=4)])[0].successful
+
+
+def test_a_rounded_covariance_does_not_grow_into_a_negative_variance(lockstep, robot_at):
+    """Variances that are slightly negative would grow with the distance, and end the node later."""
+    robot = robot_at(cmd_vel_timeout=0.0, wheel_travel_variance=0.0)
+    odometry = lockstep.listen(Odometry, 'odom')
+    message = PoseWithCovarianceStamped()
+    message.pose.pose.orientation.w = 1.0
+    message.pose.covariance[0] = message.pose.covariance[7] = 1.0
+    message.pose.covariance[35] = -9e-10
+    lockstep.publish('initialpose', message)
+    lockstep.publish('cmd_vel', twist(10.0, 0.0))
+    lockstep.jump(6e4)
+    lockstep.run_for(0.1)
+    assert robot.set_parameters([Parameter('wheel_radius', value=0.04)])[0].successful
+    lockstep.run_for(0.1)
+    assert min(np.diag(np.reshape(odometry[-1].pose.covariance, (6, 6)))) >= 0.0

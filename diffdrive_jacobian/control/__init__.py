@@ -1,6 +1,13 @@
-"""Control laws that turn a goal into velocities: pure functions and values, no ROS."""
+"""Control laws that compute velocities from a goal, and controllers by name. No ROS."""
 
 from diffdrive_jacobian.control.arrival import Arrival
+from diffdrive_jacobian.control.controller import Boundary, Controller, LawError, ReferenceGains
+from diffdrive_jacobian.control.controllers import (
+    ControllerError,
+    Controllers,
+    controller_names,
+    find_controller,
+)
 from diffdrive_jacobian.control.go_to_goal import go_to_goal, turn_in_place
 from diffdrive_jacobian.control.offset_point import offset_point
 from diffdrive_jacobian.control.pose import go_to_pose
@@ -10,9 +17,17 @@ from diffdrive_jacobian.control.waypoints import Waypoints
 
 __all__ = [
     'Arrival',
+    'Boundary',
+    'Controller',
+    'ControllerError',
+    'Controllers',
+    'LawError',
+    'ReferenceGains',
     'StraightLine',
     'VelocityLimits',
     'Waypoints',
+    'controller_names',
+    'find_controller',
     'go_to_goal',
     'go_to_pose',
     'offset_point',

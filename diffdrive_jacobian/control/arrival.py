@@ -1,7 +1,7 @@
-"""What counts as having arrived.
+"""Arrival criterion.
 
-Source: document A's law needs a tolerance, for at distance zero the heading to the goal is undefined;
-document B's is judged at the point that it drives (MATH.md, "Control laws", "Differential drive").
+Document A's law needs a tolerance, because the heading to the goal is undefined at distance zero. For
+document B's law the distance is measured from the offset point (doc/mathematics.md, "Control laws").
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from diffdrive_jacobian.kinematics._elementary import (
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Arrival:
-    """What counts as having arrived. A value: it can be compared and hashed, and does not change.
+    """Arrival criterion. Immutable, comparable and hashable.
 
     Raises:
         ValueError: A tolerance is negative or not finite, the offset is not finite, or `use_heading` is
@@ -38,13 +38,13 @@ class Arrival:
     """
 
     xy_tolerance: float = 0.02
-    """Largest distance to a goal that counts as there (m)."""
+    """Largest distance to a goal that counts as arrived (m)."""
     yaw_tolerance: float = 0.02
-    """Largest heading error at the goal, if its heading counts (rad)."""
+    """Largest heading error at the goal, if the heading counts (rad)."""
     use_heading: bool = False
     """Whether the heading of the last goal counts."""
     offset: Any = 0.0
-    """How far ahead of the axle centre the point is that is to arrive (m); or an array of it."""
+    """X coordinate in the body frame of the point that is to arrive (m), a number or an array."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -68,7 +68,7 @@ class Arrival:
         return self.xy_tolerance, self.yaw_tolerance, self.use_heading
 
     def distance(self, x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any) -> Any:
-        """Compute the distance to a goal of the point that is to arrive.
+        """Compute the distance of the driven point from a goal.
 
         Args:
             x: Position of the axle centre, shape (...) (m).

@@ -1,17 +1,20 @@
-"""Document A's law that drives a unicycle to a position, and the turn in place that may follow it.
+"""Document A's law that drives a unicycle to a position, and a turn in place.
 
 State: pose `[x, y, theta]` (m, m, rad). Output: body twist `v, omega` (m/s, rad/s). Everything
 broadcasts over leading axes, the gains too.
 
-Source: document A, equations (9)-(11); MATH.md, "Control laws".
+Source: document A, equations (9)-(11); doc/mathematics.md, "Control laws".
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 from numpy.typing import ArrayLike
 
+from diffdrive_jacobian.control.controller import Boundary, Controller, GainValues, ReferenceGains
+from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.kinematics._elementary import (
     agree,
     arctan2,
@@ -25,11 +28,11 @@ from diffdrive_jacobian.kinematics._elementary import (
 
 
 def go_to_goal(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any) -> tuple[Any, Any]:
-    """Turn towards the goal, and drive as far as the robot looks at it.
+    """Compute the twist that drives a unicycle to a position.
 
-    `e = wrap(atan2(y_g - y, x_g - x) - theta)`, `omega = Kp e`, `v = Kv d cos(e)`, d the distance.
-    Held continuously, `d_dot = -Kv d cos^2(e) <= 0`: the distance never grows. With `Kp < Kv` the
-    heading error settles away from zero and the robot spirals in.
+    `e = wrap(atan2(y_g - y, x_g - x) - theta)`, `omega = Kp e`, `v = Kv d cos(e)`, where d is the
+    distance. In continuous time `d_dot = -Kv d cos^2(e) <= 0`, so the distance never grows. With
+    `Kp < Kv` the heading error does not converge to zero and the robot spirals in.
 
     Args:
         state: Pose of the robot, shape (..., 3).
@@ -58,20 +61,41 @@ def _law(x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any, Kp: Any, Kv: Any)
     c, s = cos(theta), sin(theta)
     # d cos(e) and d sin(e): the goal's position in the body frame. It needs no wrapping. Without
     # negative zeros the angle of (0, 0) is 0.
-    return steer(c * dx + s * dy + 0.0, c * dy - s * dx + 0.0, Kp, Kv)
+    return steer(c * dx + s * dy + 0.0, c * dy - s * dx + 0.0, 0.0, Kp, Kv)
 
 
-def steer(ahead: Any, aside: Any, Kp: Any, Kv: Any) -> tuple[Any, Any]:
-    """Give the law for a goal that lies `[ahead, aside]` of the robot (m), unchecked."""
-    return Kv * ahead, Kp * arctan2(aside, ahead)
+def steer(x: Any, y: Any, turn: Any, Kp: Any, Kv: Any) -> tuple[Any, Any]:
+    """Compute the law for a goal at `[x, y]` in the body frame (m), unchecked; `turn` is ignored."""
+    return Kv * x, Kp * arctan2(y, x)
+
+
+def _advice(gains: GainValues, limits: VelocityLimits) -> Iterator[str]:
+    if gains.kp <= gains.kv:
+        yield (
+            f'kp {gains.kp:g} is not larger than kv {gains.kv:g}: the robot approaches faster than it '
+            'turns and spirals in; choose kp > kv'
+        )
+
+
+CONTROLLER = Controller(
+    name='go_to_goal',
+    law=go_to_goal,
+    summary="document A's law, to a position",
+    advice=_advice,
+    boundary=Boundary(ratio=1.0, beyond='with a larger kv the robot spirals in'),
+    reference_gains=ReferenceGains(kp=3.0, kv=0.5, source="document A's gains"),
+    steer=steer,
+)
 
 
 def turn_in_place(theta: Any, heading: Any, Kp: Any) -> tuple[Any, Any]:
-    """Turn to a heading the short way round: `v = 0`, `omega = Kp wrap(heading - theta)`.
+    """Compute the twist that turns to a heading by the smaller angle.
+
+    `v = 0`, `omega = Kp wrap(heading - theta)`.
 
     Args:
         theta: Heading of the robot, shape (...) (rad).
-        heading: Heading to take, shape (...) (rad).
+        heading: Desired heading, shape (...) (rad).
         Kp: Gain on the heading error, shape (...) (1/s).
 
     Returns:

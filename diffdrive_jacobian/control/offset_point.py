@@ -1,38 +1,42 @@
-"""Document B's law that drives a point beside the axle straight to its goal.
+"""Input-output linearization at an offset point (document B).
 
-The axle centre itself cannot be controlled by its position: the Jacobian has rank 1. A point at distance
-d ahead of it (behind, if d is negative) can: its Jacobian inverts for every heading.
+The position of the axle centre cannot be controlled by inverting its Jacobian, which has rank 1. A point
+at a distance d in front of it (behind it, if d is negative) can, because its Jacobian is invertible for
+every heading.
 
 State: pose `[x, y, theta]` (m, m, rad). Output: body twist `v, omega` (m/s, rad/s). Everything
 broadcasts over leading axes, gain and offset too.
 
-Source: document B, "Let's add a control point offset"; MATH.md, "Differential drive".
+Source: document B, "Let's add a control point offset"; doc/mathematics.md, "Differential drive".
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 from numpy.typing import ArrayLike
 
+from diffdrive_jacobian.control.controller import Controller, GainValues
+from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.kinematics._checks import offset
 from diffdrive_jacobian.kinematics._elementary import agree, components, cos, evaluated, operand, sin
 
 
 def offset_point(state: ArrayLike, goal: ArrayLike, k: Any, d: Any) -> tuple[Any, Any]:
-    """Drive the offset point along a straight line: `p_d_dot = k (goal - p_d)`.
+    """Compute the twist that drives the offset point along a straight line: `p_d_dot = k (goal - p_d)`.
 
-    With wheel speeds the law is `w = J_d^-1 k (goal - p_d)`; here as the body twist `u = J_w w`:
-    `v = k a`, `omega = k b / d`, where `[a, b]` is the way from the point to the goal, seen from the
-    robot. The distance of the point decays as exp(-k t), whatever the heading. The point comes to rest
-    on the goal, the axle centre |d| away from it. Sampled at a rate, that holds while
-    `k distance < 2 |d| rate`: far from the goal, a short offset makes the robot turn too far.
+    As wheel speeds the law is `w = J_d^-1 k (goal - p_d)`. Here it is the body twist `u = J_w w`:
+    `v = k a`, `omega = k b / d`, where `[a, b]` is the vector from the point to the goal in the body
+    frame. The distance of the point decays as exp(-k t), whatever the heading. The point comes to rest
+    on the goal, the axle centre at a distance |d| from it. When the law is sampled, this requires
+    `k distance < 2 |d| rate`. With a shorter offset the robot turns too far when the goal is far away.
 
     Args:
         state: Pose of the robot, shape (..., 3).
         goal: Position for the point `[x, y]`, shape (..., 2) (m).
         k: Gain on the distance, shape (...) (1/s).
-        d: Distance of the point ahead of the axle centre, not 0, shape (...) (m).
+        d: X coordinate of the point in the body frame, not 0, shape (...) (m).
 
     Returns:
         `(v, omega)`, each of shape (...) (m/s, rad/s).
@@ -52,9 +56,28 @@ def offset_point(state: ArrayLike, goal: ArrayLike, k: Any, d: Any) -> tuple[Any
 def _law(x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any, k: Any, d: Any) -> tuple[Any, Any]:
     dx, dy = x_goal - x, y_goal - y
     c, s = cos(theta), sin(theta)
-    return steer(c * dx + s * dy, c * dy - s * dx, k, d)
+    return steer(c * dx + s * dy, c * dy - s * dx, 0.0, k, d)
 
 
-def steer(ahead: Any, aside: Any, k: Any, d: Any) -> tuple[Any, Any]:
-    """Give the law for a goal that lies `[ahead, aside]` of the robot (m), unchecked."""
-    return k * (ahead - d), k * aside / d
+def steer(x: Any, y: Any, turn: Any, k: Any, d: Any) -> tuple[Any, Any]:
+    """Compute the law for a goal at `[x, y]` in the body frame (m), unchecked; `turn` is ignored."""
+    return k * (x - d), k * y / d
+
+
+def _advice(gains: GainValues, limits: VelocityLimits) -> Iterator[str]:
+    if limits.min_v == 0.0:
+        yield (
+            'linear.x.min_velocity is 0: the robot may not back up, which controller offset_point does '
+            'where the goal lies behind; it may come to rest before the goal'
+        )
+
+
+CONTROLLER = Controller(
+    name='offset_point',
+    law=offset_point,
+    summary='input-output linearization at an offset point, document B',
+    gains=('kv', 'offset'),
+    offset='offset',
+    advice=_advice,
+    steer=steer,
+)

@@ -1,11 +1,11 @@
-"""A law that drives a unicycle to a position and a heading, smoothly, from wherever it stands.
+"""A law that drives a unicycle smoothly to a position and a heading.
 
-In polar coordinates about the goal, with rho the distance to it, alpha the bearing of the goal seen from
-the robot, and phi the same bearing seen from the goal's heading, the unicycle moves as
+In polar coordinates about the goal, with rho the distance to it, alpha the bearing of the goal relative
+to the robot's heading, and phi the same bearing relative to the goal's heading, the unicycle moves as
 
     rho_dot = -v cos(alpha),  alpha_dot = v sin(alpha) / rho - omega,  phi_dot = v sin(alpha) / rho
 
-Document A's law knows rho and alpha only; here the heading that is left, phi, bends the way.
+Document A's law uses rho and alpha only. This law also uses phi, which curves the path.
 
 State: pose `[x, y, theta]` (m, m, rad). Output: body twist `v, omega` (m/s, rad/s). Everything
 broadcasts over leading axes, the gains too.
@@ -16,10 +16,13 @@ vehicles via Lyapunov techniques", IEEE Robotics & Automation Magazine 2(1), 199
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 from numpy.typing import ArrayLike
 
+from diffdrive_jacobian.control.controller import Boundary, Controller, GainValues
+from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.kinematics._checks import positive
 from diffdrive_jacobian.kinematics._elementary import (
     agree,
@@ -35,30 +38,33 @@ from diffdrive_jacobian.kinematics._elementary import (
 )
 
 FASTER = 2.0
-"""How many times as fast as the distance the heading settles, if nothing else is asked for."""
+"""Ratio of the default rates at which heading and distance converge [-]."""
 
 
 def go_to_pose(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any, h: Any = None) -> tuple[Any, Any]:
-    """Drive to a position and a heading.
+    """Compute the twist that drives a unicycle to a position and a heading.
 
-    `v = Kv rho cos(alpha)`, as document A's law has it, and
-    `omega = Kp alpha + Kv cos(alpha) sin(alpha)/alpha (alpha + h phi)`. Held continuously,
-    `V = rho^2 + alpha^2 + h phi^2` never grows, and everything comes to rest on the goal. Near it,
-    heading and bearing settle like an oscillator of frequency `Kv sqrt(h)` damped by Kp, the distance
-    like exp(-Kv t): for the heading to be there first, Kp should be above 2 Kv. A weight that is larger
-    than it needs to be makes long ways round. Where the goal lies behind, the robot backs up while it
-    turns to it, then drives on forwards; where it may not back up, it turns first. Sampled, Kp should be
-    below a quarter of the rate; with a weight h of your own also `Kv^2 h < Kp rate`: from about twice
-    that on, heading and bearing oscillate ever more near the goal.
+    `v = Kv rho cos(alpha)`, as in document A's law, and
+    `omega = Kp alpha + Kv cos(alpha) sin(alpha)/alpha (alpha + h phi)`. In continuous time
+    `V = rho^2 + alpha^2 + h phi^2` never grows, and all three converge to zero.
+
+    Near the goal, heading and bearing behave like an oscillator of frequency `Kv sqrt(h)` with damping
+    Kp, and the distance decays like exp(-Kv t). For the heading to converge first, Kp should be above
+    2 Kv. A weight larger than necessary leads to longer paths. If the goal lies behind, the robot backs
+    up while it turns to it and then drives forwards. If it may not back up, it turns first.
+
+    When the law is sampled, Kp should be below a quarter of the rate. With a given weight h also
+    `Kv^2 h < Kp rate` should hold. From about twice that value, heading and bearing oscillate with a
+    growing amplitude near the goal.
 
     Args:
         state: Pose of the robot, shape (..., 3).
-        goal: Pose to take `[x, y, theta]`, shape (..., 3).
+        goal: Desired pose `[x, y, theta]`, shape (..., 3).
         Kp: Gain on the bearing, positive, shape (...) (1/s).
         Kv: Gain on the distance, positive, shape (...) (1/s).
         h: Weight of the heading, positive, shape (...); sampled, below `Kp rate / Kv^2`. None:
-            `(Kp / (2 Kv))^2`, which damps critically, or from `Kp = 4 Kv` on `2 Kp / Kv - 4`, with which
-            the heading settles like exp(-2 Kv t).
+            `(Kp / (2 Kv))^2`, which is critical damping, or for `Kp > 4 Kv` the smaller `2 Kp / Kv - 4`,
+            with which the heading decays like exp(-2 Kv t).
 
     Returns:
         `(v, omega)`, each of shape (...) (m/s, rad/s). Exactly on the goal's position, where the bearing
@@ -90,19 +96,38 @@ def _law(
     return steer(c * dx + s * dy + 0.0, c * dy - s * dx + 0.0, heading - theta, Kp, Kv, h)
 
 
-def steer(ahead: Any, aside: Any, turn: Any, Kp: Any, Kv: Any, h: Any = None) -> tuple[Any, Any]:
-    """Give the law for a goal that lies `[ahead, aside]` of the robot (m) and looks `turn` further to
-    the left (rad), unchecked.
+def steer(x: Any, y: Any, turn: Any, Kp: Any, Kv: Any, h: Any = None) -> tuple[Any, Any]:
+    """Compute the law for a goal at `[x, y]` (m) with the heading `turn` (rad) in the body frame,
+    unchecked.
     """
     if h is None:
         least = minimum(Kp, 2.0 * FASTER * Kv)
-        # The tangent goes on where the parabola would rise steeply; either way h Kv cannot overflow.
+        # The parabola is continued by its tangent. In both forms h Kv cannot overflow.
         weight = least / (4.0 * Kv) * least + FASTER * (Kp - least)
     else:
         weight = h * Kv
-    alpha = arctan2(aside, ahead)
-    # cos(alpha) sin(alpha) / alpha, without a hole at zero.
+    alpha = arctan2(y, x)
+    # cos(alpha) sin(alpha) / alpha, defined at zero too.
     bend = cos(alpha) * sinc(alpha)
-    away = (ahead != 0.0) | (aside != 0.0)
+    away = (x != 0.0) | (y != 0.0)
     omega = Kp * alpha + bend * (Kv * alpha + weight * wrapped(alpha - turn))
-    return Kv * ahead, omega * away
+    return Kv * x, omega * away
+
+
+def _advice(gains: GainValues, limits: VelocityLimits) -> Iterator[str]:
+    if gains.kp <= 2.0 * gains.kv:
+        yield (
+            f'kp {gains.kp:g} is not larger than twice kv {gains.kv:g}: the robot reaches the position '
+            'before the heading, and turns in place there; choose kp > 2 kv'
+        )
+
+
+CONTROLLER = Controller(
+    name='pose',
+    law=go_to_pose,
+    summary='to a position and a heading',
+    takes_heading=True,
+    advice=_advice,
+    boundary=Boundary(ratio=2.0, beyond='with a larger kv the robot turns on the spot at the goal'),
+    steer=steer,
+)

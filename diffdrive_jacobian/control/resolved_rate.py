@@ -1,12 +1,13 @@
-"""Resolved rate: the tip of an arm, or of a mobile manipulator, along a given path.
+"""Resolved-rate control of the tip of an arm or of a mobile manipulator along a given path.
 
 The inverse of the Jacobian turns a desired velocity of the tip into joint velocities. Feedback of the
-position, an addition to the documents, keeps the tip from drifting off. Damping bounds the joint
+position, an addition to the documents, prevents drift of the tip. Damping bounds the joint
 velocities where the Jacobian is nearly singular.
 
 Everything broadcasts over leading axes. Wrong shapes and values that are not finite raise ValueError.
 
-Source: documents A (3.2.3), C ("Inverse differential kinematics"), D (4.1); MATH.md, "Control laws".
+Source: documents A (3.2.3), C ("Inverse differential kinematics"), D (4.1);
+doc/mathematics.md, "Control laws".
 """
 
 from __future__ import annotations
@@ -58,8 +59,8 @@ def resolved_rate(
         damping: lambda of damped least squares, zero or positive, shape (...), in the units of J.
         q_dot_0: Secondary joint velocities, projected into the null space of the task (see
             `inverse_velocity.redundant`), shape (..., n); None: the least ones.
-        max_correction: Longest `K (x_d - x)`, positive, shape (...) (m/s): the feedback of an error that
-            cannot be reduced, of a target out of reach, would drive the joints ever faster.
+        max_correction: Largest norm of `K (x_d - x)`, positive, shape (...) (m/s). Without a limit, the
+            growing error of a target out of reach would lead to growing joint velocities.
         weights: Weights of the joints, positive, shape (..., n); None: all 1. A joint with a larger
             weight moves less.
         max_velocity: Largest joint speeds, positive, shape (..., n), or one for all joints: all joints
@@ -97,7 +98,7 @@ def resolved_rate(
 
 @dataclass(frozen=True, eq=False)
 class StraightLine:
-    """A straight path at constant speed from one point to another, and rest before and after (D, 4.1).
+    """Straight path at constant speed from one point to another, with rest before and after (D, 4.1).
 
     Raises:
         ValueError: The ends have different or no coordinates, the speed is not positive and finite, or
@@ -109,10 +110,10 @@ class StraightLine:
     end: Any
     """Shape (..., m) (m), read-only."""
     speed: Any
-    """Along the line, shape (...) (m/s), read-only."""
+    """Speed along the line, shape (...) (m/s), read-only."""
 
     def __post_init__(self) -> None:
-        """Check everything, and copy it."""
+        """Check and copy every value."""
         start = array('start', self.start, 'm')
         end, speed = array('end', self.end, 'm'), floats('speed', self.speed)
         if start.shape[-1] != end.shape[-1]:
@@ -138,7 +139,7 @@ class StraightLine:
         """Return the position at a time, shape (..., m) (m).
 
         Args:
-            t: Time since the start (s): before 0 it is the start, after the duration the end.
+            t: Time since the start (s). Before 0 the position is the start, after the duration the end.
 
         Raises:
             ValueError: t is not a single finite number.

@@ -1,8 +1,8 @@
 """Velocity limits that keep the curvature: a saturated robot is slower, but on the same path.
 
-Limits on the body twist and on the wheel speeds are met by one common factor on `v` and `omega`.
-Source: MATH.md, "Control laws"; asked for by the users of diff_drive_controller, which clips each
-component by itself and so bends the path.
+Limits of the body twist and of the wheel speeds are met by scaling `v` and `omega` by one factor.
+Clipping each component separately, as diff_drive_controller does, changes the path.
+Source: doc/mathematics.md, "Control laws".
 """
 
 from __future__ import annotations
@@ -29,13 +29,12 @@ SMALLEST = 5e-324
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class VelocityLimits:
-    """Limits of a differential drive; infinity means none. Each is a number, or an array, for as many
-    robots, that broadcasts with the commands. A value: it can be compared and hashed, and does not
-    change.
+    """Velocity limits of a differential drive; infinity means no limit. Each is a number, or an array
+    for several robots that broadcasts with the commands. Immutable, comparable and hashable.
 
     Raises:
-        ValueError: A limit is NaN or lies on the wrong side of zero: standing still must be allowed.
-            Or arrays do not broadcast.
+        ValueError: A limit is NaN or has the wrong sign (standing still must be allowed), or arrays do
+            not broadcast.
     """
 
     min_v: Any = -np.inf
@@ -47,13 +46,13 @@ class VelocityLimits:
     max_omega: Any = np.inf
     """Fastest counter-clockwise yaw rate (rad/s)."""
     max_wheel_speed: Any = np.inf
-    """Fastest speed of either wheel, either way (rad/s)."""
+    """Largest absolute speed of either wheel (rad/s)."""
     unlimited: bool = field(init=False, repr=False, compare=False)
     """Whether no limit is set."""
     alike: bool = field(init=False, repr=False, compare=False)
-    """Whether every limit is a number, the same for all robots."""
+    """Whether every limit is a number, equal for all robots."""
     _bounds: tuple[Any, ...] = field(init=False, repr=False, compare=False)
-    """Of v, then of omega: what is forbidden below and above, and what scales below and above."""
+    """For v, then omega: bounds that clip, lower and upper, and bounds that scale, lower and upper."""
 
     def __post_init__(self) -> None:
         """Check every limit."""
@@ -72,7 +71,7 @@ class VelocityLimits:
         unlimited = all(type(limit) is float and abs(limit) == np.inf for limit in self.all())
         object.__setattr__(self, 'unlimited', unlimited)
         object.__setattr__(self, 'alike', all(type(limit) is float for limit in self.all()))
-        # Computed once, for every message needs it.
+        # Computed once, because every message needs it.
         bounds = (
             (
                 where(low == 0.0, 0.0, -np.inf),
@@ -97,29 +96,29 @@ class VelocityLimits:
         return hash(tuple(map(hashable, self.all())))
 
     def all(self) -> tuple[Any, ...]:
-        """Return the limits in their order."""
+        """Return the limits, in the order of `names`."""
         return self.min_v, self.max_v, self.min_omega, self.max_omega, self.max_wheel_speed
 
     @staticmethod
     def names() -> tuple[str, ...]:
-        """Return the names of the limits in their order."""
+        """Return the names of the limits."""
         return 'min_v', 'max_v', 'min_omega', 'max_omega', 'max_wheel_speed'
 
 
 def saturate(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tuple[Any, Any]:
     """Scale a twist by the largest factor, at most 1, that meets every limit; `v : omega` is kept.
 
-    A direction whose limit is zero is forbidden rather than slow: its component is dropped first,
-    for no factor but 0 would do. So a robot that may not reverse still turns on the spot.
+    A direction whose limit is zero is forbidden: its component is set to zero first, because no other
+    factor than 0 would meet the limit. So a robot that may not reverse still turns on the spot.
 
-    The result meets every limit exactly, also that of the wheels: no speed that `body_to_wheel` returns
-    for it is larger. Twists whose wheel speeds would overflow are scaled, too.
+    The result meets every limit exactly, including that of the wheel speeds that `body_to_wheel`
+    returns for it. Twists whose wheel speeds would overflow are scaled too.
 
     Args:
         v: Forward speed, shape (...) (m/s).
         omega: Yaw rate, shape (...) (rad/s).
         limits: The limits.
-        r: Wheel radius, shape (...) (m); counts only if the wheels have a limit.
+        r: Wheel radius, shape (...) (m); used only if the wheels have a limit.
         L: Wheel separation, shape (...) (m); likewise.
 
     Returns:
@@ -165,7 +164,7 @@ def _saturated(
     v = minimum(maximum(v / divisor, limits.min_v), limits.max_v)
     omega = minimum(maximum(omega / divisor, limits.min_omega), limits.max_omega)
     if wheels:
-        # So may the wheel speeds: shrink by a unit in the last place, then by twice as much, and so on.
+        # So may the wheel speeds. Shrink by one unit in the last place, then by two, four, and so on.
         step = 2.0**-53
         while _any(above := _fastest(v, omega, r, L) > limits.max_wheel_speed):
             v, omega = where(above, v - step * v, v), where(above, omega - step * omega, omega)
@@ -174,12 +173,12 @@ def _saturated(
 
 
 def _excess(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, least: Any) -> Any:
-    """Compute how many times too fast a twist is; at least `least`."""
+    """Compute the factor by which a twist exceeds the limits; at least `least`."""
     (_, _, v_low, v_high), (_, _, omega_low, omega_high) = limits._bounds
     most = maximum(maximum(v / v_low, v / v_high), maximum(omega / omega_low, omega / omega_high))
     limit = limits.max_wheel_speed
     if type(limit) is not float:
-        # An infinite speed without a limit would be NaN.
+        # Infinity divided by infinity would be NaN.
         most = maximum(most, np.where(limit < np.inf, _fastest(v, omega, r, L) / limit, 0.0))
     elif limit < np.inf:
         most = maximum(most, _fastest(v, omega, r, L) / limit)
@@ -189,7 +188,7 @@ def _excess(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, least: A
 def _scaled_down(
     v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, divisor: Any
 ) -> tuple[Any, Any, Any]:
-    """Scale what is infinitely too fast until its excess can be computed."""
+    """Scale twists whose excess is infinite until it can be computed."""
     least: Any = 1.0
     while _any(infinite := divisor == np.inf):
         factor = where(infinite, 2.0**-600, 1.0)
@@ -199,7 +198,7 @@ def _scaled_down(
 
 
 def _fastest(v: Any, omega: Any, r: Any, L: Any) -> Any:
-    """Compute the speed of the faster wheel, to the last bit what `body_to_wheel` has for it."""
+    """Compute the speed of the faster wheel, bit-identical to `body_to_wheel`."""
     return (abs(v) + abs(omega * L / 2.0)) / r
 
 

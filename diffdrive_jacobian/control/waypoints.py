@@ -1,4 +1,4 @@
-"""Poses to reach in order, as a value: each step takes the robot's pose and gives the next command."""
+"""Waypoints: poses to reach in order. Each step takes the robot's pose and returns the next command."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from diffdrive_jacobian.kinematics._checks import (
 from diffdrive_jacobian.kinematics._elementary import components, operand
 
 Law = Callable[[NDArray[np.float64], NDArray[np.float64]], tuple[Any, Any]]
-"""A control law: pose (3,) and goal (3,) to `(v, omega)`; it may look at the goal's heading or not."""
+"""A control law with its gains: pose, shape (3,), and goal, shape (3,), to `(v, omega)`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Waypoints:
-    """Poses to reach in order, and the progress along them. A value: it does not change.
+    """Poses to reach in order, and the progress along them. Immutable.
 
     Raises:
         ValueError: The poses have another shape than (n, 3) with n >= 1 or are not finite, there is no
@@ -37,9 +37,9 @@ class Waypoints:
     poses: NDArray[np.float64]
     """`[x, y, theta]` each, shape (n, 3), n >= 1."""
     index: int = 0
-    """The waypoint that is driven to."""
+    """Index of the waypoint that is driven to."""
     turning: bool = False
-    """Whether the last position was reached and only its heading is left to take."""
+    """Whether the last position was reached and only the heading remains."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -58,17 +58,17 @@ class Waypoints:
     def follow(
         self, pose: NDArray[np.float64], law: Law, arrival: Arrival, turning_gain: float
     ) -> tuple[Waypoints, tuple[Any, Any] | None]:
-        """Take one step of the way.
+        """Compute the next command.
 
         Args:
-            pose: Where the robot is, shape (3,).
+            pose: Pose of the robot, shape (3,).
             law: The control law that drives to a waypoint.
-            arrival: What counts as having arrived.
+            arrival: Arrival criterion.
             turning_gain: Gain of the turn in place (1/s).
 
         Returns:
-            The waypoints with their progress, and the command `(v, omega)` (m/s, rad/s), or None in
-            its place when everything is reached.
+            The waypoints with their new progress, and the command `(v, omega)` (m/s, rad/s). The
+            command is None when all waypoints are reached.
 
         Raises:
             ValueError: An argument is of another class or shape, or not finite.
@@ -81,7 +81,7 @@ class Waypoints:
         turning_gain = operand('turning_gain', turning_gain)
         here = self
         if here.turning and not arrival.use_heading:
-            # Asked for no longer: the position was reached.
+            # The heading no longer counts, and the position was reached.
             return here, None
         while not here.turning:
             x_goal, y_goal, _ = here.poses[here.index].tolist()
@@ -99,9 +99,9 @@ class Waypoints:
         return here, turn_in_place(theta, heading, turning_gain)
 
     def resumed(self) -> Waypoints:
-        """Return the waypoints with the last position to be reached again if the robot is not there.
+        """Return the waypoints with the last position to be checked again.
 
-        For a change of the law or of the point that has to arrive, while the robot turns in place.
+        Needed when the law or the driven point changes while the robot turns in place.
         """
         return self._progressed(self.index, turning=False) if self.turning else self
 

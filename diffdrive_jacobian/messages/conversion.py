@@ -176,17 +176,21 @@ def from_pose_with_covariance(
     pose = from_pose(message.pose)
     covariance = np.asarray(message.covariance)[_PLANAR].reshape(3, 3)
     scale = np.abs(covariance).max()
-    if not (
-        scale <= MAX_POSITION**2
-        and np.allclose(covariance, covariance.T, rtol=0.0, atol=1e-9 * scale)
-        and np.linalg.eigvalsh(covariance).min() >= -1e-9 * scale
-    ):
+    valid = scale <= MAX_POSITION**2 and np.abs(covariance - covariance.T).max() <= 1e-9 * scale
+    if valid:
+        symmetric = (covariance + covariance.T) / 2.0
+        values, vectors = np.linalg.eigh(symmetric)
+        valid = values[0] >= -1e-9 * scale
+    if not valid:
         raise MessageError(
             f'covariance of x, y, yaw must be finite, at most {MAX_POSITION**2:g}, symmetric and '
             'positive semidefinite, '
             f'got {covariance.tolist()}'
         )
-    return pose, (covariance + covariance.T) / 2.0
+    if values[0] < 0.0:
+        # Rounding of the sender: as the motion grows, so would a negative variance.
+        symmetric = vectors * np.maximum(values, 0.0) @ vectors.T
+    return pose, (symmetric + symmetric.T) / 2.0
 
 
 def set_pose_with_covariance(

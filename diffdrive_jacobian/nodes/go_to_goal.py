@@ -1,8 +1,7 @@
-"""Drive a robot to goals by one of three laws: odometry and goals in, body twists out."""
+"""Drive a robot to goals by a controller: odometry and goals in, body twists out."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 from action_msgs.msg import GoalInfo, GoalStatus
@@ -10,14 +9,7 @@ from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Goals, Odometry
 from std_srvs.srv import Trigger
 
-from diffdrive_jacobian.control import (
-    Arrival,
-    go_to_goal,
-    go_to_pose,
-    offset_point,
-    saturate,
-)
-from diffdrive_jacobian.control.waypoints import Law
+from diffdrive_jacobian.control import Arrival, Controller, LawError, saturate
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.goal import MAX_WAYPOINTS, Goal, goal_info, read_goal
@@ -26,15 +18,6 @@ from diffdrive_jacobian.ros import serialization
 from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.text import printable
-
-LAWS: dict[str, Callable[[GoToGoalParameters], Law]] = {
-    'go_to_goal': lambda gains: lambda pose, goal: go_to_goal(pose, goal[:2], gains.kp, gains.kv),
-    'offset_point': lambda gains: (
-        lambda pose, goal: offset_point(pose, goal[:2], gains.kv, gains.offset)
-    ),
-    'pose': lambda gains: lambda pose, goal: go_to_pose(pose, goal, gains.kp, gains.kv),
-}
-"""Parameter `controller` to the law with its gains."""
 
 
 class GoToGoal(ParameterizedNode[GoToGoalParameters]):
@@ -45,9 +28,22 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
     silent, so that others may drive.
     """
 
-    def __init__(self, **kwargs: Any) -> None:
-        """Create the controller without a goal; `kwargs` as for `ParameterizedNode`."""
-        super().__init__('go_to_goal', GoToGoalParameters, **kwargs)
+    def __init__(self, *, controller: Controller | None = None, **kwargs: Any) -> None:
+        """Create the node without a goal.
+
+        Args:
+            controller: A controller that can be chosen besides the built-in and the installed ones. Its
+                name becomes the default of the parameter `controller`.
+            kwargs: As for `ParameterizedNode`.
+
+        Raises:
+            ValueError: `controller` is not a Controller, or has the name of a built-in one.
+            ParameterError: The parameters given are not a valid set.
+        """
+        parameters = GoToGoalParameters
+        if controller is not None:
+            parameters = GoToGoalParameters.with_controller(controller)
+        super().__init__('go_to_goal', parameters, **kwargs)
         self._goal: Goal | None = None
         self._odom_frame = ''
         # Whether the last command makes the robot move: it outlives a goal that is replaced.
@@ -57,7 +53,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._status = self.advertise(GoalStatus, 'goal_status', latched=True)
         self.subscribe(Odometry, 'odom', self._on_odometry)
         self.subscribe(PoseStamped, 'goal_pose', self._on_goal_pose)
-        # As bytes: to make Python objects of a long message blocks the node for seconds.
+        # As bytes, because creating Python objects from a long message blocks the node for seconds.
         self.subscribe(Goals, 'goals', self._on_goals, raw=True)
         self.provide(Trigger, 'cancel_goal', self._on_cancel)
         self._message: Twist | TwistStamped = TwistStamped() if stamped else Twist()
@@ -67,12 +63,12 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
 
     @property
     def waypoint(self) -> int | None:
-        """Which pose of the active goal is driven to; None without a goal."""
+        """Index of the pose of the active goal that is driven to; None without a goal."""
         return None if self._goal is None else self._goal.waypoints.index
 
     @property
     def arrival(self) -> Arrival:
-        """What counts as having arrived, by the parameters."""
+        """Arrival criterion according to the parameters."""
         return self._arrival
 
     # --- Goals
@@ -96,7 +92,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         info = goal_info(stamp)
         try:
             if count > MAX_WAYPOINTS:
-                raise MessageError(f'goals must hold at most {MAX_WAYPOINTS} poses, got {count}')
+                raise MessageError(f'goals must contain at most {MAX_WAYPOINTS} poses, got {count}')
             message = serialization.deserialized(data, Goals)
             goal = Goal(info, *read_goal(message.header.frame_id, message.goals))
             self._match_frames(goal)
@@ -106,11 +102,11 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._accept(goal)
 
     def _refuse(self, info: GoalInfo, error: MessageError) -> None:
-        """Report a goal as aborted; the active one goes on."""
+        """Publish that a goal is aborted. The active goal is kept."""
         self.log_event_warning('goal refused', f'goal refused: {error}')
         self._publish_status(info, GoalStatus.STATUS_ABORTED)
         if self._goal is not None:
-            # What is latched last must be what goes on.
+            # The last latched status must be that of the active goal.
             self._publish_status(self._goal.info, self._goal_status(self._goal))
 
     def _accept(self, goal: Goal) -> None:
@@ -118,13 +114,14 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         if self._goal is not None:
             self._publish_status(self._goal.info, GoalStatus.STATUS_CANCELED)
         if not self._driving:
-            # A robot that moves is watched already; a new goal is no sign of life of its odometry.
+            # While the robot moves the watchdog runs already, and a new goal is no sign of odometry.
             self._watchdog.start(nanoseconds(self.parameters.odom_timeout))
         self._goal = goal
         self._publish_status(goal.info, GoalStatus.STATUS_ACCEPTED)
         x, y, _ = goal.waypoints.poses[-1]
-        more = f' by way of {count} more' if (count := len(goal.waypoints.poses) - 1) else ''
-        self.log_event_info('goal accepted', f'goal accepted: x {x:.3f}, y {y:.3f}{more}')
+        count = len(goal.waypoints.poses)
+        last = f'{count} waypoints, the last at ' if count > 1 else ''
+        self.log_event_info('goal accepted', f'goal accepted: {last}x {x:.3f}, y {y:.3f}')
 
     def _match_frames(self, goal: Goal) -> None:
         if goal.frame and self._odom_frame and goal.frame != self._odom_frame:
@@ -143,7 +140,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         return response
 
     def _end(self, status: int, what: str) -> None:
-        """Let go of the active goal, the robot standing."""
+        """Stop the robot and end the active goal."""
         if self._driving:
             self._publish_command(0.0, 0.0)
         if self._goal is not None:
@@ -172,7 +169,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
                     f"got '{printable(message.header.frame_id)}'"
                 )
             if goal is not None and self.now() == 0:
-                raise MessageError('simulated time has not begun, nothing came on /clock')
+                raise MessageError('simulated time has not begun, nothing was received on /clock')
         except MessageError as error:
             self.get_logger().warning(f'odometry dropped: {error}', throttle_duration_sec=THROTTLE)
             return
@@ -184,19 +181,25 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             return
         if goal.stale:
             goal.stale = False
-            self.log_event_info('odometry is back', 'odometry is back: driving on')
-        goal.waypoints, command = goal.waypoints.follow(
-            pose, self._law, self._arrival, self.parameters.kp
-        )
+            self.log_event_info('odometry is back', 'odometry is received again: driving on')
+        try:
+            goal.waypoints, command = goal.waypoints.follow(
+                pose, self._law, self._arrival, self.parameters.kp
+            )
+        except LawError as error:
+            self.log_event_warning('law', f'goal aborted: {error}')
+            self._publish_command(0.0, 0.0)
+            self._end(GoalStatus.STATUS_ABORTED, 'aborted')
+            return
         if command is None:
             self._publish_command(0.0, 0.0)
             self._end(GoalStatus.STATUS_SUCCEEDED, 'reached')
             return
-        # Without wheels in the limits the geometry of the wheels does not matter.
+        # These limits contain no wheel speed, so wheel radius and separation do not matter.
         self._publish_command(*saturate(*command, self._limits, 1.0, 1.0))
 
     def _begin(self, goal: Goal) -> bool:
-        """Begin to drive, now that the odometry's frame is known."""
+        """Start executing a goal, now that the frame of the odometry is known."""
         try:
             self._match_frames(goal)
         except MessageError as error:
@@ -208,7 +211,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         return True
 
     def _on_stale_odometry(self) -> None:
-        """Stop the robot that is no longer seen; the goal stays, and odometry may come back."""
+        """Stop the robot because odometry is missing, and keep the goal."""
         goal = self._goal
         if goal is None:
             return
@@ -218,7 +221,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._publish_command(0.0, 0.0)
             self.log_event_warning(
                 'odometry is stale',
-                f'no valid odometry on {topic} for {timeout:g} s: zero sent, waiting',
+                f'no valid odometry on {topic} for {timeout:g} s: robot stopped, waiting',
             )
         else:
             self.log_event_warning(
@@ -228,78 +231,59 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
     def _publish_command(self, v: float, omega: float) -> None:
         self._driving = (v, omega) != (0.0, 0.0)
         if isinstance(self._message, TwistStamped):
-            # No frame: the twist is the robot's own, and its name is not ours to know.
+            # Without a frame: the twist is in the body frame, whose name this node does not know.
             messages.set_twist_stamped(self._message, (v, omega), self.now())
         else:
             messages.set_twist(self._message, (v, omega))
         self._cmd_vel.publish(self._message)
 
     def stop(self, why: str) -> None:
-        """Send zero and give the goal up, if there is one."""
+        """Stop the robot and cancel the goal, if there is one."""
         if self._goal is not None:
             self._publish_command(0.0, 0.0)
-            self._end(GoalStatus.STATUS_CANCELED, f'given up: {why}')
+            self._end(GoalStatus.STATUS_CANCELED, f'canceled: {why}')
             self.flush(self._cmd_vel)
             self.flush(self._status)
 
     # --- Parameters
 
     def parameters_changed(self, previous: GoToGoalParameters) -> None:
-        """Control on with the new parameters."""
-        driven = previous.controller, self._arrival.offset
+        """Apply the new parameters; an active goal is kept."""
+        before = self._controller, self._arrival.offset
         self._configure()
         goal = self._goal
         if goal is None:
             return
-        if (self.parameters.controller, self._arrival.offset) != driven:
-            # Another point of the robot may have to arrive, or another law decides how.
+        if (self._controller, self._arrival.offset) != before:
+            # The driven point or the law is another one.
             goal.waypoints = goal.waypoints.resumed()
         if self.parameters.odom_timeout != previous.odom_timeout:
             self._watchdog.start(nanoseconds(self.parameters.odom_timeout))
 
     def _configure(self) -> None:
-        """Make from the parameters what every step needs."""
+        """Compute from the parameters what every step needs, and warn of values that do not suit."""
         parameters = self.parameters
-        self._law = LAWS[parameters.controller](parameters)
-        # Far from the goal the law may ask for more than any robot believes.
+        self._controller = controller = parameters.chosen_controller()
+        self._law = controller.bind(parameters)
+        # Far from the goal a law may return more than what counts as a plausible command.
         self._limits = parameters.limits(without=messages.MAX_SPEED)
         self._arrival = Arrival(
             xy_tolerance=parameters.xy_goal_tolerance,
             yaw_tolerance=parameters.yaw_goal_tolerance,
-            # A law that takes the heading on its way must not stop short of it.
-            use_heading=parameters.use_goal_heading or parameters.controller == 'pose',
-            offset=parameters.offset if parameters.controller == 'offset_point' else 0.0,
+            # A law that takes the heading must not stop before it has reached it.
+            use_heading=parameters.use_goal_heading or controller.takes_heading,
+            offset=controller.driven_offset(parameters),
         )
         if self._limits.max_v == 0.0:
             self.log_event_warning(
                 'max_v',
-                'linear.x.max_velocity is 0: the robot may not drive forward, goals stay out of reach',
-            )
-        if self._limits.min_v == 0.0 and parameters.controller == 'offset_point':
-            self.log_event_warning(
-                'min_v',
-                'linear.x.min_velocity is 0: the robot may not back up, which controller offset_point '
-                'does where the goal lies behind; it may come to rest before the goal',
+                'linear.x.max_velocity is 0: the robot may not drive forward, goals cannot be reached',
             )
         if 0.0 in (self._limits.min_omega, self._limits.max_omega):
             self.log_event_warning(
                 'omega',
-                'angular.z.min_velocity or max_velocity is 0: the robot may turn one way only or not at '
-                'all, goals and headings may stay out of reach',
+                'angular.z.min_velocity or angular.z.max_velocity is 0: the robot may turn in one '
+                'direction only or not at all, some goals and headings cannot be reached',
             )
-        self._judge_gains()
-
-    def _judge_gains(self) -> None:
-        kp, kv = self.parameters.kp, self.parameters.kv
-        if self.parameters.controller == 'pose' and kp <= 2.0 * kv:
-            self.log_event_warning(
-                'gains',
-                f'kp {kp:g} is not larger than twice kv {kv:g}: the robot is at the position before it '
-                'has the heading, and turns in place there; choose kp > 2 kv',
-            )
-        elif self.parameters.controller == 'go_to_goal' and kp <= kv:
-            self.log_event_warning(
-                'gains',
-                f'kp {kp:g} is not larger than kv {kv:g}: the robot approaches faster than it turns '
-                'and spirals in; choose kp > kv',
-            )
+        for number, warning in enumerate(controller.warnings(parameters, self._limits)):
+            self.log_event_warning(f'advice {number}', warning)

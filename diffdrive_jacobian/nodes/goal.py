@@ -1,4 +1,4 @@
-"""A goal of the node go_to_goal, as it is read from a message."""
+"""A goal of the node go_to_goal, read from a message."""
 
 from __future__ import annotations
 
@@ -17,36 +17,36 @@ from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MessageError
 
 MAX_WAYPOINTS = 2_000
-"""Most poses of a `goals` message that is converted: rclpy takes some 20 us for each."""
+"""Largest number of poses in a `goals` message: rclpy takes about 20 us to convert each of them."""
 
 
 @dataclass(slots=True)
 class Goal:
-    """A goal that was accepted: what came in one message."""
+    """A goal that was accepted: the content of one message."""
 
     info: GoalInfo
     frame: str
-    """Frame of its poses; empty: the odometry's."""
+    """Frame of its poses; empty: that of the odometry."""
     waypoints: Waypoints
     executing: bool = False
-    """Whether odometry has come for it."""
+    """Whether odometry was received after it was accepted."""
     stale: bool = False
-    """Whether the robot was stopped for want of odometry."""
+    """Whether the robot is stopped because odometry is missing."""
 
 
 def goal_info(stamp: Time) -> GoalInfo:
-    """Return a new identity of a goal that has a stamp."""
+    """Return a new goal identifier with this stamp."""
     return GoalInfo(goal_id=UUID(uuid=list(uuid.uuid4().bytes)), stamp=stamp)
 
 
 def read_goal(frame: str, poses: Sequence[PoseStamped]) -> tuple[str, Waypoints]:
-    """Read the frame and the poses of a goal.
+    """Return the frame and the poses of a goal.
 
     Raises:
-        MessageError: There is no pose, one is not valid, or they are given in several frames.
+        MessageError: There is no pose, a pose is invalid, or the poses are in several frames.
     """
     if not poses:
-        raise MessageError('goals must hold at least one pose, got none (to stop, call cancel_goal)')
+        raise MessageError('goals must contain at least one pose, got none (to stop, call cancel_goal)')
     frames = {pose.header.frame_id or frame for pose in poses}
     if len(frames) > 1:
         raise MessageError(

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
@@ -37,7 +37,8 @@ class Specification:
     low: float | None
     high: float | None
     above: float | None
-    choices: tuple[str, ...]
+    choices: Collection[str]
+    constraint: str
     nan_is_none: bool
     read_only: bool
 
@@ -77,7 +78,8 @@ def parameter(
     name: str | None = None,
     bounds: tuple[float, float] | None = None,
     above: float | None = None,
-    choices: tuple[str, ...] = (),
+    choices: Collection[str] = (),
+    constraint: str = '',
     nan_is_none: bool = False,
     read_only: bool = False,
 ) -> Any:
@@ -90,6 +92,7 @@ def parameter(
         bounds: Smallest and largest value allowed.
         above: With `bounds`: the smallest value is itself not allowed, and stands here.
         choices: The strings allowed.
+        constraint: Text for the descriptor instead of the list of choices, where these are searched for.
         nan_is_none: NaN is allowed and means: none. ROS ranges reject NaN, so the descriptor of such
             a parameter carries no range; the description and the validation do.
         read_only: Fixed once the node runs.
@@ -102,6 +105,7 @@ def parameter(
         high=high,
         above=above,
         choices=choices,
+        constraint=constraint,
         nan_is_none=nan_is_none,
         read_only=read_only,
     )

@@ -6,17 +6,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
+from diffdrive_jacobian.control.controller import Controller
+from diffdrive_jacobian.control.controllers import BUILT_IN, ControllerError, Controllers
+from diffdrive_jacobian.control.controllers import CONTROLLERS as CONTROLLERS
 from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION, MAX_SPEED
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, parameter
 from diffdrive_jacobian.simulation.robot import NANOSECONDS, RobotModel
 from diffdrive_jacobian.text import printable
 
-CONTROLLERS = ('go_to_goal', 'offset_point', 'pose')
 MIN_OFFSET = 1e-3
-"""The yaw rate of document B's law grows like the inverse of the offset (m)."""
+"""Smallest distance of the driven point from the axle: the yaw rate grows like its inverse (m)."""
 _STAMPED = 'cmd_vel is a TwistStamped instead of a Twist. Read-only.'
 
 
@@ -156,22 +158,32 @@ class VirtualRobotParameters(LimitParameters):
         )
 
 
+def _controller(default: str, choices: Controllers) -> Any:
+    laws = '; '.join(f'{name}, {one.summary}' for name, one in BUILT_IN.items())
+    names = ', '.join(map(repr, BUILT_IN))
+    return parameter(
+        default,
+        f'Control law: {laws}; or the name of an installed one.',
+        choices=choices,
+        constraint=f'one of {names}, or an installed or given one',
+    )
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class GoToGoalParameters(LimitParameters):
     """Parameters of the node go_to_goal."""
+
+    controllers: ClassVar[Controllers] = CONTROLLERS
+    """The controllers that can be chosen."""
 
     kp: float = parameter(
         3.0, 'Gain on the heading error [1/s]; larger than kv.', bounds=(0.0, 100.0), above=0.0
     )
     kv: float = parameter(0.5, 'Gain on the distance [1/s].', bounds=(0.0, 100.0), above=0.0)
-    controller: str = parameter(
-        'go_to_goal',
-        "Control law: go_to_goal (document A's), offset_point (document B's), or pose, with heading.",
-        choices=CONTROLLERS,
-    )
+    controller: str = _controller('go_to_goal', CONTROLLERS)
     offset: float = parameter(
         0.1,
-        'Of controller offset_point: how far ahead of the axle the point is that is driven; not 0 [m].',
+        'X coordinate in the body frame of the point that offset_point drives; not 0 [m].',
         bounds=(-100.0, 100.0),
     )
     xy_goal_tolerance: float = parameter(
@@ -182,17 +194,46 @@ class GoToGoalParameters(LimitParameters):
     )
     use_goal_heading: bool = parameter(False, 'Turn to the heading of the last waypoint at the end.')
     odom_timeout: float = _timeout(
-        0.5, 'Odometry older than this stops the robot until it comes again [s]; 0: never.'
+        0.5, 'Without odometry for this long the robot is stopped [s]; 0: never.'
     )
     enable_stamped_cmd_vel: bool = parameter(False, _STAMPED, read_only=True)
 
+    @classmethod
+    def with_controller(cls, controller: Controller) -> type[GoToGoalParameters]:
+        """Return the class of the parameters with a further controller, which is the default.
+
+        Raises:
+            ValueError: It is not a Controller, or has the name of a built-in one.
+        """
+        known = Controllers(controller)
+        choice = _controller(controller.name, known)
+
+        @dataclass(frozen=True, kw_only=True, slots=True)
+        class Parameters(cls):  # type: ignore[valid-type, misc]
+            controllers: ClassVar[Controllers] = known
+            controller: str = choice
+
+        return Parameters
+
     def check(self) -> None:
-        """The point that is driven must stand off the axle."""
+        """Check that the driven point is not on the axle, and that the controller can be loaded."""
         if abs(self.offset) < MIN_OFFSET:
             raise ParameterError(
-                f"parameter 'offset' must be at least {MIN_OFFSET:g} m ahead of the axle or behind it, "
+                f"parameter 'offset' must be at least {MIN_OFFSET:g} m or at most {-MIN_OFFSET:g} m, "
                 f'got {self.offset:g}: the Jacobian of the axle centre itself has rank 1'
             )
+        self.chosen_controller()
+
+    def chosen_controller(self) -> Controller:
+        """Return the controller; an installed one is imported.
+
+        Raises:
+            ParameterError: It cannot be loaded.
+        """
+        try:
+            return self.controllers.find(self.controller)
+        except ControllerError as error:
+            raise ParameterError(f"parameter 'controller': {error}") from error
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

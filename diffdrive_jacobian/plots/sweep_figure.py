@@ -22,37 +22,30 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.sweeps.sweep import Setup, Sweep
 
 SIZE = (13.0, 5.2)
-"""Of the picture (inches)."""
+"""Size of the picture (inches)."""
 TITLES = {
     'time': 'time to goal [s]',
     'path_length': 'path length [m]',
     'overshoot': 'overshoot beyond the goal [m]',
 }
-BORDERS = {
-    'go_to_goal': (1.0, 'kp = kv', 'with a larger kv the robot spirals in'),
-    'pose': (2.0, 'kp = 2 kv', 'with a larger kv the robot turns on the spot at the goal'),
-}
-"""Of each law the kp at the border, as a multiple of kv; its name, and what is beyond it."""
-DOCUMENT_A = (3.0, 0.5)
-"""kp and kv of document A (1/s)."""
-MANY_TIMES = 4.0
-"""Values that differ by a larger factor are told apart on a logarithmic scale."""
-FINE = 10
-"""Lines between fewer cells would tell nothing."""
+LOGARITHMIC_RATIO = 4.0
+"""A logarithmic scale is used if the largest value is more than this times the smallest [-]."""
+CONTOUR_GRID = 10
+"""Smallest grid for which contour lines are drawn."""
 COLORS = 'viridis'
-"""Perceptually even, and the same to the colour-blind."""
+"""Perceptually uniform, also for the colour-blind."""
 TICKS = (1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 7.0)
-"""Of a logarithmic scale, and their tenfold."""
+"""Ticks of a logarithmic scale within one decade."""
 LINE, LIT, EMPTY = 'black', 'white', '#dcdcdc'
 DASHES = (0, (5, 2))
 
 
 def draw(swept: Sweep, ending: str) -> bytes:
-    """Draw a sweep; gives the content of a file.
+    """Draw a sweep and return the content of a file.
 
     Args:
         swept: The sweep.
-        ending: `png`, `svg` or `pdf`.
+        ending: Format, `png`, `svg` or `pdf`.
 
     Raises:
         ModuleNotFoundError: matplotlib is not installed.
@@ -64,7 +57,7 @@ def draw(swept: Sweep, ending: str) -> bytes:
 
 
 def figure(swept: Sweep) -> Figure:
-    """Draw a sweep; its axes are the heat maps, then the legend, then the scales.
+    """Return a sweep as a figure. Its axes are the heat maps, then the legend, then the scales.
 
     Raises:
         ModuleNotFoundError: matplotlib is not installed.
@@ -72,27 +65,27 @@ def figure(swept: Sweep) -> Figure:
     from matplotlib.figure import Figure
 
     with styled():
-        made = Figure(figsize=SIZE, layout='constrained')
-        grid = made.add_gridspec(2, len(TITLES), height_ratios=[1.0, 0.02])
-        panels = [made.add_subplot(grid[0, column]) for column in range(len(TITLES))]
-        below = made.add_subplot(grid[1, :])
+        drawn = Figure(figsize=SIZE, layout='constrained')
+        grid = drawn.add_gridspec(2, len(TITLES), height_ratios=[1.0, 0.02])
+        panels = [drawn.add_subplot(grid[0, column]) for column in range(len(TITLES))]
+        below = drawn.add_subplot(grid[1, :])
         for panel, (measure, title) in zip(panels, TITLES.items(), strict=True):
-            _draw_map(made, panel, swept, measure)
-            _draw_border(panel, swept.setup)
+            _draw_map(drawn, panel, swept, measure)
+            _draw_boundary(panel, swept.setup)
             _draw_marks(panel, swept)
             panel.set_title(title, pad=10.0)
             panel.set_xlabel('kp [1/s]')
         panels[0].set_ylabel('kv [1/s]')
         below.axis('off')
         below.legend(handles=_legend(swept), loc='center', ncol=4, borderaxespad=0.0)
-        made.suptitle(describe(swept.setup))
-    return made
+        drawn.suptitle(describe(swept.setup))
+    return drawn
 
 
 def describe(setup: Setup) -> str:
-    """Say in two lines what was swept, and how."""
+    """Return two lines about the settings of a sweep."""
     limits = setup.robot.limits
-    held = [
+    bounds = [
         f'{name} {_within(low, high)} {unit}'
         for name, low, high, unit in (
             ('v', limits.min_v, limits.max_v, 'm/s'),
@@ -101,13 +94,13 @@ def describe(setup: Setup) -> str:
         )
         if math.isfinite(low) or math.isfinite(high)
     ]
-    starts = f'{setup.starts} starts facing every way' if setup.starts > 1 else '1 start'
+    starts = f'{setup.starts} starts in all directions' if setup.starts > 1 else '1 start'
     there = f'{setup.tolerance:g} m'
     if setup.arrival.use_heading:
         there += f' and {setup.arrival.yaw_tolerance:g} rad'
     return (
-        f'{setup.controller}: mean over {starts}, {setup.distance:g} m from the goal\n'
-        f'asked at {setup.rate:g} Hz; limits: {", ".join(held) or "none"}; arrived within {there}'
+        f'{setup.resolved_controller.name}: mean over {starts}, {setup.distance:g} m from the goal\n'
+        f'control rate {setup.rate:g} Hz; limits: {", ".join(bounds) or "none"}; arrived within {there}'
     )
 
 
@@ -115,17 +108,17 @@ def _within(low: float, high: float) -> str:
     return f'±{high:g}' if -low == high else f'{low:g} to {high:g}'
 
 
-def _draw_map(made: Figure, panel: Axes, swept: Sweep, measure: str) -> None:
-    """Draw where all starts arrived, and its scale; hatched: not all have."""
+def _draw_map(drawn: Figure, panel: Axes, swept: Sweep, measure: str) -> None:
+    """Draw a heat map with its scale; hatched where the robot did not arrive from all starts."""
     from matplotlib.colors import LogNorm, Normalize
     from matplotlib.ticker import FuncFormatter, LogLocator
 
-    # What is NaN stays empty.
+    # Cells with NaN stay empty.
     values = np.where(swept.complete, swept.mean(measure), np.nan)
     found = values[swept.complete]
     low, high = _range(found, from_zero=measure == 'overshoot')
-    many = low > 0.0 and high / low > MANY_TIMES
-    norm: Any = LogNorm(low, high) if many else Normalize(low, high)
+    logarithmic = low > 0.0 and high / low > LOGARITHMIC_RATIO
+    norm: Any = LogNorm(low, high) if logarithmic else Normalize(low, high)
     mesh = panel.pcolormesh(
         _edges(swept.kp),
         _edges(swept.kv),
@@ -138,51 +131,50 @@ def _draw_map(made: Figure, panel: Axes, swept: Sweep, measure: str) -> None:
     panel.patch.set(hatch='////', edgecolor='white', lw=0.0)
     panel.grid(False)
     panel.spines[:].set_visible(True)
-    scale = made.colorbar(mesh, ax=panel, pad=0.02, aspect=28)
+    scale = drawn.colorbar(mesh, ax=panel, pad=0.02, aspect=28)
     outline: Any = scale.outline
     outline.set_linewidth(0.8)
-    if many:
+    if logarithmic:
         scale.ax.yaxis.set_major_locator(LogLocator(subs=TICKS))
         scale.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
         scale.ax.minorticks_off()
-    # The same lines in the map and on its scale spare the numbers in the map.
+    # The same lines in the map and on its scale make numbers in the map unnecessary.
     levels = [level for level in scale.get_ticks() if (found < level).any() and (found > level).any()]
-    if levels and swept.setup.grid >= FINE:
-        how: Any = {'colors': LIT, 'linewidths': 0.7, 'alpha': 0.6}
-        scale.add_lines(panel.contour(swept.kp, swept.kv, values, levels, **how))
+    if levels and swept.setup.grid >= CONTOUR_GRID:
+        style: Any = {'colors': LIT, 'linewidths': 0.7, 'alpha': 0.6}
+        scale.add_lines(panel.contour(swept.kp, swept.kv, values, levels, **style))
 
 
 def _range(values: NDArray[np.float64], *, from_zero: bool) -> tuple[float, float]:
-    """Find the ends of a scale that have something between them."""
+    """Return the ends of a scale, which are never equal."""
     low, high = (float(np.min(values)), float(np.max(values))) if len(values) else (0.0, 1.0)
     low = 0.0 if from_zero else low
     return (low, high) if high - low > 1e-3 else (low, low + 1e-3)
 
 
 def _edges(centres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Give the borders of the cells; the outermost end at the first and at the last gain."""
+    """Return the edges of the cells; the outermost are the first and the last gain."""
     return np.concatenate([centres[:1], (centres[1:] + centres[:-1]) / 2.0, centres[-1:]])
 
 
-def _draw_border(panel: Axes, setup: Setup) -> None:
-    """Draw the border where it lies in the picture, with its name along it where there is room."""
+def _draw_boundary(panel: Axes, setup: Setup) -> None:
+    """Draw the boundary of the controller where it lies in the picture, with its equation if it fits."""
     from matplotlib.patheffects import withStroke
 
-    low, high = _border(setup)
-    if not low < high:
+    boundary, (low, high) = setup.resolved_controller.boundary, _visible_boundary(setup)
+    if boundary is None or not low < high:
         return
-    factor, name, _ = BORDERS[setup.controller]
-    kv = np.array([low, high])
-    panel.plot(factor * kv, kv, color=LIT, lw=3.6, alpha=0.55)
-    panel.plot(factor * kv, kv, color=LINE, lw=1.6, ls=DASHES)
-    ends = np.ptp(panel.transLimits.transform(np.column_stack([factor * kv, kv])), axis=0)
+    ratio, kv = boundary.ratio, np.array([low, high])
+    panel.plot(ratio * kv, kv, color=LIT, lw=3.6, alpha=0.55)
+    panel.plot(ratio * kv, kv, color=LINE, lw=1.6, ls=DASHES)
+    ends = np.ptp(panel.transLimits.transform(np.column_stack([ratio * kv, kv])), axis=0)
     if np.hypot(*ends) > 0.6:
         at = low + 0.62 * (high - low)
         panel.text(
-            factor * at + 0.02 * (setup.kp[1] - setup.kp[0]),
+            ratio * at + 0.02 * (setup.kp[1] - setup.kp[0]),
             at,
-            name,
-            rotation=math.degrees(math.atan2(1.0, factor)),
+            boundary.equation,
+            rotation=math.degrees(math.atan2(1.0, ratio)),
             rotation_mode='anchor',
             transform_rotates_text=True,
             va='top',
@@ -191,14 +183,17 @@ def _draw_border(panel: Axes, setup: Setup) -> None:
         )
 
 
-def _border(setup: Setup) -> tuple[float, float]:
-    """Give the first and the last kv of the border that lie in the picture."""
-    factor = BORDERS[setup.controller][0]
-    return max(setup.kp[0] / factor, setup.kv[0]), min(setup.kp[1] / factor, setup.kv[1])
+def _visible_boundary(setup: Setup) -> tuple[float, float]:
+    """Return the first and the last kv of the boundary in the picture; not ascending: there is none."""
+    boundary = setup.resolved_controller.boundary
+    if boundary is None:
+        return 0.0, 0.0
+    ratio = boundary.ratio
+    return max(setup.kp[0] / ratio, setup.kv[0]), min(setup.kp[1] / ratio, setup.kv[1])
 
 
 def _draw_marks(panel: Axes, swept: Sweep) -> None:
-    """Mark document A's gains and the fastest ones."""
+    """Mark the reference gains and the fastest ones."""
     for mark in _marks(swept):
         mark.set_clip_on(False)
         panel.add_line(mark)
@@ -208,30 +203,31 @@ def _marks(swept: Sweep) -> list[Line2D]:
     from matplotlib.lines import Line2D
 
     marks = []
-    how: Any = {'ls': '', 'mec': LINE, 'mfc': LIT, 'mew': 1.2, 'zorder': 5}
-    setup, (kp, kv) = swept.setup, DOCUMENT_A
-    inside = setup.kp[0] <= kp <= setup.kp[1] and setup.kv[0] <= kv <= setup.kv[1]
-    if inside and setup.controller == 'go_to_goal':
-        label = f"document A's gains: kp {kp:g}, kv {kv:g}"
-        marks.append(Line2D([kp], [kv], marker='o', ms=8, label=label, **how))
+    style: Any = {'ls': '', 'mec': LINE, 'mfc': LIT, 'mew': 1.2, 'zorder': 5}
+    setup, reference = swept.setup, swept.setup.resolved_controller.reference_gains
+    if reference is not None:
+        kp, kv = reference.kp, reference.kv
+        if setup.kp[0] <= kp <= setup.kp[1] and setup.kv[0] <= kv <= setup.kv[1]:
+            label = f'{reference.source}: kp {kp:g}, kv {kv:g}'
+            marks.append(Line2D([kp], [kv], marker='o', ms=8, label=label, **style))
     found = swept.fastest()
     if found is not None:
         kp, kv = float(swept.kp[found[1]]), float(swept.kv[found[0]])
         label = f'fastest: kp {kp:.4g}, kv {kv:.4g}, {swept.mean("time")[found]:.2f} s'
-        marks.append(Line2D([kp], [kv], marker='*', ms=14, label=label, **how))
+        marks.append(Line2D([kp], [kv], marker='*', ms=14, label=label, **style))
     return marks
 
 
 def _legend(swept: Sweep) -> list[Any]:
-    """Say what was drawn."""
+    """Return the entries of the legend."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     setup = swept.setup
     entries: list[Any] = []
-    low, high = _border(setup)
-    if low < high:
-        label = ': '.join(BORDERS[setup.controller][1:])
+    boundary, (low, high) = setup.resolved_controller.boundary, _visible_boundary(setup)
+    if boundary is not None and low < high:
+        label = f'{boundary.equation}: {boundary.beyond}'
         entries.append(Line2D([], [], color=LINE, lw=1.6, ls=DASHES, label=label))
     entries += _marks(swept)
     if not swept.complete.all():

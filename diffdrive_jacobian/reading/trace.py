@@ -12,6 +12,7 @@ import numpy as np
 from action_msgs.msg import GoalStatus
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.kinematics._elementary import wrapped
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 from diffdrive_jacobian.reading.reader import BagError
@@ -190,14 +191,18 @@ def _routes(run: Run) -> list[range]:
 
 
 def _driven_points(run: Run) -> Array:
-    """Give the point that the controller drives to the goal, shape (n, 2): of document B's it lies
-    ahead of the axle centre.
+    """Return the point that the controller drives to the goal, shape (n, 2).
+
+    It is the axle centre if the controller is not built in. Its package may not be installed here, and
+    reading a bag must not import it.
     """
     poses = run.odometry.values[:, :3]
-    told = run.of_node('go_to_goal')
-    if told.get('controller') != 'offset_point':
+    name = run.of_node('go_to_goal').get('controller')
+    controller = BUILT_IN.get(name) if isinstance(name, str) else None
+    if controller is None or not controller.offset:
         return poses[:, :2]
-    d = run.number_of_node('go_to_goal', 'offset', GoToGoalParameters().offset)
+    default = controller.driven_offset(GoToGoalParameters())
+    d = run.number_of_node('go_to_goal', controller.offset, default)
     return poses[:, :2] + d * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
 
 

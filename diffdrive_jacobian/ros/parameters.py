@@ -31,10 +31,11 @@ P = TypeVar('P', bound=NodeParameters)
 
 def descriptor(specification: Specification, default: Any) -> ParameterDescriptor:
     """Write a specification as the descriptor that ROS tools show."""
+    constraint = specification.constraint or specification.allowed
     made = ParameterDescriptor(
         description=specification.description,
         read_only=specification.read_only,
-        additional_constraints=f'must be {specification.allowed}' if specification.allowed else '',
+        additional_constraints=f'must be {constraint}' if constraint else '',
     )
     low = specification.low if specification.above is None else specification.above
     if low is None or specification.high is None or specification.nan_is_none:

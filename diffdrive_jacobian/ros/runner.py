@@ -12,31 +12,23 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr
 from itertools import pairwise
-from typing import TypeVar
 
 import rclpy
 from rclpy.context import Context
-from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.logging import get_logger_level, set_logger_level
 from rclpy.node import Node
-from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.signals import SignalHandlerOptions
 
 from diffdrive_jacobian.errors import UserError as UserError
-from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.node import ParameterizedNode
-from diffdrive_jacobian.ros.parameters import report_unknown
+from diffdrive_jacobian.ros.node_runner import MAX_NAME_LENGTH, NodeRunner
 from diffdrive_jacobian.text import printable
-
-N = TypeVar('N', bound=Node)
 
 MAX_DOMAIN_ID = 232
 """Beyond it a domain's ports do not exist."""
-MAX_NAME_LENGTH = 247
-"""Longest name of a topic or service, with its leading slash, that Fast DDS can have (characters)."""
 LOOK_PERIOD = 0.1
 """How long the loop may wait before it looks at its condition again (s)."""
 
@@ -153,64 +145,25 @@ def running(context: Context, *, closed_world: bool) -> Iterator[Runner]:
         runner.close()
 
 
-def made(make: Callable[[], N]) -> N:
-    """Make a node.
-
-    Raises:
-        UserError: The name, the parameters or the QoS that its user gave cannot be.
-    """
-    try:
-        return make()
-    except NameValidationException as error:
-        # Its lines: the kind of name and the rule, the name, a mark under the place.
-        rule, name, *_ = str(error).splitlines()
-        raise UserError(f'{rule} {printable(name.strip())}') from error
-    except (ParameterError, ParameterException, InvalidQosOverridesError) as error:
-        raise UserError(str(error)) from error
-    except rclpy_implementation.RCLError as error:
-        # rcl appends the place in its sources.
-        reason = str(error).split(', at /')[0]
-        if 'length should not exceed' in reason:
-            # Each part was short enough, see _check_name_length.
-            reason += f'; a name with its namespace must have at most {MAX_NAME_LENGTH} characters'
-        raise UserError(reason) from error
-
-
-class Runner:
-    """An executor with its nodes."""
+class Runner(NodeRunner):
+    """Nodes in real time: an executor with its nodes."""
 
     def __init__(self, context: Context, executor: Executor) -> None:
-        """Begin without nodes."""
-        self.context = context
+        """Start without nodes."""
+        super().__init__(context)
         self._executor = executor
-        self._nodes: list[Node] = []
-        self._begun = False
 
     def seconds(self) -> float:
-        """Give the time by which the nodes live, from an arbitrary beginning (s)."""
+        """Return the monotonic time (s)."""
         return time.monotonic()
 
-    def add(self, make: Callable[[], N]) -> N:
-        """Make a node and add it.
-
-        Raises:
-            UserError: The name, the parameters or the QoS that its user gave cannot be.
-        """
-        node = made(make)
+    def _add(self, node: Node) -> None:
         if not isinstance(node, ParameterizedNode):
             guard_inputs(node)
-        self._nodes.append(node)
         self._executor.add_node(node)
-        return node
 
-    def spin(self, until: Callable[[], bool]) -> bool:
-        """Serve the nodes until a condition holds; False if the context was shut down before.
-
-        The condition is looked at after every callback and at least every LOOK_PERIOD.
-        """
-        if not self._begun:
-            self._begun = True
-            report_unknown([node for node in self._nodes if isinstance(node, ParameterizedNode)])
+    def _spin(self, until: Callable[[], bool]) -> bool:
+        # The condition is checked after every callback and at least every LOOK_PERIOD.
         try:
             while not until():
                 if not self.context.ok():
@@ -221,7 +174,7 @@ class Runner:
         return True
 
     def close(self) -> None:
-        """Stop the nodes while they can still speak, then take everything down."""
+        """Stop the nodes while they can still publish, then destroy them."""
         if self.context.ok():
             for node in self._nodes:
                 if isinstance(node, ParameterizedNode):

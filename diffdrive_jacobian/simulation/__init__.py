@@ -1,4 +1,4 @@
-"""The robot as a value that advances in time, closed loops in batches, lines followed: no ROS."""
+"""Simulation of robots, of closed loops in batches, and of manipulators along lines. No ROS."""
 
 from diffdrive_jacobian.simulation.closed_loop import closed_loops, trajectories
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel

@@ -1,9 +1,8 @@
-"""A batch of closed loops: its arguments, checked and flattened, and what becomes of it."""
+"""A batch of closed loops: its arguments, checked and flattened, and its outcomes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -11,6 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.control.arrival import Arrival
+from diffdrive_jacobian.control.controller import Controller, Law
+from diffdrive_jacobian.control.controllers import controller_of
 from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.kinematics._checks import (
     array,
@@ -25,37 +26,39 @@ from diffdrive_jacobian.kinematics._checks import (
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Rows = NDArray[np.intp]
-Law = Callable[..., tuple[Any, Any]]
-"""`law(poses, goals, *gains)` with shapes (k, 3), (k, 2 or 3) and for each gain () or (k,); gives `(v,
-omega)`. `go_to_goal`, `offset_point` and `go_to_pose` are such laws."""
 MAX_STEPS = 1e12
+"""Largest number of samples of a loop."""
 
 
 class Outcomes(NamedTuple):
-    """What became of each robot; every field has the shape of the batch.
+    """Outcome of each robot; every field has the shape of the batch.
 
     Attributes:
         arrived: Whether it arrived in time.
-        time: When it arrived; NaN: it did not (s).
-        path_length: Way of the axle centre, backwards too (m).
-        effort: Integral of the squares of both wheel speeds over time (rad^2/s).
-        overshoot: How far it went beyond the goal, along the line from start to goal (m).
-        pose: Where it was at the end, shape (..., 3).
+        time: Time of arrival; NaN: it did not arrive (s).
+        path_length: Length of the path of the axle centre, forwards and backwards (m).
+        control_cost: Integral of the squares of both wheel speeds over time (rad^2/s).
+        overshoot: Largest distance beyond the goal, along the line from start to goal (m).
+        pose: Last pose, shape (..., 3).
     """
 
     arrived: Mask
     time: Array
     path_length: Array
-    effort: Array
+    control_cost: Array
     overshoot: Array
     pose: Array
 
 
 @dataclass(frozen=True, kw_only=True)
 class Batch:
-    """The whole batch: what is the same for all as a number, the rest with a first axis of robots."""
+    """A batch. Values that are equal for all robots are numbers, others have a first axis of robots."""
 
     law: Law
+    steer: Law | None
+    """Faster form of the law, as `Controller.steer`."""
+    takes_heading: bool
+    """Whether `steer` uses the goal's heading."""
     starts: Array
     goals: Array
     gains: tuple[Any, ...]
@@ -67,12 +70,12 @@ class Batch:
     r: Any
     L: Any
     shape: tuple[int, ...]
-    """Of the batch, before it was flattened."""
+    """Shape of the batch before it was flattened."""
 
     @classmethod
     def of(
         cls,
-        law: Law,
+        law: Law | Controller,
         starts: ArrayLike,
         goals: ArrayLike,
         gains: tuple[ArrayLike, ...],
@@ -86,7 +89,12 @@ class Batch:
     ) -> Batch:
         """Check the arguments and flatten the batch."""
         arrival = Arrival() if arrival is None else arrival
-        function('law', law)
+        if isinstance(law, Controller):
+            controller: Controller | None = law
+            law = law.law
+        else:
+            function('law', law)
+            controller = controller_of(law)
         instance('arrival', arrival, Arrival)
         instance('limits', limits, VelocityLimits)
         starts, goals = array('starts', starts, 3), array('goals', goals, 'm')
@@ -119,6 +127,8 @@ class Batch:
         }
         return cls(
             law=law,
+            steer=None if controller is None else controller.steer,
+            takes_heading=controller is not None and controller.takes_heading,
             starts=np.broadcast_to(starts, (*shape, 3)).reshape(-1, 3),
             goals=np.broadcast_to(goals, (*shape, goals.shape[-1])).reshape(-1, goals.shape[-1]),
             gains=tuple(flat[f'gain {index}'] for index in range(len(gains))),
@@ -134,11 +144,11 @@ class Batch:
 
     @property
     def size(self) -> int:
-        """How many robots there are."""
+        """Number of robots."""
         return len(self.starts)
 
     def some(self, rows: Any) -> Batch:
-        """Give some of the robots, their coordinates each in one piece of memory."""
+        """Return the batch of some of the robots, each coordinate contiguous in memory."""
 
         def pick(value: Any) -> Any:
             return value if isinstance(value, float) else value[rows]

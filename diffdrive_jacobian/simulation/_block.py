@@ -1,8 +1,8 @@
-"""Robots that are advanced together, each coordinate in one piece of memory.
+"""Robots of a batch that are advanced together, each coordinate contiguous in memory.
 
-The law of a robot and its arc both need cosine and sine of the heading, which take longer than all the
-rest. They are carried along: turned with the robot, and computed anew every now and then. Laws of this
-package also share the way to the goal with the look for who has arrived.
+The law of a robot and its arc both need cosine and sine of the heading, which take longer to compute
+than everything else. They are updated by rotation in every step, and computed exactly every few steps.
+Controllers with a `steer` also share the vector to the goal with the check for arrival.
 """
 
 from __future__ import annotations
@@ -12,74 +12,66 @@ from typing import Any
 
 import numpy as np
 
-from diffdrive_jacobian.control.go_to_goal import go_to_goal
-from diffdrive_jacobian.control.go_to_goal import steer as steer_to_goal
-from diffdrive_jacobian.control.offset_point import offset_point
-from diffdrive_jacobian.control.offset_point import steer as steer_offset_point
-from diffdrive_jacobian.control.pose import go_to_pose
-from diffdrive_jacobian.control.pose import steer as steer_to_pose
 from diffdrive_jacobian.control.saturation import saturate
 from diffdrive_jacobian.kinematics._checks import floats
 from diffdrive_jacobian.kinematics._elementary import wrapped
-from diffdrive_jacobian.simulation._batch import Array, Batch, Law, Mask, Outcomes, Rows
+from diffdrive_jacobian.simulation._batch import Array, Batch, Mask, Outcomes, Rows
 
 LOST = 1e6
-"""A robot that is so much farther from its goal than at the start was driven away by its law (m)."""
-ANEW = 32
-"""After so many steps cosine and sine of the heading are computed anew."""
+"""A robot is given up when its distance to the goal has grown by this much (m)."""
+EXACT_PERIOD = 32
+"""Number of steps after which cosine and sine of the heading are computed exactly."""
 SHRINK = 0.94
-"""When less than this share of the robots still drives, the others are let go of."""
-STEERED: tuple[tuple[Law, Callable[..., tuple[Any, Any]]], ...] = (
-    (go_to_goal, lambda ahead, aside, _, *gains: steer_to_goal(ahead, aside, *gains)),
-    (offset_point, lambda ahead, aside, _, *gains: steer_offset_point(ahead, aside, *gains)),
-    (go_to_pose, lambda ahead, aside, turn, *gains: steer_to_pose(ahead, aside, turn(), *gains)),
-)
-"""Laws of this package, and what they are for a goal that is given as seen from the robot."""
-
-
-def steered(law: Law) -> Callable[..., tuple[Any, Any]] | None:
-    """Give what a law of this package is for a goal as seen from the robot; None: not one of them."""
-    return next((core for known, core in STEERED if known is law), None)
-
+"""When less than this share of the robots still drives, the others are removed from the arrays [-]."""
 
 Keep = Callable[[int, Rows, Array, Any, Any], None]
+"""Receives step, rows, poses (k, 3), v (k,) and omega (k,); the last two are None at the end."""
 
 
 class Block:
-    """Some robots of a batch, on their way."""
+    """Some robots of a batch and their current states."""
 
     def __init__(self, batch: Batch, rows: Rows) -> None:
-        """Place the robots, which are these of the whole batch, at their starts."""
+        """Place the robots at their starts.
+
+        Args:
+            batch: The batch of these robots alone.
+            rows: Their indices in the whole batch.
+        """
         self.batch, self.rows, count = batch, rows, len(rows)
-        self.steered = steered(batch.law)
         self.x, self.y, theta = batch.starts.T.copy()
         self.theta: Array = wrapped(theta)
         self.open: Mask = np.ones(count, dtype=np.bool_)
         self.turning: Mask = np.zeros(count, dtype=np.bool_)
-        # Summed up: |v|, v^2, omega^2; the farthest way beyond the goal.
+        # Sums of |v|, v^2 and omega^2, and the largest distance beyond the goal.
         self.sums: Array = np.zeros((3, count))
         self.beyond: Array = np.zeros(count)
         with np.errstate(over='ignore', invalid='ignore'):
-            way = batch.goals[:, :2] - batch.starts[:, :2]
-            length = np.hypot(*way.T)
-            self.along: Array = np.array((way / np.where(length > 0.0, length, 1.0)[:, np.newaxis]).T)
+            line = batch.goals[:, :2] - batch.starts[:, :2]
+            length = np.hypot(*line.T)
+            self.along: Array = np.array((line / np.where(length > 0.0, length, 1.0)[:, np.newaxis]).T)
             self.too_far: Array = (length + LOST) ** 2
 
     def drive(
         self, keep: Keep | None, on_step: Callable[[], object] | None = None
     ) -> Iterator[tuple[Rows, Outcomes]]:
-        """Drive them to their ends; gives who is done, and what became of them.
+        """Drive the robots until each has arrived or is given up.
 
-        `on_step` is called at the beginning of every step.
+        Args:
+            keep: Called with every sample of every robot; None: samples are not kept.
+            on_step: Called at the beginning of every step.
+
+        Yields:
+            The rows that are finished, and their outcomes.
         """
         batch = self.batch
         for step in range(batch.steps + 1):
             if on_step is not None:
                 on_step()
-            if step % ANEW == 0:
-                # By the number of the step alone, so that the result does not depend on the company.
+            if step % EXACT_PERIOD == 0:
+                # Depends on the step alone, so that results do not depend on the other robots.
                 self.c, self.s = np.cos(self.theta), np.sin(self.theta)
-            arrived, lost = self._look()
+            arrived, lost = self._check_ends()
             ended = arrived | lost
             ended &= self.open
             if step == batch.steps:
@@ -97,8 +89,8 @@ class Block:
                 v, omega = self._shrink(v, omega)
             self._advance(v, omega)
 
-    def _look(self) -> tuple[Mask, Mask]:
-        """Tell who has arrived, and whom the law has driven away."""
+    def _check_ends(self) -> tuple[Mask, Mask]:
+        """Return which robots have arrived, and which were driven away by their law."""
         batch, arrival = self.batch, self.batch.arrival
         goal = batch.goals.T
         with np.errstate(over='ignore', invalid='ignore'):
@@ -116,55 +108,57 @@ class Block:
         return there, squared > self.too_far
 
     def _command(self) -> tuple[Array, Array]:
-        """Ask the law, and hold what it gives to the limits."""
+        """Evaluate the law and saturate its twists."""
         batch, shape = self.batch, (len(self.rows),)
-        if self.steered is None:
+        if batch.steer is None:
             twist = batch.law(np.array([self.x, self.y, self.theta]).T, batch.goals, *batch.gains)
         else:
-            # Without negative zeros the angle of (0, 0) is 0.
-            ahead = self.c * self.dx + self.s * self.dy + 0.0
-            aside = self.c * self.dy - self.s * self.dx + 0.0
-            twist = self.steered(ahead, aside, self._turn, *batch.gains)
+            # Adding 0.0 removes negative zeros, so that the angle of (0, 0) is 0.
+            x = self.c * self.dx + self.s * self.dy + 0.0
+            y = self.c * self.dy - self.s * self.dx + 0.0
+            twist = batch.steer(x, y, self._turn() if batch.takes_heading else 0.0, *batch.gains)
         try:
             v, omega = (np.broadcast_to(floats('law', part), shape) for part in twist)
         except (TypeError, ValueError) as error:
             raise ValueError(
-                f'law must give (v, omega), each of shape () or {shape}, got {twist!r:.80}'
+                f'law must return (v, omega), each of shape () or {shape}, got {twist!r:.80}'
             ) from error
         if batch.arrival.use_heading and self.turning.any():
             v = np.where(self.turning, 0.0, v)
             omega = np.where(self.turning, batch.turning_gain * wrapped(self._turn()), omega)
         if not self.open.all():
-            # Who is done stays where it is, whatever its law makes of that.
+            # Finished robots stand still, whatever their law returns.
             v, omega = np.where(self.open, v, 0.0), np.where(self.open, omega, 0.0)
         finite = np.isfinite(v) & np.isfinite(omega)
         if not finite.all():
             row = int(np.argmin(finite))
             pose = [float(one[row]) for one in (self.x, self.y, self.theta)]
             raise ValueError(
-                f'law must give finite (v, omega), got ({v[row]}, {omega[row]}) at pose {pose}'
+                f'law must return finite (v, omega), got ({v[row]}, {omega[row]}) at pose {pose}'
             )
         if not batch.limits.unlimited:
             v, omega = saturate(v, omega, batch.limits, batch.r, batch.L)
         return v, omega
 
     def _turn(self) -> Array:
-        """Give how much further the goals look to the left, not wrapped (rad)."""
+        """Return the headings of the goals relative to those of the robots, not wrapped (rad)."""
         turn: Array = self.batch.goals[:, 2] - self.theta
         return turn
 
     def _advance(self, v: Array, omega: Array) -> None:
-        """Hold a twist until the next sample: the chord of the arc along its middle heading, as in
-        `se2.integrate`, the heading turned by half the turn before it and half after it.
+        """Apply a constant twist until the next sample.
+
+        As in `se2.integrate`, the position moves by the chord of the arc, in the direction of the
+        heading at the middle of the step.
         """
         dt = 1.0 / self.batch.rate
-        # What overflows is found at the end.
+        # Overflow is detected in the outcomes.
         with np.errstate(over='ignore', invalid='ignore'):
             self.sums[0] += np.abs(v)
             self.sums[1] += v * v
             self.sums[2] += omega * omega
             half = omega * (0.5 * dt)
-            # A tiny angle in the place of zero gives a chord as long as the arc.
+            # With a tiny angle instead of zero the chord is as long as the arc.
             hole = (half == 0.0) * 1e-20
             c_half, s_half = np.cos(half), np.sin(half)
             c, s = self.c * c_half - self.s * s_half, self.s * c_half + self.c * s_half
@@ -180,7 +174,7 @@ class Block:
         return np.column_stack([self.x[which], self.y[which], self.theta[which]])
 
     def _outcomes(self, done: Mask, arrived: Mask, step: int) -> tuple[Rows, Outcomes]:
-        """Sum up those who are done."""
+        """Return the rows and the outcomes of the robots that are finished."""
         batch = self.batch
         which = np.flatnonzero(done)
         r, L = (
@@ -190,16 +184,16 @@ class Block:
         with np.errstate(all='ignore'):
             path, squares_v, squares_omega = self.sums[:, which] / batch.rate
             # Both wheels: (v + omega L/2)^2 + (v - omega L/2)^2, over r^2.
-            effort = 2.0 * (squares_v + squares_omega * (L / 2.0) ** 2) / r**2
+            control_cost = 2.0 * (squares_v + squares_omega * (L / 2.0) ** 2) / r**2
         outcomes = Outcomes(
             arrived[which],
             np.where(arrived[which], step / batch.rate, np.nan),
             path,
-            effort,
+            control_cost,
             self.beyond[which],
             self._poses(done),
         )
-        if not all(np.isfinite(values).all() for values in (path, effort, *outcomes[4:])):
+        if not all(np.isfinite(values).all() for values in (path, control_cost, *outcomes[4:])):
             raise ValueError(
                 'starts, goals, gains, rate, limits, r and L must give finite outcomes, '
                 'but they overflow'
@@ -213,7 +207,7 @@ class Block:
             keep(step, self.rows[going], self._poses(going), v[going], omega[going])
 
     def _shrink(self, v: Array, omega: Array) -> tuple[Array, Array]:
-        """Let go of those who are done; gives the twists of the others."""
+        """Remove the robots that are finished, and return the twists of the others."""
         going = np.flatnonzero(self.open)
         self.batch, self.rows = self.batch.some(going), self.rows[going]
         for name in ('x', 'y', 'theta', 'c', 's', 'turning', 'open', 'beyond', 'too_far'):

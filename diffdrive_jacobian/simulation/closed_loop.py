@@ -1,12 +1,12 @@
-"""Closed loops in batches: thousands of unicycles, each under a control law, at once.
+"""Closed loops in batches: thousands of unicycles under a control law, simulated together.
 
-Every robot is sampled at a rate. At each sample it either has arrived, or its law gives a body twist
-`[v, omega]` (m/s, rad/s), which is held within the limits and driven along the exact arc until the next
-one: the loop of go_to_goal and virtual_robot, without delay.
+Every robot is sampled at the control rate. At each sample it either has arrived, or its law returns a
+body twist `[v, omega]` (m/s, rad/s). The twist is saturated and applied along the exact arc until the
+next sample. This is the loop of go_to_goal and virtual_robot without delay.
 
 Starts, goals, gains, robots and limits broadcast with each other; the batch is their leading axes.
 
-Source: MATH.md, "Motion of a virtual robot" and "Control laws".
+Source: doc/mathematics.md, "Motion" and "Control laws".
 """
 
 from __future__ import annotations
@@ -18,26 +18,27 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.control.arrival import Arrival
+from diffdrive_jacobian.control.controller import Controller, Law
 from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.kinematics._checks import function
-from diffdrive_jacobian.simulation._batch import Array, Batch, Law, Outcomes, Rows
-from diffdrive_jacobian.simulation._block import Block, Keep, steered
+from diffdrive_jacobian.simulation._batch import Array, Batch, Outcomes, Rows
+from diffdrive_jacobian.simulation._block import Block, Keep
 
 BLOCK = 8192
-"""Robots that are advanced together: as many as fit into the processor's cache."""
+"""Number of robots that are advanced together; their states fit into the processor's cache."""
 MAX_SAMPLES = 1e9
-"""As many are kept: 40 GB."""
+"""Largest number of samples that are kept, in 40 GB."""
 NO_LIMITS = VelocityLimits()
 
 
 class Trajectories(NamedTuple):
-    """Every sample of every robot, k + 1 of them; who has arrived stands still.
+    """All k + 1 samples of every robot. A robot that has arrived stands still.
 
     Attributes:
         times: Shape (k + 1,) (s).
         poses: Shape (k + 1, ..., 3): time first, then the batch.
-        twists: `[v, omega]` held from each sample to the next, shape (k, ..., 2) (m/s, rad/s).
-        outcomes: What became of each robot, as `closed_loops` gives it.
+        twists: `[v, omega]` from each sample to the next, shape (k, ..., 2) (m/s, rad/s).
+        outcomes: Outcome of each robot, as `closed_loops` returns it.
     """
 
     times: Array
@@ -47,7 +48,7 @@ class Trajectories(NamedTuple):
 
 
 def closed_loops(
-    law: Law,
+    law: Law | Controller,
     starts: ArrayLike,
     goals: ArrayLike,
     *gains: ArrayLike,
@@ -61,32 +62,32 @@ def closed_loops(
     progress: Callable[[int], object] | None = None,
     on_step: Callable[[int], object] | None = None,
 ) -> Outcomes:
-    """Drive every robot to its goal and tell what became of it; memory does not grow with the time.
+    """Drive every robot to its goal and return the outcomes. Memory does not grow with the duration.
 
     Args:
-        law: The controller, `law(poses, goals, *gains)`.
+        law: The control law, `law(poses, goals, *gains)`, or a `Controller`, whose faster form is used.
         starts: Poses, shape (..., 3).
-        goals: Positions or poses, shape (..., 2) or (..., 3), as the law wants them.
-        gains: Whatever else the law takes, each of shape (...).
-        rate: How often the law is asked (Hz).
-        duration: After how long a robot is given up (s).
-        arrival: What counts as having arrived, a `control.Arrival`; None: its defaults. If the heading
-            counts (`use_heading=True`, as with go_to_pose), a robot that has reached its position turns
-            in place. With the law offset_point give its offset, for the point arrives, not the axle.
-        turning_gain: Gain of that turn, shape (...) (1/s).
-        limits: What the drives can do.
+        goals: Positions or poses, shape (..., 2) or (..., 3), as the law requires.
+        gains: Further arguments of the law, each of shape (...).
+        rate: Control rate (Hz).
+        duration: Time after which a robot is given up (s).
+        arrival: Arrival criterion; None: its defaults. If the heading counts (`use_heading=True`, as
+            with go_to_pose), a robot that has reached its position turns in place. For the law
+            offset_point set its offset, because the offset point is to arrive, not the axle centre.
+        turning_gain: Gain of the turn in place, shape (...) (1/s).
+        limits: Velocity limits.
         r: Wheel radius, shape (...) (m).
         L: Wheel separation, shape (...) (m).
-        progress: Called now and then with the number of robots that are done.
-        on_step: Called with that number at every step of every block of robots, so that a computation
-            can be interrupted: an exception that it raises ends the batch and is passed on.
+        progress: Called from time to time with the number of robots that are finished.
+        on_step: Called with that number at every step of every block of robots. An exception that it
+            raises ends the batch and is passed on.
 
     Returns:
-        The outcomes. A law that drives a robot away has not arrived; nothing is raised.
+        The outcomes. A robot that its law drives away has not arrived; this raises no error.
 
     Raises:
-        ValueError: An argument has a wrong shape or value, the law returns something that does not fit,
-            or an outcome overflows.
+        ValueError: An argument has a wrong shape or value, the law returns something invalid, or an
+            outcome overflows.
     """
     batch = Batch.of(law, starts, goals, gains, rate, duration, arrival, turning_gain, limits, r, L)
     if progress is not None:
@@ -97,7 +98,7 @@ def closed_loops(
 
 
 def trajectories(
-    law: Law,
+    law: Law | Controller,
     starts: ArrayLike,
     goals: ArrayLike,
     *gains: ArrayLike,
@@ -109,15 +110,15 @@ def trajectories(
     r: ArrayLike = 0.033,
     L: ArrayLike = 0.16,
 ) -> Trajectories:
-    """Drive every robot to its goal and keep every sample, until the last one is done.
+    """Drive every robot to its goal and return every sample until the last robot is finished.
 
     Arguments and errors are those of `closed_loops`.
     """
     batch = Batch.of(law, starts, goals, gains, rate, duration, arrival, turning_gain, limits, r, L)
     if (batch.steps + 1) * batch.size > MAX_SAMPLES:
         raise ValueError(
-            f'duration must be shorter, for at most {MAX_SAMPLES:g} samples are kept, got {duration:g} '
-            f'with {batch.size} robots'
+            f'duration must be shorter, because at most {MAX_SAMPLES:g} samples are kept, '
+            f'got {duration:g} with {batch.size} robots'
         )
     poses = np.empty((batch.steps + 1, batch.size, 3))
     twists = np.zeros((batch.steps, batch.size, 2))
@@ -146,13 +147,13 @@ def _drive(
     progress: Callable[[int], object] | None = None,
     on_step: Callable[[int], object] | None = None,
 ) -> Outcomes:
-    """Drive a batch, block by block."""
-    if steered(batch.law) is not None:
-        # The laws of this package check their arguments, but not what `steered` evaluates.
+    """Drive a batch block by block and return its outcomes."""
+    if batch.steer is not None:
+        # The law checks its arguments, `steer` does not.
         try:
             batch.law(batch.starts, batch.goals, *batch.gains)
         except ValueError as error:
-            raise ValueError(f'law cannot take the starts, goals and gains: {error}') from error
+            raise ValueError(f'law rejects the starts, goals and gains: {error}') from error
     count = batch.size
     found = Outcomes(
         np.zeros(count, dtype=np.bool_),
@@ -172,5 +173,4 @@ def _drive(
             done += len(finished)
             if progress is not None:
                 progress(done)
-    made = [field.reshape((*batch.shape, *field.shape[1:])) for field in found]
-    return Outcomes._make(made)
+    return Outcomes._make(field.reshape((*batch.shape, *field.shape[1:])) for field in found)

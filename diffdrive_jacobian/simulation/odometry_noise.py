@@ -1,12 +1,12 @@
-"""How sure odometry is of itself: the covariance of pose and twist, through the motion's Jacobians.
+"""Odometry covariance: the covariance of pose and twist, propagated with the Jacobians of the motion.
 
-Model: the travel of each wheel has a variance that grows with its way, `k |ds|` (m^2; k in m),
+Model: the variance of the distance travelled by each wheel grows by `k |ds|` (m^2; k in m),
 independently of the other wheel. The covariance is the integral along the exact arc, not a sum over
-ticks, so it does not depend on how often it is asked for:
+steps, so it does not depend on the rate at which it is computed:
 
     P(T) = Phi P(0) Phi^T + integral_0^T g(s) W g(s)^T ds,  g(s) = Phi(T, s) S(theta_s)
 
-Source: MATH.md, "Motion of a virtual robot"; the noise model is that of Siegwart, Nourbakhsh,
+Source: doc/mathematics.md, "Odometry covariance"; the noise model is that of Siegwart, Nourbakhsh,
 Scaramuzza, *Introduction to Autonomous Mobile Robots*, 5.2.4.
 """
 
@@ -32,7 +32,7 @@ from diffdrive_jacobian.kinematics._elementary import (
 )
 
 ROUNDING = 1e-8
-"""How far a covariance may be from symmetric and semidefinite, relative to its largest entry."""
+"""Tolerance on symmetry and semidefiniteness of a covariance, relative to its largest entry."""
 # Taylor coefficients of _sinc_defect in the square of its argument, (-1)^n / (2n + 3)!
 _DEFECT = [(-1.0) ** n / math.factorial(2 * n + 3) for n in range(9)]
 
@@ -40,7 +40,7 @@ _DEFECT = [(-1.0) ** n / math.factorial(2 * n + 3) for n in range(9)]
 def twist_covariance(
     twist: ArrayLike, L: Any, wheel_travel_variance: Any, interval: Any
 ) -> NDArray[np.float64]:
-    """Compute the covariance of a twist measured by the wheels' travel over an interval: `W / interval`.
+    """Compute the covariance of a twist measured from wheel travel over an interval, `W / interval`.
 
     Args:
         twist: `[v, omega]`, shape (..., 2) (m/s, rad/s).
@@ -92,14 +92,14 @@ def propagate_covariance(
     L: Any,
     wheel_travel_variance: Any,
 ) -> NDArray[np.float64]:
-    """Carry the covariance of a pose along an arc.
+    """Propagate the covariance of a pose along an arc.
 
     Args:
         covariance: Covariance of `[x, y, theta]` at the start, symmetric and positive semidefinite up
             to rounding, shape (..., 3, 3).
         pose: Pose at the start, shape (..., 3).
-        twist: The twist held, `[v, omega]`, shape (..., 2) (m/s, rad/s).
-        dt: Time for which it is held, zero or positive, shape (...) (s).
+        twist: The constant twist, `[v, omega]`, shape (..., 2) (m/s, rad/s).
+        dt: Duration, zero or positive, shape (...) (s).
         L: Wheel separation, positive, shape (...) (m).
         wheel_travel_variance: k, variance per distance travelled of each wheel, zero or positive, shape
             (...) (m).
@@ -179,9 +179,9 @@ def _margins(
     ty: Any,
     tt: Any,
 ) -> tuple[Any, ...]:
-    """Compute what must not be negative: all principal minors, and minus the asymmetry.
+    """Compute quantities that must not be negative: all principal minors, and minus the asymmetry.
 
-    They are relative to the largest entry, which keeps products from overflow.
+    They are relative to the largest entry, so that products do not overflow.
     """
     scale = largest + (largest == 0.0)
     a, b, c, d, e, f = xx / scale, xy / scale, xt / scale, yy / scale, yt / scale, tt / scale
@@ -206,12 +206,12 @@ def _propagated(
     L: Any,
     wheel_travel_variance: Any,
 ) -> tuple[Any, ...]:
-    turn, way = omega * dt, v * dt
+    turn, path = omega * dt, v * dt
     c, s = cos(theta + turn), sin(theta + turn)
-    # The displacement, seen from the end of the arc, then in the world.
-    along, across = way * sinc(turn), -way * sinc(turn / 2.0) * sin(turn / 2.0)
+    # The displacement, in the body frame at the end of the arc, then in the world frame.
+    along, across = path * sinc(turn), -path * sinc(turn / 2.0) * sin(turn / 2.0)
     dx, dy = c * along - s * across, s * along + c * across
-    # The noise, rotated from the frame at the end into the world.
+    # The noise, rotated from the body frame at the end into the world frame.
     xx, xy, xt, yy, yt, tt = _noise_at_end(v, omega, dt, L, wheel_travel_variance)
     # Phi P Phi^T, written out for Phi = [[1, 0, -dy], [0, 1, dx], [0, 0, 1]].
     end_xx = pxx - 2.0 * dy * pxt + dy * dy * ptt + c * c * xx - 2.0 * c * s * xy + s * s * yy
@@ -224,7 +224,7 @@ def _propagated(
 
 
 def _wheel_variances(v: Any, omega: Any, L: Any, wheel_travel_variance: Any) -> tuple[Any, Any]:
-    """Give how fast the variance of the right and of the left wheel's travel grows (m^2/s)."""
+    """Compute the growth rates of the variances of right and left wheel travel (m^2/s)."""
     half = omega * L / 2.0
     return wheel_travel_variance * abs(v + half), wheel_travel_variance * abs(v - half)
 
@@ -232,9 +232,9 @@ def _wheel_variances(v: Any, omega: Any, L: Any, wheel_travel_variance: Any) -> 
 def _noise_at_end(v: Any, omega: Any, dt: Any, L: Any, wheel_travel_variance: Any) -> Any:
     """Integrate `g W g^T` over an arc, in the body frame at its end; entries xx, xy, xt, yy, yt, tt.
 
-    With phi = omega (T - s) the turn that is left, the columns of g are `[cos phi, -sin phi, 0]` and
+    With the remaining turn phi = omega (T - s), the columns of g are `[cos phi, -sin phi, 0]` and
     `[v (1 - cos phi) / omega, v sin(phi) / omega, 1]`. The integrals over s are written so that no
-    digits cancel as omega goes to zero; all that would is in `_sinc_defect`.
+    digits cancel as omega goes to zero. Terms that would cancel are in `_sinc_defect`.
     """
     right, left = _wheel_variances(v, omega, L, wheel_travel_variance)
     # W = [[vv, vw], [vw, ww]], times the duration.
@@ -243,20 +243,20 @@ def _noise_at_end(v: Any, omega: Any, dt: Any, L: Any, wheel_travel_variance: An
         (right - left) / (2.0 * L) * dt,
         (right + left) / (L * L) * dt,
     )
-    turn, way = omega * dt, v * dt
+    turn, path = omega * dt, v * dt
     whole, half = sinc(turn), sinc(turn / 2.0)
     once, twice = _sinc_defect(turn), _sinc_defect(2.0 * turn)
     cosine = cos(turn)
     return (
         vv * (1.0 + whole * cosine) / 2.0
-        + vw * way * turn * 2.0 * (2.0 * twice - once)
-        + ww * (way * way) * 2.0 * (once - twice),
+        + vw * path * turn * 2.0 * (2.0 * twice - once)
+        + ww * (path * path) * 2.0 * (once - twice),
         -vv * turn * whole**2 / 2.0
-        + vw * way * half**2 * cosine / 2.0
-        + ww * (way * way) * turn * half**4 / 8.0,
-        vw * whole + ww * way * turn * once,
-        2.0 * twice * (vv * (turn * turn) - 2.0 * vw * way * turn + ww * (way * way)),
-        -vw * turn / 2.0 * half**2 + ww * way * half**2 / 2.0,
+        + vw * path * half**2 * cosine / 2.0
+        + ww * (path * path) * turn * half**4 / 8.0,
+        vw * whole + ww * path * turn * once,
+        2.0 * twice * (vv * (turn * turn) - 2.0 * vw * path * turn + ww * (path * path)),
+        -vw * turn / 2.0 * half**2 + ww * path * half**2 / 2.0,
         ww,
     )
 

@@ -1,18 +1,18 @@
-"""The virtual robot as a value: a unicycle on two wheels whose motion is a function of its commands.
+"""The virtual robot as an immutable value: a unicycle whose motion is a function of its commands.
 
-State: pose `[x, y, theta]` (m, m, rad) with its covariance, wheel angles `[right, left]` (rad), all
-at one instant, and the body twist `[v, omega]` (m/s, rad/s) that moves it from there on. Input: twist
-commands at their instants. Instants are integer nanoseconds, so that nothing is lost near the epoch.
+State at a time: pose `[x, y, theta]` (m, m, rad) with its covariance, wheel angles `[right, left]`
+(rad), and the body twist `[v, omega]` (m/s, rad/s) from that time on. Input: twist commands with their
+timestamps. Times are integer nanoseconds, so that Unix time loses no precision.
 
-The state is kept as of the last event (command, timeout, placement) and every later instant is
-reached from there along one exact arc: how often somebody looks changes nothing, to the last bit.
+The state is stored at the last event (command, timeout, placement). Every later state is computed from
+it along one exact arc, so the motion does not depend, to the last bit, on when states are computed.
 
-Source: MATH.md, "Motion of a virtual robot".
+Source: doc/mathematics.md, "Motion".
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -56,9 +56,9 @@ class RobotModel:
     wheel_separation: float = 0.16
     """L (m)."""
     limits: VelocityLimits = field(default_factory=VelocityLimits)
-    """What the drives can do; none: the ideal unicycle."""
+    """Velocity limits; without limits the robot is an ideal unicycle."""
     command_timeout: int = 0
-    """Time for which a command is held (ns); 0: without end."""
+    """Time after which the last command is replaced by zero (ns); 0: never."""
     wheel_travel_variance: float = 1e-5
     """k, variance of each wheel's travel per distance travelled (m)."""
 
@@ -104,7 +104,7 @@ class Robot:
 
     model: RobotModel
     stamp: int
-    """The instant of this state (ns)."""
+    """Time of this state (ns)."""
     pose: NDArray[np.float64]
     """`[x, y, theta]`, shape (3,)."""
     covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 3)))
@@ -112,11 +112,11 @@ class Robot:
     wheel_angles: tuple[float, float] = (0.0, 0.0)
     """`(right, left)`, unwrapped (rad)."""
     command: tuple[float, float] = STANDSTILL
-    """The twist that was asked for last, `(v, omega)`."""
+    """The last commanded twist, `(v, omega)`."""
     twist: tuple[float, float] = STANDSTILL
-    """The twist that is driven: the command within the limits."""
+    """The applied twist: the command after saturation."""
     commanded_at: int | None = None
-    """When the command took effect (ns); None: none that moves."""
+    """Time at which the command took effect (ns); None: it is zero."""
 
     def __post_init__(self) -> None:
         """Check every value. The methods below construct their results without these checks."""
@@ -142,10 +142,10 @@ class Robot:
 
     @property
     def expiry(self) -> int | None:
-        """The instant at which the timeout stops the robot (ns); None: nothing is to be stopped."""
+        """Time at which the timeout stops the robot (ns); None: it is not moving, or has no timeout."""
         if self.commanded_at is None or not self.model.command_timeout:
             return None
-        # A timeout that was shortened meanwhile strikes at once, not in the past.
+        # If the timeout was shortened, it expires now, not in the past.
         return max(self.stamp, self.commanded_at + self.model.command_timeout)
 
     @property
@@ -215,7 +215,7 @@ class Robot:
         )
 
     def placed(self, pose: ArrayLike, covariance: ArrayLike, stamp: int) -> Robot:
-        """Restart at a pose; the command and the wheel angles go on.
+        """Restart at a pose, with the same command and wheel angles.
 
         Args:
             pose: `[x, y, theta]`, shape (3,) (m, m, rad).
@@ -225,17 +225,24 @@ class Robot:
         Raises:
             ValueError: The pose or the covariance is invalid, as in the constructor; or as `at`.
         """
-        return replace(
-            self.at(stamp),
-            pose=array('pose', pose, 3),
-            covariance=array('covariance', covariance, 3, 3),
+        here = self.at(stamp)
+        placed = Robot(model=self.model, stamp=here.stamp, pose=pose, covariance=covariance)  # type: ignore[arg-type]
+        return _robot(
+            here.model,
+            here.stamp,
+            placed.pose,
+            placed.covariance,
+            here.wheel_angles,
+            here.command,
+            here.twist,
+            here.commanded_at,
         )
 
     def remodelled(self, model: RobotModel, stamp: int, *, wheels_commanded: bool = False) -> Robot:
-        """Go on with another model: its limits and timeout apply to the running command.
+        """Change the model. Its limits and timeout apply to the current command.
 
-        With `wheels_commanded` the command was one of wheel speeds: on other wheels these stay, and
-        the twist changes.
+        With `wheels_commanded` the command was one of wheel speeds. Then these are kept, and the twist
+        changes with the wheels.
 
         Raises:
             ValueError: The model is of another class; or as `at`.
@@ -246,15 +253,27 @@ class Robot:
         if wheels_commanded:
             speeds = body_to_wheel(*command, self.model.wheel_radius, self.model.wheel_separation)
             command = wheel_to_body(*speeds, model.wheel_radius, model.wheel_separation)
-        return replace(here, model=model, command=command, twist=model.limited(command))
+        return _robot(
+            model,
+            here.stamp,
+            here.pose,
+            here.covariance,
+            here.wheel_angles,
+            command,
+            model.limited(command),
+            here.commanded_at,
+        )
 
     def restarted(self, stamp: int) -> Robot:
-        """Stand still in the same place on another time line, where earlier times mean nothing.
+        """Stop at the same pose, at a time that may be earlier.
 
         Raises:
             ValueError: The time is not an integer (ns).
         """
-        return replace(self, stamp=stamp, command=STANDSTILL, twist=STANDSTILL, commanded_at=None)
+        stamp = nanoseconds('stamp', stamp)
+        return _robot(
+            self.model, stamp, self.pose, self.covariance, self.wheel_angles, STANDSTILL, STANDSTILL
+        )
 
     def _moved(self, stamp: int) -> Robot:
         dt = (stamp - self.stamp) / NANOSECONDS
@@ -290,7 +309,7 @@ def _robot(
     twist: tuple[float, float],
     commanded_at: int | None = None,
 ) -> Robot:
-    """Construct a robot from values that were checked before: this runs for every message."""
+    """Return a robot with checked values, without checking them again for every message."""
     robot = object.__new__(Robot)
     _set(robot, 'model', model)
     _set(robot, 'stamp', stamp)

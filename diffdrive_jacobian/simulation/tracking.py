@@ -1,6 +1,6 @@
-"""Arms and mobile manipulators whose tip follows a straight line, at the rate of a controller.
+"""Simulation of arms and mobile manipulators whose tip follows a straight line.
 
-Source: document D, 4.1; documents A and C on damping and redundancy; MATH.md, "Control laws".
+Source: document D, 4.1; documents A and C on damping and redundancy; doc/mathematics.md, "Control laws".
 """
 
 from __future__ import annotations
@@ -95,8 +95,8 @@ def track_line(
             slowed down alike, and the tip falls behind; None: no limits.
 
     Returns:
-        Everything at each sample. An error that remains is the price of damping, of limits, or of a line
-        that leaves the reach of the robot.
+        The motion. An error can remain because of damping, limits, or a line that leaves the workspace
+        of the robot.
 
     Raises:
         ValueError: Rate, threshold or speed is not positive, another number negative, the gain not below
@@ -111,7 +111,7 @@ def track_line(
     if gain >= rate:
         raise ValueError(f'gain must be at least 0 and below the rate {rate:g}, got {gain:g}')
     if not rate * (float(np.max(line.duration, initial=0.0)) + settling) < MAX_STEPS:
-        raise ValueError(f'rate must make fewer than {MAX_STEPS:g} samples of the line, got {rate:g}')
+        raise ValueError(f'rate must give fewer than {MAX_STEPS:g} samples of the line, got {rate:g}')
     steps = math.ceil(rate * (float(np.max(line.duration, initial=0.0)) + settling) - 1e-9)
     most = number('maximum_damping', maximum_damping, not_negative)
     if threshold is not None:
@@ -134,9 +134,9 @@ def track_line(
     errors: list[Array] = []
     for step in range(steps + 1):
         x = robot.forward_kinematics(q)[..., :2]
-        wanted = line.position(step / rate)
+        desired = line.position(step / rate)
         track.append(q)
-        errors.append(np.asarray(np.linalg.norm(wanted - x, axis=-1)))
+        errors.append(np.asarray(np.linalg.norm(desired - x, axis=-1)))
         if step == steps:
             break
         J = robot.jacobian(q)
@@ -146,10 +146,10 @@ def track_line(
             factor = damping_factor(manipulability(measured), threshold, most)
         q_dot_0 = None if secondary is None else _inputs(robot, secondary, q, inputs, roots)
         # The velocity that moves the target to its next sample, also when the line ends before it.
-        moving = (line.position((step + 1) / rate) - wanted) * rate
+        moving = (line.position((step + 1) / rate) - desired) * rate
         velocities.append(
             resolved_rate(
-                *(J, x, wanted, moving, gain, factor, q_dot_0),
+                *(J, x, desired, moving, gain, factor, q_dot_0),
                 max_correction=line.speed,
                 weights=weights,
                 max_velocity=max_velocity,
@@ -182,15 +182,15 @@ def _inputs(
     roots: Array | None,
 ) -> Array:
     """Compute the secondary task's inputs, shape (..., inputs)."""
-    task = array('what secondary returns', secondary(q), 'n')
+    task = array('result of secondary', secondary(q), 'n')
     n = q.shape[-1]
     if task.shape[-1] == inputs:
         return task
     to_configuration = getattr(robot, 'configuration_jacobian', None)
     allowed = f'(..., {inputs})' if to_configuration is None else f'(..., {inputs}) or (..., {n})'
     if to_configuration is None or task.shape[-1] != n:
-        raise ValueError(f'what secondary returns must have shape {allowed}, got {task.shape}')
+        raise ValueError(f'result of secondary must have shape {allowed}, got {task.shape}')
     uphill = task[..., np.newaxis, :] @ array('configuration_jacobian', to_configuration(q), n, inputs)
     found: Array = uphill[..., 0, :]
-    # Least in the weighted norm for the same increase, and uphill also after the projection.
+    # The smallest inputs in the weighted norm for this increase; also after the projection it increases.
     return found if roots is None else found / (roots * roots)

@@ -1,4 +1,4 @@
-"""Sweeps of gains: thousands of closed loops at once."""
+"""Sweeps of gains: thousands of closed loops simulated together."""
 
 from diffdrive_jacobian.sweeps.sweep import Setup, Sweep, describe, sweep, table
 

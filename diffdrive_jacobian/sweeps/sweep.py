@@ -1,76 +1,113 @@
-"""Gains of a control law swept over a grid, as one batch of closed loops."""
+"""Sweeps of the gains of a controller over a grid, simulated as one batch of closed loops."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.control import Arrival, go_to_goal, go_to_pose
+from diffdrive_jacobian.control import Arrival, Controller
+from diffdrive_jacobian.control.controllers import BUILT_IN, CONTROLLERS
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.simulation import RobotModel, closed_loops
-from diffdrive_jacobian.simulation._batch import Law, Outcomes
+from diffdrive_jacobian.simulation._batch import Outcomes
 from diffdrive_jacobian.simulation._block import LOST
 
 Array = NDArray[np.float64]
 
-CONTROLLERS: dict[str, Law] = {'go_to_goal': go_to_goal, 'pose': go_to_pose}
-"""As the parameter `controller` of go_to_goal; offset_point has no kp."""
+SWEPT_GAINS = ('kp', 'kv')
+"""Gains that a controller must have to be swept."""
 MEASURES = ('time', 'path_length', 'overshoot')
 """Fields of `Outcomes` that are drawn and written."""
 COLUMNS = (
     *('kp_per_s', 'kv_per_s', 'starts', 'arrived', 'time_mean_s', 'time_max_s'),
     *('path_length_mean_m', 'path_length_max_m', 'overshoot_mean_m', 'overshoot_max_m'),
 )
-"""Of a CSV file."""
+"""Columns of the CSV table."""
 MIN_GAIN, MAX_GAIN = 1e-3, 100.0
-"""The nodes take no larger ones (1/s)."""
+"""Smallest and largest gain; the nodes accept no larger ones (1/s)."""
 MIN_LIMIT = 1e-6
-"""Nothing moves slower (m/s, rad/s)."""
+"""Smallest velocity limit other than 0 (m/s, rad/s)."""
 MAX_LOOPS, MAX_SAMPLES = 1_000_000, 10_000_000_000
-"""More would need too much memory, or time."""
+"""Largest number of loops and of samples: more would need too much memory or time."""
+
+
+class SweptControllers(Collection[str]):
+    """Names of the controllers that can be swept: those with the gains kp and kv.
+
+    Of installed controllers the gains are unknown until they are imported, so all of them are included.
+    """
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether the controller of that name may be swept, without importing it."""
+        if isinstance(name, str) and name in BUILT_IN:
+            return _has_gains(BUILT_IN[name])
+        return name in CONTROLLERS
+
+    def __iter__(self) -> Iterator[str]:
+        """Return the names, sorted."""
+        return (name for name in CONTROLLERS if name in self)
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(list(iter(self)))
+
+
+def _has_gains(controller: Controller) -> bool:
+    return set(SWEPT_GAINS) <= set(controller.gains)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Setup:
-    """What is swept, and how.
+    """Settings of a sweep.
 
     Raises:
-        ValueError: Something cannot be; the message names it.
+        ValueError: A value is invalid; the message names it.
+        ControllerError: The controller cannot be loaded.
     """
 
-    controller: str = 'go_to_goal'
-    """One of `CONTROLLERS`."""
+    controller: str | Controller = 'go_to_goal'
+    """A controller with the gains kp and kv, or the name of one."""
     kp: tuple[float, float] = (0.2, 6.0)
     """First and last gain on the heading error (1/s)."""
     kv: tuple[float, float] = (0.1, 3.0)
     """First and last gain on the distance (1/s)."""
     grid: int = 59
-    """How many gains there are of each; 59: steps of 0.1 and 0.05."""
+    """Number of values of each gain; 59: steps of 0.1 and 0.05."""
     starts: int = 12
-    """From how many poses each pair of gains is tried."""
+    """Number of start poses for each pair of gains."""
     distance: float = 2.0
-    """How far the starts are from the goal (m)."""
+    """Distance of the starts from the goal (m)."""
     rate: float = 50.0
-    """How often the law is asked (Hz)."""
+    """Control rate (Hz)."""
     duration: float = 60.0
-    """After how long a robot is given up (s)."""
+    """Time after which a robot is given up (s)."""
     tolerance: float = 0.02
     """Distance that counts as arrived (m)."""
+    offset: float = 0.1
+    """X coordinate in the body frame of the driven point, for controllers that take it (m)."""
     robot: RobotModel = field(default_factory=RobotModel)
-    """Its wheels and limits count."""
+    """The robot; its wheels and limits are used."""
 
     def __post_init__(self) -> None:
-        """Check every value, and that all together can be computed."""
-        if self.controller not in CONTROLLERS:
+        """Check every value, and that the sweep is not too large."""
+        if not isinstance(self.controller, Controller):
+            names = SweptControllers()
+            if self.controller not in names:
+                raise ValueError(
+                    f'controller must be one of {", ".join(names)}, got {self.controller!r}'
+                )
+        if not _has_gains(self.resolved_controller):
+            name, gains = self.resolved_controller.name, self.resolved_controller.gains
             raise ValueError(
-                f'controller must be one of {", ".join(CONTROLLERS)}, got {self.controller!r}'
+                f'controller must have the gains kp and kv to be swept, but {name!r} has '
+                f'{", ".join(gains) or "none"}'
             )
         for name, least in (('grid', 2), ('starts', 1)):
             if getattr(self, name) < least:
@@ -88,13 +125,13 @@ class Setup:
             raise ValueError(f'limits must be at least {MIN_LIMIT:g}, got {abs(small[0]):g}')
         if self.loops > MAX_LOOPS:
             raise ValueError(
-                f'grid {self.grid} with {self.starts} starts makes {self.loops} closed loops; at most '
-                f'{MAX_LOOPS} are swept, for they need up to a gigabyte of memory'
+                f'grid {self.grid} with {self.starts} starts gives {self.loops} closed loops; at most '
+                f'{MAX_LOOPS} are possible, because they need up to a gigabyte of memory'
             )
         if self.loops * self.duration * self.rate > MAX_SAMPLES:
             raise ValueError(
                 f'{self.loops} closed loops of {self.duration:g} s at {self.rate:g} Hz have more than '
-                f'{MAX_SAMPLES} samples, which may take an hour: choose a smaller grid, fewer starts, '
+                f'{MAX_SAMPLES} samples, which may take an hour; choose a smaller grid, fewer starts, '
                 'a shorter duration or a lower rate'
             )
         for name in ('kp', 'kv'):
@@ -105,31 +142,41 @@ class Setup:
                     f'got {first:g} {last:g}'
                 )
             if not (np.diff(self.gains(name)) > 0.0).all():
-                raise ValueError(
-                    f'{name} must have {self.grid} values that can be told apart, got {first} {last}'
-                )
+                raise ValueError(f'{name} must have {self.grid} different values, got {first} {last}')
+
+    @property
+    def resolved_controller(self) -> Controller:
+        """The controller; an installed one is imported."""
+        if isinstance(self.controller, Controller):
+            return self.controller
+        return CONTROLLERS.find(self.controller)
 
     @property
     def loops(self) -> int:
-        """How many closed loops that makes."""
+        """Number of closed loops."""
         return self.grid**2 * self.starts
 
     @property
     def arrival(self) -> Arrival:
-        """What counts as arrived."""
-        return Arrival(xy_tolerance=self.tolerance, use_heading=self.controller == 'pose')
+        """Arrival criterion."""
+        controller = self.resolved_controller
+        return Arrival(
+            xy_tolerance=self.tolerance,
+            use_heading=controller.takes_heading,
+            offset=self.offset if controller.offset else 0.0,
+        )
 
     def gains(self, name: str) -> Array:
-        """Give the gains `kp` or `kv`, evenly spaced, as decimals that people write (1/s)."""
+        """Return the values of `kp` or `kv`, evenly spaced and rounded to 9 decimals (1/s)."""
         first, last = self.kp if name == 'kp' else self.kv
         return np.asarray(np.linspace(first, last, self.grid).round(9), dtype=np.float64)
 
     def poses(self) -> Array:
-        """Give the starts, shape (starts, 3): evenly around the goal, which lies at the origin.
+        """Return the start poses, shape (starts, 3), evenly spaced around the goal at the origin.
 
-        The heading errors are spread evenly, too, in another order. They stand a quarter of their
-        spacing off zero: a law treats left and right alike, so what counts is the size of the error,
-        and so these sizes are all different and spread evenly between 0 and 180 degrees.
+        The heading errors are evenly spaced too, in another order, and shifted by a quarter of their
+        spacing. Laws are symmetric in left and right, so only the magnitude of the error matters. With
+        this shift all magnitudes are different and evenly spaced between 0 and 180 degrees.
         """
         number = self.starts
         golden = 0.618 * number
@@ -145,7 +192,7 @@ class Setup:
 
 
 class Sweep(NamedTuple):
-    """What became of every pair of gains, from every start."""
+    """Outcomes of every pair of gains from every start."""
 
     setup: Setup
     kp: Array
@@ -157,27 +204,29 @@ class Sweep(NamedTuple):
 
     @property
     def arrived(self) -> NDArray[np.int_]:
-        """How many starts arrived, shape (n, n): kv, kp."""
+        """Number of starts from which the robot arrived, shape (n, n): kv, kp."""
         return np.asarray(np.count_nonzero(self.outcomes.arrived, axis=-1))
 
     @property
     def complete(self) -> NDArray[np.bool_]:
-        """Where all starts arrived, shape (n, n): kv, kp."""
+        """Whether the robot arrived from all starts, shape (n, n): kv, kp."""
         return np.asarray(self.outcomes.arrived.all(axis=-1))
 
     def mean(self, measure: str) -> Array:
-        """Give the mean over the starts that arrived, shape (n, n): kv, kp; NaN: none has."""
+        """Return the mean over the starts that arrived, shape (n, n): kv, kp; NaN: none arrived."""
         arrived = self.outcomes.arrived
         total = np.where(arrived, getattr(self.outcomes, measure), 0.0).sum(axis=-1)
         return np.asarray(total / np.where(self.arrived > 0, self.arrived, np.nan))
 
     def largest(self, measure: str) -> Array:
-        """Give the largest of the starts that arrived, shape (n, n): kv, kp; NaN: none has."""
+        """Return the maximum over the starts that arrived, shape (n, n): kv, kp; NaN: none arrived."""
         values = np.where(self.outcomes.arrived, getattr(self.outcomes, measure), -np.inf)
         return np.where(self.arrived > 0, values.max(axis=-1), np.nan)
 
     def fastest(self) -> tuple[int, int] | None:
-        """Find the least mean time where all starts arrived, as indices of kv and kp; None: nowhere."""
+        """Return the indices of kv and kp with the least mean time among those that arrived from all
+        starts; None: there are none.
+        """
         if not self.complete.any():
             return None
         best = int(np.argmin(np.where(self.complete, self.mean('time'), np.inf)))
@@ -186,29 +235,35 @@ class Sweep(NamedTuple):
 
 
 def sweep(setup: Setup, progress: Callable[[int], object] | None = None) -> Sweep:
-    """Drive every pair of gains from every start to the goal.
+    """Drive the robot to the goal with every pair of gains from every start.
 
     Args:
-        setup: What is swept, and how.
-        progress: Called at every step with the number of loops that are done. An exception that it
+        setup: Settings of the sweep.
+        progress: Called at every step with the number of loops that are finished. An exception that it
             raises ends the sweep and is passed on.
 
     Raises:
-        ValueError: The robot cannot be, or its numbers overflow.
+        ValueError: The law cannot be evaluated for arrays of poses, or outcomes overflow.
     """
-    arrival = setup.arrival
+    controller, arrival = setup.resolved_controller, setup.arrival
     kp, kv = setup.gains('kp'), setup.gains('kv')
-    gains = kp[np.newaxis, :, np.newaxis], kv[:, np.newaxis, np.newaxis]
+    values: dict[str, Any] = {
+        'kp': kp[np.newaxis, :, np.newaxis],
+        'kv': kv[:, np.newaxis, np.newaxis],
+        'offset': setup.offset,
+    }
+    gains = [values[name] for name in controller.gains]
+    starts, goal = setup.poses(), np.zeros(3 if controller.takes_heading else 2)
+    _check_law(controller, starts, goal, gains)
     outcomes = closed_loops(
-        # The law itself: a wrapper of it would not be recognized as one that has a faster form.
-        CONTROLLERS[setup.controller],
-        setup.poses(),
-        np.zeros(3 if arrival.use_heading else 2),
+        controller,
+        starts,
+        goal,
         *gains,
         rate=setup.rate,
         duration=setup.duration,
         arrival=arrival,
-        turning_gain=gains[0],
+        turning_gain=values['kp'],
         limits=setup.robot.limits,
         r=setup.robot.wheel_radius,
         L=setup.robot.wheel_separation,
@@ -217,8 +272,25 @@ def sweep(setup: Setup, progress: Callable[[int], object] | None = None) -> Swee
     return Sweep(setup, kp, kv, outcomes)
 
 
+def _check_law(controller: Controller, starts: Array, goal: Array, gains: list[Any]) -> None:
+    """Evaluate a law once for all starts.
+
+    Raises:
+        ValueError: It raises an exception; laws for single poses do so when they are given arrays.
+    """
+    first = [float(np.ravel(gain)[0]) for gain in gains]
+    goals = np.broadcast_to(goal, (len(starts), len(goal)))
+    try:
+        controller.law(starts, goals, *first)
+    except Exception as error:
+        raise ValueError(
+            f'the law of controller {controller.name!r} must accept poses of shape '
+            f'{starts.shape} to be swept, but failed: {type(error).__name__}: {error}'
+        ) from error
+
+
 def table(swept: Sweep) -> str:
-    """Give a sweep as CSV, one row for each pair of gains, `COLUMNS`; empty: no start arrived."""
+    """Return a sweep as CSV, one row for each pair of gains, with `COLUMNS`; empty: no start arrived."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator='\n')
     writer.writerow(COLUMNS)
@@ -226,14 +298,14 @@ def table(swept: Sweep) -> str:
     starts = np.full(kp.shape, swept.setup.starts)
     measured = [of(measure) for measure in MEASURES for of in (swept.mean, swept.largest)]
     columns = [kp, kv, starts, swept.arrived, *measured]
-    # By kp first.
+    # Sorted by kp, then by kv.
     for row in zip(*(column.T.ravel().tolist() for column in columns), strict=True):
         writer.writerow(['' if value != value else repr(value) for value in row])
     return text.getvalue()
 
 
 def describe(swept: Sweep) -> str:
-    """Say in one line which gains are the fastest."""
+    """Return one line about the gains that are the fastest."""
     setup, found = swept.setup, swept.fastest()
     if found is None:
         return f'no gains bring the robot to the goal from every start within {setup.duration:g} s'

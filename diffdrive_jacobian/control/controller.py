@@ -1,0 +1,216 @@
+"""A controller: a control law and everything that nodes, sweeps and batches need to know about it.
+
+A law is a function `law(poses, goals, *gains) -> (v, omega)` of NumPy arrays:
+
+    poses   shape (..., 3), `[x, y, theta]` (m, m, rad)
+    goals   shape (..., 2), or (..., 3) if the controller takes the goal's heading
+    gains   each of shape (...), in the order of `Controller.gains`
+    v       forward speed, shape (...) (m/s)
+    omega   yaw rate, shape (...) (rad/s)
+
+The node go_to_goal calls it with one pose at a time. Batches and sweeps call it with many.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import traceback
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffdrive_jacobian.control.saturation import VelocityLimits
+from diffdrive_jacobian.kinematics._checks import boolean, function, instance, short
+
+Law = Callable[..., tuple[Any, Any]]
+"""`law(poses, goals, *gains) -> (v, omega)`, as described above."""
+BoundLaw = Callable[[NDArray[np.float64], NDArray[np.float64]], tuple[float, float]]
+"""A law with its gains: one pose, shape (3,), and one goal, shape (3,), to `(v, omega)`."""
+GAINS = ('kp', 'kv', 'offset')
+"""Parameters that a law can take."""
+_NAME = re.compile(r'[A-Za-z][A-Za-z0-9_.-]{0,63}')
+
+
+class GainValues(Protocol):
+    """Values of the gains, such as the parameters of the node go_to_goal."""
+
+    @property
+    def kp(self) -> float:
+        """Gain on the heading error (1/s)."""
+
+    @property
+    def kv(self) -> float:
+        """Gain on the distance (1/s)."""
+
+    @property
+    def offset(self) -> float:
+        """X coordinate of the driven point in the body frame (m)."""
+
+
+class LawError(ValueError):
+    """A law raised an exception or returned something other than two finite numbers."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Boundary:
+    """A straight line `kp = ratio * kv` across the plane of gains."""
+
+    ratio: float
+    """Positive, kp on the line divided by kv [-]."""
+    beyond: str
+    """What happens where kv is larger than on the line."""
+
+    def __post_init__(self) -> None:
+        """Check the ratio."""
+        if not 0.0 < self.ratio < math.inf:
+            raise ValueError(f'ratio must be positive and finite, got {self.ratio}')
+
+    @property
+    def equation(self) -> str:
+        """The equation of the line, such as `kp = 2 kv`."""
+        return 'kp = kv' if self.ratio == 1.0 else f'kp = {self.ratio:g} kv'
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ReferenceGains:
+    """A pair of gains that is marked in the picture of a sweep."""
+
+    kp: float
+    """Gain on the heading error (1/s)."""
+    kv: float
+    """Gain on the distance (1/s)."""
+    source: str
+    """Where they come from."""
+
+
+def no_advice(gains: GainValues, limits: VelocityLimits) -> Iterable[str]:
+    """Return no warnings."""
+    return ()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Controller:
+    """A control law that drives a unicycle to a goal.
+
+    The node go_to_goal, sweeps, their pictures and batches of closed loops read this object. Only `name`
+    and `law` are required.
+
+    Raises:
+        ValueError: A field is invalid.
+    """
+
+    name: str
+    """Name by which it is chosen: a letter, then letters, digits, `_`, `.` or `-`, at most 64."""
+    law: Law
+    """The law, `law(poses, goals, *gains) -> (v, omega)`."""
+    summary: str = ''
+    """One sentence for help texts."""
+    gains: tuple[str, ...] = ('kp', 'kv')
+    """Parameters that are passed to the law, in this order; of `kp`, `kv` and `offset`."""
+    takes_heading: bool = False
+    """Whether the law takes the heading of the goal. The robot then always turns to it at the end."""
+    offset: str = ''
+    """Parameter that holds the x coordinate of the driven point in the body frame, `offset`; empty: the
+    law drives the axle centre."""
+    advice: Callable[[GainValues, VelocityLimits], Iterable[str]] = no_advice
+    """Return warnings about gains or limits that do not suit the law."""
+    boundary: Boundary | None = None
+    """Line that is drawn in the picture of a sweep."""
+    reference_gains: ReferenceGains | None = None
+    """Gains that are marked in the picture of a sweep."""
+    steer: Law | None = None
+    """Faster form of the law for batches, `steer(x, y, turn, *gains) -> (v, omega)`. Its arguments are
+    the goal's position in the body frame (m) and its heading relative to the robot's (rad, not wrapped;
+    0 without `takes_heading`). They are finite and need not be checked."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        if not isinstance(self.name, str) or not _NAME.fullmatch(self.name):
+            raise ValueError(
+                "name of a controller must be a letter, then letters, digits, '_', '.' or '-', "
+                f'at most 64, got {short(repr(self.name))}'
+            )
+        function('law', self.law)
+        function('advice', self.advice)
+        if self.steer is not None:
+            function('steer', self.steer)
+        instance('summary', self.summary, str)
+        boolean('takes_heading', self.takes_heading)
+        if not isinstance(self.gains, tuple) or not all(gain in GAINS for gain in self.gains):
+            raise ValueError(f'gains must be a tuple of {", ".join(GAINS)}, got {short(self.gains)}')
+        if self.offset not in ('', 'offset'):
+            raise ValueError(f"offset must be 'offset' or '', got {short(repr(self.offset))}")
+        for name, kind in (('boundary', Boundary), ('reference_gains', ReferenceGains)):
+            if getattr(self, name) is not None:
+                instance(name, getattr(self, name), kind)
+
+    def values(self, gains: GainValues) -> tuple[float, ...]:
+        """Return the values that are passed to the law, in its order."""
+        return tuple(getattr(gains, name) for name in self.gains)
+
+    def driven_offset(self, gains: GainValues) -> float:
+        """Return the x coordinate of the driven point in the body frame (m)."""
+        return float(getattr(gains, self.offset)) if self.offset else 0.0
+
+    def warnings(self, gains: GainValues, limits: VelocityLimits) -> list[str]:
+        """Return the warnings about gains or limits; a failure of `advice` is one of them."""
+        try:
+            return [str(text) for text in self.advice(gains, limits)]
+        except Exception as error:
+            return [f'the advice of controller {self.name!r} failed: {_reason(error)}']
+
+    def bind(self, gains: GainValues) -> BoundLaw:
+        """Return the law with its gains, for single poses.
+
+        Args:
+            gains: The gains, such as the parameters of go_to_goal.
+
+        Returns:
+            A function of a pose, shape (3,), and a goal, shape (3,), that returns `(v, omega)`. It
+            raises LawError if the law raises an exception or does not return two finite numbers.
+        """
+        law, values, size = self.law, self.values(gains), 3 if self.takes_heading else 2
+
+        def bound(pose: NDArray[np.float64], goal: NDArray[np.float64]) -> tuple[float, float]:
+            try:
+                twist = law(pose, goal[:size], *values)
+            except Exception as error:
+                raise LawError(
+                    f'the law of controller {self.name!r} failed: {_reason(error)}'
+                ) from error
+            try:
+                v, omega = twist
+                v, omega = _number(v), _number(omega)
+            except (TypeError, ValueError) as error:
+                raise LawError(
+                    f'the law of controller {self.name!r} must return (v, omega), two numbers, '
+                    f'got {short(twist)}'
+                ) from error
+            if not (math.isfinite(v) and math.isfinite(omega)):
+                raise LawError(
+                    f'the law of controller {self.name!r} must return finite (v, omega), '
+                    f'got ({v:g}, {omega:g})'
+                )
+            return v, omega
+
+        return bound
+
+
+def _number(value: Any) -> float:
+    if type(value) is float:
+        return value
+    if np.shape(value) != ():
+        raise ValueError('an array')
+    return float(value)
+
+
+def _reason(error: Exception) -> str:
+    """Return kind, message and place of an exception in one line."""
+    text = traceback.format_exception_only(type(error), error)[-1].strip()
+    *_, last = traceback.extract_tb(error.__traceback__)
+    return f'{text} ({Path(last.filename).name}, line {last.lineno})'

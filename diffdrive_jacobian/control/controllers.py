@@ -1,0 +1,179 @@
+"""Controllers by name: those of this package, and those that other installed packages provide.
+
+The controllers of this package are the objects named `CONTROLLER` in the modules beside this one. Other
+packages provide theirs as entry points of the group `diffdrive_jacobian.controllers`:
+
+    entry_points={'diffdrive_jacobian.controllers': ['my_law = my_package.my_law:CONTROLLER']}
+
+An entry point is imported when its controller is used, not before.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from diffdrive_jacobian.control.controller import Controller, Law
+from diffdrive_jacobian.kinematics._checks import instance, short
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+GROUP = 'diffdrive_jacobian.controllers'
+"""Entry-point group of the controllers of other packages."""
+
+
+class ControllerError(ValueError):
+    """There is no such controller, or it cannot be loaded."""
+
+
+def _built_in() -> dict[str, Controller]:
+    """Return the controllers that are defined in the modules of this package, by name."""
+    found = {}
+    for module in pkgutil.iter_modules([str(Path(__file__).parent)]):
+        if module.name == __name__.rpartition('.')[2]:
+            continue
+        controller = getattr(importlib.import_module(f'{__package__}.{module.name}'), 'CONTROLLER', None)
+        if isinstance(controller, Controller):
+            found[controller.name] = controller
+    return dict(sorted(found.items()))
+
+
+BUILT_IN: dict[str, Controller] = _built_in()
+"""The controllers of this package, by name. Reading it imports nothing."""
+
+
+class Controllers(Collection[str]):
+    """Names of the controllers that can be used, and the controllers by name.
+
+    Iteration and `in` look for installed entry points, but do not import them.
+    """
+
+    def __init__(self, *given: Controller) -> None:
+        """Create the collection.
+
+        Args:
+            given: Further controllers. They take precedence over installed ones of the same name.
+
+        Raises:
+            ValueError: Something given is not a Controller, or has the name of a built-in one.
+        """
+        self._given: dict[str, Controller] = {}
+        for controller in given:
+            instance('controller', controller, Controller)
+            if BUILT_IN.get(controller.name, controller) != controller:
+                raise ValueError(
+                    f'controller must have a name of its own, got {controller.name!r}, which is built in'
+                )
+            self._given[controller.name] = controller
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is a controller of that name, without loading it."""
+        if not isinstance(name, str):
+            return False
+        known = name in BUILT_IN or name in self._given or name in _loaded
+        return known or bool(_entry_points(name))
+
+    def __iter__(self) -> Iterator[str]:
+        """Return the names, sorted."""
+        return iter(sorted({*BUILT_IN, *self._given, *(one.name for one in _entry_points())}))
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(list(iter(self)))
+
+    def __bool__(self) -> bool:
+        """Return True: there are always the built-in ones."""
+        return True
+
+    def find(self, name: str) -> Controller:
+        """Return the controller of that name; an installed one is imported.
+
+        Raises:
+            ControllerError: There is none, or it cannot be loaded.
+        """
+        found = self._given.get(name) or BUILT_IN.get(name)
+        if found is not None:
+            return found
+        if name not in self:
+            raise ControllerError(
+                f'controller must be one of {", ".join(map(repr, self))}, got {short(repr(name))}'
+            )
+        return _load(name)
+
+
+CONTROLLERS = Controllers()
+"""The built-in and the installed controllers."""
+
+
+def find_controller(name: str) -> Controller:
+    """Return the built-in or installed controller of that name; an installed one is imported.
+
+    Raises:
+        ControllerError: There is none of that name, or it cannot be loaded.
+    """
+    return CONTROLLERS.find(name)
+
+
+def controller_names() -> tuple[str, ...]:
+    """Return the names of the built-in and the installed controllers, sorted. Nothing is imported."""
+    return tuple(CONTROLLERS)
+
+
+def controller_of(law: Law) -> Controller | None:
+    """Return the built-in controller that has this law; None if there is none."""
+    return next((one for one in BUILT_IN.values() if one.law is law), None)
+
+
+def _entry_points(name: str | None = None) -> list[EntryPoint]:
+    """Return the installed entry points, all or those of one name."""
+    # It takes tens of milliseconds to import and to search, and built-in controllers do not need it.
+    from importlib.metadata import entry_points
+
+    found = entry_points(group=GROUP) if name is None else entry_points(group=GROUP, name=name)
+    # The names of all others would only lead to errors.
+    return [one for one in found if one.name not in BUILT_IN]
+
+
+_loaded: dict[str, Controller] = {}
+"""The installed controllers that were imported, by name."""
+
+
+def _load(name: str) -> Controller:
+    """Import an installed controller.
+
+    Raises:
+        ControllerError: Several packages provide that name, or it cannot be loaded.
+    """
+    if name in _loaded:
+        return _loaded[name]
+    found = _entry_points(name)
+    owners = ' and '.join(sorted(_owner(one) for one in found))
+    if len(found) > 1:
+        raise ControllerError(f'controller {name!r} is provided by several packages: {owners}')
+    (entry_point,) = found
+    what = f'controller {name!r} of {owners} ({short(entry_point.value)})'
+    try:
+        controller = entry_point.load()
+    except (Exception, SystemExit) as error:
+        reason = ' '.join(f'{type(error).__name__}: {error}'.split())[:200]
+        raise ControllerError(f'{what} cannot be loaded: {reason}') from error
+    if not isinstance(controller, Controller):
+        raise ControllerError(f'{what} must be a Controller, got {short(controller)}')
+    if controller.name != name:
+        raise ControllerError(
+            f'{what} must have the name of its entry point, {name!r}, got {controller.name!r}'
+        )
+    _loaded[name] = controller
+    return controller
+
+
+def _owner(entry_point: EntryPoint) -> str:
+    """Return name and version of the package that provides an entry point."""
+    distribution = entry_point.dist
+    if distribution is None:
+        return 'an unknown package'
+    return f'{distribution.name} {distribution.version}'
