@@ -62,6 +62,7 @@ setup(
             f'ros-std-srvs=={MESSAGES}',
             'ros-unique-identifier-msgs==2.5.0',
         ],
+        'doc': ['pdoc>=15'],
         'plot': ['matplotlib>=3.5'],
         'test': ['mcap>=1.2', 'hypothesis>=6', 'matplotlib>=3.5', 'pytest>=7', 'pyyaml>=5'],
     },

@@ -1,0 +1,64 @@
+"""Write the API reference from the docstrings: `python doc/api.py [DIRECTORY]` (default: build/api).
+
+Needs pdoc: `pip install '.[jazzy,plot,test,doc]'`. Every warning is an error.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+import sys
+import typing
+import warnings
+from pathlib import Path
+from typing import Generic, TypeVar
+
+import numpy.typing
+import pdoc
+
+PACKAGE = 'diffdrive_jacobian'
+Scalar = TypeVar('Scalar', covariant=True)
+
+
+class ArrayLike:
+    """Stands for numpy.typing.ArrayLike, which is a union that fills a page."""
+
+
+class NDArray(Generic[Scalar]):
+    """Stands for numpy.typing.NDArray, which is written out as its parts otherwise."""
+
+
+def abbreviate_numpy_types() -> None:
+    """Have the types of NumPy written by their names. Call it before the package is imported."""
+    for replacement in (ArrayLike, NDArray):
+        replacement.__module__ = 'numpy.typing'
+        setattr(numpy.typing, replacement.__name__, replacement)
+
+
+def resolve_named_tuples() -> None:
+    """Replace the annotations of named tuples, which are strings, by the types.
+
+    pdoc evaluates them in the namespace of `collections`, where their names are unknown.
+    """
+    package = importlib.import_module(PACKAGE)
+    for info in pkgutil.walk_packages(package.__path__, f'{PACKAGE}.'):
+        module = importlib.import_module(info.name)
+        for _, member in inspect.getmembers(module, inspect.isclass):
+            if hasattr(member, '_fields') and member.__module__ == info.name:
+                hints = typing.get_type_hints(member)
+                member.__new__.__annotations__ = {name: hints[name] for name in member._fields}
+
+
+def main(directory: Path) -> None:
+    """Write the pages."""
+    abbreviate_numpy_types()
+    resolve_named_tuples()
+    warnings.simplefilter('error')
+    pdoc.render.configure(docformat='google', show_source=True)
+    pdoc.pdoc(PACKAGE, output_directory=directory)
+    print(directory / 'index.html')
+
+
+if __name__ == '__main__':
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else 'build/api'))
