@@ -152,8 +152,8 @@ def _parser() -> argparse.ArgumentParser:
         prog=PROGRAM,
         usage=f'{PROGRAM} BAG [options] [--ros-args ...]',
         description='Replay a recorded run: the commands (cmd_vel), unless an option selects other '
-        'topics. On a terminal, Enter pauses and resumes. Exit code 0: played; 1: not played to the end, '
-        'or nothing to play; 2: wrong arguments or no bag; 130: interrupted.',
+        'topics. On a terminal, Enter pauses and resumes. Exit code 0: played; 1: not played to the '
+        'end, or nothing to play; 2: wrong arguments or no bag; 130: interrupted.',
     )
     parser.add_argument('bag', metavar='BAG', help='directory of a rosbag2 bag')
     what = parser.add_mutually_exclusive_group()
