@@ -527,6 +527,11 @@ def test_an_invalid_controller_is_refused(changes, words):
         replace(MINE, **changes)
 
 
-def test_a_boundary_has_a_positive_ratio():
-    with pytest.raises(ValueError, match='ratio must be positive and finite'):
-        control.Boundary(ratio=0.0, beyond='')
+@pytest.mark.parametrize('bad', [0.0, -1.0, math.nan, math.inf, '1', None, [1.0]], ids=str)
+def test_boundary_and_reference_gains_are_positive_numbers(bad):
+    with pytest.raises(ValueError, match='ratio must be'):
+        control.Boundary(ratio=bad, beyond='')
+    for name in ('kp', 'kv'):
+        with pytest.raises(ValueError, match=f'{name} must be'):
+            control.ReferenceGains(**{'kp': 1.0, 'kv': 1.0, name: bad}, source='')
+    assert control.Boundary(ratio=2, beyond='').equation == 'kp = 2 kv'
