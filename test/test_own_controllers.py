@@ -223,6 +223,15 @@ def test_a_broken_controller_ends_the_process_with_one_line(site, install):
     assert 'cannot be loaded: RuntimeError: no licence' in line
 
 
+@pytest.mark.parametrize('bad', ['', 'other', 'a\nb', 3, None, []], ids=repr)
+def test_an_unknown_name_is_refused_with_the_choices(bad):
+    with pytest.raises(ControllerError) as caught:
+        find_controller(bad)
+    assert str(caught.value) == (
+        f"controller must be one of 'go_to_goal', 'offset_point', 'pose', got {bad!r}"
+    )
+
+
 def test_a_name_that_two_packages_provide_is_refused(install):
     install('twice', package='first-laws')
     install('twice', package='second-laws', version='4')

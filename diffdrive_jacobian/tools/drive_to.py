@@ -408,7 +408,7 @@ def _report(outcome: Outcome, timeout: float, time: str) -> int:
         print(f'interrupted: {where}')
         return _cli.INTERRUPTED
     reasons = {
-        GoalStatus.STATUS_ABORTED: 'goal refused',
+        GoalStatus.STATUS_ABORTED: 'goal refused or aborted',
         GoalStatus.STATUS_CANCELED: 'goal canceled by somebody else',
     }
     reason = f'--timeout {timeout:g} s was too short'
