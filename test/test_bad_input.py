@@ -106,8 +106,12 @@ OTHERS = {
     trajectories: {'law': control.go_to_goal, **LOOP, 'arrival': Arrival(), 'limits': LIMITS},
 }
 CALLS = FUNCTIONS | OTHERS
-ELSEWHERE = {'resolved_rate', 'track_line'}
-"""Tested in test_resolved_rate."""
+ELSEWHERE = {
+    *('resolved_rate', 'track_line'),
+    *('Boundary', 'Controller', 'ControllerError', 'Controllers', 'LawError', 'ReferenceGains'),
+    *('controller_names', 'find_controller'),
+}
+"""Tested in test_resolved_rate and test_own_controllers."""
 OPTIONAL = {'h', 'arrival', 'progress', 'commanded_at'}
 """Arguments that may be None."""
 

@@ -86,7 +86,7 @@ def test_a_batch_is_each_of_its_robots_in_a_scalar_loop(name, limits, use_headin
     assert gone.outcomes.arrived.sum() >= 3
 
 
-def test_the_robot_of_the_nodes_drives_the_same_way():
+def test_the_robot_of_the_nodes_drives_the_same_path():
     (start, to), gains = random_batch(2), (6.0, 1.5)
     gone = trajectories(go_to_pose, start[np.newaxis], to, *gains, limits=LIMITS)
     model = RobotModel(limits=LIMITS)
@@ -434,7 +434,7 @@ BAD = {
 @pytest.mark.parametrize(
     ('name', 'bad'), [(name, bad) for name, row in BAD.items() for bad in row], ids=str
 )
-def test_what_cannot_be_is_named(drive, name, bad):
+def test_invalid_arguments_are_named(drive, name, bad):
     arguments = {'starts': np.zeros((2, 3)), 'goals': [1.0, 0.0], 'gain 1': 0.5}
     if name in arguments:
         arguments[name], options = bad, {}

@@ -1,4 +1,4 @@
-"""The three laws of the node go_to_goal: chosen at the start, switched in the middle of a drive."""
+"""The built-in controllers of the node go_to_goal, chosen at the start and changed during a drive."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_each_law_answers_when_it_is_chosen_at_the_start(lockstep, name):
         assert controller.at(*pose) == pytest.approx(expected, rel=1e-9)
 
 
-def test_document_as_law_and_a_point_ahead_are_the_defaults(lockstep):
+def test_document_as_law_and_a_point_in_front_are_the_defaults(lockstep):
     node = Controller(lockstep).node
     assert [node.get_parameter(name).value for name in ('controller', 'offset')] == ['go_to_goal', 0.1]
 

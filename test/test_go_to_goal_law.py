@@ -133,7 +133,7 @@ def test_the_sampled_loop_arrives_from_every_start():
     assert np.all(offsets(here, goals)[1] <= 0.02)
 
 
-def test_turning_in_place_takes_the_short_way_and_ends_at_the_heading():
+def test_turning_in_place_takes_the_smaller_angle_and_ends_at_the_heading():
     rng = np.random.default_rng(5)
     here = start = rng.uniform(-np.pi, np.pi, (10_000, 3))
     heading, turned = rng.uniform(-np.pi, np.pi, 10_000), np.zeros(10_000)

@@ -153,7 +153,7 @@ def test_cancel_sends_zero_and_there_must_be_a_goal(lockstep, controller):
     ('heading', 'theta'), [(-2.0, 2.0), (0.0, math.pi), (math.pi, -3.0), (1.0, 1.2), (-1.0, -1.2)]
 )
 @pytest.mark.parametrize('kp', [3.0, 12.0])
-def test_final_heading_is_taken_the_short_way_when_asked_for(lockstep, heading, theta, kp):
+def test_final_heading_is_reached_by_the_smaller_angle_when_it_counts(lockstep, heading, theta, kp):
     controller = Controller(lockstep, kp=kp, use_goal_heading=True, yaw_goal_tolerance=0.1)
     controller.send(goals(goal(1, 0, 2.0), goal(1, 1, heading)))
     controller.at(0, 0)
@@ -237,7 +237,7 @@ def test_gains_that_spiral_are_warned_about(controller, capfd, kp, warned):
 
 @pytest.mark.parametrize('name', ['kp', 'kv'])
 @pytest.mark.parametrize('bad', [0.0, -1.0, math.nan, math.inf, 101.0])
-def test_gains_that_cannot_be_are_refused(controller, name, bad):
+def test_invalid_gains_are_refused(controller, name, bad):
     controller.send(goal(1, 0))
     before = controller.at(0, 0, 1.0)
     result = change(controller.node, **{name: bad})

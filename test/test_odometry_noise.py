@@ -92,8 +92,8 @@ def test_the_closed_form_is_the_integral(v, omega, duration, start):
 
 
 @pytest.mark.parametrize('omega', [0.0, 1e-12, -1e-6, 1e-3, 0.1])
-def test_across_a_nearly_straight_way_no_digits_are_lost(omega):
-    """Seen along the way, x and y differ by decades: each entry is held to its own size."""
+def test_across_a_nearly_straight_path_no_digits_are_lost(omega):
+    """Along the path, x and y differ by decades: each entry is compared relative to its own size."""
     v, duration = 0.2, 4.0
     pose = np.array([0.0, 0.0, -omega * duration])
     actual = propagated(NONE, pose, (v, omega), duration)
@@ -102,8 +102,8 @@ def test_across_a_nearly_straight_way_no_digits_are_lost(omega):
     assert np.all(np.abs(actual - expected) <= 1e-13 * np.outer(deviations, deviations))
 
 
-def test_a_straight_way_has_the_textbook_covariance():
-    """Along the way k d / 2, in heading 2 k d / L^2, across the way d^2 / 3 of the latter."""
+def test_a_straight_path_has_the_textbook_covariance():
+    """Along the path k d / 2, in heading 2 k d / L^2, across the path d^2 / 3 of the latter."""
     way = 0.8
     heading = 2.0 * K * way / L**2
     expected = [
@@ -184,7 +184,7 @@ def assert_same_within_sampling_error(samples, expected, standard_errors=5.0):
 )
 @pytest.mark.parametrize('start', [NONE, 1e-4 * COVARIANCE], ids=['sure', 'unsure'])
 def test_twenty_thousand_noisy_wheels_have_the_reported_covariances(v, omega, duration, start):
-    """Each wheel's travel is perturbed in 100 sub-steps by a variance of k times its way.
+    """Each wheel's travel is perturbed in 100 sub-steps by a variance of k times its distance.
 
     k is so small that the motion is linear in the noise to 1e-4 of it, far below the sampling error.
     """

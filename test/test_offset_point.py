@@ -33,7 +33,7 @@ NODE = {'controller': 'offset_point', 'kv': 4.0}
 
 
 def random_cases(seed, count=COUNT):
-    """States, goals, gains, and points ahead of the axle and behind it."""
+    """States, goals, gains, and points in front of the axle and behind it."""
     rng = np.random.default_rng(seed)
     states = rng.uniform([-5.0, -5.0, -np.pi], [5.0, 5.0, np.pi], (count, 3))
     goals = rng.uniform(-5.0, 5.0, (count, 2))
@@ -160,7 +160,7 @@ GOOD = {'state': np.zeros((2, 3)), 'goal': [1.0, 1.0], 'k': 1.0, 'd': 0.1}
         ('d', [np.inf, 1.0], r'^d must be finite and not 0.*got inf at index 0$'),
     ],
 )
-def test_what_cannot_be_is_named(name, bad, message):
+def test_invalid_arguments_are_named(name, bad, message):
     with pytest.raises(ValueError, match=message):
         offset_point(**{**GOOD, name: bad})
 
@@ -184,7 +184,7 @@ def test_each_odometry_is_answered_by_the_law_and_arrival_is_judged_at_the_point
     assert controller.statuses == [(0, ACCEPTED), (0, EXECUTING), (0, SUCCEEDED)]
 
 
-def test_on_a_way_of_several_goals_the_point_reaches_each(lockstep):
+def test_with_several_goals_the_point_reaches_each(lockstep):
     controller = Controller(lockstep, controller='offset_point', offset=0.5)
     controller.send(goals(goal(1, 0), goal(1, 1)))
     controller.at(1.0, 0.0)
@@ -239,7 +239,7 @@ def test_through_the_nodes_the_line_is_the_straighter_the_faster_they_run(lockst
 
 
 @pytest.mark.parametrize('bad', [0.0, -0.0, 0.0009, -0.0009, math.nan, math.inf, 101.0])
-def test_an_offset_that_cannot_be_is_refused_with_the_reason_at_the_start_and_live(lockstep, bad):
+def test_an_invalid_offset_is_refused_with_the_reason_at_the_start_and_live(lockstep, bad):
     tiny = abs(bad) < 1e-3
     with pytest.raises(ParameterError, match="'offset' must be " + ('.*rank 1' if tiny else 'in')):
         make(GoToGoal, controller='offset_point', offset=bad)

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from dataclasses import fields, replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 
@@ -30,7 +31,8 @@ from diffdrive_jacobian.reading.trace import trace
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.simulation import closed_loops
 from diffdrive_jacobian.sweeps import Setup, sweep
-from diffdrive_jacobian.tools import sweep_gains
+from diffdrive_jacobian.tools import drive_to, sweep_gains
+from diffdrive_jacobian.tools.run_node import run_node
 
 PAGE = Path(__file__).parent.parent / 'doc' / 'controllers.md'
 SOURCE = '''
@@ -123,9 +125,6 @@ def test_an_installed_controller_drives_to_the_goal_by_the_parameter(site, insta
     pose, (v, omega) = driven.odometry.values[0, :3], driven.cmd_vel.values[0]
     assert (v, omega) == pytest.approx(law(pose, np.array([0.8, 0.5]), 6.0, 0.5), rel=1e-9)
     assert math.dist(driven.odometry.values[-1, :2], (0.8, 0.5)) <= 0.021
-    # And by the option of drive_to.
-    ended = run(site, 'drive_to', '0.3', '0', '--lockstep', '--no-record', '--controller', 'tanh')
-    assert ended.returncode == 0, ended.stderr
 
 
 def test_an_installed_controller_is_chosen_at_the_start_and_live(lockstep, install):
@@ -141,12 +140,17 @@ def test_an_installed_controller_is_chosen_at_the_start_and_live(lockstep, insta
     assert controller.at(*pose) == pytest.approx(expected, rel=1e-12)
 
 
-@pytest.mark.parametrize('program', ['drive_to', 'go_to_goal', 'sweep_gains'])
-def test_help_lists_installed_controllers_without_importing_them(site, install, program):
+@pytest.mark.parametrize(
+    'main',
+    [drive_to.main, sweep_gains.main, partial(run_node, 'go_to_goal')],
+    ids=['drive', 'sweep', 'node'],
+)
+def test_help_lists_installed_controllers_without_importing_them(site, install, capsys, main):
     install('listed')
-    ended = run(site, program, '--help')
-    assert ended.returncode == 0, ended.stderr
-    assert 'listed' in ended.stdout
+    with pytest.raises(SystemExit) as ended:
+        main(['--help'], Signals())
+    assert ended.value.code == 0
+    assert 'listed' in capsys.readouterr().out
     assert not (site / 'imported').exists()
 
 
@@ -221,6 +225,15 @@ def test_a_broken_controller_ends_the_process_with_one_line(site, install):
     (line,) = ended.stderr.splitlines()
     assert "controller 'broken' of broken-laws 1.2" in line
     assert 'cannot be loaded: RuntimeError: no licence' in line
+
+
+@pytest.mark.parametrize('bad', ['', 'other', 'a\nb', 3, None, []], ids=repr)
+def test_an_unknown_name_is_refused_with_the_choices(bad):
+    with pytest.raises(ControllerError) as caught:
+        find_controller(bad)
+    assert str(caught.value) == (
+        f"controller must be one of 'go_to_goal', 'offset_point', 'pose', got {bad!r}"
+    )
 
 
 def test_a_name_that_two_packages_provide_is_refused(install):
@@ -363,9 +376,9 @@ def test_a_bag_is_read_without_the_import_of_its_controller(site, install, monke
         # Its driven point is not known, so the distance is that of the axle centre.
         expected = math.dist(read.run.odometry.values[-1, :2], (0.4, 0.2))
         assert read.distance[-1] == pytest.approx(expected)
-        for program in (('plot_run', bag, '-o', f'{path.name}.png'), ('replay_run', bag, '--verify')):
-            ended = run(path, *program)
-            assert ended.returncode == 0, ended.stderr
+    for program in (('plot_run', bag, '-o', 'run.png'), ('replay_run', bag, '--verify')):
+        ended = run(site, *program)
+        assert ended.returncode == 0, ended.stderr
     assert not (site / 'imported').exists()
 
 
@@ -527,6 +540,11 @@ def test_an_invalid_controller_is_refused(changes, words):
         replace(MINE, **changes)
 
 
-def test_a_boundary_has_a_positive_ratio():
-    with pytest.raises(ValueError, match='ratio must be positive and finite'):
-        control.Boundary(ratio=0.0, beyond='')
+@pytest.mark.parametrize('bad', [0.0, -1.0, math.nan, math.inf, '1', None, [1.0]], ids=str)
+def test_boundary_and_reference_gains_are_positive_numbers(bad):
+    with pytest.raises(ValueError, match='ratio must be'):
+        control.Boundary(ratio=bad, beyond='')
+    for name in ('kp', 'kv'):
+        with pytest.raises(ValueError, match=f'{name} must be'):
+            control.ReferenceGains(**{'kp': 1.0, 'kv': 1.0, name: bad}, source='')
+    assert control.Boundary(ratio=2, beyond='').equation == 'kp = 2 kv'

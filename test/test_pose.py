@@ -80,7 +80,7 @@ def test_the_law_is_that_of_aicardi_with_document_as_speed():
     assert np.array_equal(v, go_to_goal(states, targets[:, :2], Kp, Kv)[0])
 
 
-def test_where_no_weight_is_given_the_heading_settles_as_fast_as_it_can_or_twice_as_fast_as_the_way():
+def test_without_a_weight_the_heading_converges_at_critical_damping_or_twice_as_fast_as_the_distance():
     (states, targets), (Kp, Kv, _) = random_poses(1), random_gains(2)
     ratio = Kp / Kv
     assert 0.1 < np.mean(ratio > 4.0) < 0.9
@@ -252,7 +252,7 @@ def test_near_goals_headings_beside_pi_and_other_gains_are_taken_too():
 
 
 def test_limits_slow_the_robot_down_on_the_same_path():
-    """To first order in the sampling time: the law asks a slower robot more often on its way."""
+    """To first order in the sampling time: a slower robot is controlled more often along its path."""
     count = 10
     states, targets = random_poses(15, count, 1.0)
     slower = VelocityLimits(min_v=-0.1, max_v=0.1, min_omega=-0.5, max_omega=0.5, max_wheel_speed=4.0)
@@ -309,7 +309,7 @@ GOOD = {'state': np.zeros((2, 3)), 'goal': [1.0, 1.0, 0.0], 'Kp': 3.0, 'Kv': 0.5
         ('goal', np.zeros((3, 3)), r'^state and goal .*broadcast, got state \(2,\), goal \(3,\)'),
     ],
 )
-def test_what_cannot_be_is_named(name, bad, message):
+def test_invalid_arguments_are_named(name, bad, message):
     with pytest.raises(ValueError, match=message):
         go_to_pose(**{**GOOD, name: bad})
 

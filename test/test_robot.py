@@ -1,4 +1,4 @@
-"""The virtual robot as a value: its motion is a function of its commands and their instants alone."""
+"""The virtual robot as a value: its motion depends on its commands and their timestamps alone."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def start(model=MODEL, stamp=0) -> Robot:
 
 
 def random_commands(rng, count=12):
-    """Draw commands at instants up to 0.4 s apart: some outlive their timeout of 0.25 s, some do not."""
+    """Draw commands at times up to 0.4 s apart: some outlive their timeout of 0.25 s, some do not."""
     instants = np.cumsum(rng.integers(1, 2 * SECOND // 5, count)).tolist()
     twists = rng.normal(0.0, [0.3, 3.0], (count, 2))
     twists[rng.random(count) < 0.2] = 0.0
@@ -80,7 +80,7 @@ def close(robot, other, tolerance=1e-12):
 
 @pytest.mark.parametrize('seed', range(5))
 @pytest.mark.parametrize('model', [MODEL, HELD])
-def test_looking_changes_nothing_to_the_last_bit(seed, model):
+def test_intermediate_states_change_nothing_to_the_last_bit(seed, model):
     commands = random_commands(np.random.default_rng(seed))
     unseen = driven(start(model), commands)
     assert np.hypot(*(unseen.pose - START)[:2]) > 1e-3
@@ -99,7 +99,7 @@ def test_near_the_epoch_nothing_is_lost(seed):
     assert one.pose[0] == 0.2 * 1e-9
 
 
-def test_a_held_command_is_the_same_command_issued_often():
+def test_a_constant_command_is_the_same_command_issued_often():
     twist, rng = (0.2, -1.3), np.random.default_rng(20)
     once = often = start(HELD).commanded(twist, 0)
     for instant in np.unique(rng.integers(1, 3 * SECOND, 500)).tolist():
@@ -206,7 +206,7 @@ def test_the_driven_twist_keeps_the_commanded_curvature_and_the_wheels_turn_with
 
 @pytest.mark.parametrize('stamp', [0, EPOCH])
 @pytest.mark.parametrize('look_after', [250_000_000, 250_000_001, 3 * SECOND])
-def test_the_timeout_strikes_at_its_own_instant(stamp, look_after):
+def test_the_timeout_expires_at_its_own_time(stamp, look_after):
     robot = start(stamp=stamp).commanded((0.2, 1.0), stamp)
     assert robot.expiry == stamp + 250_000_000
     before, after = robot.at(robot.expiry - 1), robot.at(stamp + look_after)
@@ -216,7 +216,7 @@ def test_the_timeout_strikes_at_its_own_instant(stamp, look_after):
     assert after.stamp == stamp + look_after
 
 
-def test_a_new_command_starts_the_timeout_anew_and_standing_still_needs_none():
+def test_a_new_command_restarts_the_timeout_and_standing_still_needs_none():
     robot = start().commanded((0.2, 0.0), 0).commanded((0.2, 0.0), 200_000_000)
     assert robot.expiry == 450_000_000
     assert robot.commanded((0.0, 0.0), 300_000_000).expiry is None
@@ -262,7 +262,7 @@ def test_new_limits_apply_at_once_and_raised_again_they_give_the_command_back():
     assert forbidden.remodelled(MODEL, SECOND).twist == (0.0, 0.0)
 
 
-def test_new_wheels_turn_from_the_instant_they_are_mounted():
+def test_new_wheels_turn_from_the_time_they_are_mounted():
     now, command = 100_000_000, (0.15, 1.0)
     robot = start(HELD).commanded(command, 0)
     twice = replace(HELD, wheel_radius=2.0 * HELD.wheel_radius)
@@ -272,7 +272,7 @@ def test_new_wheels_turn_from_the_instant_they_are_mounted():
     np.testing.assert_allclose(here.at(2 * now).wheel_angles, expected, rtol=1e-12)
 
 
-def test_placed_begins_anew_and_drives_on():
+def test_placed_restarts_and_drives_on():
     robot, place, now = start().commanded((0.2, 1.0), 0), np.array([5.0, 6.0, -3.0]), 100_000_000
     placed = robot.placed(place, np.zeros((3, 3)), now)
     assert placed.pose.tolist() == place.tolist()

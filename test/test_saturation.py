@@ -111,7 +111,7 @@ def test_a_limit_of_zero_forbids_a_direction_and_leaves_the_rest(name):
     assert limited[1 - component].all()
 
 
-def test_limits_of_zero_both_ways_leave_nothing_of_a_component():
+def test_limits_of_zero_in_both_directions_leave_nothing_of_a_component():
     v, omega = random_commands(np.random.default_rng(6))
     v_limited, omega_limited = saturate(v, omega, VelocityLimits(min_v=0.0, max_v=0.0), R, L)
     assert not v_limited.any()

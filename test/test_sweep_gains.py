@@ -1,4 +1,4 @@
-"""The tool sweep_gains: its numbers are those of single loops and of the theory, mistakes are told."""
+"""The tool sweep_gains: numbers equal those of single loops and of the theory, mistakes are reported."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_the_fast_form_of_the_law_is_used(name):
     assert calls.count('steer') > 100
 
 
-def test_beyond_the_border_it_spirals_in_as_the_theory_says():
+def test_beyond_the_boundary_it_spirals_in_as_the_theory_says():
     """The distance decays as exp(-kv cos^2(e) t), with the heading error e at which it settles."""
     setup = Setup(kp=(0.5, 2.0), kv=(0.5, 2.0), grid=4, starts=4, duration=80.0)
     near, nearer = (sweep(replace(setup, tolerance=tolerance)) for tolerance in (2e-3, 2e-5))
@@ -151,7 +151,7 @@ def test_beyond_the_border_it_spirals_in_as_the_theory_says():
     assert seen == {True, False}
 
 
-def test_beyond_the_border_ways_and_times_are_longer():
+def test_beyond_the_boundary_paths_and_times_are_longer():
     swept = sweep(Setup(kp=(0.25, 4.0), kv=(0.999, 1.001), grid=16, starts=6))
     spirals = swept.kp < 1.0
     assert spirals.sum() == 3
@@ -164,7 +164,7 @@ def test_beyond_the_border_ways_and_times_are_longer():
 
 
 @pytest.mark.parametrize('count', [1, 2, 7, 12, 16])
-def test_starts_lie_evenly_around_the_goal_and_face_every_way(count):
+def test_starts_lie_evenly_around_the_goal_and_face_all_directions(count):
     poses = Setup(starts=count, distance=3.0).poses()
     assert poses.shape == (count, 3)
     assert np.hypot(poses[:, 0], poses[:, 1]) == pytest.approx(3.0)
@@ -204,7 +204,7 @@ def test_the_fastest_is_one_from_which_all_arrive():
     assert changed.fastest() == swept.fastest() == (4, 4)
 
 
-def test_progress_is_told_at_every_step_and_may_end_all():
+def test_progress_is_reported_at_every_step_and_may_end_all():
     seen = []
     sweep(replace(SMALL, grid=2), seen.append)
     assert seen == sorted(seen)
@@ -523,7 +523,7 @@ def test_it_says_which_gains_are_the_fastest():
     ],
     ids=lambda value: ' '.join(value)[:40] if isinstance(value, tuple) else '',
 )
-def test_what_cannot_be_is_told(folder, capsys, arguments, words):
+def test_invalid_arguments_are_reported(folder, capsys, arguments, words):
     try:
         code = run(*arguments)
     except SystemExit as end:
@@ -533,7 +533,7 @@ def test_what_cannot_be_is_told(folder, capsys, arguments, words):
     assert left(folder) == []
 
 
-def test_parameters_that_cannot_be_are_told(folder, capsys):
+def test_invalid_parameters_are_reported(folder, capsys):
     Path('wrong.yaml').write_text('virtual_robot:\n  ros__parameters:\n    wheel_radius: -1.0\n')
     assert run('--params-file', 'wrong.yaml') == 2
     refuses(capsys, "parameter 'wheel_radius' must be in [0.001, 10], got -1.0")
@@ -568,7 +568,7 @@ def test_nothing_is_ever_overwritten(folder, capsys, option):
 
 @pytest.mark.parametrize('place', ['/proc/no/a', 'none/a', 'file/a', 'a' * 300])
 @pytest.mark.parametrize('option', ['-o', '--csv'])
-def test_where_nobody_may_write_is_told_before_the_batch(folder, capsys, monkeypatch, place, option):
+def test_where_nobody_may_write_is_reported_before_the_batch(folder, capsys, monkeypatch, place, option):
     monkeypatch.delattr(sweep_gains, 'sweep')
     Path('file').touch()
     place += '.png' if option == '-o' else '.csv'
@@ -577,7 +577,7 @@ def test_where_nobody_may_write_is_told_before_the_batch(folder, capsys, monkeyp
     assert left(folder) == ['file']
 
 
-def test_without_permission_it_is_told_before_the_batch(folder, capsys, monkeypatch):
+def test_missing_permission_is_reported_before_the_batch(folder, capsys, monkeypatch):
     monkeypatch.delattr(sweep_gains, 'sweep')
     # Root may write everywhere, and tests may run as root.
     monkeypatch.setattr(os, 'access', lambda path, mode: not (mode & stat.S_IWOTH))

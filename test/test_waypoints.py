@@ -1,4 +1,4 @@
-"""Waypoints as a value: driven in order, the heading at the end only when asked for."""
+"""Waypoints: driven in order, with the heading of the last one only when it counts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def refuses(pose, goal):
 
 
 def echo(pose, goal):
-    """A law that tells what it was asked."""
+    """A law that records its arguments."""
     return (*pose, *goal)
 
 
@@ -56,7 +56,7 @@ def test_waypoints_are_reached_in_order_each_within_the_tolerance(arrival):
     assert math.dist(end[:2], POSES[-1, :2]) <= arrival.xy_tolerance
 
 
-def test_the_heading_is_taken_at_the_end_and_only_when_asked_for():
+def test_the_heading_is_reached_at_the_end_and_only_when_it_counts():
     driven, end = drive(Waypoints(POSES), POSITIONS_ONLY, np.zeros(3))
     assert abs(wrap_angle(end[2] - POSES[-1, 2])) > 1.0
     assert not any(waypoints.turning for _, waypoints in driven)
@@ -71,7 +71,7 @@ def test_the_heading_is_taken_at_the_end_and_only_when_asked_for():
     assert {tuple(pose[:2]) for pose, _ in turning} == {tuple(end[:2])}
 
 
-def test_the_law_is_asked_with_the_pose_and_the_position_driven_to():
+def test_the_law_is_called_with_the_pose_and_the_position_driven_to():
     pose = np.array([0.25, 0.5, 3.0])
     for index in range(3):
         here, command = Waypoints(POSES, index).follow(pose, echo, WITH_HEADING, GAIN)
@@ -89,7 +89,7 @@ def test_waypoints_already_reached_are_skipped_in_one_step(arrival):
     assert command == (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
 
 
-def test_a_turn_that_is_not_asked_for_any_more_ends():
+def test_a_turn_ends_when_the_heading_no_longer_counts():
     turning = Waypoints(POSES[:1], turning=True)
     here = np.array([1.0, 0.0, 0.0])
     assert turning.follow(here, refuses, WITH_HEADING, GAIN)[1] == turn_in_place(0.0, 2.0, GAIN)
@@ -156,7 +156,7 @@ def test_arrival_is_judged_at_the_point_that_the_offset_names():
         ('offset', [0.1, np.inf]),
     ],
 )
-def test_what_cannot_be_arrived_at_is_named(name, bad):
+def test_invalid_waypoints_are_named(name, bad):
     with pytest.raises(ValueError, match=rf'^{name} must be '):
         Arrival(**{name: bad})
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.control.saturation import VelocityLimits
-from diffdrive_jacobian.kinematics._checks import boolean, function, instance, short
+from diffdrive_jacobian.kinematics._checks import boolean, function, instance, number, positive, short
 
 Law = Callable[..., tuple[Any, Any]]
 """`law(poses, goals, *gains) -> (v, omega)`, as described above."""
@@ -58,7 +58,11 @@ class LawError(ValueError):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Boundary:
-    """A straight line `kp = ratio * kv` across the plane of gains."""
+    """A straight line `kp = ratio * kv` in the plane of gains.
+
+    Raises:
+        ValueError: The ratio is not positive and finite, or `beyond` is not a string.
+    """
 
     ratio: float
     """Positive, kp on the line divided by kv [-]."""
@@ -66,9 +70,9 @@ class Boundary:
     """What happens where kv is larger than on the line."""
 
     def __post_init__(self) -> None:
-        """Check the ratio."""
-        if not 0.0 < self.ratio < math.inf:
-            raise ValueError(f'ratio must be positive and finite, got {self.ratio}')
+        """Check every value."""
+        object.__setattr__(self, 'ratio', number('ratio', self.ratio, positive))
+        instance('beyond', self.beyond, str)
 
     @property
     def equation(self) -> str:
@@ -78,7 +82,11 @@ class Boundary:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ReferenceGains:
-    """A pair of gains that is marked in the picture of a sweep."""
+    """A pair of gains that is marked in the picture of a sweep.
+
+    Raises:
+        ValueError: A gain is not positive and finite, or `source` is not a string.
+    """
 
     kp: float
     """Gain on the heading error (1/s)."""
@@ -86,6 +94,12 @@ class ReferenceGains:
     """Gain on the distance (1/s)."""
     source: str
     """Where they come from."""
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        for name in ('kp', 'kv'):
+            object.__setattr__(self, name, number(name, getattr(self, name), positive))
+        instance('source', self.source, str)
 
 
 def no_advice(gains: GainValues, limits: VelocityLimits) -> Iterable[str]:

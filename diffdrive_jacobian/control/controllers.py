@@ -95,8 +95,7 @@ class Controllers(Collection[str]):
         Raises:
             ControllerError: There is none, or it cannot be loaded.
         """
-        found = self._given.get(name) or BUILT_IN.get(name)
-        if found is not None:
+        if isinstance(name, str) and (found := self._given.get(name) or BUILT_IN.get(name)):
             return found
         if name not in self:
             raise ControllerError(

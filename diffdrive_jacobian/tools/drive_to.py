@@ -181,7 +181,7 @@ def _reason(outcome: Outcome, timeout: float) -> str:
     if outcome.seconds > timeout:
         return f'--timeout {timeout:g} s was too short'
     reasons = {
-        GoalStatus.STATUS_ABORTED: 'goal refused',
+        GoalStatus.STATUS_ABORTED: 'goal refused or aborted',
         GoalStatus.STATUS_CANCELED: 'goal canceled by another process',
     }
     return reasons.get(outcome.status, 'ROS was shut down')
