@@ -1,1 +1,1 @@
-"""What all pictures share: their style, and the files they are written to. No ROS."""
+"""Figures and tables of runs and sweeps, their style and their files. No ROS is needed."""
