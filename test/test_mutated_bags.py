@@ -136,7 +136,7 @@ def test_mutated_metadata(bags, tmp_path, storage):
     text = (bags[storage] / 'metadata.yaml').read_text()
     bag = shutil.copytree(bags[storage], tmp_path / 'bag')
     results = []
-    for number in range(12):
+    for number in range(8):
         content = yaml.load(text)
         mutate(content, chance)
         with open(bag / 'metadata.yaml', 'w') as file:
@@ -150,7 +150,7 @@ def test_mutated_cells_of_sqlite(bags, tmp_path):
     cells = [one for one in VALUES if not isinstance(one, (list, dict)) and one not in (2**63, 10**30)]
     cells += [b'', b'\0', b'\0\1\0\0', b'\xff' * 40, chance.randbytes(400)]
     results = []
-    for number in range(18):
+    for number in range(12):
         bag = shutil.copytree(bags['sqlite3'], tmp_path / f'bag{number}')
         database = sqlite3.connect(bag / 'sqlite3.db3')
         # Types as declared would be forced upon the values: rows of a table without them are not.
@@ -227,7 +227,7 @@ def test_mutated_records_of_journals(tmp_path):
     chance = random.Random('journal')
     path = tmp_path / 'run.journal'
     results = []
-    for number in range(24):
+    for number in range(14):
         records = [[kind, packed(kind, content)] for kind, content in journal_records()]
         for _ in range(chance.choice((1, 1, 2, 3))):
             index = chance.randrange(len(records))
@@ -276,7 +276,7 @@ def test_an_invalid_record_with_a_right_checksum_is_left_out(tmp_path, kind, pay
 def test_mutated_messages(tmp_path):
     """Damaged messages are either used or counted."""
     chance = random.Random('messages')
-    for number in range(6):
+    for number in range(4):
         damaged = []
         for at, topic, message in sent():
             data = bytearray(serialize_message(message))
