@@ -7,6 +7,7 @@ is created.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +61,11 @@ def load_yaml(source: Path | str) -> Any:
 
 def check_yaml(source: Path | str) -> None:
     """Check that YAML is of moderate size, depth and expansion; arguments and errors of `load_yaml`."""
-    text = _read(source) if isinstance(source, Path) else source
+    _check_text(_read(source) if isinstance(source, Path) else source)
+
+
+@lru_cache(maxsize=8)  # Opening a bag checks metadata.yaml several times.
+def _check_text(text: str) -> None:
     if len(text) > MAX_SIZE:
         raise TooLargeError(
             f'the YAML text has {format_size(len(text))}; at most {format_size(MAX_SIZE)} are read'

@@ -104,7 +104,7 @@ def test_a_length_beyond_the_end_asks_for_no_memory():
 def test_another_file_is_refused(tmp_path, content):
     path = tmp_path / 'x.journal'
     path.write_bytes(content)
-    with pytest.raises(JournalError, match=r'x\.journal is no journal of record_run'):
+    with pytest.raises(JournalError, match=r'x\.journal is not a journal of record_run'):
         list(read_journal(path))
 
 

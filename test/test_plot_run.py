@@ -642,14 +642,14 @@ def test_a_topic_may_have_another_name(tmp_path, capsys):
 def test_the_numbers_of_several_runs_need_a_directory(bag, tmp_path, capsys):
     other = write_bag(tmp_path / 'other', sample())
     assert plot(bag, other, '--csv', tmp_path / 'a.csv') == 2
-    refuses(capsys, 2, 'need a directory')
+    refuses(capsys, 2, '--csv must be a directory for 2 runs')
 
 
 @pytest.mark.parametrize('output', ['x.txt', 'x.csv.gz', 'x.png'])
 def test_another_ending_of_the_numbers_is_told(bag, tmp_path, capsys, monkeypatch, output):
     monkeypatch.chdir(tmp_path)
     assert plot(bag, '--csv', output) == 2
-    refuses(capsys, 2, f'must end in .csv, got {output!r}')
+    refuses(capsys, 2, f'--csv must be a file that ends in .csv or a directory, got {output!r}')
     assert os.listdir(tmp_path) == ['bag']
 
 

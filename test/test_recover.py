@@ -194,7 +194,7 @@ def test_a_bag_of_ros2_bag_record(tmp_path, capsys):
     os.truncate(file, 777_777)
     code, out, _ = recover(capsys, bag, '-s', 'mcap')
     assert code == 0
-    assert 'lost: tb3_sqlite_0.db3: it breaks off: 365007 bytes are missing' in out
+    assert 'lost: tb3_sqlite_0.db3: it is cut off: 365007 bytes are missing' in out
     found = read_bag(tmp_path / 'run_recovered')
     assert found == true[: len(found)]
     assert len(found) > 900

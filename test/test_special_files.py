@@ -6,7 +6,7 @@ import os
 import shutil
 
 import pytest
-from test_damaged_bags import make_bag
+from test_damaged_bags import COUNT, make_bag
 
 from diffdrive_jacobian.reading import BagError, read_run
 from diffdrive_jacobian.recovery import NotABagError, recover
@@ -39,7 +39,7 @@ def test_metadata(bag, kind):
         read_run(bag)
     recovery = recover(bag)
     assert recovery.lost[0] == 'metadata.yaml: metadata.yaml is not a regular file'
-    assert len(read_run(recovery.bag).odometry) == 20
+    assert len(read_run(recovery.bag).odometry) == COUNT
 
 
 @pytest.mark.parametrize('kind', ['pipe', 'device', 'directory'])
@@ -79,4 +79,4 @@ def test_one_of_two_data_files_is_reported(bag):
         read_run(bag)
     recovery = recover(bag)
     assert f'{other} is not a regular file' in recovery.lost
-    assert len(read_run(recovery.bag).odometry) == 20
+    assert len(read_run(recovery.bag).odometry) == COUNT

@@ -1,1 +1,1 @@
-"""File formats: rosbag2 bags, read within limits and written whole, and journals."""
+"""File formats: rosbag2 bags, which are read within limits and written completely, and journals."""

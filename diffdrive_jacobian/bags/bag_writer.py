@@ -1,4 +1,4 @@
-"""Bags made from what was recorded: rosbag2's version 9, MCAP or SQLite, through rosbags."""
+"""Writing of bags from the records of a journal: rosbag2 version 9, MCAP or SQLite."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ _SUM = (1 << 64) - 1
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Summary:
-    """What a bag holds."""
+    """Content of a bag."""
 
     messages: int
     topics: dict[str, int]
     """Messages by topic."""
     start: int | None
-    """Stamp of the first message (ns); None: there is none."""
+    """Time of the first message (ns); None: there is none."""
     end: int | None
-    """Stamp of the last one (ns)."""
+    """Time of the last message (ns)."""
     lost: dict[str, int] = field(default_factory=dict)
     """Messages that are known to be missing, by topic."""
 
@@ -43,8 +43,8 @@ def check_target(target: Path) -> None:
     """Check that a bag can have this path, before anything is recorded for it.
 
     Raises:
-        FileExistsError: It exists, be it as a symbolic link to nothing.
-        OSError: Its name is not UTF-8, which metadata.yaml has to be.
+        FileExistsError: It exists, possibly as a broken symbolic link.
+        OSError: Its name is not UTF-8, as metadata.yaml must be.
     """
     if os.path.lexists(target):
         raise FileExistsError(f'{target} exists already')
@@ -55,22 +55,22 @@ def check_target(target: Path) -> None:
 
 
 def build_bag(records: Callable[[], Iterable[Record]], target: Path, storage: str) -> Summary:
-    """Write records into a new bag, read it back, and only then give it its name.
+    """Write records to a new bag, and give it its name after it was read back.
 
     Args:
-        records: Returns them, from the beginning with each call.
+        records: Returns all records, with each call from the beginning.
         target: The bag's directory; it must not exist.
         storage: `mcap` or `sqlite3`.
 
     Raises:
         FileExistsError: `target` exists.
-        OSError: It cannot be written, or differs from what was written. Nothing is left of it.
+        OSError: It cannot be written, or is not read back as it was written. It is removed then.
     """
     check_target(target)
     channels = {record.id: record for record in records() if isinstance(record, Channel)}
     scratch = Path(tempfile.mkdtemp(prefix=f'.{target.name[:40]}.building-', dir=target.parent))
     try:
-        # In a directory of the final name, for rosbags names the files after it.
+        # The directory has the final name, after which rosbags names the files.
         bag = scratch / target.name
         summary, written = _write(records(), channels, bag, storage)
         if _contents(bag) != written:
@@ -78,7 +78,7 @@ def build_bag(records: Callable[[], Iterable[Record]], target: Path, storage: st
         for path in bag.iterdir():
             _sync(path)
         _sync(bag)
-        # Renaming would replace an empty directory of somebody else.
+        # Renaming would replace an empty directory that was created meanwhile.
         check_target(target)
         os.rename(bag, target)
         _sync(target.parent)
@@ -89,7 +89,7 @@ def build_bag(records: Callable[[], Iterable[Record]], target: Path, storage: st
 
 @dataclass(slots=True)
 class Content:
-    """Messages by topic, in numbers that do not depend on their order."""
+    """Counts and checksums of messages by topic, which do not depend on the order."""
 
     counts: Counter[str] = field(default_factory=Counter)
     checksums: Counter[str] = field(default_factory=Counter)
@@ -129,7 +129,7 @@ def _write(
         writer.close()
     except BaseException as error:
         with suppress(Exception):
-            # What it cannot write now it cannot write then.
+            # Closing would fail for the same reason as writing.
             writer.abort()
         if isinstance(error, sqlite3.Error):
             raise OSError(errno.EIO, str(error)) from error

@@ -1,11 +1,11 @@
-"""A journal: what a recorder has received, on the disk within a moment, readable up to its last record.
+"""Journals: what a recorder has received, on the disk almost at once, readable up to the last record.
 
-A bag is complete only when it is closed: a recorder that is killed loses its index, its metadata and up
-to a whole chunk of messages. So messages go into a journal first, in the order in which they came,
-and the bag is made from it at the end, or by whoever finds it after a crash.
+A bag is complete only when it is closed. A recorder that is killed loses its index, its metadata and up
+to a whole chunk of messages. So messages are written to a journal first, in the order in which they were
+received. The bag is written from it at the end, or by recover_run after a crash.
 
-Layout: the magic, then records of a kind (1 byte), the payload's length (u32) and its CRC-32 (u32), all
-little-endian, and the payload. A record that was cut off or damaged ends the journal.
+Layout: the magic, then records. A record has its kind (1 byte), the length of the payload (u32), its
+CRC-32 (u32) and the payload, all little-endian. A record that was cut off or damaged ends the journal.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from typing import Any, BinaryIO
 from diffdrive_jacobian.text import printable
 
 JOURNAL = '.journal'
-"""Ends the name of a journal; before it stands the name of the bag."""
+"""Ends the name of a journal, after the name of the bag."""
 PARAMETERS = 'parameters of '
-"""Before a node's name, the key of the custom data that holds its parameters as JSON."""
+"""Followed by a node's name, the key of the custom data that holds its parameters as JSON."""
 LOST = 'messages lost'
 """Key of the custom data with the number of messages that are known to be missing, by topic, as JSON."""
 MAGIC = b'\x89ddjournal1\r\n\x1a\n'
@@ -36,9 +36,9 @@ _HEAD = struct.Struct('<cII')
 _MESSAGE = struct.Struct('<Hq')
 _CONNECTION, _DATA, _TEXT = b'C', b'M', b'T'
 BLOCK = 8 << 20
-"""What is written at once (bytes), about."""
+"""Approximate number of bytes per write."""
 OVERHEAD = 250
-"""Memory that a record takes besides its payload (bytes), about."""
+"""Approximate memory of a record without its payload (bytes)."""
 _TEXT_FIELDS: dict[str, type] = {'key': str, 'value': str}
 _CHANNEL_FIELDS: dict[str, type] = {
     'id': int,
@@ -51,12 +51,12 @@ _CHANNEL_FIELDS: dict[str, type] = {
 
 
 def journal_of(bag: Path) -> Path:
-    """Return the journal that lies beside a bag while it is recorded, and after a crash."""
+    """Return the path of a bag's journal, which exists while it is recorded and after a crash."""
     return bag.with_name(bag.name + JOURNAL)
 
 
 class JournalError(Exception):
-    """A file is no journal, or a record in it is invalid."""
+    """A file is not a journal, or a record in it is invalid."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -69,12 +69,12 @@ class Channel:
     definition: str
     type_hash: str
     qos: tuple[dict[str, Any], ...] = ()
-    """The profiles that its publishers offered, in rosbag2's words."""
+    """The QoS profiles that its publishers offered, with the keys of rosbag2."""
 
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message: when it came (ns), on which channel, as CDR."""
+    """A message: its channel, when it was received (ns), and its CDR."""
 
     channel: int
     stamp: int
@@ -83,7 +83,7 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """Something to be known about the run; a later one with the same key counts."""
+    """An entry of the custom data; a later one replaces an earlier one with the same key."""
 
     key: str
     value: str
@@ -103,9 +103,9 @@ class JournalWriter:
             OSError: It cannot be written.
         """
         self.path = path
-        # Its own buffer: that of `open` would raise once more for what could not be written.
+        # Unbuffered: the buffer of `open` would raise again when it is closed after a failed write.
         self._file = open(path, 'x+b', buffering=0)  # noqa: SIM115
-        # The lock ends with the process, however that ends.
+        # The lock ends with the process, also if that is killed.
         fcntl.flock(self._file, fcntl.LOCK_EX)
         self._lock = threading.Lock()
         self._pending = [MAGIC]
@@ -137,10 +137,10 @@ class JournalWriter:
             self.waiting += OVERHEAD + len(payload)
 
     def flush(self) -> None:
-        """Hand everything to the operating system. A killed process loses nothing of it.
+        """Write all records to the operating system, where they survive the end of the process.
 
         Raises:
-            OSError: The disk is full, or gone. What was not written is dropped.
+            OSError: The disk is full or was removed. What was not written is dropped.
         """
         with self._lock:
             pending, self._pending = self._pending, []
@@ -157,10 +157,10 @@ class JournalWriter:
                 self.waiting -= waiting
 
     def sync(self) -> None:
-        """Wait until everything flushed is on the disk. A power cut loses nothing of it.
+        """Wait until all flushed records are on the disk, where they survive a power cut.
 
         Raises:
-            OSError: The disk is full, or gone.
+            OSError: The disk is full or was removed.
         """
         written = self._written
         if written > self._synced:
@@ -168,14 +168,14 @@ class JournalWriter:
             self._synced = written
 
     def in_place(self) -> bool:
-        """Whether the file is still found at `path`: not removed, renamed or replaced."""
+        """Return whether the file is still at `path`: not removed, renamed or replaced."""
         try:
             return os.path.samestat(os.stat(self.path), os.fstat(self._file.fileno()))
         except OSError:
             return False
 
     def rescue(self) -> Path:
-        """Return where a file that is not `in_place` was moved to, or, if it was removed, a copy of it.
+        """Return where a file that is not `in_place` was moved, or a copy of it if it was removed.
 
         The copy is in the directory of `path`, or in the nearest one above that still exists. It is
         complete when this returns.
@@ -185,7 +185,7 @@ class JournalWriter:
         """
         descriptor = self._file.fileno()
         with suppress(OSError):
-            # Linux knows its name.
+            # Linux reports the present name.
             moved = Path(os.readlink(f'/proc/self/fd/{descriptor}'))
             if os.path.samestat(os.stat(moved), os.fstat(descriptor)):
                 return moved
@@ -194,7 +194,7 @@ class JournalWriter:
         folder = next(one for one in folders if one.is_dir() and os.access(one, os.W_OK))
         handle, name = tempfile.mkstemp(path.suffix, f'{path.stem[:50]}_rescued_', folder)
         with open(handle, 'wb') as copy:
-            # The descriptor still has what the removed file held.
+            # The content of a removed file can still be read.
             while data := os.pread(descriptor, BLOCK, copy.tell()):
                 copy.write(data)
             copy.flush()
@@ -202,16 +202,16 @@ class JournalWriter:
         return Path(name)
 
     def close(self) -> None:
-        """Close the file. Flush before."""
+        """Close the file; records that were not flushed are lost."""
         self._file.close()
 
 
 def _blocks(pieces: list[bytes]) -> Iterator[bytes]:
-    """Yield bytes joined to blocks of about BLOCK: a write to a slow disk takes long, however small."""
+    """Yield bytes joined to blocks of about BLOCK, since each write to a slow disk takes long."""
     block: list[bytes] = []
     size = 0
     for index, piece in enumerate(pieces):
-        # Memory is given back while the rest is being written.
+        # The memory is freed while the rest is being written.
         pieces[index] = b''
         block.append(piece)
         size += len(piece)
@@ -223,7 +223,7 @@ def _blocks(pieces: list[bytes]) -> Iterator[bytes]:
 
 
 def is_being_written(path: Path) -> bool:
-    """Whether the process that writes a journal still lives."""
+    """Return whether the process that writes a journal is still running."""
     with open(path, 'rb') as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -237,20 +237,20 @@ def read_journal(path: Path, note: Callable[[str], None] | None = None) -> Gener
 
     Args:
         path: The journal.
-        note: Is told of each record whose content is invalid although its checksum is right; such a
-            record is left out. Without it, it is an error.
+        note: Is called with a description of each record whose content is invalid although its checksum
+            is right; the record is left out. By default it is an error.
 
     Returns:
         The records; the generator's value is how many bytes at the end could not be read.
 
     Raises:
-        JournalError: The file is no journal, or a record's content is invalid.
+        JournalError: The file is not a journal, or a record's content is invalid.
         OSError: It cannot be read.
     """
     with open(path, 'rb') as file:
         size = os.fstat(file.fileno()).st_size
         if file.read(len(MAGIC)) != MAGIC:
-            raise JournalError(f'{path} is no journal of record_run')
+            raise JournalError(f'{path} is not a journal of record_run')
         end = file.tell()
         while (raw := _read_record(file, size - end)) is not None:
             begin, end = end, file.tell()
@@ -271,7 +271,7 @@ def _read_record(file: BinaryIO, left: int) -> tuple[bytes, bytes] | None:
     if len(head) < _HEAD.size:
         return None
     kind, length, checksum = _HEAD.unpack(head)
-    # A length that was damaged would ask for gigabytes of memory.
+    # Reading a damaged length could take gigabytes of memory.
     if kind not in (_CONNECTION, _DATA, _TEXT) or _HEAD.size + length > left:
         return None
     payload = file.read(length)
@@ -307,10 +307,10 @@ def _parsed(kind: bytes, payload: bytes) -> Record:
 
 
 def _fields(content: object, types: dict[str, type]) -> dict[str, Any]:
-    """Return a JSON object that has just these fields.
+    """Return a JSON object after a check of its fields.
 
     Raises:
-        JournalError: It has not.
+        JournalError: It has other fields, or fields of other types.
     """
     if not isinstance(content, dict) or content.keys() != types.keys():
         got = printable(repr(content), 40)

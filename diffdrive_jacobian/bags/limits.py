@@ -1,7 +1,7 @@
 """Limits on the memory and time that a bag of unknown origin may take, and decompression within them.
 
-The limits are per message, per chunk and relative to a file's size: a bag may be as large as it likes,
-but a small file must not unpack to something huge.
+The limits are per message, per chunk and relative to the size of a file. A bag may have any size, but a
+small file must not unpack to a huge one.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ else:
 MAX_RECORD = 1 << 27
 """Size of the largest message, chunk or other record that is read (bytes, unpacked)."""
 MAX_OVERLAP = 1 << 29
-"""How much the chunks that are open at the same time may unpack to (bytes)."""
+"""Unpacked size of all chunks that are open at the same time (bytes)."""
 FREE = 1 << 28
-"""How much every file may unpack to (bytes)."""
+"""Unpacked size that is allowed for any file (bytes)."""
 MAX_RATIO = 1000
-"""How many times its size a larger file may unpack to."""
+"""Largest ratio of unpacked to packed size of a larger file."""
 UNPACK_ERRORS = (ValueError, RuntimeError, EOFError, zstd.ZstdError)
-"""What damaged or too large data leads to when it is unpacked."""
+"""What unpacking raises on damaged or too large data."""
 _BLOCK = 1 << 20
 _MAX_FRAMES = 1000
 
@@ -47,7 +47,7 @@ def check_record(size: int, what: str) -> None:
 
 
 class Budget:
-    """How much one file may unpack to in all, in proportion to its size."""
+    """Total size that one file may unpack to, in proportion to its size."""
 
     def __init__(self, packed: int, ratio: int = MAX_RATIO) -> None:
         """Allow a multiple of the size of the file, and at least `FREE`.
@@ -74,15 +74,15 @@ class Budget:
 
 
 def unpack(compression: str, data: bytes, size: int) -> bytes:
-    """Decompress a chunk of MCAP, as far as its data goes.
+    """Decompress a chunk of MCAP, or as much of it as there is.
 
     Args:
         compression: `lz4`, `zstd`, or empty for none.
         data: The chunk's data, which may be cut off.
-        size: How much the chunk claims to unpack to (bytes). At most one byte more is returned.
+        size: The size that the chunk declares (bytes). At most one byte more is returned.
 
     Raises:
-        TooLargeError: The claimed size is larger than `MAX_RECORD`.
+        TooLargeError: The declared size is larger than `MAX_RECORD`.
         ValueError: The compression is unknown.
         RuntimeError, EOFError, zstd.ZstdError: The data is damaged.
     """
@@ -131,16 +131,16 @@ def _unpack_zstd(data: bytes, limit: int, *, whole: bool = False) -> bytes:
 
 
 def unpack_file(path: Path, out: BinaryIO | None) -> None:
-    """Decompress a file, as far as its data goes.
+    """Decompress a file, or as much of it as there is.
 
     Args:
         path: A Zstandard file.
-        out: Where to write the content; None only checks how large it is.
+        out: Where to write the content; None: only its size is checked.
 
     Raises:
         TooLargeError: It unpacks to more than a file of its size may.
         OSError: It cannot be read, or `out` not be written.
-        EOFError, zstd.ZstdError: It is damaged; what comes before has been written.
+        EOFError, zstd.ZstdError: It is damaged. What precedes the damage has been written.
     """
     budget = Budget(path.stat().st_size)
     with open(path, 'rb') as file:

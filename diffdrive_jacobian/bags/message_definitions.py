@@ -23,7 +23,7 @@ from diffdrive_jacobian.text import printable
 DELIMITER = '=' * 80
 _NAME = re.compile(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9_]*)')
 _LIBRARIES = (('lib',), ('lib64',), ('local', 'lib'), ('Lib',))
-"""Where the Python packages of a prefix are, relative to it."""
+"""Directories of Python packages, relative to a prefix."""
 _FIELD = re.compile(r'^\s*([A-Za-z]\w*(?:/[A-Za-z]\w*)?)(?:<=\d+)?(?:\[[^]]*\])?\s+[A-Za-z]\w*')
 _PRIMITIVE = re.compile(r'bool|byte|char|float(32|64)|u?int(8|16|32|64)|w?string')
 
@@ -39,14 +39,14 @@ class Definition:
     name: str
     """`package/msg/Name`."""
     text: str
-    """Its .msg file, followed by those of all types that it is made of, as rosbag2 stores it."""
+    """Its .msg file, followed by those of all types in its fields, as rosbag2 stores it."""
     type_hash: str
     """`RIHS01_` and 64 hexadecimal digits (REP 2011)."""
 
 
 @cache
 def definition(name: str) -> Definition:
-    """Look a message type up.
+    """Return the definition of an installed message type.
 
     Args:
         name: `package/msg/Name`.
@@ -89,7 +89,7 @@ def _split(name: str) -> tuple[str, str]:
 
 
 def _full_text(package: str, message: str, seen: set[tuple[str, str]]) -> str:
-    """Give a .msg file and, depth first and in the order of their names, those that it needs."""
+    """Return a .msg file and those that it depends on, depth first and sorted by name."""
     text = _file(package, message, '.msg').read_text(encoding='utf-8')
     parts = [text]
     for dependency in sorted(_dependencies(package, text)):
@@ -112,7 +112,7 @@ def _dependencies(package: str, text: str) -> set[tuple[str, str]]:
 
 
 def _file(package: str, message: str, ending: str) -> Path:
-    """Return a file of an interface package: it is in the prefix in which its Python code is, too."""
+    """Return a file of an interface package, from the prefix that also has its Python code."""
     for prefix in _prefixes(package):
         path = prefix / 'share' / package / 'msg' / f'{message}{ending}'
         if path.is_file():
@@ -127,7 +127,7 @@ def _prefixes(package: str) -> list[Path]:
     if spec is None or spec.origin is None:
         return []
     library = Path(spec.origin).parent.parent
-    # With an empty entry in PYTHONPATH whatever lies beside a bag would be found.
+    # With an empty entry in PYTHONPATH a package in the current directory would be found.
     if not library.is_absolute() or library.resolve() == Path.cwd():
         return []
     return [

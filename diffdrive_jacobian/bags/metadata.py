@@ -1,7 +1,7 @@
-"""Validation of what a bag says about itself: metadata.yaml, recorded parameters, topics.
+"""Validation of metadata.yaml, recorded parameters and topics of a bag.
 
-rosbags takes these values as they are. They are checked once, before anything else uses them, so that
-each tool finds the same bags damaged and names the same key.
+rosbags does not check these values. They are checked once, before they are used, so that all tools
+report the same damage and name the same key.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ LATEST_VERSION = 9
 """Of metadata.yaml, that rosbags reads."""
 ROOT = 'rosbag2_bagfile_information'
 INVALID = (ReaderError, YAMLError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
-"""What rosbags and the YAML parser raise on values of another kind than they expect."""
+"""What rosbags and the YAML parser raise on values of unexpected types."""
 _COMPRESSIONS = ('', 'none', 'file', 'message', 'storage')
 _INT64 = 2**63
 
@@ -69,7 +69,7 @@ def check_metadata(source: Path | str) -> None:
     count = _integer(_required(root, 'message_count', ''), 'message_count', 0, _INT64 - 1)
     for key, name in (('duration', 'nanoseconds'), ('starting_time', 'nanoseconds_since_epoch')):
         value = _required(_mapping(_required(root, key, ''), key), name, key)
-        # Of a bag without messages, the writers differ.
+        # Writers differ for a bag without messages.
         _integer(value, f'{key}.{name}', 0 if count else -_INT64, _INT64 - 1)
     topics = _sequence(_required(root, 'topics_with_message_count', ''), 'topics_with_message_count')
     for index, topic in enumerate(topics):
@@ -150,11 +150,11 @@ def check_connections(described: Iterable[Connection], stored: Iterable[Connecti
     """Check the topics of an open bag.
 
     rosbags reads a message only if metadata.yaml describes its topic exactly as the data file does, and
-    passes over all others without a word.
+    skips all others silently.
 
     Args:
-        described: The bag's topics, as metadata.yaml has them.
-        stored: The topics of the data files. Of a bag that is a single file, the same.
+        described: The bag's topics according to metadata.yaml.
+        stored: The topics of the data files. They are the same if the bag is a single file.
 
     Raises:
         DamagedError: A topic's name or type is not text, or a topic with messages is not described.
@@ -176,13 +176,13 @@ def check_connections(described: Iterable[Connection], stored: Iterable[Connecti
 
 
 def _alike(stored: Connection, described: Connection) -> bool:
-    """Return whether rosbags takes two topics for the same."""
+    """Return whether rosbags considers two topics the same."""
     if (stored.topic, stored.msgtype, stored.ext) != (described.topic, described.msgtype, described.ext):
         return False
     return not stored.digest or not described.digest or stored.digest == described.digest
 
 
-# --- Values by their kind
+# --- Checks of single values
 
 
 def _required(mapping: dict[str, Any], key: str, where: str) -> Any:

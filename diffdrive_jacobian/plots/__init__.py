@@ -1,1 +1,4 @@
-"""What all pictures share: their style, and the files they are written to. No ROS."""
+"""Figures and tables of runs and sweeps, their style and their files. No ROS is needed.
+
+`run_figure.draw` draws runs, `run_table.write_csv` writes a run as CSV, `sweep_figure` draws gain sweeps.
+"""

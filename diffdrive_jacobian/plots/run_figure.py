@@ -1,7 +1,7 @@
-"""Runs as one picture.
+"""A figure of one or several runs.
 
-The plane with the path; over time the distance to the goal and the heading error, v and omega, and the
-wheel speeds, each with its limits. matplotlib is imported when something is drawn; no display is needed.
+It shows the paths in the plane, and over time the distance to the goal, the heading error, v, omega and
+the wheel speeds with their limits. matplotlib is imported when it is drawn. No display is needed.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
 SIZE = (11.0, 7.0)
-"""Of the picture (inches)."""
+"""Size of the figure (inches)."""
 ARROWS = 14
-"""Headings along a path."""
+"""Number of headings along a path."""
 LABEL = 40
-"""A longer name of a bag is cut in the middle."""
+"""Length beyond which the name of a bag is shortened in the middle."""
 NUMBERED, MARKED = 12, 30
-"""With more goals than that they bear no numbers; their changes are not marked over time."""
+"""Numbers of goals beyond which they have no numbers, and their changes are not marked over time."""
 NOTED = 4
-"""Lines of notes below the picture."""
+"""Number of lines of notes below the figure."""
 COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
-"""Okabe and Ito's, those that stand out from white; the lines' styles tell runs apart as well."""
+"""The colors of Okabe and Ito that contrast with white. The line styles differ between runs as well."""
 STYLES: tuple[Any, ...] = ('-', (0, (5, 1.5)), '-.', (0, (1.2, 1)), (0, (7, 1.5, 1, 1.5, 1, 1.5)))
 LIMIT = (0, (6, 3))
 GREY, COMMAND = '#777777', '#d2d2d2'
@@ -62,7 +62,7 @@ _ARROW: Any = {
 
 
 def draw(runs: Sequence[Run], path: Path) -> None:
-    """Draw runs, over each other, into a new file.
+    """Draw runs into one set of axes, and write the figure to a new file.
 
     Args:
         runs: One or more, with odometry.
@@ -70,10 +70,10 @@ def draw(runs: Sequence[Run], path: Path) -> None:
 
     Raises:
         BagError: A run has no odometry.
-        FileExistsError: The file exists; it stays as it is.
+        FileExistsError: The file exists.
         ModuleNotFoundError: matplotlib is not installed.
-        OSError: The file cannot be written; nothing is left of it.
-        ValueError: The ending is another one.
+        OSError: The file cannot be written.
+        ValueError: The path has another ending.
     """
     ending = path.suffix.lower().removeprefix('.')
     if ending not in FORMATS:
@@ -82,16 +82,16 @@ def draw(runs: Sequence[Run], path: Path) -> None:
         raise FileExistsError(f'{path} exists already')
     drawn = io.BytesIO()
     with warnings.catch_warnings(), styled():
-        # A letter of a bag's name that the font does not have.
+        # The font may lack a letter of a bag's name.
         warnings.filterwarnings('ignore', message='Glyph')
-        # So many runs that there is no room left for their names.
+        # With many runs there may be no room for their names.
         warnings.filterwarnings('ignore', message='constrained_layout not applied')
         figure(runs).savefig(drawn, format=ending, dpi=DPI)
     create(path, drawn.getvalue())
 
 
 def names(paths: Sequence[Path]) -> list[str]:
-    """Tell bags apart by as much of the ends of their paths as it takes."""
+    """Return names for bags: as many last parts of their paths as make them different."""
     parts = [path.resolve().parts for path in paths]
     count = 1
     while count < max(map(len, parts)) and len({one[-count:] for one in parts}) < len(set(parts)):
@@ -100,10 +100,9 @@ def names(paths: Sequence[Path]) -> list[str]:
 
 
 def figure(runs: Sequence[Run]) -> Figure:
-    """Draw runs, over each other; the plane is the first of the axes.
+    """Return a figure of runs in one set of axes. The plane is the first of its axes.
 
-    A single run also shows what was commanded, and when its goals changed; of several that would be
-    too much.
+    A single run is drawn with its commands and the changes of its goals.
 
     Raises:
         BagError: A run has no odometry.
@@ -121,30 +120,30 @@ def figure(runs: Sequence[Run]) -> Figure:
     rows = len(quantities) // columns
     labels = names([run.path for run in runs])
     with styled():
-        made = Figure(figsize=SIZE, layout='constrained')
-        grid = made.add_gridspec(
+        drawing = Figure(figsize=SIZE, layout='constrained')
+        grid = drawing.add_gridspec(
             rows + 1,
             columns + 1,
             width_ratios=[1.55, *[2.0 / columns] * columns],
             height_ratios=[*[1.0] * rows, 0.03 * rows],
         )
-        plane, panels = made.add_subplot(grid[:-1, 0]), _panels(made, grid, quantities, columns)
+        plane, panels = drawing.add_subplot(grid[:-1, 0]), _panels(drawing, grid, quantities, columns)
         for one, label, color, style in zip(traces, labels, cycle(COLORS), cycle(STYLES), strict=False):
             _draw_path(plane, one, label, color, style)
             for quantity, panel in panels.items():
                 _draw_over_time(panel, one, quantity, color, style, alone=len(runs) == 1)
         _draw_goals(plane, traces)
         _finish(plane, traces)
-        below = made.add_subplot(grid[-1, :])
+        below = drawing.add_subplot(grid[-1, :])
         below.axis('off')
         below.legend(handles=_marks(traces), loc='center', ncol=6, borderaxespad=0.0)
         if notes := _notes(runs, labels):
-            made.supxlabel(notes, fontsize=8.0, color=GREY)
-    return made
+            drawing.supxlabel(notes, fontsize=8.0, color=GREY)
+    return drawing
 
 
 def _notes(runs: Sequence[Run], labels: Sequence[str]) -> str:
-    """Return what is wrong with the bags, one line each; of several runs with their names."""
+    """Return the notes of the runs, one line each, with the names of the runs if there are several."""
     lines = [
         f'{f"{label}: " if len(runs) > 1 else ""}{note}'.replace('$', r'\$')
         for run, label in zip(runs, labels, strict=True)
@@ -155,12 +154,12 @@ def _notes(runs: Sequence[Run], labels: Sequence[str]) -> str:
     return '\n'.join(lines)
 
 
-def _panels(made: Figure, grid: Any, quantities: Sequence[str], columns: int) -> dict[str, Axes]:
-    """Make the axes over time, one for each quantity; those of the wheels have one scale."""
+def _panels(drawing: Figure, grid: Any, quantities: Sequence[str], columns: int) -> dict[str, Axes]:
+    """Create the axes over time, one for each quantity. Those of the wheels share their scale."""
     panels: dict[str, Axes] = {}
     for index, quantity in enumerate(quantities):
         row, column = divmod(index, columns)
-        panel = made.add_subplot(
+        panel = drawing.add_subplot(
             grid[row, 1 + column],
             sharex=panels.get(quantities[0]),
             sharey=panels.get('right') if quantity == 'left' else None,
@@ -173,18 +172,18 @@ def _panels(made: Figure, grid: Any, quantities: Sequence[str], columns: int) ->
 
 
 def _draw_path(plane: Axes, one: Trace, name: str, color: str, style: Any) -> None:
-    """Draw the way with evenly spaced headings, where it begins and where it ends."""
+    """Draw the path with evenly spaced headings, its start and its end."""
     poses = one.run.odometry.values[:, :3]
     steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
     steps[one.breaks - 1] = 0.0
-    way = np.concatenate([[0.0], np.cumsum(steps)])
+    travelled = np.concatenate([[0.0], np.cumsum(steps)])
     name = name if len(name) <= LABEL else f'{name[: LABEL // 2]}…{name[-LABEL // 2 :]}'
-    # A dollar begins a formula, and an underscore hides a label.
-    label = f'{name}: {np.ptp(one.time):.1f} s, {way[-1]:.2f} m'.replace('$', r'\$')
+    # matplotlib reads a dollar as a formula, and hides labels that start with an underscore.
+    label = f'{name}: {np.ptp(one.time):.1f} s, {travelled[-1]:.2f} m'.replace('$', r'\$')
     label = f' {label}' if label.startswith('_') else label
     plane.plot(*line(poses[:, :2], one.breaks).T, color=color, ls=style, lw=1.8, label=label)
-    evenly = np.searchsorted(way, np.linspace(0.0, way[-1], ARROWS, endpoint=False))
-    x, y, theta = poses[np.unique([*evenly, len(way) - 1])].T
+    evenly = np.searchsorted(travelled, np.linspace(0.0, travelled[-1], ARROWS, endpoint=False))
+    x, y, theta = poses[np.unique([*evenly, len(travelled) - 1])].T
     plane.quiver(x, y, np.cos(theta), np.sin(theta), color=color, zorder=3, **_ARROW)
     x, y, _ = poses[[0, *one.breaks[:MARKED]]].T
     plane.plot(x, y, 'o', ms=9, mfc='white', mec=color, mew=1.8, zorder=2.5)
@@ -192,7 +191,7 @@ def _draw_path(plane: Axes, one: Trace, name: str, color: str, style: Any) -> No
 
 
 def _draw_goals(plane: Axes, traces: Sequence[Trace]) -> None:
-    """Draw each goal once, with what counts as arrived, in the order in which they were given."""
+    """Draw each goal once with its tolerance, in the order in which they were sent."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Circle
 
@@ -221,7 +220,7 @@ def _draw_goals(plane: Axes, traces: Sequence[Trace]) -> None:
 
 
 def _free_corner(places: Array, place: tuple[float, float]) -> tuple[int, int]:
-    """Find on which side of a place, right 1 or left -1 and above 1 or below -1, least was driven."""
+    """Return the side of a place with the fewest poses: right 1 or left -1, above 1 or below -1."""
     reach = 0.2 * np.nanmax(np.nanmax(places, axis=0) - np.nanmin(places, axis=0))
     dx, dy = (places - place).T
     near = np.hypot(dx, dy) < reach
@@ -235,14 +234,14 @@ def _free_corner(places: Array, place: tuple[float, float]) -> tuple[int, int]:
 def _draw_over_time(
     panel: Axes, one: Trace, quantity: str, color: str, style: Any, *, alone: bool
 ) -> None:
-    """Draw a quantity, its limits, and of a single run what was commanded and when goals changed."""
+    """Draw a quantity and its limits, and for a single run its commands and the changes of goals."""
     panel.axhline(0.0, color='#bbbbbb', lw=0.8, zorder=1)
-    asked, told = commanded(one, quantity), measured(one, quantity)
-    if not len(told):
-        panel.plot(*asked.T, color=color, ls=style, lw=1.5, drawstyle='steps-post')
+    command, measurement = commanded(one, quantity), measured(one, quantity)
+    if not len(measurement):
+        panel.plot(*command.T, color=color, ls=style, lw=1.5, drawstyle='steps-post')
     elif alone:
-        panel.plot(*asked.T, color=COMMAND, lw=4.5, drawstyle='steps-post', zorder=1.5)
-    panel.plot(*told.T, color=color, ls=style, lw=1.5)
+        panel.plot(*command.T, color=COMMAND, lw=4.5, drawstyle='steps-post', zorder=1.5)
+    panel.plot(*measurement.T, color=color, ls=style, lw=1.5)
     for bound in limits(one).get(quantity, ()):
         panel.plot(*bound.T, color='black', ls=LIMIT, lw=1.0, drawstyle='steps-post', zorder=3)
     changes = np.flatnonzero(np.diff(one.goal)) + 1
@@ -252,9 +251,9 @@ def _draw_over_time(
 
 
 def _finish(plane: Axes, traces: Sequence[Trace]) -> None:
-    """Scale the plane alike along both axes, and name the runs."""
+    """Set equal scales of the plane's axes, and add the legend of the runs."""
     places = np.concatenate([one.run.odometry.values[:, :2] for one in traces])
-    # A robot that stands is not to fill the picture with its noise.
+    # The noise of a robot at rest must not fill the figure.
     middle = (places.min(axis=0) + places.max(axis=0)) / 2.0
     plane.update_datalim([middle - 0.25, middle + 0.25])
     plane.set_aspect('equal', adjustable='datalim')
@@ -270,7 +269,7 @@ def _finish(plane: Axes, traces: Sequence[Trace]) -> None:
 
 
 def _marks(traces: Sequence[Trace]) -> list[Line2D]:
-    """Say what the marks mean that were drawn."""
+    """Return the legend of the marks that were drawn."""
     from matplotlib.lines import Line2D
 
     alone = len(traces) == 1

@@ -1,11 +1,11 @@
-"""The style of all pictures. matplotlib is imported when something is drawn; no display is needed."""
+"""The style of all figures. matplotlib is imported when something is drawn. No display is needed."""
 
 from __future__ import annotations
 
 from typing import Any
 
 DPI = 130
-"""Resolution of pictures (dots per inch)."""
+"""Resolution of figures (dots per inch)."""
 _STYLE: Any = {
     'font.size': 9.5,
     'axes.spines.top': False,
@@ -20,9 +20,9 @@ _STYLE: Any = {
 
 
 def styled() -> Any:
-    """Return a context manager that sets this style, whatever the user has configured."""
+    """Return a context manager that sets this style, independent of the user's configuration."""
     import matplotlib
 
-    # Not the backend, which nothing here needs: it would stay changed.
+    # The backend is not needed, and would not be restored.
     style: Any = {name: value for name, value in matplotlib.rcParamsDefault.items() if name != 'backend'}
     return matplotlib.rc_context({**style, **_STYLE})

@@ -1,4 +1,4 @@
-"""The lines that are drawn of a run over time: rows `[time, value]`, NaN where a line is broken."""
+"""Lines of a run over time, as they are drawn: rows `[time, value]`, NaN where a line is broken."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from diffdrive_jacobian.reading.run import Run, Series, number
 from diffdrive_jacobian.reading.trace import Array, Indices, Mask, Trace, seconds
 
 BUCKETS = 1500
-"""A longer line shows the least and the greatest of so many stretches."""
+"""A longer line is reduced to the minimum and the maximum of so many parts."""
 _TWIST = {'v': 0, 'omega': 1}
 _WHEEL = {'right': 0, 'left': 1}
 _BODY = ('virtual_robot', 'go_to_goal')
@@ -24,7 +24,7 @@ _LIMITS = {
 
 
 def measured(one: Trace, quantity: str) -> Array:
-    """Give what was measured, shape (m, 2); m may be 0."""
+    """Return the measured values of a quantity, shape (m, 2); m may be 0."""
     run = one.run
     if quantity in _WHEEL:
         values = np.column_stack([seconds(run, run.wheels), run.wheels.values[:, _WHEEL[quantity]]])
@@ -39,7 +39,7 @@ def measured(one: Trace, quantity: str) -> Array:
 
 
 def commanded(one: Trace, quantity: str) -> Array:
-    """Give what was asked for, each value until the next, shape (m, 2); m may be 0."""
+    """Return the commanded values of a quantity, each valid until the next, shape (m, 2); m may be 0."""
     run = one.run
     if quantity in _WHEEL:
         series, column = run.wheel_commands, _WHEEL[quantity]
@@ -47,12 +47,12 @@ def commanded(one: Trace, quantity: str) -> Array:
         series, column = run.cmd_vel if len(run.cmd_vel) else run.cmd_vel_out, _TWIST[quantity]
     else:
         return np.empty((0, 2))
-    return _held(one, np.column_stack([seconds(run, series), series.values[:, column]]))
+    return _continued(one, np.column_stack([seconds(run, series), series.values[:, column]]))
 
 
 def limits(one: Trace) -> dict[str, Array]:
-    """Give the narrowest limits that the nodes had, by quantity: the lower and the upper one, each a
-    line (s, and m/s or rad/s), shape (2, m, 2). NaN: none.
+    """Return the tightest limits of all nodes, by quantity: the lower and the upper one, each a line
+    (s, and m/s or rad/s), shape (2, m, 2). NaN: no limit.
     """
     rows: dict[str, list[list[list[float]]]] = {name: [] for name in _LIMITS}
     for time, run in _configurations(one.run):
@@ -64,14 +64,14 @@ def limits(one: Trace) -> dict[str, Array]:
             bounds = _tightest(max, least), _tightest(min, most)
             rows[name].append([[time, bound] for bound in bounds])
     found = {
-        name: np.array([_held(one, bound) for bound in np.swapaxes(np.array(values), 0, 1)])
+        name: np.array([_continued(one, bound) for bound in np.swapaxes(np.array(values), 0, 1)])
         for name, values in rows.items()
     }
     return {**found, 'left': found['right']}
 
 
 def _configurations(run: Run) -> Iterator[tuple[float, Run]]:
-    """Give the run with the parameters as they were, from when on (s)."""
+    """Yield the run with the parameters of each time, and since when they are valid (s)."""
     yield 0.0, run
     for received, node, values in run.parameter_events:
         now = np.array([received])
@@ -85,16 +85,17 @@ def _tightest(choose: Callable[[list[float]], float], bounds: list[float]) -> fl
     return choose([bound for bound in bounds if not np.isnan(bound)] or [np.nan])
 
 
-def _held(one: Trace, rows: Array) -> Array:
-    """Hold the last value until the end."""
+def _continued(one: Trace, rows: Array) -> Array:
+    """Return a line whose last value is continued to the end of the run."""
     if len(rows):
         rows = np.vstack([rows, [max(one.time[-1], rows[-1, 0]), rows[-1, 1]]])
     return line(rows, np.array([], dtype=np.intp))
 
 
 def line(rows: Array, breaks: Indices) -> Array:
-    """Break a line before some of its rows, and thin it out: of a long one stays, of each stretch,
-    where each column is least and greatest.
+    """Return a line that is broken before some of its rows and reduced if it is long.
+
+    Of each part of a long line, the rows with the minimum and the maximum of each column remain.
     """
     rows = np.where(np.isfinite(rows), rows, np.nan)
     rows = np.insert(rows, breaks, np.nan, axis=0)
@@ -103,13 +104,13 @@ def line(rows: Array, breaks: Indices) -> Array:
         return rows
     holes: Mask = np.any(np.isnan(rows), axis=1)
     gaps = np.flatnonzero(holes[1:] & ~holes[:-1]) + 1
-    # So many would leave nothing but dots.
+    # With more gaps only dots would remain.
     keep = [np.array([0, count - 1]), gaps[: len(gaps) * (len(gaps) <= BUCKETS // 10)]]
     size = -(-count // BUCKETS)
     starts = np.arange(0, count, size)
     for column in rows.T:
         for sign in (1.0, -1.0):
-            # argmin is the first of equals: a hole counts as greatest.
+            # Rows with NaN count as the greatest.
             padded = np.full(len(starts) * size, np.inf)
             padded[:count] = np.where(np.isnan(column), np.inf, sign * column)
             keep.append(starts + padded.reshape(-1, size).argmin(axis=1))

@@ -29,13 +29,13 @@ TELEPORT = 0.1
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Trace:
-    """What a run means, one value for each odometry message; arrays of shape (n,)."""
+    """Quantities of a run, one value for each odometry message; arrays of shape (n,)."""
 
     run: Run
     time: Array
     """Since the first of them (s)."""
     breaks: Indices
-    """Where the odometry begins anew: no way leads there from the one before."""
+    """Where the odometry is reset: no path leads there from the message before."""
     goal: Indices
     """Which of `run.goals` is driven to; -1: none."""
     distance: Array
@@ -97,22 +97,22 @@ def seconds(run: Run, series: Series) -> Array:
 
 
 def _breaks(run: Run) -> Indices:
-    """Find where the odometry begins anew: after a start_pose, back in time, or by a teleport."""
+    """Return where the odometry is reset: after a start_pose, back in time, or by a teleport."""
     stamps, values = run.odometry.stamps, run.odometry.values
     dt, step = np.diff(stamps) / 1e9, np.hypot(*np.diff(values[:, :2], axis=0).T)
     moving = (dt > 0.0) & (step > 0.0)
     usual = np.median(step[moving] / dt[moving]) if moving.any() else 0.0
     speed = np.abs(values[:, 3])
     fastest = np.maximum(np.fmax(speed[:-1], speed[1:]), usual)
-    anew = (dt < 0.0) | (step > np.fmax(TELEPORT, 3.0 * fastest * dt))
+    reset = (dt < 0.0) | (step > np.fmax(TELEPORT, 3.0 * fastest * dt))
     for stamp, pose in zip(run.start_pose.stamps, run.start_pose.values, strict=True):
         first = int(np.searchsorted(stamps, stamp))
         if first < len(stamps) and stamps[first] == stamp:
-            # Of the same instant, but from before.
+            # A message with the same stamp may be from before the reset.
             first += not np.allclose(values[first, :2], pose[:2], rtol=0.0, atol=1e-9)
         if 0 < first < len(stamps):
-            anew[first - 1] = True
-    return np.flatnonzero(anew) + 1
+            reset[first - 1] = True
+    return np.flatnonzero(reset) + 1
 
 
 def _progress(run: Run, breaks: Indices) -> tuple[Indices, NDArray[np.bool_]]:
@@ -207,12 +207,12 @@ def _driven_points(run: Run) -> Array:
 
 
 def _statuses(run: Run, begin: int, end: int) -> tuple[Array, NDArray[np.int64]]:
-    """Give what was told from `begin` until before `end` (ns), and when."""
+    """Return the goal states recorded from `begin` until before `end` (ns), and their times."""
     first, last = np.searchsorted(run.goal_status.received, [begin, end])
     return run.goal_status.values[first:last, 0], run.goal_status.received[first:last]
 
 
 def tolerance(run: Run) -> float:
-    """Give the distance from a goal that counts as arrived (m)."""
+    """Return the distance from a goal that counts as arrived (m)."""
     default = GoToGoalParameters().xy_goal_tolerance
     return run.number_of_node('go_to_goal', 'xy_goal_tolerance', default)

@@ -1,10 +1,9 @@
-"""Whether a robot still moves as it did: a recorded run, driven again, beside its odometry.
+"""Verification of a recorded run: a simulation from its commands is compared with its odometry.
 
-What was commanded is driven again through `simulation.Robot`, as in the node `virtual_robot`, and each
-odometry message is held against where that robot is at the message's stamp. `cmd_vel_out` tells each
-command as it was applied, limits and timeout included, with the instant it took effect, so that nothing
-else need be known. Without it the commands are taken by the time of their recording, through the limits
-and the timeout of the parameters.
+The commands are applied to `simulation.Robot`, as in the node `virtual_robot`, and each odometry message
+is compared with the pose of that robot at the message's stamp. `cmd_vel_out` has each command as it was
+applied, after limits and timeout, with the time it took effect, so that no parameter is needed. Without
+it the commands take effect when they were recorded, with the limits and the timeout of the parameters.
 """
 
 from __future__ import annotations
@@ -29,17 +28,17 @@ from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot, RobotModel
 
 ROBOT = 'virtual_robot'
 EXACT, BY_RECORDING_TIME = 1e-9, 0.02
-"""Differences that are allowed if nothing else is said, by how well the commands are known (m, rad)."""
+"""Default tolerances, with `cmd_vel_out` and with commands by their time of recording (m, rad)."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Verification:
-    """How far odometry and the robot driven again are apart, at each of n odometry messages."""
+    """Differences of odometry and simulated robot at each of n odometry messages."""
 
     source: str
     """The topic from which the commands were taken."""
     start: str
-    """Where the robot driven again began: `start_pose` or `odometry`."""
+    """The topic from which the start of the simulated robot was taken: `start_pose` or `odometry`."""
     seconds: NDArray[np.float64]
     """Stamps of the odometry messages, since the first one of the run, shape (n,) (s)."""
     distances: NDArray[np.float64]
@@ -47,37 +46,37 @@ class Verification:
     headings: NDArray[np.float64]
     """Differences of the heading, not negative, shape (n,) (rad)."""
     notes: tuple[str, ...] = ()
-    """What is wrong with the bag although it could be read, such as messages that were skipped."""
+    """Faults of the bag that did not prevent reading it, such as messages that were skipped."""
 
     @property
     def allowed(self) -> float:
-        """The difference that is allowed if nothing else is said (m, rad)."""
+        """The default tolerance (m, rad)."""
         return EXACT if self.source == 'cmd_vel_out' else BY_RECORDING_TIME
 
     def holds(self, tolerance: float, yaw_tolerance: float) -> bool:
-        """Say whether no difference is larger than allowed (m, rad)."""
+        """Return whether no difference exceeds the tolerances (m, rad)."""
         return bool(np.all(self.distances <= tolerance) and np.all(self.headings <= yaw_tolerance))
 
 
 @dataclass(frozen=True, slots=True)
 class _Anchor:
-    """The robot after an event, and when that was recorded (ns)."""
+    """The robot after an event, and when the event was recorded (ns)."""
 
     robot: Robot
     received: int
 
 
 def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verification:
-    """Drive a run again.
+    """Simulate a run again and return its differences from the odometry.
 
     Args:
-        run: What was recorded.
-        parameters: Of the robot, by their ROS names; else those that were recorded with the run. They
-            matter only where `cmd_vel_out` was not recorded.
+        run: The recorded run.
+        parameters: Parameters of the robot, by their ROS names. By default those recorded with the run.
+            They are used only if `cmd_vel_out` was not recorded.
 
     Raises:
-        BagError: There is no odometry, or nothing that tells what was commanded.
-        ParameterError: The parameters are not those of the robot.
+        BagError: There is no odometry, or there are no commands.
+        ParameterError: The parameters are not valid parameters of the robot.
     """
     if not len(run.odometry):
         raise BagError(f'{run.path} has no odometry: record the topic odom')
@@ -97,7 +96,7 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
     if epochs[-1] >= len(anchors):
         raise BagError(
             f'{run.path} cannot be followed: time goes back {epochs[-1]} times in the odometry, but the '
-            f'robot began anew {len(anchors) - 1} times. Where /clock goes back, '
+            f'robot was restarted {len(anchors) - 1} times. Where /clock goes back, '
             'record without use_sim_time'
         )
     for index, epoch in enumerate(epochs):
@@ -120,17 +119,17 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
 
 
 def _epochs(series: Series) -> list[int]:
-    """Count for each message how often time went back before it."""
+    """Return for each message how often time went back before it."""
     back = np.diff(series.stamps) < 0
     return [0, *np.cumsum(back).astype(int).tolist()]
 
 
 def _nearest(anchors: list[_Anchor], odometry: Series, index: int) -> Robot | None:
-    """Give the robot at the stamp of an odometry message; None if it begins later.
+    """Return the robot at the stamp of an odometry message; None: it starts later.
 
     A command that took effect before that stamp, but was recorded no sooner than the message, may have
-    come late, so that the robot did not know of it yet; or it was the recorder that got it later. What
-    was published first is not known then, and the nearer one counts.
+    reached the robot after it sent the message, or only the recorder late. Which was published first is
+    unknown then, and the robot that is nearer to the odometry counts.
     """
     stamp, received = int(odometry.stamps[index]), int(odometry.received[index])
     last = bisect_right(anchors, stamp, key=lambda anchor: anchor.robot.stamp) - 1
@@ -152,11 +151,11 @@ def _nearest(anchors: list[_Anchor], odometry: Series, index: int) -> Robot | No
 
 
 def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
-    """Follow `cmd_vel_out` and `start_pose`, an epoch of time after the other."""
+    """Return the robot after each event of `cmd_vel_out` and `start_pose`, one list for each restart."""
     first = _beginning(run)
     starts = run.start_pose
     whole = len(starts) > 0 and int(starts.stamps[0]) >= first.stamp - _period(run)
-    # Else the first one is latched, from before the recording.
+    # Otherwise the first one is latched, from before the recording.
     skipped = 0 if whole else 1
     events: list[tuple[int, int, bool, NDArray[np.float64]]] = []
     for is_start, series, begin in ((True, starts, skipped), (False, run.cmd_vel_out, 0)):
@@ -182,27 +181,27 @@ def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
 
 
 def _beginning(run: Run) -> Robot:
-    """Give the robot as the first odometry message tells it, its twist included."""
+    """Return the robot with the pose and the twist of the first odometry message."""
     x, y, theta, v, omega = run.odometry.values[0].tolist()
     robot = Robot(model=RobotModel(), stamp=int(run.odometry.stamps[0]), pose=np.array([x, y, theta]))
     return robot.commanded((v, omega), robot.stamp)
 
 
 def _period(run: Run) -> int:
-    """Give the odometry's period, and half as much again for a timer that was late (ns)."""
+    """Return 1.5 periods of the odometry, which allows for a late timer (ns)."""
     gaps = np.diff(run.odometry.stamps)
     return int(np.median(gaps) * 1.5) if len(gaps) else 0
 
 
 def _commanded(run: Run, given: Mapping[str, Any] | None) -> tuple[str, str, list[list[_Anchor]]]:
-    """Follow `cmd_vel`, or `joint_command` of a robot that is driven by its wheels."""
+    """Return the robot after each `cmd_vel`, or `joint_command` if it is driven by its wheels."""
     values = dict(given if given is not None else run.of_node(ROBOT))
     parameters = from_ros(VirtualRobotParameters, values)
     source, series = 'cmd_vel', run.cmd_vel
     if parameters.command_interface == 'wheels':
         source, series = 'joint_command', run.wheel_commands
     if not len(series):
-        raise BagError(f'{run.path} tells of no commands: record cmd_vel_out, or {source}')
+        raise BagError(f'{run.path} has no commands: record cmd_vel_out, or {source}')
     events: list[tuple[int, Any]] = list(zip(series.received.tolist(), series.values, strict=True))
     events += [
         (received, changes)
@@ -231,7 +230,7 @@ def _commanded(run: Run, given: Mapping[str, Any] | None) -> tuple[str, str, lis
             try:
                 twist = _twist(parameters, source, event)
             except MessageError:
-                # The node drops it, too.
+                # The node drops it as well.
                 continue
             robot = robot.commanded(twist, received)
         anchors.append(_Anchor(robot, received))

@@ -1,6 +1,6 @@
-"""What is left of a broken MCAP file: every message that can be read whole, and none that cannot.
+"""Messages of a damaged MCAP file: all that are complete.
 
-MCAP (mcap.dev/spec) is read record by record up to the cut, chunks that were cut off included.
+MCAP (mcap.dev/spec) is read record by record up to the damage, including chunks that were cut off.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ from diffdrive_jacobian.text import format_size
 
 Schemas = dict[int, tuple[str, str]]
 """Numbers of types to their names and definitions."""
-Note = Callable[[str], None]  # Takes what was lost, in words.
+Note = Callable[[str], None]
+"""Is called with a description of each loss."""
 
 
 class Topic(NamedTuple):
-    """A topic as a file describes it, `id` as in its messages; what the file does not say is empty."""
+    """A topic as a file describes it, with the `id` of its messages. Unknown fields are empty."""
 
     id: int
     name: str
@@ -41,7 +42,7 @@ class Topic(NamedTuple):
 
 
 Found = Topic | Message | str
-"""A text is what metadata.yaml holds, too."""
+"""A text is a copy of metadata.yaml in the file."""
 
 
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0C
@@ -52,7 +53,7 @@ _ATTACHMENT = 0x09
 
 
 class _Cursor:
-    """Reads the fields of an MCAP record; ValueError: the record is too short."""
+    """Reads the fields of an MCAP record, or raises ValueError if the record is too short."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -60,11 +61,11 @@ class _Cursor:
 
     @property
     def left(self) -> bytes:
-        """What was not taken yet."""
+        """The bytes that were not read yet."""
         return self._data[self._at :]
 
     def __bool__(self) -> bool:
-        """Whether something is left."""
+        """Return whether there are bytes that were not read yet."""
         return self._at < len(self._data)
 
     def take(self, length: int) -> bytes:
@@ -89,11 +90,11 @@ class _Cursor:
 
 
 def read_mcap(file: BinaryIO, note: Note) -> Iterator[Found]:
-    """Read an MCAP file up to its end, or to what was cut off or damaged."""
+    """Read an MCAP file up to its end, or up to where it is cut off or damaged."""
     size = file.seek(0, 2)
     file.seek(0)
     if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
-        note(f'its {size} bytes do not begin as MCAP does')
+        note(f'its {size} bytes are not the start of an MCAP file')
         return
     schemas: Schemas = {}
     budget = Budget(size)
@@ -107,25 +108,26 @@ def read_mcap(file: BinaryIO, note: Note) -> Iterator[Found]:
             if end <= size:
                 good = end
     except ValueError:
-        pass  # A record is not what it says: what follows cannot be trusted either.
+        # A record is invalid, so the position of the next one is unknown.
+        pass
     file.seek(good)
     if opcode != _FOOTER or file.read(len(MCAP_MAGIC) + 1) != MCAP_MAGIC:
-        note(f'it breaks off: the last {size - good} of its {size} bytes hold no whole record')
+        note(f'it is cut off: the last {size - good} of its {size} bytes are not a complete record')
 
 
 def _walk(file: BinaryIO, size: int, note: Note) -> Iterator[tuple[int, bytes, int]]:
-    """Give opcode, payload and end of each record; the end of one that was cut off is beyond `size`.
+    """Yield opcode, payload and end of each record. The end of one that is cut off is beyond `size`.
 
-    A message is given when a record follows it, or the end: else its length may be wrong.
+    A message is yielded when a record or the end follows it. Otherwise its length may be damaged.
     """
-    held: list[tuple[int, bytes, int]] = []
+    waiting: list[tuple[int, bytes, int]] = []
     end, opcode = file.tell(), 0
     while end <= size and opcode != _FOOTER and (head := file.read(_HEAD.size)):
         if head[0] not in _OPCODES:
-            held = [] if opcode == _MESSAGE else held
+            waiting = [] if opcode == _MESSAGE else waiting
             break
-        yield from held
-        held = []
+        yield from waiting
+        waiting = []
         if len(head) < _HEAD.size:
             break
         opcode, length = _HEAD.unpack(head)
@@ -135,8 +137,8 @@ def _walk(file: BinaryIO, size: int, note: Note) -> Iterator[tuple[int, bytes, i
                 note(f'a record of {format_size(length)} is not read: it is too large')
             file.seek(end)
             continue
-        held = [(opcode, file.read(min(length, size, MAX_RECORD)), end)]
-    yield from held
+        waiting = [(opcode, file.read(min(length, size, MAX_RECORD)), end)]
+    yield from waiting
 
 
 def _read_chunk(
@@ -161,7 +163,7 @@ def _read_chunk(
 
 
 def _read_record(opcode: int, payload: bytes, schemas: Schemas) -> Iterator[Found]:
-    """Read a record that is there whole; ValueError: it is not what it says."""
+    """Read a complete record, or raise ValueError if it is invalid."""
     cursor = _Cursor(payload)
     if opcode == _MESSAGE:
         channel, _, stamp, _ = _MESSAGE_HEAD.unpack(cursor.take(_MESSAGE_HEAD.size))

@@ -1,7 +1,7 @@
-"""What is left of a broken SQLite file: every message that can be read whole, and none that cannot.
+"""Messages of a damaged SQLite file: all that are complete.
 
-SQLite (sqlite.org/fileformat2.html) is read by its leaf pages: the tree above them may be missing or
-stale, and so rows are found, too, that were written but never committed.
+SQLite (sqlite.org/fileformat2.html) is read by its leaf pages, since the tree above them may be missing
+or out of date. So rows are found that were written but not committed.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _LEAF = 0x0D
 _WIDTHS = (0, 1, 2, 3, 4, 6, 8, 8, 0, 0)  # of the serial types below 10
 _MAX_COLUMNS = 32
 _COPIES = 4
-"""How many times the size of a database its rows may be in all: pages have older copies sometimes."""
+"""Largest ratio of the size of all rows to that of the file: there may be older copies of pages."""
 
 
 class _Pages:
@@ -34,7 +34,7 @@ class _Pages:
         self.usable = self.size - head[20]
         self.count = self.bytes // self.size if self.valid else 0
         self._budget = Budget(self.bytes, ratio=_COPIES)
-        # How many there were at the last commit, if that is known.
+        # Number of pages at the last commit; 0: unknown.
         self.committed = int.from_bytes(head[28:32], 'big') if head[24:28] == head[92:96] else 0
 
     def page(self, number: int) -> bytes:
@@ -42,7 +42,7 @@ class _Pages:
         return self._file.read(self.size)
 
     def rows(self, number: int) -> Iterator[tuple[int, list[Any] | None]]:
-        """Give the rows of a leaf page of a table: number and values, None if they cannot be read."""
+        """Yield number and values of the rows of a table's leaf page; None: a row cannot be read."""
         page, start = self.page(number), 100 if number == 1 else 0
         if page[start] != _LEAF:
             return
@@ -58,7 +58,7 @@ class _Pages:
                 yield row, None
 
     def _payload(self, page: bytes, at: int, length: int) -> bytes:
-        """Give what a cell holds; what has no room in its page is in a chain of others."""
+        """Return the content of a cell, which may continue in a chain of overflow pages."""
         most, least = self.usable - 35, (self.usable - 12) * 32 // 255 - 23
         local = length
         if length > most:
@@ -73,10 +73,10 @@ class _Pages:
         while missing > 0 and len(parts[0]) == local:
             number = int.from_bytes(following, 'big')
             if not 1 < number <= self.count or number in seen:
-                raise ValueError('the chain breaks off or goes in a circle')
+                raise ValueError('the chain of pages is incomplete or a cycle')
             seen.add(number)
             more = self.page(number)
-            # Of a commit that never came, pages may be there without their content.
+            # Before a commit, pages may exist without their content.
             if number > self.committed and not any(more):
                 raise ValueError('a page of the chain was never written')
             parts.append(more[4 : min(self.usable, 4 + missing)])
@@ -97,14 +97,14 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
 
 
 def _values(record: bytes) -> list[Any]:
-    """Read a row; ValueError or IndexError: it is none."""
+    """Return the values of a row, or raise ValueError or IndexError if it is invalid."""
     body, at = _varint(record, 0)
     place = body
     values: list[Any] = []
     while at < body:
         kind, at = _varint(record, at)
         if kind in (10, 11) or len(values) == _MAX_COLUMNS:
-            raise ValueError(f'no serial type, or too many columns: {kind}')
+            raise ValueError(f'invalid serial type, or too many columns: {kind}')
         width = _WIDTHS[kind] if kind < 10 else (kind - 12) // 2
         raw, place = record[place : place + width], place + width
         if kind >= 12:
@@ -118,10 +118,10 @@ def _values(record: bytes) -> list[Any]:
 
 
 def read_sqlite(file: BinaryIO, note: Note) -> Iterator[Found]:
-    """Read what an SQLite file of rosbag2 holds, committed or not; the rows in their order."""
+    """Read an SQLite file of rosbag2, including rows that were not committed, in their order."""
     pages = _Pages(file)
     if not pages.valid:
-        note(f'its {pages.bytes} bytes do not begin as an SQLite database does')
+        note(f'its {pages.bytes} bytes are not the start of an SQLite database')
         return
     topics: dict[int, list[Any]] = {}
     definitions: dict[str, str] = {}
@@ -147,11 +147,11 @@ def read_sqlite(file: BinaryIO, note: Note) -> Iterator[Found]:
     starts.sort()
     for (_, number), (limit, _) in zip(starts, [*starts, (2**63, 0)][1:], strict=True):
         for row, values in pages.rows(number):
-            # Pages have older copies sometimes.
+            # There may be older copies of pages.
             if values and last < row < limit:
                 yield Message(*values[1:])
                 last, read = row, read + 1
     if last > read:
         note(f'{last - read} of its first {last} messages cannot be read')
     if missing := max(pages.committed * pages.size - pages.bytes, pages.bytes % pages.size):
-        note(f'it breaks off: {missing} bytes are missing or hold no whole page')
+        note(f'it is cut off: {missing} bytes are missing or are not a complete page')
