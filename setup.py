@@ -14,6 +14,7 @@ COMMANDS = [
     'record_run',
     'recover_run',
     'replay_run',
+    'verify_run',
     'plot_run',
     'sweep_gains',
 ]

@@ -205,7 +205,7 @@ def test_queries_end(tmp_path, monkeypatch):
     monkeypatch.setattr('diffdrive_jacobian.bags.bounded_reader._STEPS', 100)
     monkeypatch.setattr('diffdrive_jacobian.bags.bounded_reader._FREE_STEPS', 1000)
     monkeypatch.setattr('diffdrive_jacobian.bags.bounded_reader._STEPS_PER_BYTE', 0)
-    refused(tmp_path / 'run', 'its queries take longer')
+    refused(tmp_path / 'run', 'its queries take more steps')
 
 
 def test_a_log_that_names_a_page_far_away(tmp_path, monkeypatch):

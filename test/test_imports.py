@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import diffdrive_jacobian
+from diffdrive_jacobian.tools.entry_points import ROS_MODULES
 
 PACKAGE = diffdrive_jacobian.__name__
 HOUSE = Path(diffdrive_jacobian.__file__).parent
@@ -21,6 +22,8 @@ LAYERS = (
     *('plots', 'ros', 'nodes', 'recording', 'replay', 'lockstep', 'drives', 'testing', 'tools'),
 )
 PURE = LAYERS[:3]
+# These may load rosbags and what it needs, but nothing of ROS, and matplotlib only when they draw.
+WITHOUT_ROS = ('messages', 'parameters', 'bags', 'recovery', 'reading', 'plots')
 # Modules beside the layers, and the layers they may import.
 DOORS = {
     '__init__': (),
@@ -102,6 +105,27 @@ def test_the_pure_half_loads_nothing_but_numpy(layer):
     assert {name.split('.')[0] for name in loaded} - sys.stdlib_module_names <= {'numpy', PACKAGE}
     floors = {name.split('.')[1] for name in loaded if name.startswith(f'{PACKAGE}.')}
     assert floors <= set(LAYERS[: LAYERS.index(layer) + 1])
+
+
+@pytest.mark.parametrize('layer', WITHOUT_ROS)
+def test_reading_and_drawing_load_nothing_of_ros(layer):
+    """In an interpreter of its own, with every module of the layer."""
+    modules = [f'{PACKAGE}.{layer}.{path.stem}' for path in sources(layer)]
+    program = f'import sys\nimport {", ".join(one.removesuffix(".__init__") for one in modules)}\n'
+    program += 'print(*sorted({name.split(".")[0] for name in sys.modules}))'
+    run = subprocess.run(
+        [sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=60
+    )
+    loaded = set(run.stdout.split())
+    assert {PACKAGE, 'numpy'} <= loaded
+    assert not loaded & {*ROS_MODULES, 'rpyutils', 'matplotlib', 'rich'}
+
+
+@pytest.mark.parametrize('path', sources(*WITHOUT_ROS), ids=lambda path: str(path.relative_to(HOUSE)))
+def test_reading_and_drawing_name_ros_only_where_it_is_optional(path):
+    named = {name.split('.')[0] for name in imported(path)} & set(ROS_MODULES)
+    checked_only = {'messages/conversion.py', 'recovery/decoding_check.py'}
+    assert not named or str(path.relative_to(HOUSE)) in checked_only
 
 
 def test_only_the_tools_print():

@@ -25,9 +25,7 @@ from diffdrive_jacobian.reading.reader import BagError, read_run
 from diffdrive_jacobian.reading.time_series import commanded, limits, measured
 from diffdrive_jacobian.reading.trace import trace
 from diffdrive_jacobian.reading.verification import verify
-from diffdrive_jacobian.recovery.damaged_bag import NotABagError
-from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools.recover_run import NothingToSaveError, recover
+from diffdrive_jacobian.recovery import NotABagError, NothingToSaveError, recover
 
 TYPED = (BagError, JournalError, NotABagError, NothingToSaveError, ParameterError)
 VALUES = (
@@ -93,11 +91,11 @@ def check(bag, tmp_path, number):
     """Hold that a bag is readable, or that recover_run makes a readable one or says why it cannot."""
     readable = attempt(read_and_use, bag)
     new = tmp_path / f'new{number}'
-    if attempt(recover, bag, new, None, Signals()):
+    if attempt(recover, bag, new):
         read_run(new)
         # What was made of it is in order, unless nobody understands the definition of a type.
         with suppress(NothingToSaveError):
-            assert recover(new, tmp_path / 'again', None, Signals()).left_out
+            assert recover(new, tmp_path / 'again').topics_left_out
             shutil.rmtree(tmp_path / 'again')
         shutil.rmtree(new)
     return readable
@@ -267,7 +265,7 @@ def test_an_invalid_record_with_a_right_checksum_is_left_out(tmp_path, kind, pay
     path.write_bytes(MAGIC + b''.join([*good[:6], frame(kind, payload), *good[6:]]))
     with pytest.raises(JournalError, match=r'run\.journal is damaged at byte \d+: '):
         list(read_journal(path))
-    report = recover(path, None, None, Signals())
+    report = recover(path)
     assert report.lost[0].startswith('run.journal: 1 records are invalid, the first: the record at byte')
     assert report.summary.topics == {'/odom': 6, '/cmd_vel': 6}
 
@@ -299,5 +297,5 @@ def write_raw(path, messages):
             file.write(frame(b'C', json.dumps(channel(number, topic, name)).encode()))
         for topic, stamp, data in messages:
             file.write(frame(b'M', packed(b'M', [list(names).index(topic), stamp, data])))
-    recover(journal, path, None, Signals())
+    recover(journal, path)
     return path

@@ -19,13 +19,14 @@ from diffdrive_jacobian.kinematics.se2 import integrate, wrap_angle
 from diffdrive_jacobian.plots import output_files
 from diffdrive_jacobian.plots import run_figure as _figure
 from diffdrive_jacobian.plots.run_figure import LABELS, figure, names
+from diffdrive_jacobian.plots.run_table import COLUMNS, decimal_seconds
 from diffdrive_jacobian.reading import time_series as _lines
 from diffdrive_jacobian.reading import trace as _trace
 from diffdrive_jacobian.reading.reader import BagError, read_run
 from diffdrive_jacobian.reading.time_series import limits, line
 from diffdrive_jacobian.reading.trace import trace
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools.plot_run import COLUMNS, _seconds, main
+from diffdrive_jacobian.tools.plot_run import main
 
 RATE = 50
 PARAMETERS = {
@@ -486,7 +487,7 @@ def test_csv_has_exact_times_and_no_artefacts_of_floats(tmp_path):
     ],
 )
 def test_csv_times_are_exact(nanoseconds, text):
-    assert _seconds(nanoseconds) == text
+    assert decimal_seconds(nanoseconds) == text
 
 
 def test_csv_prefers_the_commands_that_were_applied(tmp_path):

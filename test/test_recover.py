@@ -228,7 +228,7 @@ def test_a_part_that_is_missing(tmp_path, capsys, messages):
     code, out, _ = recover(capsys, tmp_path / 'run')
     assert code == 0
     assert 'lost: run_1.mcap is missing' in out
-    assert 'lost: metadata.yaml tells of 70 messages, 50 were found' in out
+    assert 'lost: metadata.yaml counts 70 messages, 50 were found' in out
 
 
 def test_a_write_ahead_log(tmp_path, capsys, messages):
@@ -263,7 +263,7 @@ def test_a_journal(tmp_path, capsys, messages, storage, given):
     before = contents(tmp_path)
     code, out, err = recover(capsys, tmp_path / given)
     assert (code, err) == (0, '')
-    assert 'lost: run.journal breaks off: its last 3 bytes hold no record' in out
+    assert 'lost: run.journal is cut off: its last 3 bytes are not a record' in out
     assert read_bag(tmp_path / 'run') == messages
     assert (tmp_path / 'run' / ('run.mcap' if storage == 'mcap' else 'run.db3')).exists()
     assert contents(tmp_path) == before
@@ -275,3 +275,28 @@ def test_an_empty_journal(tmp_path, capsys):
     assert (code, out) == (1, '')
     assert err == f'recover_run: {tmp_path}/run.journal holds no message that can be saved\n'
     assert os.listdir(tmp_path) == ['run.journal']
+
+
+def test_losses_that_the_recorder_noted_are_reported(tmp_path, capsys):
+    """They are in the custom data, and a bag with them is not one without losses."""
+    writer = JournalWriter(tmp_path / 'run.journal')
+    known = definition('geometry_msgs/msg/Twist')
+    writer.add(Text('messages lost', '{"/odom": 12}'))
+    writer.add(
+        Channel(
+            id=0,
+            topic='/cmd_vel',
+            type_name=known.name,
+            definition=known.text,
+            type_hash=known.type_hash,
+        )
+    )
+    writer.add(Message(0, START, b'\0\1\0\0' + bytes(48)))
+    writer.add(Text('messages lost', '{"/odom": 12, "/cmd_vel": 3}'))
+    writer.flush()
+    writer.close()
+    code, out, _ = recover(capsys, tmp_path / 'run.journal')
+    assert code == 0
+    assert 'lost: 3 messages on /cmd_vel while it was recorded\n' in out
+    assert 'lost: 12 messages on /odom while it was recorded\n' in out
+    assert 'no loss was found' not in out

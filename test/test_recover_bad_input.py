@@ -68,7 +68,7 @@ def test_output_that_cannot_be_written(tmp_path, capsys, messages):
     (tmp_path / 'file').write_text('dear')
     # Nobody may make a directory there, not even root.
     for place in ('/sys/new', tmp_path / 'file' / 'new'):
-        assert_refused(capsys, tmp_path, [tmp_path / 'run', '-o', place], 2, 'no bag was made')
+        assert_refused(capsys, tmp_path, [tmp_path / 'run', '-o', place], 2, 'no bag was written')
 
 
 def test_wrong_arguments(tmp_path, capsys):
@@ -100,5 +100,5 @@ def test_a_signal_leaves_no_bag(tmp_path, capsys, messages):
     signals = Signals()
     signals.count = 1
     assert main([str(tmp_path / 'run')], signals) == 130
-    assert capsys.readouterr().err == 'recover_run: interrupted: no bag was made\n'
+    assert capsys.readouterr().err == 'recover_run: interrupted: no bag was written\n'
     assert os.listdir(tmp_path) == ['run']

@@ -193,7 +193,7 @@ def test_a_full_disk(world, tmp_path, capsys, storage):
         before = journal_of(bag).read_bytes()
         code, out, err = recover(capsys, bag)
         assert (code, out) == (1, '')
-        assert err.startswith('recover_run: error: no bag was made: ')
+        assert err.startswith('recover_run: error: no bag was written: ')
         assert os.listdir(folder) == ['run.journal']
         assert journal_of(bag).read_bytes() == before
 

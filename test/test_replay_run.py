@@ -292,7 +292,7 @@ def test_bag_of_others_is_verified_with_parameters_from_a_file(capsys, request, 
     file.write_text('virtual_robot:\n  ros__parameters:\n    linear: {x: {max_velocity: 0.05}}\n')
     code, said = verify(capsys, foreign, '--params-file', file)
     assert code == 1
-    assert 'position: beyond that in' in said
+    assert 'position: exceeded in' in said
     assert said.splitlines()[-1] == 'the robot moves NOT as recorded'
     assert verify(capsys, foreign, '--tolerance', '1e-6')[0] == 1
 
@@ -316,7 +316,10 @@ def test_bag_of_others_is_verified_with_parameters_from_a_file(capsys, request, 
             'file of ROS parameters, got file.txt',
         ),
         (['BAG', '--verify', '--tolerance', '0'], 'must be positive'),
-        (['BAG', '--goals', '--verify'], 'not allowed with'),
+        (['BAG', '--goals', '--verify'], 'not allowed with --verify: --goals'),
+        (['--verify', 'BAG', '-r', '2'], 'not allowed with --verify: -r 2'),
+        (['--verify', 'BAG', '--ros-args', '-p', 'x:=1'], 'not allowed with --verify: --ros-args'),
+        (['BAG', '--tolerance', '1'], 'unrecognized arguments: --tolerance 1'),
     ],
 )
 def test_what_cannot_be_is_said(capsys, bag, tmp_path, monkeypatch, arguments, words):

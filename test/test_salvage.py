@@ -107,7 +107,7 @@ def test_complete_files_without_metadata(bag, capsys):
     broken = cut(path, len(data))
     code, out, _ = recover(capsys, broken)
     assert code == 0
-    assert 'nothing was lost' in out
+    assert 'no loss was found' in out
     recovered = broken.with_name(f'{broken.name}_recovered')
     assert read_bag(recovered) == messages
     assert names_of(recovered) == names_of(path)

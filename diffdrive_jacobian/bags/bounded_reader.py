@@ -1,7 +1,7 @@
 """rosbags' reader for bags of unknown origin: memory and time stay in proportion to the bag's size.
 
-rosbags decompresses whatever a file claims, evaluates views and generated columns of SQLite, and takes
-the characters `#`, `?` and `%` in a path for parts of a URI. The classes here check before it does so.
+rosbags decompresses to any size that a file claims, and evaluates views and generated columns of SQLite.
+The classes here check before it does so.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from collections.abc import Collection, Generator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import apsw
 from rosbags.interfaces import Connection, Qos
@@ -20,7 +19,6 @@ from rosbags.rosbag2 import reader as rosbags_reader
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_mcap import McapReader
-from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from ruamel.yaml.error import YAMLError
 
 from diffdrive_jacobian.bags.limits import (
@@ -32,12 +30,13 @@ from diffdrive_jacobian.bags.limits import (
     unpack_file,
     unpack_message,
 )
+from diffdrive_jacobian.bags.storage import PathSqlite3Reader
 from diffdrive_jacobian.bounded_yaml import TooLargeError, check_yaml, load_yaml
 from diffdrive_jacobian.text import format_size
 
 Messages = Generator[tuple[Connection, int, bytes], None, None]
 
-# --- What rosbags' modules call by name
+# --- Replacements of functions of rosbags' modules
 
 
 def parse_bounded_qos(profiles: Any) -> list[Qos]:
@@ -48,7 +47,7 @@ def parse_bounded_qos(profiles: Any) -> list[Qos]:
     """
     if isinstance(profiles, str):
         with suppress(YAMLError):
-            # Which rosbags reports itself.
+            # rosbags reports invalid YAML itself.
             check_yaml(profiles)
     return parse_qos(profiles)
 
@@ -99,13 +98,13 @@ class _McapReader(McapReader):
             check_record(chunk.uncompressed_size, 'a chunk')
             check_record(chunk.compressed_size, 'a chunk')
             self._budget.spend(chunk.uncompressed_size)
-        # rosbags holds all chunks whose times overlap at once.
+        # rosbags unpacks all chunks whose times overlap before it yields their messages.
         ends = ((one.message_end_time, 1, -one.uncompressed_size) for one in self.chunks)
-        begins = ((one.message_start_time, 0, one.uncompressed_size) for one in self.chunks)
-        held = 0
-        for _, _, change in sorted([*begins, *ends]):
-            held += change
-            if held > MAX_OVERLAP:
+        starts = ((one.message_start_time, 0, one.uncompressed_size) for one in self.chunks)
+        unpacked = 0
+        for _, _, change in sorted([*starts, *ends]):
+            unpacked += change
+            if unpacked > MAX_OVERLAP:
                 raise TooLargeError(
                     'its chunks overlap in time and unpack to more than '
                     f'{format_size(MAX_OVERLAP)} at once'
@@ -136,38 +135,31 @@ class _McapReader(McapReader):
 
 _TABLES = ('messages', 'topics', 'schema', 'metadata', 'message_definitions')
 _STEPS = 100_000
-"""After how many instructions SQLite asks whether to go on."""
+"""Number of instructions after which SQLite calls the progress handler."""
 _FREE_STEPS, _STEPS_PER_BYTE = 50_000_000, 100
-"""How many instructions queries of a database may take: at least, and per byte of its file."""
+"""Number of instructions that queries of a database may take: at least, and per byte of its file."""
 
 
-class _SqliteReader(Sqlite3Reader):
+class _SqliteReader(PathSqlite3Reader):
     """Reads plain tables only, and values of moderate size."""
 
-    def __init__(self, path: Path) -> None:
-        # rosbags makes a URI of it: 'file:' + path + '?immutable=1'.
-        super().__init__(Path(quote(str(path.absolute()))))
-        self._file = path
-
     def open(self) -> None:
-        # Official, but for every connection of the process: this thread opens none but rosbags'.
+        # The hook is called for every connection of the process, but this thread opens only rosbags'.
         apsw.connection_hooks.append(self._limit)
         try:
             super().open()
-        except ReaderError as error:
-            raise ReaderError(str(error).replace(str(self.path), str(self._file))) from error
         finally:
             apsw.connection_hooks.remove(self._limit)
 
     def _limit(self, connection: apsw.Connection) -> None:
         connection.limit(apsw.SQLITE_LIMIT_LENGTH, MAX_RECORD)
-        left = (_FREE_STEPS + _STEPS_PER_BYTE * self._file.stat().st_size) // _STEPS
+        left = (_FREE_STEPS + _STEPS_PER_BYTE * self.file.stat().st_size) // _STEPS
 
         def count() -> bool:
             nonlocal left
             left -= 1
             if left < 0:
-                raise TooLargeError('its queries take longer than those of a file of its size may')
+                raise TooLargeError('its queries take more steps than a file of its size may')
             return False
 
         connection.set_progress_handler(count, _STEPS)
@@ -195,7 +187,7 @@ class _DirectoryReader(DirectoryReader):
         for file in _compressed_files(folder, metadata):
             unpack_file(file, None)
         super().open()
-        # rosbags would unpack messages to any size.
+        # rosbags itself would unpack messages to any size.
         self._packed = self.metadata.compression_mode == 'message'
         self.metadata = self.metadata._replace(compression_mode=None)
         self._budget = Budget(sum(file.stat().st_size for file in folder.iterdir()))

@@ -1,82 +1,146 @@
-"""Deserialization of recorded messages, and the check whether recorded messages can be deserialized."""
+"""Deserialization of recorded messages without ROS.
+
+rosbags generates Python code from definitions of message types, and executes it. So only the definitions
+that come with rosbags, and the one in this module, are used for it, and never a definition in a bag.
+Where a bag has the hash of a type (RIHS01, REP 2011), it is compared with that of the known definition.
+"""
 
 from __future__ import annotations
 
-from collections import Counter
+import re
+import struct
+from collections.abc import Iterable
+from functools import cache
 from typing import Any
 
-from rclpy.serialization import deserialize_message
+from rosbags.interfaces import Connection
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
-from diffdrive_jacobian.bags.journal import Channel
-from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
+from diffdrive_jacobian.bags.message_definitions import Definition, UnknownTypeError
 from diffdrive_jacobian.text import printable
+
+GOALS = 'nav_msgs/msg/Goals'
+GOALS_DEFINITION = """std_msgs/Header header
+geometry_msgs/PoseStamped[] goals
+"""
+"""The only type of ROS 2 Jazzy that is read here and that rosbags lacks."""
+_HASH = re.compile('RIHS01_[0-9a-f]{64}')
+_ERRORS = (
+    *(SerdeError, struct.error, ValueError, IndexError, AssertionError),
+    *(MemoryError, OverflowError, RecursionError),
+)
+"""What generated code raises on data that is not a message of its type."""
+_MAX_REPAIRS = 50
 
 
 class UndecodableError(ValueError):
-    """A recorded message is not a message of its type."""
+    """A recorded message is not a valid message of its type."""
 
 
-def decode(data: bytes, message_type: Any) -> Any:
-    """Return a message from its CDR.
+@cache
+def _typestore() -> Typestore:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(GOALS_DEFINITION, GOALS))
+    return store
+
+
+def is_known(type_name: str) -> bool:
+    """Return whether messages of a type (`package/msg/Name`) can be decoded without ROS."""
+    return type_name in _typestore().fielddefs
+
+
+@cache
+def known_definition(type_name: str) -> Definition:
+    """Return the definition of a type that is known without ROS.
+
+    Args:
+        type_name: `package/msg/Name`.
+
+    Raises:
+        UnknownTypeError: It is not known.
+    """
+    if not is_known(type_name):
+        raise UnknownTypeError(f'{printable(type_name)} is not a type of ROS 2 Jazzy')
+    store = _typestore()
+    text, _ = store.generate_msgdef(type_name, ros_version=2)
+    return Definition(name=type_name, text=text, type_hash=store.hash_rihs01(type_name))
+
+
+def decode(data: bytes, type_name: str) -> Any:
+    """Return a message from its CDR, little-endian or big-endian.
+
+    Fields have the names of ROS. Arrays of numbers are NumPy arrays. In a text that is not UTF-8 each
+    invalid byte is replaced by `?`.
 
     Args:
         data: The serialized message.
-        message_type: Its Python class.
+        type_name: Its type, `package/msg/Name`.
 
     Raises:
-        UndecodableError: It is not a message of that type.
+        UndecodableError: It is not a message of that type, or the type is not known.
     """
-    try:
-        return deserialize_message(data, message_type)
-    except (RuntimeError, ValueError, AssertionError, SystemError, MemoryError) as error:
-        # MemoryError: a length in the message that was damaged.
-        raise UndecodableError(f'not a message of {message_type.__name__}') from error
-
-
-class DecodingCheck:
-    """Counts, by topic, the recorded messages that readers cannot decode."""
-
-    def __init__(self) -> None:
-        """Begin without messages."""
-        self._total: Counter[str] = Counter()
-        self._failed: Counter[str] = Counter()
-        self._unchecked: set[str] = set()
-        self._types: dict[tuple[str, str], Any] = {}
-
-    def add(self, channel: Channel, data: bytes) -> None:
-        """Check a message of a channel."""
-        key = channel.type_name, channel.type_hash
-        if key not in self._types:
-            self._types[key] = _message_type(channel)
-        self._total[channel.topic] += 1
-        if self._types[key] is None:
-            self._unchecked.add(channel.topic)
-            return
+    if not is_known(type_name):
+        raise UndecodableError(f'{printable(type_name)} is not a type of ROS 2 Jazzy')
+    for _ in range(_MAX_REPAIRS):
         try:
-            decode(data, self._types[key])
-        except UndecodableError:
-            self._failed[channel.topic] += 1
-
-    @property
-    def undecodable(self) -> list[str]:
-        """Messages that cannot be decoded, and topics that could not be checked, in words."""
-        found = [
-            f'{count} of {self._total[topic]} messages on {printable(topic)} cannot be decoded'
-            for topic, count in self._failed.items()
-        ]
-        found += [
-            f'the {self._total[topic]} messages on {printable(topic)} were not checked: their type '
-            'is not installed as it was recorded'
-            for topic in sorted(self._unchecked)
-        ]
-        return found
+            return _deserialized(data, type_name)
+        except UnicodeDecodeError as error:
+            repaired = _with_valid_text(data, error.object)
+            if repaired is None:
+                raise UndecodableError(f'not a message of {type_name}') from error
+            data = repaired
+        except _ERRORS as error:
+            raise UndecodableError(f'not a message of {type_name}') from error
+    raise UndecodableError(f'not a message of {type_name}: more than {_MAX_REPAIRS} texts are not UTF-8')
 
 
-def _message_type(channel: Channel) -> Any:
-    """Return the Python class of a type that is installed as it was recorded; None: it is not."""
-    try:
-        if definition(channel.type_name).type_hash == channel.type_hash:
-            return message_class(channel.type_name)
-    except UnknownTypeError:
-        pass
-    return None
+def _deserialized(data: bytes, type_name: str) -> Any:
+    """Return a message from its CDR, whatever follows it.
+
+    rosbags' own `deserialize_cdr` refuses more than 3 bytes behind a message. Fast CDR writes 4 behind
+    some messages with empty arrays of float64, such as JointState, and ignores any number of them.
+    """
+    if data[:2] not in (b'\x00\x00', b'\x00\x01') or len(data) < 4:
+        raise SerdeError(f'the encapsulation must be CDR, got {data[:2].hex()}')
+    store = _typestore()
+    message_definition = store.get_msgdef(type_name)
+    little = message_definition.deserialize_cdr_le
+    deserialize = little if data[1] else message_definition.deserialize_cdr_be
+    message, _ = deserialize(memoryview(data)[4:], 0, message_definition.cls, store)
+    return message
+
+
+def _with_valid_text(data: bytes, text: bytes) -> bytes | None:
+    """Return a message in which a text that is not UTF-8 is made valid; None: it is not found."""
+    length = struct.pack('<I' if data[1] & 1 else '>I', len(text) + 1)
+    # With its length and its terminator it is not mistaken for another field.
+    at = data.find(length + text + b'\0')
+    if at < 0:
+        return None
+    # Each invalid byte becomes a surrogate, and that a `?`: the length stays the same.
+    valid = text.decode(errors='surrogateescape').encode(errors='replace')
+    return data[: at + 4] + valid + data[at + 4 + len(text) :]
+
+
+def recorded_definition_differs(type_name: str, type_hashes: Iterable[str]) -> bool:
+    """Return whether a type was recorded with another definition than the known one.
+
+    Args:
+        type_name: `package/msg/Name`; it is known.
+        type_hashes: Hashes that a bag has for it. Those that are empty or no RIHS01 hash do not count.
+    """
+    known = _typestore().hash_rihs01(type_name)
+    return any(_HASH.fullmatch(one) and one != known for one in type_hashes)
+
+
+def type_hashes(connection: Connection, stored: Iterable[Connection]) -> list[str]:
+    """Return what a bag says about the hash of a topic's type: in metadata.yaml and in its data files.
+
+    Args:
+        connection: The topic, as metadata.yaml has it.
+        stored: The topics of the data files.
+    """
+    alike = (one for one in stored if (one.topic, one.msgtype) == (connection.topic, connection.msgtype))
+    return [str(one.digest) for one in (connection, *alike)]

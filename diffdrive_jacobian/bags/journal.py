@@ -29,6 +29,8 @@ JOURNAL = '.journal'
 """Ends the name of a journal; before it stands the name of the bag."""
 PARAMETERS = 'parameters of '
 """Before a node's name, the key of the custom data that holds its parameters as JSON."""
+LOST = 'messages lost'
+"""Key of the custom data with the number of messages that are known to be missing, by topic, as JSON."""
 MAGIC = b'\x89ddjournal1\r\n\x1a\n'
 _HEAD = struct.Struct('<cII')
 _MESSAGE = struct.Struct('<Hq')

@@ -17,6 +17,7 @@ from ruamel.yaml.error import YAMLError
 
 from diffdrive_jacobian.bags.bag_writer import STORAGES
 from diffdrive_jacobian.bags.bounded_reader import parse_bounded_qos
+from diffdrive_jacobian.bags.files import NotARegularFileError, check_regular
 from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, TooLargeError, load_yaml
 from diffdrive_jacobian.text import printable
 
@@ -41,10 +42,15 @@ def check_metadata(source: Path | str) -> None:
 
     Raises:
         OSError: The file cannot be read.
-        DamagedError: It is not YAML of moderate size, or one of its values is invalid.
+        DamagedError: It, or a data file that it lists, is not a regular file; or it is not YAML of
+            moderate size; or one of its values is invalid.
     """
     try:
+        if isinstance(source, Path):
+            check_regular(source)
         found = load_yaml(source)
+    except NotARegularFileError as error:
+        raise DamagedError(str(error)) from error
     except TooLargeError as error:
         raise DamagedError(f'metadata.yaml is too large: {error}') from error
     except YAML_ERRORS as error:
@@ -58,6 +64,8 @@ def check_metadata(source: Path | str) -> None:
         where = f'relative_file_paths[{index}]'
         if not _string(path, where) or '\0' in path:
             raise _wrong(where, 'the name of a file', path)
+        if isinstance(source, Path):
+            _check_data_file(source.parent / Path(path).name)
     count = _integer(_required(root, 'message_count', ''), 'message_count', 0, _INT64 - 1)
     for key, name in (('duration', 'nanoseconds'), ('starting_time', 'nanoseconds_since_epoch')):
         value = _required(_mapping(_required(root, key, ''), key), name, key)
@@ -75,6 +83,16 @@ def check_metadata(source: Path | str) -> None:
     for index, file in enumerate(_sequence(root.get('files', []), 'files')):
         _mapping(file, f'files[{index}]')
     check_custom_data(root.get('custom_data'))
+
+
+def _check_data_file(path: Path) -> None:
+    try:
+        check_regular(path)
+    except NotARegularFileError as error:
+        raise DamagedError(str(error)) from error
+    except OSError:
+        # rosbags reports a file that is missing.
+        pass
 
 
 def _check_topic(topic: dict[str, Any], index: int) -> None:

@@ -1,12 +1,9 @@
-"""Quality of service between rclpy, the journal and rosbags: what publishers offer, what readers ask."""
+"""Quality of service of recorded topics: the numbers in a journal, and rosbags' objects."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from typing import Any
 
-from rclpy.duration import Duration
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import (
     Qos,
     QosDurability,
@@ -19,22 +16,15 @@ from rosbags.interfaces import (
 NANOSECONDS = 1_000_000_000
 
 
-def to_fields(profile: QoSProfile) -> dict[str, Any]:
-    """Write a profile as plain numbers; rclpy and rosbag2 number the policies alike (as rmw does)."""
-    return {
-        'history': int(profile.history),
-        'depth': profile.depth,
-        'reliability': int(profile.reliability),
-        'durability': int(profile.durability),
-        'deadline': profile.deadline.nanoseconds,
-        'lifespan': profile.lifespan.nanoseconds,
-        'liveliness': int(profile.liveliness),
-        'liveliness_lease_duration': profile.liveliness_lease_duration.nanoseconds,
-    }
-
-
 def to_rosbags(fields: dict[str, Any]) -> Qos:
-    """Give those numbers to rosbags."""
+    """Return a profile for rosbags.
+
+    Args:
+        fields: Policies by their numbers in rmw, which rosbag2 shares; durations in nanoseconds.
+
+    Raises:
+        KeyError, ValueError: A policy is missing, or its number is invalid.
+    """
 
     def time(name: str) -> QosTime:
         return QosTime(*divmod(fields[name], NANOSECONDS))
@@ -52,26 +42,28 @@ def to_rosbags(fields: dict[str, Any]) -> Qos:
     )
 
 
-def to_hear_all(offered: Iterable[QoSProfile], depth: int) -> QoSProfile:
-    """Ask for what every publisher of a topic offers, and for no more: else one would not be heard."""
-    offered = list(offered)
-    profile = QoSProfile(depth=depth)
-    if any(one.reliability == ReliabilityPolicy.BEST_EFFORT for one in offered):
-        profile.reliability = ReliabilityPolicy.BEST_EFFORT
-    if offered and all(one.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in offered):
-        profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
-    return profile
+def from_rosbags(profile: Qos) -> dict[str, Any]:
+    """Return the fields of a profile of rosbags, as `to_rosbags` takes them."""
+    return {
+        'history': profile.history.value,
+        'depth': int(profile.depth),
+        'reliability': profile.reliability.value,
+        'durability': profile.durability.value,
+        'deadline': _nanoseconds(profile.deadline),
+        'lifespan': _nanoseconds(profile.lifespan),
+        'liveliness': profile.liveliness.value,
+        'liveliness_lease_duration': _nanoseconds(profile.liveliness_lease_duration),
+    }
 
 
-def to_offer_again(recorded: Sequence[Qos], depth: int) -> QoSProfile:
-    """Offer what the recorded publishers offered: latched if one was, reliable unless none was."""
-    profile = QoSProfile(depth=depth)
-    if recorded and all(one.reliability == QosReliability.BEST_EFFORT for one in recorded):
-        profile.reliability = ReliabilityPolicy.BEST_EFFORT
-    if any(one.durability == QosDurability.TRANSIENT_LOCAL for one in recorded):
-        profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
-    deadlines = [one.deadline for one in recorded]
-    if deadlines:
-        shortest = min(deadlines)
-        profile.deadline = Duration(seconds=shortest.sec, nanoseconds=shortest.nsec)
-    return profile
+def is_valid(fields: dict[str, Any]) -> bool:
+    """Return whether a bag can store a profile: known policies, and no negative or huge number."""
+    try:
+        to_rosbags(fields)
+    except (KeyError, ValueError):
+        return False
+    return all(0 <= value < 2**63 for value in fields.values())
+
+
+def _nanoseconds(time: QosTime) -> int:
+    return NANOSECONDS * int(time.sec) + int(time.nsec)

@@ -1,7 +1,7 @@
 """rosbags' reader and writer for bags at any path.
 
-rosbags opens SQLite files as `file:PATH`, a URI in which `#`, `?` and `%` have a meaning: it writes and
-reads another file than the one of that name.
+rosbags opens SQLite files as `file:PATH`, a URI in which `#`, `?` and `%` have a meaning, so that it
+would write and read a file of another name.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
-from rosbags.rosbag2 import CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionMode, ReaderError, StoragePlugin, Writer
 from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_mcap import McapReader, McapWriter
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader, Sqlite3Writer
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from rosbags.rosbag2.writer import StorageWriter
 
 
-class PlainSqlite3Writer(Sqlite3Writer):
-    """Opens its file by the path, not by a URI."""
+class PathSqlite3Writer(Sqlite3Writer):
+    """rosbags' writer, which opens its file by the path and not by a URI."""
 
     def __init__(self, path: Path, compression: CompressionMode) -> None:
         """Create the file, named after the directory.
@@ -40,12 +40,24 @@ class PlainSqlite3Writer(Sqlite3Writer):
         self.cursor = self.conn.cursor()
 
 
-class PlainSqlite3Reader(Sqlite3Reader):
-    """Opens its file by a URI in which the path is quoted."""
+class PathSqlite3Reader(Sqlite3Reader):
+    """rosbags' reader, which opens its file by a URI in which the path is quoted."""
 
     def __init__(self, path: Path) -> None:
-        """Set up a reader of a file."""
+        """Set the file that `open` opens."""
         super().__init__(Path(quote(str(path.absolute()))))
+        self.file = path
+
+    def open(self) -> None:
+        """Open the file.
+
+        Raises:
+            ReaderError: It cannot be opened; the message has its path as it was given.
+        """
+        try:
+            super().open()
+        except ReaderError as error:
+            raise ReaderError(str(error).replace(str(self.path), str(self.file))) from error
 
 
 class BagWriter(Writer):
@@ -53,7 +65,7 @@ class BagWriter(Writer):
 
     STORAGE_PLUGINS: Mapping[StoragePlugin, type[StorageWriter]] = {
         StoragePlugin.MCAP: McapWriter,
-        StoragePlugin.SQLITE3: PlainSqlite3Writer,
+        StoragePlugin.SQLITE3: PathSqlite3Writer,
     }
 
 
@@ -62,5 +74,5 @@ class BagReader(DirectoryReader):
 
     STORAGE_PLUGINS: Mapping[str, type[ReaderProtocol]] = {
         'mcap': McapReader,
-        'sqlite3': PlainSqlite3Reader,
+        'sqlite3': PathSqlite3Reader,
     }

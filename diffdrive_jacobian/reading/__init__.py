@@ -1,6 +1,16 @@
-"""Recorded runs as NumPy arrays, and their verification."""
+"""Recorded runs as NumPy arrays, and their verification. No ROS is needed."""
 
-from diffdrive_jacobian.reading.reader import BagError, DamagedBagError, read_run
+from diffdrive_jacobian.bags.bag_reader import BagError, DamagedBagError
+from diffdrive_jacobian.reading.reader import read_run
 from diffdrive_jacobian.reading.run import Run, Series
+from diffdrive_jacobian.reading.verification import Verification, verify
 
-__all__ = ['BagError', 'DamagedBagError', 'Run', 'Series', 'read_run']
+__all__ = [
+    'BagError',
+    'DamagedBagError',
+    'Run',
+    'Series',
+    'Verification',
+    'read_run',
+    'verify',
+]

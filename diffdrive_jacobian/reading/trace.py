@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from action_msgs.msg import GoalStatus
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.kinematics._elementary import wrapped
+from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 from diffdrive_jacobian.reading.reader import BagError
 from diffdrive_jacobian.reading.run import Run, Series
@@ -127,9 +127,9 @@ def _progress(run: Run, breaks: Indices) -> tuple[Indices, NDArray[np.bool_]]:
         states, times = _statuses(run, begun, until)
         here, end = np.searchsorted(seen, [begun, until]).tolist()
         stop = end
-        if len(states) and states[-1] in (GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED):
+        if len(states) and states[-1] in (GoalState.CANCELED, GoalState.ABORTED):
             stop = min(stop, int(np.searchsorted(seen, times[-1], side='right')))
-        succeeded = times[states == GoalStatus.STATUS_SUCCEEDED]
+        succeeded = times[states == GoalState.SUCCEEDED]
         for target in route[:-1]:
             goal[here:stop] = target
             within = _within(run, places[here:stop], target)
@@ -185,7 +185,7 @@ def _routes(run: Run) -> list[range]:
     for index, route in enumerate(routes):
         until = goals.received[route.stop] if index + 1 < len(routes) else _NEVER
         states, _ = _statuses(run, goals.received[route.start], until)
-        if not len(states) or states[0] != GoalStatus.STATUS_ABORTED:
+        if not len(states) or states[0] != GoalState.ABORTED:
             accepted.append(route)
     return accepted
 

@@ -19,11 +19,11 @@ from rclpy.subscription import Subscription
 
 from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Record, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
-from diffdrive_jacobian.bags.qos import to_fields, to_hear_all
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.recording.missed import MissedMessages
 from diffdrive_jacobian.recording.parameter_query import ParameterQuery
 from diffdrive_jacobian.recording.selection import Selection as Selection
+from diffdrive_jacobian.ros.qos import subscription_profile, to_fields
 
 DEPTH = 4000
 """Depth of the queue of each subscription."""
@@ -169,7 +169,7 @@ class Recorder(Node):  # type: ignore[misc]
             type_hash=described.type_hash,
             qos=_profiles(publishers),
         )
-        profile = to_hear_all((one.qos_profile for one in publishers), DEPTH)
+        profile = subscription_profile((one.qos_profile for one in publishers), DEPTH)
         self._channels[topic] = channel
         self._missed[topic] = MissedMessages(partial(self.count_publishers, topic))
         self._sink.add(channel)

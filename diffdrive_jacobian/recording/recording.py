@@ -13,6 +13,7 @@ from pathlib import Path
 from diffdrive_jacobian import __version__
 from diffdrive_jacobian.bags.bag_writer import Summary, build_bag, check_target
 from diffdrive_jacobian.bags.journal import (
+    LOST,
     Channel,
     JournalWriter,
     Message,
@@ -23,9 +24,6 @@ from diffdrive_jacobian.bags.journal import (
 )
 from diffdrive_jacobian.plots.output_files import names_by_time
 from diffdrive_jacobian.recording.journal_thread import CAPACITY, JournalThread
-
-LOST = 'messages lost'
-"""Key of the custom data with the number of messages known to be lost, by topic, as JSON."""
 
 
 class RecordingError(Exception):

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from io import BytesIO
 from typing import BinaryIO, NamedTuple
 
+from diffdrive_jacobian.bags.files import MCAP_MAGIC
 from diffdrive_jacobian.bags.journal import Message
 from diffdrive_jacobian.bags.limits import (
     MAX_RECORD,
@@ -43,7 +44,6 @@ Found = Topic | Message | str
 """A text is what metadata.yaml holds, too."""
 
 
-MCAP_MAGIC = b'\x89MCAP0\r\n'
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0C
 _OPCODES = range(0x01, 0x10)
 _HEAD = struct.Struct('<BQ')

@@ -16,10 +16,10 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2
 from rosbags.rosbag2 import Reader
 from rosgraph_msgs.msg import Clock as ClockMessage
 
+from diffdrive_jacobian.bags.bag_reader import BagError, base_name, messages
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, message_class
-from diffdrive_jacobian.bags.qos import to_offer_again
-from diffdrive_jacobian.reading.reader import BagError, base_name, messages
 from diffdrive_jacobian.replay.lateness import Lateness
+from diffdrive_jacobian.ros.qos import publisher_profile
 
 NANOSECONDS = 1_000_000_000
 DEPTH = 1000
@@ -159,7 +159,7 @@ class Replayer(Node):  # type: ignore[misc]
     def _advertise(self, connection: Connection) -> Publisher:
         topic = self._playback.remap.get(connection.topic, connection.topic)
         assert isinstance(connection.ext, ConnectionExtRosbag2)
-        profile = to_offer_again(connection.ext.offered_qos_profiles, DEPTH)
+        profile = publisher_profile(connection.ext.offered_qos_profiles, DEPTH)
         try:
             return self.create_publisher(message_class(connection.msgtype), topic, profile)
         except UnknownTypeError as error:

@@ -6,7 +6,6 @@ import argparse
 import re
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from diffdrive_jacobian.errors import UserError
@@ -16,7 +15,6 @@ from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli
 
 if TYPE_CHECKING:
-    from diffdrive_jacobian.bags.bag_writer import Summary
     from diffdrive_jacobian.recording.record import Status
 
 PROGRAM = 'record_run'
@@ -65,6 +63,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     # Not above: --help needs no ROS.
     from diffdrive_jacobian.recording.record import open_recording, record
     from diffdrive_jacobian.recording.recording import RecordingError
+    from diffdrive_jacobian.tools._bags import describe
 
     topics = tuple(options.topics)
     selection = Selection(
@@ -100,18 +99,6 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         return _cli.FAILED
     print(describe(bag, summary))
     return _cli.DONE
-
-
-def describe(bag: Path, summary: Summary, *, complete: bool = True) -> str:
-    """Return a line about the content of a bag."""
-    what = f'{printable(bag, PATH_LIMIT)} is {"complete" if complete else "incomplete"}'
-    if summary.start is None or summary.end is None:
-        return f'{what} and empty: no message was received'
-    counts = sorted(summary.topics.items())
-    topics = ', '.join(f'{printable(topic)} {count}' for topic, count in counts if count)
-    seconds = (summary.end - summary.start) / 1e9
-    lost = f'; {sum(summary.lost.values())} lost' if summary.lost else ''
-    return f'{what}: {_cli.counted(summary.messages, "message")} in {seconds:.1f} s ({topics}){lost}'
 
 
 def _pattern(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Replay a recorded run, or verify that the robot still moves as it did."""
+"""Replay a recorded run."""
 
 from __future__ import annotations
 
@@ -10,59 +10,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import ParameterError
-from diffdrive_jacobian.parameters.file import robot_parameters
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools import _cli, verify_run
 
 if TYPE_CHECKING:
-    from diffdrive_jacobian.reading.verification import Verification
     from diffdrive_jacobian.replay import ReplayResult
 
 PROGRAM = 'replay_run'
+VERIFY = '--verify'
 MATCH_PATIENCE = 5.0
 """Longest wait for subscriptions without -w (s): an older participant is announced every 3 s."""
-
-
-def report(verification: Verification, tolerance: float, yaw_tolerance: float) -> str:
-    """Say how far the robot driven again and the odometry are apart."""
-    lines = [
-        f'{len(verification.seconds)} odometry messages, commands from {verification.source}, '
-        f'begun at the first {verification.start}',
-        *(f'note: {note}' for note in verification.notes),
-    ]
-    for name, unit, values, allowed in (
-        ('position', 'm', verification.distances, tolerance),
-        ('heading', 'rad', verification.headings, yaw_tolerance),
-    ):
-        worst = int(np.argmax(values))
-        rms = float(np.sqrt(np.mean(values**2)))
-        lines.append(
-            f'{name}: at most {values[worst]:.3g} {unit} apart, at {verification.seconds[worst]:.3f} s; '
-            f'RMS {rms:.3g} {unit}; allowed {allowed:g} {unit}'
-        )
-        beyond = np.flatnonzero(values > allowed)
-        if len(beyond):
-            first = verification.seconds[beyond[0]]
-            lines.append(f'{name}: beyond that in {len(beyond)} messages, first at {first:.3f} s')
-    verdict = 'as recorded' if verification.holds(tolerance, yaw_tolerance) else 'NOT as recorded'
-    return '\n'.join([*lines, f'the robot moves {verdict}'])
-
-
-def _verify(bag: Path, options: argparse.Namespace) -> int:
-    from diffdrive_jacobian.reading.reader import read_run
-    from diffdrive_jacobian.reading.verification import verify
-
-    parameters = None if options.params_file is None else robot_parameters(options.params_file)
-    verification = verify(read_run(bag), parameters)
-    allowed = verification.allowed
-    tolerance = allowed if options.tolerance is None else options.tolerance
-    yaw_tolerance = allowed if options.yaw_tolerance is None else options.yaw_tolerance
-    print(report(verification, tolerance, yaw_tolerance))
-    return _cli.DONE if verification.holds(tolerance, yaw_tolerance) else _cli.FAILED
 
 
 def _replay(bag: Path, options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> int:
@@ -157,16 +116,19 @@ def _report(result: ReplayResult, options: argparse.Namespace) -> int:
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
     own, ros = _cli.split_arguments(arguments)
+    if any(VERIFY.startswith(word) and word.startswith('--v') for word in own):
+        rest = [word for word in own if not (VERIFY.startswith(word) and word.startswith('--v'))]
+        return verify_run.run_as_option(PROGRAM, VERIFY, [*rest, *ros])
     parser = _parser()
     options = _cli.parse(parser, own)
     if options.timeout is not None and options.readers is None:
         parser.error('--timeout needs -w: it is the longest wait for the subscriptions of -w')
     # Not above: --help needs no ROS.
-    from diffdrive_jacobian.reading.reader import BagError
+    from diffdrive_jacobian.bags.bag_reader import BagError
 
     bag = Path(options.bag)
     try:
-        return _verify(bag, options) if options.verify else _replay(bag, options, ros, signals)
+        return _replay(bag, options, ros, signals)
     except (UserError, BagError, ParameterError) as error:
         return _cli.complain(PROGRAM, error)
 
@@ -190,10 +152,8 @@ def _parser() -> argparse.ArgumentParser:
         prog=PROGRAM,
         usage=f'{PROGRAM} BAG [options] [--ros-args ...]',
         description='Replay a recorded run: the commands (cmd_vel), unless an option selects other '
-        'topics. On a terminal, Enter pauses and resumes. With --verify nothing is published: the '
-        'robot is simulated again in memory and its path compared with the odometry. Exit code 0: '
-        'played, or as recorded; 1: not played to the end, or not as recorded, or nothing to play; '
-        '2: wrong arguments or no bag; 130: interrupted.',
+        'topics. On a terminal, Enter pauses and resumes. Exit code 0: played; 1: not played to the end, '
+        'or nothing to play; 2: wrong arguments or no bag; 130: interrupted.',
     )
     parser.add_argument('bag', metavar='BAG', help='directory of a rosbag2 bag')
     what = parser.add_mutually_exclusive_group()
@@ -202,7 +162,7 @@ def _parser() -> argparse.ArgumentParser:
     what.add_argument(
         '--topics', nargs='+', metavar='TOPIC', help='play these topics (fully qualified names)'
     )
-    what.add_argument('--verify', action='store_true', help='compare the robot with the odometry')
+    what.add_argument(VERIFY, action='store_true', help='run verify_run instead, with its options')
     parser.add_argument(
         '-r', '--rate', type=_cli.positive, default=1.0, help='factor on the speed (default: 1.0)'
     )
@@ -249,13 +209,5 @@ def _parser() -> argparse.ArgumentParser:
         metavar='MS',
         help='at the end wait up to this time (ms) until all reliable subscriptions have acknowledged '
         'all messages, 0: no limit; exit code 1 if they have not (default: do not wait)',
-    )
-    parser.add_argument('--tolerance', type=_cli.positive, help='with --verify: position (m)')
-    parser.add_argument('--yaw-tolerance', type=_cli.positive, help='with --verify: heading (rad)')
-    parser.add_argument(
-        '--params-file',
-        metavar='FILE',
-        type=_cli.readable_file,
-        help='with --verify: the parameters of the robot (YAML), where the bag has none',
     )
     return parser

@@ -1,0 +1,90 @@
+"""Files of a bag: which there are, and what they are by their first bytes."""
+
+from __future__ import annotations
+
+import re
+import stat
+from pathlib import Path
+
+from diffdrive_jacobian.bags.journal import JOURNAL, MAGIC, journal_of
+
+MCAP_MAGIC = b'\x89MCAP0\r\n'
+SQLITE_MAGIC = b'SQLite format 3\0'
+ZSTD = '.zstd'
+DATA_KINDS = ('mcap', 'sqlite3')
+_KINDS = {'.mcap': 'mcap', '.db3': 'sqlite3', JOURNAL: 'journal'}
+_MAGICS = {MCAP_MAGIC: 'mcap', SQLITE_MAGIC: 'sqlite3', MAGIC: 'journal'}
+
+
+class NotARegularFileError(OSError):
+    """A path exists but is not a regular file."""
+
+
+class NotABagError(Exception):
+    """A path holds nothing of a bag."""
+
+
+def check_regular(path: Path) -> None:
+    """Check that reading a file cannot block for ever, as reading a named pipe or a device can.
+
+    Raises:
+        NotARegularFileError: It is a directory, a named pipe, a device or a socket.
+        OSError: It does not exist.
+    """
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise NotARegularFileError(f'{path.name} is not a regular file')
+
+
+def file_kind(path: Path) -> str:
+    """Return what a file is by its first bytes, or, as these may be damaged, by its name.
+
+    Returns:
+        `mcap`, `sqlite3`, `journal`, or empty for anything else.
+    """
+    with open(path, 'rb') as file:
+        begin = file.read(len(SQLITE_MAGIC))
+    for magic, kind in _MAGICS.items():
+        if begin.startswith(magic):
+            return kind
+    name = path.with_suffix('') if path.suffix == ZSTD else path
+    return _KINDS.get(name.suffix, '')
+
+
+def bag_files(path: Path) -> list[Path]:
+    """Return the data files of a bag in their order, or the one that is given.
+
+    Args:
+        path: A bag's directory, one of its files, or a journal.
+
+    Raises:
+        NotABagError: There is no such file.
+        OSError: It cannot be read.
+    """
+    if path.is_file():
+        if not file_kind(path):
+            raise NotABagError(f'{path} is neither MCAP nor SQLite nor a journal of record_run')
+        return [path]
+    if not path.is_dir():
+        if path.exists():
+            raise NotABagError(f'{path} is not a bag: it is not a regular file')
+        raise NotABagError(f'there is no bag {path}, and no journal {journal_of(path)}')
+    present = set(path.iterdir())
+    # A file whose compression was interrupted exists twice.
+    files = [one for one in present if one.is_file() and one.with_suffix('') not in present - {one}]
+    files = [one for one in files if file_kind(one) in DATA_KINDS]
+    if not files:
+        what = 'holds neither .mcap nor .db3 files' if present else 'is an empty folder'
+        raise NotABagError(f'{path} {what}: it is not a bag')
+    # Files are numbered, and 10 comes after 9.
+    return sorted(
+        files, key=lambda one: [int(n) if n.isdigit() else n for n in re.split('([0-9]+)', one.name)]
+    )
+
+
+def is_recoverable(path: Path) -> bool:
+    """Return whether a file or a directory may hold messages of a bag."""
+    try:
+        bag_files(path)
+    except (NotABagError, OSError):
+        return False
+    return True

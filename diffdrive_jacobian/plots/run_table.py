@@ -1,0 +1,106 @@
+"""A recorded run as a table with one row for each odometry message, and as a CSV file."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffdrive_jacobian.plots.output_files import create
+from diffdrive_jacobian.reading.run import Run, Series
+from diffdrive_jacobian.reading.trace import Trace, seconds, trace
+
+COLUMNS = (
+    *('time_s', 'x_m', 'y_m', 'theta_rad', 'v_mps', 'omega_radps'),
+    *('distance_m', 'heading_error_rad', 'v_command_mps', 'omega_command_radps'),
+    *('omega_right_radps', 'omega_left_radps'),
+)
+"""Columns of the table, with their units."""
+DECIMALS = 9
+"""Decimal places of the values in a CSV file. Its times are exact to the nanosecond."""
+
+
+def table(run: Run) -> NDArray[np.float64]:
+    """Return a run as an array, one row for each odometry message and one column for each of `COLUMNS`.
+
+    Time counts from the first odometry message. The command is the latest one at that time: as applied
+    (`cmd_vel_out`), or as sent (`cmd_vel`) if that was not recorded. Wheel speeds are interpolated
+    linearly between the messages of `joint_states`. Unknown values are NaN.
+
+    Raises:
+        BagError: There is no odometry.
+    """
+    one = trace(run)
+    commands = run.cmd_vel_out if len(run.cmd_vel_out) else run.cmd_vel
+    return np.column_stack(
+        [
+            one.time,
+            run.odometry.values,
+            one.distance,
+            one.heading_error,
+            _latest(one, commands),
+            _interpolated(one, run.wheels),
+        ]
+    )
+
+
+def _latest(one: Trace, series: Series) -> NDArray[np.float64]:
+    """Return the latest value at each odometry message, NaN before the first one, shape (n, 2)."""
+    at, known = _clocks(one, series)
+    last = np.searchsorted(known, at, side='right')
+    return np.vstack([np.full((1, 2), np.nan), series.values])[last]
+
+
+def _interpolated(one: Trace, series: Series) -> NDArray[np.float64]:
+    """Return the value at each odometry message, NaN outside of the recorded times, shape (n, 2)."""
+    at, known = _clocks(one, series)
+    if not len(series):
+        return np.full((len(at), 2), np.nan)
+    columns = [np.interp(at, known, values, np.nan, np.nan) for values in series.values.T]
+    return np.column_stack(columns)
+
+
+def _clocks(one: Trace, series: Series) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return times of the odometry and of a series that can be compared and do not decrease (s)."""
+    times = one.time, seconds(one.run, series)
+    if all((np.diff(time) >= 0.0).all() for time in times):
+        return times
+    start = one.run.odometry.received[0]
+    return (one.run.odometry.received - start) / 1e9, (series.received - start) / 1e9
+
+
+def decimal_seconds(nanoseconds: int) -> str:
+    """Return a time as an exact decimal number (s)."""
+    sign, (whole, rest) = '-' * (nanoseconds < 0), divmod(abs(nanoseconds), 1_000_000_000)
+    return f'{sign}{whole}.{rest:09d}'.rstrip('0').rstrip('.')
+
+
+def _decimal(value: float) -> str:
+    """Return a number rounded to `DECIMALS` places; '': NaN."""
+    if math.isnan(value):
+        return ''
+    text = f'{value:.{DECIMALS}f}'.rstrip('0').rstrip('.')
+    return '0' if text == '-0' else text
+
+
+def write_csv(run: Run, path: Path) -> None:
+    """Write a run to a new CSV file with a header line; the fields of unknown values are empty.
+
+    Times are exact, values are rounded to `DECIMALS` places.
+
+    Raises:
+        BagError: The run has no odometry.
+        FileExistsError: The file exists.
+        OSError: The file cannot be written.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator='\n')
+    writer.writerow(COLUMNS)
+    stamps = (run.odometry.stamps - run.odometry.stamps[0]).tolist()
+    for stamp, (_, *values) in zip(stamps, table(run).tolist(), strict=True):
+        writer.writerow([decimal_seconds(stamp), *map(_decimal, values)])
+    create(path, text.getvalue().encode())

@@ -1,0 +1,167 @@
+"""Recovery: a complete bag with all messages of a damaged bag or a journal that can be read."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+from diffdrive_jacobian.bags.bag_reader import find_damage
+from diffdrive_jacobian.bags.bag_writer import Summary, build_bag
+from diffdrive_jacobian.bags.files import NotABagError as NotABagError
+from diffdrive_jacobian.bags.journal import (
+    JOURNAL,
+    LOST,
+    Channel,
+    Message,
+    Record,
+    Text,
+    is_being_written,
+    journal_of,
+)
+from diffdrive_jacobian.recovery.damaged_bag import DamagedBag
+from diffdrive_jacobian.recovery.decoding_check import DecodingCheck
+from diffdrive_jacobian.text import printable
+
+RECOVERED = '_recovered'
+"""Ends the name of a recovered bag."""
+
+
+class NothingToSaveError(Exception):
+    """There is nothing to recover; the arguments are the reason and what could not be read."""
+
+
+class RecoveryInterruptedError(Exception):
+    """The recovery was interrupted; no bag was written."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Recovery:
+    """A recovered bag, and what could not be recovered."""
+
+    bag: Path
+    """Directory of the new bag."""
+    summary: Summary
+    """Its content."""
+    damaged: str
+    """Why readers refuse the old bag; '' if they do not, or if it is a journal."""
+    lost: tuple[str, ...]
+    """Descriptions of what could not be read."""
+    lost_before: tuple[str, ...]
+    """What the recorder reported as lost, one description for each topic."""
+    topics_left_out: bool
+    """Whether there are topics whose messages were read but could not be written."""
+    undecodable: tuple[str, ...]
+    """Descriptions of messages that were saved but cannot be decoded, and of topics not checked."""
+
+
+def recover(
+    what: Path,
+    output: Path | None = None,
+    storage: str | None = None,
+    *,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> Recovery:
+    """Write a new bag with what can be read of another one, which stays as it is.
+
+    Args:
+        what: A bag's directory, one of its files, a journal, or the bag that a journal belongs to.
+        output: The new bag's directory. By default it is beside the old one.
+        storage: `mcap` or `sqlite3`. By default that of the old bag.
+        interrupted: Is called for each record; once it returns True nothing is left of the new bag.
+
+    Raises:
+        NotABagError: There is nothing like a bag.
+        NothingToSaveError: The bag is complete, or not a message can be read.
+        JournalError: The journal is not one of record_run.
+        FileExistsError: The new bag exists.
+        OSError: The old bag cannot be read, or the new one not be written.
+        RecoveryInterruptedError: `interrupted` returned True.
+    """
+    if not what.exists() and journal_of(what).is_file():
+        what = journal_of(what)
+    with tempfile.TemporaryDirectory(prefix='recover_run_') as scratch:
+        old = DamagedBag(what, Path(scratch))
+        target = output or _default_target(what, old.kind)
+        if target.exists():
+            raise FileExistsError(f'{target} exists already')
+        if old.kind == 'journal' and is_being_written(old.files[0]):
+            raise NothingToSaveError(f'{what} is being recorded now: end record_run first')
+
+        def records() -> Iterator[Record]:
+            for record in old.records():
+                if interrupted():
+                    raise RecoveryInterruptedError
+                yield record
+
+        survey = _Survey(records())
+        lost, left_out = tuple(old.losses), bool(old.left_out)
+        undecodable = tuple(survey.decoding.undecodable)
+        damaged = '' if old.kind == 'journal' else find_damage(what)
+        count = survey.kinds[Message]
+        whole = old.message_count == count or (what.suffix == '.mcap' and what.is_file())
+        if whole and not lost and not damaged:
+            complete = f'{what} is complete: nothing to recover'
+            raise NothingToSaveError('; '.join([complete, *undecodable]))
+        if not count:
+            raise NothingToSaveError(f'{what} holds no message that can be saved', *lost)
+        # The file may still grow: the same records as in the survey are written.
+        surveyed = survey.kinds.total()
+        summary = build_bag(lambda: islice(records(), surveyed), target, storage or old.storage)
+        return Recovery(
+            bag=target,
+            summary=summary,
+            damaged=damaged,
+            lost=lost,
+            lost_before=_lost_before(survey.lost),
+            topics_left_out=left_out,
+            undecodable=undecodable,
+        )
+
+
+class _Survey:
+    """Number of records by their kind, messages that cannot be decoded, and losses when recording."""
+
+    def __init__(self, records: Iterable[Record]) -> None:
+        self.kinds: Counter[type[Record]] = Counter()
+        self.decoding = DecodingCheck()
+        self.lost = ''
+        """The custom data of the key `LOST`."""
+        channels: dict[int, Channel] = {}
+        for record in records:
+            self.kinds[type(record)] += 1
+            if isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message):
+                self.decoding.add(channels[record.channel], record.data)
+            elif isinstance(record, Text) and record.key == LOST:
+                self.lost = record.value
+
+
+def _lost_before(text: str) -> tuple[str, ...]:
+    """Return descriptions of the losses that a recorder has noted in the custom data."""
+    if not text:
+        return ()
+    try:
+        counts = json.loads(text)
+    except (ValueError, RecursionError):
+        counts = None
+    if not isinstance(counts, dict):
+        return (f'the recorder noted losses: {printable(text)}',)
+    return tuple(
+        f'{printable(count)} messages on {printable(topic)} while it was recorded'
+        for topic, count in sorted(counts.items())
+        if count
+    )
+
+
+def _default_target(what: Path, kind: str) -> Path:
+    """Return the directory of the new bag, named after the old one."""
+    if kind == 'journal' and what.suffix == JOURNAL:
+        return what.with_suffix('')
+    stem = what.stem if what.is_file() else what.resolve().name
+    return what.resolve().with_name(stem + RECOVERED)

@@ -1,0 +1,59 @@
+"""Quality of service of rclpy: as recorded, and for subscriptions and publishers that match others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.interfaces import Qos, QosDurability, QosReliability
+
+
+def to_fields(profile: QoSProfile) -> dict[str, Any]:
+    """Return a profile as numbers: policies as in rmw, whose numbers rosbag2 shares, durations in ns."""
+    return {
+        'history': int(profile.history),
+        'depth': profile.depth,
+        'reliability': int(profile.reliability),
+        'durability': int(profile.durability),
+        'deadline': profile.deadline.nanoseconds,
+        'lifespan': profile.lifespan.nanoseconds,
+        'liveliness': int(profile.liveliness),
+        'liveliness_lease_duration': profile.liveliness_lease_duration.nanoseconds,
+    }
+
+
+def subscription_profile(offered: Iterable[QoSProfile], depth: int) -> QoSProfile:
+    """Return the strictest profile that is compatible with every publisher of a topic.
+
+    Args:
+        offered: The profiles of the publishers.
+        depth: Length of the queue.
+    """
+    offered = list(offered)
+    profile = QoSProfile(depth=depth)
+    if any(one.reliability == ReliabilityPolicy.BEST_EFFORT for one in offered):
+        profile.reliability = ReliabilityPolicy.BEST_EFFORT
+    if offered and all(one.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in offered):
+        profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
+    return profile
+
+
+def publisher_profile(recorded: Sequence[Qos], depth: int) -> QoSProfile:
+    """Return a profile for the replay of a topic: latched if a publisher was, reliable unless none was.
+
+    Args:
+        recorded: The profiles that the recorded publishers offered.
+        depth: Length of the queue.
+    """
+    profile = QoSProfile(depth=depth)
+    if recorded and all(one.reliability == QosReliability.BEST_EFFORT for one in recorded):
+        profile.reliability = ReliabilityPolicy.BEST_EFFORT
+    if any(one.durability == QosDurability.TRANSIENT_LOCAL for one in recorded):
+        profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
+    deadlines = [one.deadline for one in recorded]
+    if deadlines:
+        shortest = min(deadlines)
+        profile.deadline = Duration(seconds=shortest.sec, nanoseconds=shortest.nsec)
+    return profile

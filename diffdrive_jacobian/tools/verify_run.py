@@ -1,0 +1,116 @@
+"""Verify that a robot still moves as recorded: simulate a run again and compare it with its odometry."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from diffdrive_jacobian.bags.bag_reader import BagError
+from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.parameters.declaration import ParameterError
+from diffdrive_jacobian.parameters.file import robot_parameters
+from diffdrive_jacobian.reading.reader import read_run
+from diffdrive_jacobian.reading.verification import BY_RECORDING_TIME, EXACT, Verification, verify
+from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.tools import _cli
+
+PROGRAM = 'verify_run'
+
+
+def report(verification: Verification, tolerance: float, yaw_tolerance: float) -> str:
+    """Return a description of the differences, of several lines.
+
+    Args:
+        verification: The differences.
+        tolerance: Largest allowed difference of the position (m).
+        yaw_tolerance: Largest allowed difference of the heading (rad).
+    """
+    lines = [
+        f'{len(verification.seconds)} odometry messages, commands from {verification.source}, '
+        f'starting at the first {verification.start}',
+        *(f'note: {note}' for note in verification.notes),
+    ]
+    for name, unit, values, allowed in (
+        ('position', 'm', verification.distances, tolerance),
+        ('heading', 'rad', verification.headings, yaw_tolerance),
+    ):
+        worst = int(np.argmax(values))
+        rms = float(np.sqrt(np.mean(values**2)))
+        lines.append(
+            f'{name}: maximum error {values[worst]:.3g} {unit} at {verification.seconds[worst]:.3f} s; '
+            f'RMS {rms:.3g} {unit}; allowed {allowed:g} {unit}'
+        )
+        beyond = np.flatnonzero(values > allowed)
+        if len(beyond):
+            first = verification.seconds[beyond[0]]
+            lines.append(f'{name}: exceeded in {len(beyond)} messages, first at {first:.3f} s')
+    verdict = 'as recorded' if verification.holds(tolerance, yaw_tolerance) else 'NOT as recorded'
+    return '\n'.join([*lines, f'the robot moves {verdict}'])
+
+
+def main(arguments: Sequence[str], signals: Signals) -> int:
+    """Run the tool and return its exit code."""
+    return _run(_parser().parse_args(arguments), PROGRAM)
+
+
+def run_as_option(program: str, option: str, arguments: Sequence[str]) -> int:
+    """Run the tool as an option of another one, and return the exit code.
+
+    Args:
+        program: Name of the other tool.
+        option: The option.
+        arguments: The other arguments; those that this tool does not have are refused.
+    """
+    parser = _parser(program, option)
+    options, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        parser.error(f'not allowed with {option}: {" ".join(word.strip() for word in unknown)}')
+    return _run(options, program)
+
+
+def _run(options: argparse.Namespace, program: str) -> int:
+    try:
+        parameters = None if options.params_file is None else robot_parameters(options.params_file)
+        verification = verify(read_run(options.bag), parameters)
+    except (UserError, BagError, ParameterError) as error:
+        return _cli.complain(program, error)
+    allowed = verification.allowed
+    tolerance = allowed if options.tolerance is None else options.tolerance
+    yaw_tolerance = allowed if options.yaw_tolerance is None else options.yaw_tolerance
+    print(report(verification, tolerance, yaw_tolerance))
+    return _cli.DONE if verification.holds(tolerance, yaw_tolerance) else _cli.FAILED
+
+
+def _parser(program: str = PROGRAM, option: str = '') -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=program,
+        usage=' '.join([program, *option.split(), 'BAG [options]']),
+        description='Simulate a recorded run again from its commands, and compare the path with the '
+        'recorded odometry. Nothing is published, and no ROS is needed. Exit code 0: the robot moves as '
+        'recorded; 1: it does not; 2: wrong arguments, or the bag cannot be read.',
+    )
+    parser.add_argument('bag', metavar='BAG', type=Path, help='directory of a bag')
+    default = f'{EXACT:g} if cmd_vel_out was recorded, else {BY_RECORDING_TIME:g}'
+    parser.add_argument(
+        '--tolerance',
+        metavar='M',
+        type=_cli.positive,
+        help=f'largest allowed difference of the position in m (default: {default})',
+    )
+    parser.add_argument(
+        '--yaw-tolerance',
+        metavar='RAD',
+        type=_cli.positive,
+        help=f'largest allowed difference of the heading in rad (default: {default})',
+    )
+    parser.add_argument(
+        '--params-file',
+        metavar='FILE',
+        type=_cli.readable_file,
+        help='ROS parameters of virtual_robot (YAML), if cmd_vel_out was not recorded '
+        '(default: those recorded in the bag)',
+    )
+    return parser
