@@ -93,7 +93,7 @@ def test_requests_without_an_answer_do_not_pile_up(ros, clock):
     assert len(watch._clients['/go_to_goal']._pending_requests) == liveness.PENDING
 
 
-# --- What a sender makes of it
+# --- Loss of a controller
 
 A, B, OTHER = b'a', b'b', b'o'
 
@@ -125,7 +125,7 @@ def test_loss(sent_to, present, silence, expected):
     assert loss(sent_to, present, silence) == expected
 
 
-def test_a_restarted_controller_is_told_from_the_one_that_has_the_goal(ros):
+def test_a_restarted_controller_is_distinguished_from_the_one_that_has_the_goal(ros):
     goals = np.array([[1.0, 1.0, 0.0]])
     sender = ros.add(
         lambda context, parameter_overrides: GoalClient(
@@ -142,7 +142,9 @@ def test_a_restarted_controller_is_told_from_the_one_that_has_the_goal(ros):
     ros.add(GoToGoal)
     ros.until(lambda: len(sender.controllers()) == 2, 'the new one is found')
     restarted = 'the controller /go_to_goal was restarted'
-    ros.until(lambda: loss(controllers, sender.controllers(), 0.0) == restarted, 'it is told')
+    ros.until(
+        lambda: loss(controllers, sender.controllers(), 0.0) == restarted, 'the restart is detected'
+    )
     ros.executor.remove_node(old)
     old.destroy_node()
     ros.nodes.remove(old)

@@ -1,4 +1,4 @@
-"""A recorder survives whatever a node answers when it is asked for its parameters."""
+"""A recorder survives any answer of a node to a query of its parameters."""
 
 from __future__ import annotations
 

@@ -167,7 +167,7 @@ def test_another_reader_of_goals_is_no_controller(world):
     assert drive.controller.exit() == 0
 
 
-def test_send_goal_without_a_controller_says_so(world):
+def test_send_goal_reports_a_missing_controller(world):
     sender = world.run('send_goal', '-1', '-1e-1', '--wait', '1', '--ros-args', '-r', '__ns:=/here')
     assert sender.exit() == 1
     assert sender.last_line.startswith(
@@ -199,7 +199,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize('kind', REFUSED)
-def test_what_a_node_cannot_run_with_is_said(world, tmp_path, monkeypatch, kind):
+def test_invalid_arguments_of_a_node_are_reported(world, tmp_path, monkeypatch, kind):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'malformed.yaml').write_text('go_to_goal: [1, 2\n  b: }')
     children = [world.start(name, '--ros-args', *arguments) for name, arguments, _ in REFUSED[kind]]

@@ -1,4 +1,4 @@
-"""record_run as a process: what was sent is what the bag holds, byte for byte, however it ends."""
+"""record_run as a process: the bag contains the messages sent, byte for byte, however it ends."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def twist(index):
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_what_was_sent_is_what_the_bag_holds(world, bag, storage):
+def test_the_bag_contains_the_messages_that_were_sent(world, bag, storage):
     goals = Goals()
     goals.header.frame_id = 'odom'
     talk = Talk(
@@ -215,7 +215,9 @@ def test_topics_are_selected_and_time_is_limited(world, bag):
         (['-o', 'new', 'bad//topic'], "invalid topic name 'bad//topic': "),
     ],
 )
-def test_what_cannot_be_is_said_and_nothing_is_lost(capsys, tmp_path, monkeypatch, arguments, words):
+def test_wrong_arguments_are_reported_and_no_file_is_changed(
+    capsys, tmp_path, monkeypatch, arguments, words
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'taken').mkdir()
     JournalWriter(tmp_path / 'begun.journal').close()

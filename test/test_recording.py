@@ -185,7 +185,7 @@ def test_a_folder_of_the_user_stays(tmp_path):
 # --- A slow disk
 
 
-def test_a_disk_that_hesitates_loses_nothing_and_delays_nobody(tmp_path, disk):
+def test_a_slow_disk_loses_no_message_and_delays_no_caller(tmp_path, disk):
     recording = Recording(tmp_path / 'run', 'mcap')
     disk.ready.clear()
     add_all(recording, channel(), *messages(1))
@@ -313,7 +313,7 @@ def test_a_full_disk_is_raised_by_finish(tmp_path, disk, lossless):
     assert journal_of(tmp_path / 'run').exists()
 
 
-def test_a_bag_that_cannot_be_written_is_raised_by_finish(tmp_path):
+def test_finish_raises_if_the_bag_cannot_be_written(tmp_path):
     recording = Recording(tmp_path / 'run', 'mcap')
     add_all(recording, channel(), *messages(10))
     (tmp_path / 'run').write_text('somebody else came first')
@@ -364,7 +364,7 @@ def test_a_journal_that_goes_is_noticed_and_saved(tmp_path, capsys, change):
         assert journal_of(folder / 'run').read_text() == 'of somebody else'
 
 
-def test_discarding_leaves_the_file_of_somebody_else(tmp_path):
+def test_discarding_keeps_a_file_of_another_process(tmp_path):
     recording = Recording(tmp_path / 'run', 'mcap')
     _replace(tmp_path)
     recording.discard()

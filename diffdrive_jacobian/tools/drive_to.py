@@ -157,7 +157,8 @@ def _report(outcome: Outcome, options: argparse.Namespace) -> int:
         where = 'the robot published no odometry'
     else:
         x, y, theta = outcome.pose
-        point = f' with the point {outcome.offset:g} m ahead of its axle' if outcome.offset else ''
+        point = f' with the driven point (x {outcome.offset:g} m in the body frame)'
+        point = point if outcome.offset else ''
         simulated = ' of simulated time' if options.lockstep else ''
         where = (
             f'the robot stopped at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, '
