@@ -5,13 +5,16 @@ Needs pdoc: `pip install '.[jazzy,plot,test,doc]'`. Every warning is an error.
 
 from __future__ import annotations
 
+import ast
 import importlib
 import inspect
 import pkgutil
 import sys
 import typing
 import warnings
+from contextlib import suppress
 from pathlib import Path
+from types import ModuleType
 from typing import Generic, TypeVar
 
 import numpy.typing
@@ -36,25 +39,44 @@ def abbreviate_numpy_types() -> None:
         setattr(numpy.typing, replacement.__name__, replacement)
 
 
-def resolve_named_tuples() -> None:
+def modules() -> list[ModuleType]:
+    """Import and return all modules of the package."""
+    package = importlib.import_module(PACKAGE)
+    found = pkgutil.walk_packages(package.__path__, f'{PACKAGE}.')
+    return [package, *(importlib.import_module(info.name) for info in found)]
+
+
+def import_types(module: ModuleType) -> None:
+    """Run what a module imports for type checkers only, so that its annotations can be resolved."""
+    for node in ast.parse(inspect.getsource(module)).body:
+        if isinstance(node, ast.If) and ast.unparse(node.test) == 'TYPE_CHECKING':
+            for statement in node.body:
+                # Other packages have names that exist for type checkers only, too.
+                with suppress(ImportError):
+                    exec(compile(ast.Module([statement], []), module.__name__, 'exec'), vars(module))
+
+
+def resolve_named_tuples(module: ModuleType) -> None:
     """Replace the annotations of named tuples, which are strings, by the types.
 
     pdoc evaluates them in the namespace of `collections`, where their names are unknown.
     """
-    package = importlib.import_module(PACKAGE)
-    for info in pkgutil.walk_packages(package.__path__, f'{PACKAGE}.'):
-        module = importlib.import_module(info.name)
-        for _, member in inspect.getmembers(module, inspect.isclass):
-            if hasattr(member, '_fields') and member.__module__ == info.name:
-                hints = typing.get_type_hints(member)
-                member.__new__.__annotations__ = {name: hints[name] for name in member._fields}
+    for _, member in inspect.getmembers(module, inspect.isclass):
+        if hasattr(member, '_fields') and member.__module__ == module.__name__:
+            hints = typing.get_type_hints(member)
+            member.__new__.__annotations__ = {name: hints[name] for name in member._fields}
 
 
 def main(directory: Path) -> None:
     """Write the pages."""
     abbreviate_numpy_types()
-    resolve_named_tuples()
+    package = modules()
+    for prepare in (import_types, resolve_named_tuples):
+        for module in package:
+            prepare(module)
     warnings.simplefilter('error')
+    # Private members, which are not in the reference.
+    warnings.filterwarnings('ignore', message=rf'.* for {PACKAGE}[\w.]*\._\w+')
     pdoc.render.configure(docformat='google', show_source=True)
     pdoc.pdoc(PACKAGE, output_directory=directory)
     print(directory / 'index.html')
