@@ -23,6 +23,7 @@ import rclpy
 from rclpy.node import Node
 
 from diffdrive_jacobian.lockstep import _executor
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 SIGNAL = signal.SIGUSR2
 """Neither pytest nor its plugins use it; pytest-timeout uses SIGALRM."""
@@ -157,7 +158,7 @@ def describe(frame: FrameType, nodes: Iterable[Node]) -> str:
                 return f'{name} (reads {subscription.topic_name}, {named})'
         for timer in node.timers:
             if name := _runs(frame, timer.callback):
-                return f'{name} (timer of {timer.timer_period_ns / 1e9:g} s, {named})'
+                return f'{name} (timer of {timer.timer_period_ns / NANOSECONDS:g} s, {named})'
         for service in node.services:
             if name := _runs(frame, service.callback):
                 return f'{name} (service {node.resolve_service_name(service.srv_name)}, {named})'

@@ -10,7 +10,8 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-NANOSECONDS = 1_000_000_000
+from diffdrive_jacobian.time_units import NANOSECONDS
+
 LONGEST_ARRAY = 4
 """Longer ones are told by their length and their first elements."""
 LONG_ARRAY = 100

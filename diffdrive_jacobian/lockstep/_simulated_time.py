@@ -15,8 +15,8 @@ from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
 from diffdrive_jacobian.lockstep._guard import Guard, Stuck
 from diffdrive_jacobian.lockstep._report import Traffic
+from diffdrive_jacobian.time_units import NANOSECONDS
 
-NANOSECONDS = 1_000_000_000
 MAX_SECONDS = 2**31 - 1
 """What a stamp can hold."""
 

@@ -27,8 +27,9 @@ if TYPE_CHECKING:
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION as MAX_POSITION
 from diffdrive_jacobian.messages.plausibility import MAX_SPEED as MAX_SPEED
 from diffdrive_jacobian.messages.plausibility import MAX_WHEEL_SPEED as MAX_WHEEL_SPEED
-from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot
+from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 # x, y and yaw, and forward and yaw, in the row-major 6x6 covariances of ROS.
 _PLANAR = np.array([6 * row + column for row in (0, 1, 5) for column in (0, 1, 5)])

@@ -21,11 +21,12 @@ from diffdrive_jacobian.control.waypoints import Law
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.goal import MAX_WAYPOINTS, Goal, goal_info, read_goal
-from diffdrive_jacobian.parameters.nodes import GoToGoalParameters, nanoseconds
+from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 from diffdrive_jacobian.ros import serialization
 from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.time_units import nanoseconds
 
 LAWS: dict[str, Callable[[GoToGoalParameters], Law]] = {
     'go_to_goal': lambda gains: lambda pose, goal: go_to_goal(pose, goal[:2], gains.kp, gains.kv),

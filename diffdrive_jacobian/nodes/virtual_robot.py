@@ -26,10 +26,11 @@ from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters, nanoseconds
+from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
 from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
-from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot
+from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.time_units import nanoseconds, seconds
 
 
 class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
@@ -96,7 +97,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         elif now < self._latest:
             self.log_event_warning(
                 'time went back',
-                f'time went back by {(self._latest - now) / NANOSECONDS:.3f} s: '
+                f'time went back by {seconds(self._latest - now):.3f} s: '
                 'the robot stands still where it is',
             )
             robot = robot.at(self._latest).restarted(now)

@@ -12,9 +12,10 @@ from std_msgs.msg import Float64MultiArray
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.parameters.nodes import WheelBridgeParameters, nanoseconds
+from diffdrive_jacobian.parameters.nodes import WheelBridgeParameters
 from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
+from diffdrive_jacobian.time_units import nanoseconds
 
 
 class WheelBridge(ParameterizedNode[WheelBridgeParameters]):

@@ -11,8 +11,9 @@ from typing import Any
 from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION, MAX_SPEED
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, parameter
-from diffdrive_jacobian.simulation.robot import NANOSECONDS, RobotModel
+from diffdrive_jacobian.simulation.robot import RobotModel
 from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.time_units import nanoseconds
 
 CONTROLLERS = ('go_to_goal', 'offset_point', 'pose')
 MIN_OFFSET = 1e-3
@@ -233,8 +234,3 @@ def _differ(first: str, value: str, second: str, other: str) -> None:
         raise ParameterError(
             f"parameters '{first}' and '{second}' must differ, both are '{printable(value)}'"
         )
-
-
-def nanoseconds(seconds: float) -> int:
-    """Turn a duration parameter (s) into nanoseconds; only zero becomes zero, which means never."""
-    return max(1, round(seconds * NANOSECONDS)) if seconds else 0

@@ -38,10 +38,11 @@ from diffdrive_jacobian.bags.limits import (
 )
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition
 from diffdrive_jacobian.bags.metadata import DamagedError, parse_parameters
-from diffdrive_jacobian.bags.qos import NANOSECONDS, to_rosbags
+from diffdrive_jacobian.bags.qos import to_rosbags
 from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, TooLargeError, load_yaml
 from diffdrive_jacobian.recovery.salvage_mcap import MCAP_MAGIC, Topic, read_mcap
 from diffdrive_jacobian.recovery.salvage_sqlite import SQLITE_MAGIC, read_sqlite
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 KINDS = {'.mcap': 'mcap', '.db3': 'sqlite3', JOURNAL: 'journal'}
 READERS = {'mcap': read_mcap, 'sqlite3': read_sqlite}

@@ -20,8 +20,8 @@ from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, messag
 from diffdrive_jacobian.bags.qos import to_offer_again
 from diffdrive_jacobian.reading.reader import BagError, base_name, messages
 from diffdrive_jacobian.replay.lateness import Lateness
+from diffdrive_jacobian.time_units import NANOSECONDS
 
-NANOSECONDS = 1_000_000_000
 DEPTH = 1000
 COMMANDED = ('cmd_vel',)
 """What a robot was told."""

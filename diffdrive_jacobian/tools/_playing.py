@@ -15,6 +15,7 @@ from diffdrive_jacobian.replay.replayer import Playback, Replayer
 from diffdrive_jacobian.ros.heartbeats import fast_heartbeats
 from diffdrive_jacobian.ros.runner import Runner, ros_context, running
 from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.time_units import seconds
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._progress import Playing
 from diffdrive_jacobian.tools._waiting import Waiting
@@ -130,12 +131,12 @@ def _too_few(player: Replayer, readers: int) -> str:
 
 def _play(player: Replayer, runner: Runner, signals: Signals) -> bool:
     """Play until the end or a signal; return whether everything was played."""
-    with Playing((player.end - player.start) / 1e9) as progress:
+    with Playing(seconds(player.end - player.start)) as progress:
 
         def over() -> bool:
             if _pressed_enter():
                 player.toggle()
-            progress.show((player.position - player.start) / 1e9, paused=player.paused)
+            progress.show(seconds(player.position - player.start), paused=player.paused)
             return bool(player.done or signals.count)
 
         player.begin()

@@ -32,7 +32,7 @@ from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.parameters.nodes import CONTROLLERS, nanoseconds
+from diffdrive_jacobian.parameters.nodes import CONTROLLERS
 from diffdrive_jacobian.plots.run_figure import draw
 from diffdrive_jacobian.reading.reader import BagError, read_run
 from diffdrive_jacobian.recording.recorder import Recorder, Selection
@@ -40,6 +40,7 @@ from diffdrive_jacobian.recording.recording import Recording, RecordingError
 from diffdrive_jacobian.ros.node import THROTTLE
 from diffdrive_jacobian.ros.runner import Runner, UserError, closed_world, ros_context, running
 from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.time_units import nanoseconds
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._progress import Drive
 from diffdrive_jacobian.tools._recording import begin_recording

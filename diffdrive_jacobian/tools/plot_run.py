@@ -19,6 +19,7 @@ from diffdrive_jacobian.reading.reader import BagError, Run, Series, read_run
 from diffdrive_jacobian.reading.trace import Trace, seconds, trace
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
+from diffdrive_jacobian.time_units import NANOSECONDS
 from diffdrive_jacobian.tools import _cli
 
 PROGRAM = 'plot_run'
@@ -95,12 +96,12 @@ def _clocks(one: Trace, series: Series) -> tuple[NDArray[np.float64], NDArray[np
     if all((np.diff(time) >= 0.0).all() for time in times):
         return times
     begin = one.run.odometry.received[0]
-    return (one.run.odometry.received - begin) / 1e9, (series.received - begin) / 1e9
+    return (one.run.odometry.received - begin) / NANOSECONDS, (series.received - begin) / NANOSECONDS
 
 
 def _seconds(nanoseconds: int) -> str:
     """Return a time as an exact decimal number (s)."""
-    sign, (whole, rest) = '-' * (nanoseconds < 0), divmod(abs(nanoseconds), 1_000_000_000)
+    sign, (whole, rest) = '-' * (nanoseconds < 0), divmod(abs(nanoseconds), NANOSECONDS)
     return f'{sign}{whole}.{rest:09d}'.rstrip('0').rstrip('.')
 
 

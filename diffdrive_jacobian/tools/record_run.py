@@ -16,6 +16,7 @@ from diffdrive_jacobian.recording.recording import Recording, RecordingError
 from diffdrive_jacobian.ros.runner import UserError, ros_context, running
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
+from diffdrive_jacobian.time_units import NANOSECONDS
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._recording import begin_recording
 
@@ -159,7 +160,7 @@ def describe(bag: Path, summary: Summary, *, complete: bool = True) -> str:
         return f'{what} and empty: no message came'
     counts = sorted(summary.topics.items())
     topics = ', '.join(f'{printable(topic)} {count}' for topic, count in counts if count)
-    seconds = (summary.end - summary.start) / 1e9
+    seconds = (summary.end - summary.start) / NANOSECONDS
     lost = f'; {sum(summary.lost.values())} lost' if summary.lost else ''
     return f'{what}: {_cli.counted(summary.messages, "message")} in {seconds:.1f} s ({topics}){lost}'
 
