@@ -23,9 +23,9 @@ from diffdrive_jacobian.control import Arrival
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.ros.goal_sender import GoalSender
 from diffdrive_jacobian.ros.runner import ros_context, running
 from diffdrive_jacobian.tools.drive_to import Observer
-from diffdrive_jacobian.tools.send_goal import Sender
 
 NODES = {'virtual_robot': VirtualRobot, 'go_to_goal': GoToGoal, 'wheel_bridge': WheelBridge}
 CHANGEABLE = {'virtual_robot': 'cmd_vel_timeout', 'go_to_goal': 'kp', 'wheel_bridge': 'cmd_vel_timeout'}
@@ -155,7 +155,7 @@ def observer(context):
 
 
 def sender(context):
-    return Sender(np.zeros(3), '', context)
+    return GoalSender(np.zeros(3), '', context)
 
 
 def plain(context):

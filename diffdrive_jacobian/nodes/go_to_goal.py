@@ -64,7 +64,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._message: Twist | TwistStamped = TwistStamped() if stamped else Twist()
         self._watchdog = Watchdog(self, self._on_stale_odometry)
         self._configure()
-        self.announce('goals on', 'goal_pose', 'goals')
+        self.announce(subscribed=('odom', 'goal_pose', 'goals'), publishing=('cmd_vel', 'goal_status'))
 
     @property
     def waypoint(self) -> int | None:
@@ -194,7 +194,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._end(GoalStatus.STATUS_SUCCEEDED, 'reached')
             return
         # Without wheels in the limits the geometry of the wheels does not matter.
-        self._publish_command(*saturate(*command, self._limits, 1.0, 1.0))
+        self._publish_command(*saturate(*command, self._limits))
 
     def _begin(self, goal: Goal) -> bool:
         """Begin to drive, now that the odometry's frame is known."""
@@ -263,7 +263,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         parameters = self.parameters
         self._law = LAWS[parameters.controller](parameters)
         # Far from the goal the law may ask for more than any robot believes.
-        self._limits = parameters.limits(without=messages.MAX_SPEED)
+        self._limits = parameters.limits()
         self._arrival = Arrival(
             xy_tolerance=parameters.xy_goal_tolerance,
             yaw_tolerance=parameters.yaw_goal_tolerance,

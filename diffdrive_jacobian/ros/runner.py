@@ -7,10 +7,9 @@ node could send its last zero.
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import TypeVar
 
@@ -18,7 +17,6 @@ import rclpy
 from rclpy.context import Context
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.logging import get_logger_level, set_logger_level
 from rclpy.node import Node
 from rclpy.qos_overriding_options import InvalidQosOverridesError
@@ -29,6 +27,12 @@ from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.node import ParameterizedNode
 from diffdrive_jacobian.ros.parameters import report_unknown
+from diffdrive_jacobian.ros.rclpy_internals import (
+    RCLError,
+    UnknownROSArgsError,
+    events_executor,
+    reason,
+)
 from diffdrive_jacobian.text import printable
 
 N = TypeVar('N', bound=Node)
@@ -88,14 +92,13 @@ def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[
             context=context,
             signal_handler_options=SignalHandlerOptions.NO,
         )
-    except rclpy_implementation.UnknownROSArgsError as error:
+    except UnknownROSArgsError as error:
         raise UserError(
             f'unknown ROS arguments: {error}; other arguments come before --ros-args, or after the -- '
             'that ends the ROS arguments'
         ) from error
     except (RuntimeError, UnicodeError) as error:
-        # rcl appends where in its sources it gave up.
-        raise UserError(f'ROS arguments: {str(error).split(", at /")[0].strip()}') from error
+        raise UserError(f'ROS arguments: {reason(error)}') from error
     try:
         yield context
     finally:
@@ -132,17 +135,6 @@ def make_executor(context: Context, *, closed_world: bool) -> Executor:
     return executor or SingleThreadedExecutor(context=context)
 
 
-def events_executor(context: Context) -> Executor | None:
-    """Make an EventsExecutor; None if this rclpy has none."""
-    try:
-        from rclpy.experimental.events_executor import EventsExecutor
-    except ImportError:
-        return None
-    # It has the faulthandler write to sys.stderr, which then must be a file; in some tests it is none.
-    with redirect_stderr(sys.__stderr__):
-        return EventsExecutor(context=context)
-
-
 @contextmanager
 def running(context: Context, *, closed_world: bool) -> Iterator[Runner]:
     """Hold an executor and the nodes that are added to it; at the end each is stopped and destroyed."""
@@ -167,13 +159,12 @@ def made(make: Callable[[], N]) -> N:
         raise UserError(f'{rule} {printable(name.strip())}') from error
     except (ParameterError, ParameterException, InvalidQosOverridesError) as error:
         raise UserError(str(error)) from error
-    except rclpy_implementation.RCLError as error:
-        # rcl appends the place in its sources.
-        reason = str(error).split(', at /')[0]
-        if 'length should not exceed' in reason:
+    except RCLError as error:
+        why = reason(error)
+        if 'length should not exceed' in why:
             # Each part was short enough, see _check_name_length.
-            reason += f'; a name with its namespace must have at most {MAX_NAME_LENGTH} characters'
-        raise UserError(reason) from error
+            why += f'; a name with its namespace must have at most {MAX_NAME_LENGTH} characters'
+        raise UserError(why) from error
 
 
 class Runner:
