@@ -64,7 +64,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._message: Twist | TwistStamped = TwistStamped() if stamped else Twist()
         self._watchdog = Watchdog(self, self._on_stale_odometry)
         self._configure()
-        self.announce(subscribed=('odom', 'goal_pose', 'goals'), publishing=('cmd_vel', 'goal_status'))
+        self.announce(subscribed=['goal_pose', 'goals'], publishing=['cmd_vel'])
 
     @property
     def waypoint(self) -> int | None:
