@@ -194,7 +194,8 @@ def test_goals_with_too_many_poses_are_refused_unread(controller, monkeypatch, c
     with monkeypatch.context() as patched:
         patched.setattr(serialization, 'deserialize_message', None)
         controller.send(message)
-    assert 'goal refused: goals must hold at most 10000 poses, got 10001' in capfd.readouterr().err
+    words = f'goal refused: goals must hold at most {MAX_WAYPOINTS} poses, got {MAX_WAYPOINTS + 1}'
+    assert words in capfd.readouterr().err
     assert controller.statuses[-2:] == [(2, ABORTED), (1, EXECUTING)]
     message.goals.pop()
     controller.send(message)

@@ -246,9 +246,9 @@ class Search:
         """Write the steps of these rows, with the second derivatives of forward in the Hessian.
 
         `H = J^T M J - sum (M e)_i d^2 forward_i / dq^2`, with its eigenvalues made positive, so that the
-        step `(|H| + lambda I)^-1 J^T M e` goes downhill. J^T M J alone is wrong by more than its smallest
-        eigenvalues where J is nearly singular: lambda would have to make up for that in all directions,
-        and hundreds of steps would be needed along the others.
+        step `(|H| + lambda I)^-1 J^T M e` is a descent direction. The error of J^T M J alone exceeds its
+        smallest eigenvalues where J is nearly singular. A lambda that compensates for it would shorten
+        the step in all directions, and hundreds of steps would be needed.
         """
         around, width = self.task.around(still.q, STEP)
         k, n = still.q.shape
