@@ -37,6 +37,14 @@ def test_only_the_conversion_writes_stamps_and_wheels():
     assert {field for _, field in found} == FIELDS
 
 
+def test_no_module_assigns_a_stamp_of_its_own_making():
+    """Copies of received stamps are assigned, but none that `to_msg` creates."""
+    calls = [
+        path.name for path in PACKAGE.rglob('*.py') if '.to_msg()' in path.read_text(encoding='utf-8')
+    ]
+    assert calls == []
+
+
 @pytest.mark.parametrize('angles', [None, (0.5, -0.5)])
 def test_wheels_are_left_right_in_messages_and_right_left_in_the_library(angles):
     state, array = JointState(name=['left', 'right']), Float64MultiArray()

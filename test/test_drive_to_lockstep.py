@@ -21,7 +21,7 @@ from diffdrive_jacobian.reading import read_run
 from diffdrive_jacobian.reading.trace import trace
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.testing import Lockstep
-from diffdrive_jacobian.tools import drive_to
+from diffdrive_jacobian.tools import _progress, drive_to
 
 QUICK = ('--ros-args', '-p', 'kp:=12.0', '-p', 'kv:=3.0')
 CRAWL = (
@@ -38,17 +38,17 @@ CRAWL = (
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
-    """What it records goes where nobody minds."""
+    """Record to a temporary directory."""
     monkeypatch.chdir(tmp_path)
 
 
 def last_line(capsys):
-    """What it says of the drive; where it is recorded and drawn comes after."""
+    """Return the line about the drive; lines about the recording and the picture follow it."""
     return next(line for line in capsys.readouterr().out.splitlines() if 'the robot stopped' in line)
 
 
 @pytest.mark.parametrize('goals', [(1, 1), (-3, 0), (0.5, 0, 0.5, 0.5, 0, 0), (0, 0)])
-def test_arrives_and_says_the_same_each_time(capsys, goals):
+def test_arrives_with_the_same_output_each_time(capsys, goals):
     said = set()
     for record in (['--no-plot'], ['--no-record']):
         assert drive_to.main([*map(str, goals), '--lockstep', *record, *QUICK], Signals()) == 0
@@ -64,7 +64,7 @@ def test_arrives_and_says_the_same_each_time(capsys, goals):
     assert math.dist((x, y), goals[-2:]) <= 0.021
 
 
-def test_takes_as_long_as_the_law_says(capsys):
+def test_duration_is_that_of_the_control_law(capsys):
     """Straight ahead the distance decays as exp(-kv t), in steps of the odometry's period."""
     assert (
         drive_to.main(['1', '0', '--lockstep', '--no-record', '--ros-args', '-p', 'kv:=0.5'], Signals())
@@ -102,7 +102,7 @@ def test_without_a_heading_any_will_do(capsys):
 
 
 def test_nothing_is_driven_once_the_drive_is_over(tmp_path, capsys):
-    """The time is up before the robot was heard of, and so before a goal was sent."""
+    """The timeout is over before the first odometry, so before a goal was sent."""
     assert drive_to.main(['1', '1', '--timeout', '1e-9', '--no-plot', '-o', 'bag'], Signals()) == 1
     assert 'the robot stopped at x 0.000 m, y 0.000 m' in last_line(capsys)
     run = read_run(tmp_path / 'bag')
@@ -110,7 +110,7 @@ def test_nothing_is_driven_once_the_drive_is_over(tmp_path, capsys):
     assert not run.cmd_vel_out.values.any()
 
 
-def test_picture_that_is_there_is_told_of_before_the_drive(tmp_path, capsys):
+def test_an_existing_picture_is_reported_before_the_drive(tmp_path, capsys):
     (tmp_path / 'bag.png').write_text('precious')
     assert drive_to.main(['1', '1', '--lockstep', '-o', 'bag'], Signals()) == 2
     assert 'bag.png exists already' in capsys.readouterr().err
@@ -139,7 +139,7 @@ def test_a_full_disk_is_reported(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(journal.os, 'write', limited)
     assert drive_to.main(['1', '1', '--lockstep', '--no-plot', '-o', 'bag', *QUICK], Signals()) == 1
     said = capsys.readouterr()
-    assert 'drive_to: error: the recording broke off: No space left on device' in said.err
+    assert 'drive_to: error: the recording was aborted: No space left on device' in said.err
     assert said.out.splitlines()[-1] == 'recorded in part: bag'
     assert (tmp_path / 'bag.journal').exists()
 
@@ -164,7 +164,7 @@ def test_a_stuck_callback_fails_and_the_recording_is_kept(tmp_path, capsys, monk
 
 
 def test_a_bug_keeps_the_recording(tmp_path, monkeypatch):
-    monkeypatch.setattr(drive_to.Drive, 'show', lambda *_: 1 / 0)
+    monkeypatch.setattr(_progress.Drive, 'show', lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         drive_to.main(['1', '1', '--lockstep', '--no-plot', '-o', 'bag'], Signals())
     assert (tmp_path / 'bag').is_dir()
@@ -173,14 +173,14 @@ def test_a_bug_keeps_the_recording(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ('arguments', 'words'),
     [
-        (['--open'], '--lockstep cannot be open'),
+        (['--open'], '--lockstep and --open exclude each other'),
         (['--controller', 'pid'], "'go_to_goal', 'offset_point', 'pose'"),
         (['--heading', 'nan'], 'argument --heading: must be a finite number'),
         (['--ros-args', '-p', 'wheel_radius:=-1.0'], "parameter 'wheel_radius' must be in [0.001, 10]"),
         (['--ros-args', '--no-such-option'], 'ROS arguments: '),
     ],
 )
-def test_says_what_it_cannot_take(capsys, arguments, words):
+def test_wrong_arguments_are_reported(capsys, arguments, words):
     with pytest.raises(SystemExit) as caught:
         raise SystemExit(drive_to.main(['1', '1', '--lockstep', '--no-record', *arguments], Signals()))
     assert caught.value.code == 2

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
+import re
 import subprocess
 import sys
 from importlib.metadata import entry_points
+from pathlib import Path
 
 import pytest
+
+from diffdrive_jacobian.tools import entry_points as programs
 
 TOOLS = sorted(
     one.name
@@ -35,3 +40,18 @@ def test_an_error_of_the_system_names_the_tool(tool):
     )
     assert (ended.returncode, ended.stdout) == (1, '')
     assert ended.stderr == f'{tool}: error: the disk is full\n'
+
+
+def test_the_programs_are_the_nodes_and_the_modules_with_a_main():
+    """A new tool needs its module and the line in setup.py, and nothing else."""
+    listed = (Path(__file__).parents[1] / 'setup.py').read_text().split('COMMANDS = [')[1].split(']')[0]
+    assert sorted(re.findall(r"'(\w+)'", listed)) == sorted([*programs.NODES, *programs.tools()])
+    for name in programs.tools():
+        assert callable(importlib.import_module(f'diffdrive_jacobian.tools.{name}').main)
+    assert set(programs.tools()) < set(dir(programs))
+
+
+def test_another_name_is_no_program():
+    for name in ('nothing', '_cli', 'run_node', 'entry_points', '__init__'):
+        with pytest.raises(AttributeError, match=f"has no attribute '{name}'"):
+            programs.__getattr__(name)

@@ -224,7 +224,7 @@ def test_a_recording_on_a_full_disk_is_reported_and_the_session_goes_on(run):
     result = run(FULL_DISK)
     result.assert_outcomes(failed=1, passed=1)
     text = result.stdout.str()
-    assert 'the recording broke off: No space left on device' in text
+    assert 'the recording was aborted: No space left on device' in text
     assert 'INTERNALERROR' not in text
 
 

@@ -18,7 +18,7 @@ HOUSE = Path(diffdrive_jacobian.__file__).parent
 LAYERS = (
     *('kinematics', 'control', 'simulation', 'sweeps', 'messages', 'parameters', 'bags'),
     *('recovery', 'reading'),
-    *('plots', 'ros', 'nodes', 'recording', 'replay', 'lockstep', 'testing', 'tools'),
+    *('plots', 'ros', 'nodes', 'recording', 'replay', 'lockstep', 'drives', 'testing', 'tools'),
 )
 PURE = LAYERS[:3]
 # Modules beside the layers, and the layers they may import.

@@ -19,13 +19,11 @@ from rclpy.parameter import Parameter
 from ros_messages import odometry
 from rosgraph_msgs.msg import Clock
 
-from diffdrive_jacobian.control import Arrival
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.ros.goal_sender import GoalSender
+from diffdrive_jacobian.ros.goal_client import GoalClient
 from diffdrive_jacobian.ros.runner import ros_context, running
-from diffdrive_jacobian.tools.drive_to import Observer
 
 NODES = {'virtual_robot': VirtualRobot, 'go_to_goal': GoToGoal, 'wheel_bridge': WheelBridge}
 CHANGEABLE = {'virtual_robot': 'cmd_vel_timeout', 'go_to_goal': 'kp', 'wheel_bridge': 'cmd_vel_timeout'}
@@ -91,8 +89,8 @@ def test_refused_name_is_quoted_in_short_and_without_control_characters(lockstep
     add(GoToGoal)
     request = SetParameters.Request(parameters=[of_type('\x1b[2J' + 100_000 * 'n', 10)])
     (result,) = lockstep.call(SetParameters, 'go_to_goal/set_parameters', request).results
-    lines = capfd.readouterr().err.splitlines()
-    (written,) = (line for line in lines if 'parameter request refused: ' in line)
+    written = capfd.readouterr().err
+    assert 'parameter request refused: ' in written
     for text in (result.reason, written):
         assert len(text) < 300
         assert '\x1b' not in text
@@ -150,33 +148,36 @@ def test_clock_is_guarded_when_simulated_time_is_switched_on_later(ros, capfd, e
     ros.until(lambda: node.now() == 6_000_000_000, 'time goes on')
 
 
-def observer(context):
-    return Observer(np.zeros((1, 3)), Arrival(), ('left', 'right'), context)
+def client_of_drive_to(context):
+    return GoalClient('drive_to', np.zeros((2, 3)), context)
 
 
-def sender(context):
-    return GoalSender(np.zeros(3), '', context)
+def client_of_send_goal(context):
+    return GoalClient(
+        'send_goal', np.zeros((1, 3)), context, topic='goal_pose', start_parameter_services=False
+    )
 
 
 def plain(context):
     return Node('plain', context=context)
 
 
-def test_observer_drops_odometry_with_a_negative_stamp(capfd):
+@pytest.mark.parametrize('make', [client_of_drive_to, client_of_send_goal])
+def test_goal_client_drops_odometry_with_a_negative_stamp(capfd, make):
     with ros_context(['test']) as context, running(context, closed_world=True) as runner:
-        node = runner.add(lambda: observer(context))
+        node = runner.add(lambda: make(context))
         message = odometry(1.0, 2.0, 0.5)
         message.header.stamp.sec = -1
         node._on_odometry(message)
-        assert (node.pose, node.seen) == (None, 0)
+        assert node.robot is None
         assert 'odometry dropped: its stamp must have sec of at least 0' in capfd.readouterr().err
         message.header.stamp.sec = 7
         node._on_odometry(message)
-        assert node.seen == 7_000_000_000
+        assert node.robot.stamp == 7_000_000_000
 
 
 @pytest.mark.parametrize('isolated', [False, True])
-@pytest.mark.parametrize('make', [observer, sender, plain])
+@pytest.mark.parametrize('make', [client_of_drive_to, client_of_send_goal, plain])
 def test_runner_guards_the_nodes_of_the_tools(capfd, make, isolated):
     arguments = ['test', '--ros-args', '-p', 'use_sim_time:=true']
     with ros_context(arguments) as context, running(context, closed_world=isolated) as runner:
@@ -188,7 +189,7 @@ def test_runner_guards_the_nodes_of_the_tools(capfd, make, isolated):
         assert runner.spin(lambda: '/clock dropped: ' in capfd.readouterr().err)
         time.publish(clock(6, 0))
         assert runner.spin(lambda: node.get_clock().now().nanoseconds == 6_000_000_000)
-        if make is sender:
+        if make is client_of_send_goal:
             return
         client = peer.create_client(SetParameters, f'{node.get_name()}/set_parameters')
         assert runner.spin(client.service_is_ready)
@@ -209,7 +210,7 @@ def test_exception_of_our_own_callbacks_is_not_caught(lockstep, add):
         lockstep.call(SetParameters, 'go_to_goal/set_parameters', request)
 
 
-def test_rclpy_still_raises_for_what_the_guard_refuses(ros):
+def test_names_of_rclpy_that_the_guard_relies_on(ros):
     node = ros.add(Node, node_name='bare', parameters={'use_sim_time': True})
     source = node._time_source
     assert source._clock_sub.callback == source.clock_callback

@@ -7,7 +7,7 @@ import pytest
 
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.ros import liveness
-from diffdrive_jacobian.ros.goal_sender import SILENCE, GoalSender, loss
+from diffdrive_jacobian.ros.goal_client import SILENCE, GoalClient, loss
 from diffdrive_jacobian.ros.liveness import LONGEST_STEP, Liveness
 
 
@@ -90,10 +90,10 @@ def test_requests_without_an_answer_do_not_pile_up(ros, clock):
         clock.now += 1.0
         watch.silence()
     assert len(watch._pending) == liveness.PENDING
-    assert len(watch._clients[0]._pending_requests) == liveness.PENDING
+    assert len(watch._clients['/go_to_goal']._pending_requests) == liveness.PENDING
 
 
-# --- What a sender makes of it
+# --- Loss of a controller
 
 A, B, OTHER = b'a', b'b', b'o'
 
@@ -117,7 +117,7 @@ A, B, OTHER = b'a', b'b', b'o'
             {A: '/go_to_goal'},
             {A: '/go_to_goal'},
             3.0,
-            'the controller /go_to_goal has not answered for 3 s: it was killed, or hangs',
+            'the controller /go_to_goal has not answered for 3 s: it was killed or hangs',
         ),
     ],
 )
@@ -125,9 +125,14 @@ def test_loss(sent_to, present, silence, expected):
     assert loss(sent_to, present, silence) == expected
 
 
-def test_a_restarted_controller_is_told_from_the_one_that_has_the_goal(ros):
-    goal = np.array([1.0, 1.0, 0.0])
-    sender = ros.add(lambda context, parameter_overrides: GoalSender(goal, '', context), parameters=None)
+def test_a_restarted_controller_is_distinguished_from_the_one_that_has_the_goal(ros):
+    goals = np.array([[1.0, 1.0, 0.0]])
+    sender = ros.add(
+        lambda context, parameter_overrides: GoalClient(
+            'send_goal', goals, context, topic='goal_pose', start_parameter_services=False
+        ),
+        parameters=None,
+    )
     ros.add(GoToGoal, namespace='/here')
     old = ros.add(GoToGoal)
     ros.until(lambda: sender.obstacle() is None, 'the sender is ready')
@@ -137,7 +142,9 @@ def test_a_restarted_controller_is_told_from_the_one_that_has_the_goal(ros):
     ros.add(GoToGoal)
     ros.until(lambda: len(sender.controllers()) == 2, 'the new one is found')
     restarted = 'the controller /go_to_goal was restarted'
-    ros.until(lambda: loss(controllers, sender.controllers(), 0.0) == restarted, 'it is told')
+    ros.until(
+        lambda: loss(controllers, sender.controllers(), 0.0) == restarted, 'the restart is detected'
+    )
     ros.executor.remove_node(old)
     old.destroy_node()
     ros.nodes.remove(old)

@@ -1,4 +1,4 @@
-"""Messages that never came, counted by the numbers of those that did."""
+"""Missing messages, counted from the sequence numbers of the received ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recorder survives whatever a node answers when it is asked for its parameters."""
+"""A recorder survives any answer of a node to a query of its parameters."""
 
 from __future__ import annotations
 
@@ -235,4 +235,4 @@ def test_a_node_whose_name_no_service_can_have(lockstep):
     query = ParameterQuery(lockstep.node, '/no such/näme', said.append, said.append)
     query.advance()
     assert len(said) == 1
-    assert said[0].startswith('it cannot be asked: ')
+    assert said[0].startswith('its services cannot be called: ')

@@ -143,6 +143,14 @@ def test_a_controller_that_was_killed_is_noticed_within_seconds(world):
     assert sender.stderr == ''
 
 
+def test_send_goal_reports_the_distance_of_the_point_that_is_driven(world):
+    """The point 0.5 m ahead of the axle is at the goal already."""
+    Drive(world, '--ros-args', '-p', 'controller:=offset_point', '-p', 'offset:=0.5')
+    sender = world.run('send_goal', '0.5', '0')
+    assert sender.exit() == 0
+    assert sender.last_line == 'arrived, 0.000 m from the goal'
+
+
 def test_another_reader_of_goals_is_no_controller(world):
     from geometry_msgs.msg import PoseStamped
 
@@ -150,7 +158,7 @@ def test_another_reader_of_goals_is_no_controller(world):
     sender = world.start('send_goal', '0', '0')
     # It waits, though its goal would be read.
     world.until_published('goal_pose')
-    sender.until_says('waiting: nobody reads /goal_pose and publishes /goal_status')
+    sender.until_says('waiting: no node is subscribed to /goal_pose and publishes /goal_status')
     drive = Drive(world, *FAST)
     assert (sender.exit(), sender.last_line[:7]) == (0, 'arrived')
     world.harness.until(lambda: len(recorded) == 1, 'the goal was sent once')
@@ -159,10 +167,12 @@ def test_another_reader_of_goals_is_no_controller(world):
     assert drive.controller.exit() == 0
 
 
-def test_send_goal_without_a_controller_says_so(world):
+def test_send_goal_reports_a_missing_controller(world):
     sender = world.run('send_goal', '-1', '-1e-1', '--wait', '1', '--ros-args', '-r', '__ns:=/here')
     assert sender.exit() == 1
-    assert sender.last_line.startswith('not sent within 1 s: nobody reads /here/goal_pose and publishes')
+    assert sender.last_line.startswith(
+        'not sent within 1 s: no node is subscribed to /here/goal_pose and'
+    )
     assert sender.stderr == ''
 
 
@@ -189,7 +199,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize('kind', REFUSED)
-def test_what_a_node_cannot_run_with_is_said(world, tmp_path, monkeypatch, kind):
+def test_invalid_arguments_of_a_node_are_reported(world, tmp_path, monkeypatch, kind):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'malformed.yaml').write_text('go_to_goal: [1, 2\n  b: }')
     children = [world.start(name, '--ros-args', *arguments) for name, arguments, _ in REFUSED[kind]]

@@ -1,4 +1,4 @@
-"""record_run as a process: what was sent is what the bag holds, byte for byte, however it ends."""
+"""record_run as a process: the bag contains the messages sent, byte for byte, however it ends."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def twist(index):
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_what_was_sent_is_what_the_bag_holds(world, bag, storage):
+def test_the_bag_contains_the_messages_that_were_sent(world, bag, storage):
     goals = Goals()
     goals.header.frame_id = 'odom'
     talk = Talk(
@@ -182,7 +182,7 @@ def test_a_signal_at_the_start_leaves_an_empty_bag(world, bag):
     recorder.until_catches(signal.SIGTERM)
     recorder.signal(signal.SIGTERM)
     assert recorder.exit() == 0
-    assert recorder.last_line == f'{bag} is complete and empty: no message came'
+    assert recorder.last_line == f'{bag} is complete and empty: no message was received'
     assert content(bag) == {}
 
 
@@ -207,15 +207,17 @@ def test_topics_are_selected_and_time_is_limited(world, bag):
     [
         (['-o', 'taken'], 'cannot record to taken: taken exists already'),
         (['-o', 'nowhere/bag'], 'cannot record to nowhere/bag: no such file or directory'),
-        (['-o', 'begun'], 'recover_run begun.journal makes the bag'),
-        (['-e', '('], 'no regular expression'),
+        (['-o', 'begun'], 'recover_run begun.journal writes the bag'),
+        (['-e', '('], "must be a regular expression, got '('"),
         (['-s', 'rosbag1'], 'invalid choice'),
         (['--max-duration', '-1'], 'must be positive'),
         (['-o', 'new', '--ros-args', '--bogus'], 'ROS arguments: '),
-        (['-o', 'new', 'bad//topic'], "no topic can be called 'bad//topic': "),
+        (['-o', 'new', 'bad//topic'], "invalid topic name 'bad//topic': "),
     ],
 )
-def test_what_cannot_be_is_said_and_nothing_is_lost(capsys, tmp_path, monkeypatch, arguments, words):
+def test_wrong_arguments_are_reported_and_no_file_is_changed(
+    capsys, tmp_path, monkeypatch, arguments, words
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'taken').mkdir()
     JournalWriter(tmp_path / 'begun.journal').close()

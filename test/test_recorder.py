@@ -1,4 +1,4 @@
-"""The recorder on the executor of record_run: it takes what waits, and counts what never came."""
+"""The recorder on the executor of record_run: it takes queued messages and counts missing ones."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_what_waits_at_the_end_is_collected_and_what_comes_later_is_not(setting)
     assert setting.sink.missed == {}
 
 
-def test_the_end_comes_although_somebody_goes_on(setting):
+def test_the_recording_ends_although_messages_are_still_published(setting):
     setting.recorder.end()
 
     def drained():

@@ -185,7 +185,7 @@ def test_a_folder_of_the_user_stays(tmp_path):
 # --- A slow disk
 
 
-def test_a_disk_that_hesitates_loses_nothing_and_delays_nobody(tmp_path, disk):
+def test_a_slow_disk_loses_no_message_and_delays_no_caller(tmp_path, disk):
     recording = Recording(tmp_path / 'run', 'mcap')
     disk.ready.clear()
     add_all(recording, channel(), *messages(1))
@@ -220,7 +220,9 @@ def test_memory_is_bounded_by_bytes_and_what_is_dropped_is_counted(tmp_path, dis
         assert recording.journal.waiting <= 10_000_000
     assert recording.lost == {'/cmd_vel': 21}
     disk.ready.set()
-    with pytest.raises(RecordingError, match=r'21 came faster than the disk .*/cmd_vel 21') as caught:
+    with pytest.raises(
+        RecordingError, match=r'21 were received faster than the disk .*/cmd_vel 21'
+    ) as caught:
         recording.finish()
     summary = caught.value.summary
     assert (summary.messages, summary.lost) == (10, {'/cmd_vel': 21})
@@ -268,7 +270,7 @@ def test_losses_are_in_the_journal_while_it_is_recorded(tmp_path):
     recording.set_missed('/cmd_vel', 12)
     path = journal_of(tmp_path / 'run')
     until(lambda: LOST.encode() in path.read_bytes(), 'they are noted')
-    with pytest.raises(RecordingError, match='12 never reached the recorder'):
+    with pytest.raises(RecordingError, match='12 were not received by the recorder'):
         recording.finish()
     assert json.loads(custom_data(tmp_path / 'run')[LOST]) == {'/cmd_vel': 12}
 
@@ -303,7 +305,7 @@ def test_a_full_disk_is_raised_by_finish(tmp_path, disk, lossless):
     add_all(recording, *messages(20))
     until(lambda: recording.error is not None, 'the thread notices')
     add_all(recording, *messages(5))
-    with pytest.raises(RecordingError, match='broke off: No space left on device') as caught:
+    with pytest.raises(RecordingError, match='aborted: No space left on device') as caught:
         recording.finish()
     summary = caught.value.summary
     assert (summary.messages, summary.lost) == (10, {'/cmd_vel': 25})
@@ -311,7 +313,7 @@ def test_a_full_disk_is_raised_by_finish(tmp_path, disk, lossless):
     assert journal_of(tmp_path / 'run').exists()
 
 
-def test_a_bag_that_cannot_be_written_is_raised_by_finish(tmp_path):
+def test_finish_raises_if_the_bag_cannot_be_written(tmp_path):
     recording = Recording(tmp_path / 'run', 'mcap')
     add_all(recording, channel(), *messages(10))
     (tmp_path / 'run').write_text('somebody else came first')
@@ -355,14 +357,14 @@ def test_a_journal_that_goes_is_noticed_and_saved(tmp_path, capsys, change):
     with pytest.raises(RecordingError, match='was removed, renamed or replaced') as caught:
         recording.finish()
     assert caught.value.summary is None
-    saved = str(caught.value).split('What was recorded is in ')[1].split(': recover_run')[0]
+    saved = str(caught.value).split('The recorded messages are in ')[1].split(': recover_run')[0]
     assert recover_run([saved, '-o', str(tmp_path / 'new')], Signals()) == 0
     assert content(tmp_path / 'new') == [one.data for one in messages(50)]
     if change is _replace:
         assert journal_of(folder / 'run').read_text() == 'of somebody else'
 
 
-def test_discarding_leaves_the_file_of_somebody_else(tmp_path):
+def test_discarding_keeps_a_file_of_another_process(tmp_path):
     recording = Recording(tmp_path / 'run', 'mcap')
     _replace(tmp_path)
     recording.discard()

@@ -1,4 +1,4 @@
-"""replay_run: a bag played to whom it may concern, and a run verified."""
+"""replay_run: replay of a bag, and verification of a run."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_everything_remapped_with_a_clock_in_loops_until_interrupted(world, bag)
     times = np.array([one.clock.sec + 1e-9 * one.clock.nanosec for one in clock])
     begin = run.odometry.received[0] / 1e9
     assert begin - 0.1 <= times.min() < times.max() <= begin + LENGTH + 0.5
-    assert 'nobody listens on /odom' in child.stderr
+    assert 'no node is subscribed to /odom' in child.stderr
 
 
 def test_offset_leaves_the_beginning_out(world, bag):
@@ -128,12 +128,13 @@ def test_fast_playback_is_acknowledged_within_a_second(world, bag, monkeypatch):
     assert child.last_line == f'{len(run.cmd_vel)} messages played'
 
 
-def test_readers_that_do_not_acknowledge_are_reported(world, bag, capsys, monkeypatch):
+def test_subscriptions_that_do_not_acknowledge_are_reported(world, bag, capsys, monkeypatch):
     monkeypatch.setattr(replay_run, 'MATCH_PATIENCE', 0.1)
     monkeypatch.setattr(Replayer, 'unacknowledged', lambda player: ['/cmd_vel'])
     assert play(bag[0], '-r', '50', '--wait-for-all-acked', '1') == 1
     assert capsys.readouterr().err.splitlines()[-1] == (
-        'replay_run: error: the readers of /cmd_vel have not acknowledged all messages within 0.001 s'
+        'replay_run: error: not all subscriptions to /cmd_vel have acknowledged all messages '
+        'within 0.001 s'
     )
 
 
@@ -149,11 +150,11 @@ def test_acknowledgements_are_not_waited_for_after_a_signal(world, bag, monkeypa
     assert play(bag[0], '-r', '50', '--wait-for-all-acked', '0', signals=signals) == 130
 
 
-def test_it_waits_for_as_many_readers_as_asked_for(world, bag):
+def test_it_waits_for_the_required_number_of_subscriptions(world, bag):
     path, run = bag
     child = world.start('replay_run', str(path), '-w', '2', '-r', '4')
     received = [world.harness.listen(Twist, 'cmd_vel')]
-    child.until_says('waiting: /cmd_vel has 1 of 2 readers')
+    child.until_says('waiting: /cmd_vel has 1 of 2 subscriptions')
     received.append(world.harness.listen(Twist, 'cmd_vel'))
     world.harness.until(lambda: not child.running, 'it is played')
     assert child.exit() == 0
@@ -162,23 +163,25 @@ def test_it_waits_for_as_many_readers_as_asked_for(world, bag):
     )
 
 
-def test_nothing_is_played_to_fewer_readers_than_asked_for(world, bag, capsys):
+def test_nothing_is_played_to_fewer_subscriptions_than_required(world, bag, capsys):
     assert play(bag[0], '-w', '2', '--timeout', '0.2') == 1
     out = capsys.readouterr().out
-    assert out == 'nothing was played: /cmd_vel has 0 of 2 readers after --timeout 0.2 s\n'
+    assert out == 'nothing was played: /cmd_vel has 0 of 2 subscriptions after --timeout 0.2 s\n'
     signals = Signals()
     signals.count = 1
     assert play(bag[0], '-w', '1', signals=signals) == 130
-    assert capsys.readouterr().out == 'interrupted: nothing was played, /cmd_vel has 0 of 1 readers\n'
+    assert (
+        capsys.readouterr().out == 'interrupted: nothing was played, /cmd_vel has 0 of 1 subscriptions\n'
+    )
 
 
-def test_a_missing_reader_is_reported_with_the_remedy(world, bag, capfd, monkeypatch):
+def test_a_missing_subscription_is_reported_with_the_remedy(world, bag, capfd, monkeypatch):
     monkeypatch.setattr(replay_run, 'MATCH_PATIENCE', 0.1)
     assert play(bag[0], '-r', '50') == 0
-    assert 'nobody listens on /cmd_vel (-w 1 waits until somebody does)' in capfd.readouterr().err
+    assert 'no node is subscribed to /cmd_vel (-w 1 waits for one)' in capfd.readouterr().err
 
 
-def test_rival_is_named(world, bag):
+def test_another_publisher_is_reported(world, bag):
     path, _ = bag
     world.harness.peer.create_publisher(Twist, 'cmd_vel', 10)
     child = world.start('replay_run', str(path), '-r', '50')
@@ -307,7 +310,7 @@ def test_bag_of_others_is_verified_with_parameters_from_a_file(capsys, request, 
         (['BAG', '--topics', '/nothing'], 'has no topic /nothing; it has /cmd_vel'),
         (['BAG', '-m', 'nonsense'], 'must be OLD:=NEW'),
         (['BAG', '-w', '0'], 'must be a whole number of at least 1'),
-        (['BAG', '--timeout', '1'], '--timeout is the time to wait for the readers of -w'),
+        (['BAG', '--timeout', '1'], '--timeout needs -w'),
         (
             ['BAG', '--verify', '--params-file', 'file.txt'],
             'file of ROS parameters, got file.txt',
@@ -316,7 +319,7 @@ def test_bag_of_others_is_verified_with_parameters_from_a_file(capsys, request, 
         (['BAG', '--goals', '--verify'], 'not allowed with'),
     ],
 )
-def test_what_cannot_be_is_said(capsys, bag, tmp_path, monkeypatch, arguments, words):
+def test_wrong_arguments_are_reported(capsys, bag, tmp_path, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'empty').mkdir()
     (tmp_path / 'file.txt').write_text('not a bag')

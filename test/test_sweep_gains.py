@@ -19,6 +19,7 @@ from processes import open_world
 
 from diffdrive_jacobian.control import Arrival, VelocityLimits, go_to_goal, go_to_pose
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
+from diffdrive_jacobian.plots import output_files
 from diffdrive_jacobian.plots import sweep_figure as _sweep_figure
 from diffdrive_jacobian.plots.sweep_figure import BORDERS, TITLES, figure
 from diffdrive_jacobian.signals import Signals
@@ -246,15 +247,15 @@ def test_names_that_are_taken_meanwhile_are_not_overwritten(folder, monkeypatch,
         return inner(*arguments)
 
     def taken_names():
-        now = f'{sweep_gains.datetime.now():%Y_%m_%d-%H_%M_%S}'
+        now = f'{output_files.datetime.now():%Y_%m_%d-%H_%M_%S}'
         return [f'sweep_{now}.png', f'sweep_{now}__2.csv']
 
-    class Still(sweep_gains.datetime):
+    class Still(output_files.datetime):
         @classmethod
         def now(cls):
             return cls(2026, 1, 2, 3, 4, 5)
 
-    monkeypatch.setattr(sweep_gains, 'datetime', Still)
+    monkeypatch.setattr(output_files, 'datetime', Still)
     monkeypatch.setattr(sweep_gains, 'sweep', slow)
     assert run(*QUICK) == 0
     assert {Path(name).read_text() for name in taken} == {'precious'}
@@ -510,7 +511,7 @@ def test_it_says_which_gains_are_the_fastest():
         (('--params-file', 'nowhere.yaml'), "no such file: 'nowhere.yaml'"),
         (('-o', 'a.jpg'), "the picture must end in .png, .svg, .pdf, got 'a.jpg'"),
         (('-o', ''), "the picture must end in .png, .svg, .pdf, got ''"),
-        (('--csv', 'a.png'), "the numbers must end in .csv, got 'a.png'"),
+        (('--csv', 'a.png'), "the table must end in .csv, got 'a.png'"),
         (('everything',), 'unrecognized arguments: everything'),
         (('--ros-args', '-p', 'kp:=1'), 'unrecognized arguments: --ros-args -p kp:=1'),
     ],

@@ -1,4 +1,4 @@
-"""The tool drive_to as a process, and how the tools read their arguments."""
+"""The tool drive_to as a process, and the arguments of the tools."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def world(tmp_path):
 
 
 def assert_arrived(child, x, y, tolerance=0.02):
-    """It ended well, and says truly where."""
+    """Check that it arrived, and that it reports the right position."""
     assert (child.exit(), child.stderr) == (0, '')
     numbers = re.fullmatch(
         r'arrived: the robot stopped at x (\S+) m, y (\S+) m, heading \S+ rad, '
@@ -39,7 +39,7 @@ def assert_arrived(child, x, y, tolerance=0.02):
 
 @pytest.fixture(scope='module', autouse=True)
 def drives(tmp_path_factory):
-    """Drives that need nobody's help; they go on behind the other tests, all at once."""
+    """Start drives that need no interaction, all at once; they run during the other tests."""
     directory = tmp_path_factory.mktemp('drives')
     malformed = directory / 'malformed.yaml'
     malformed.write_text('go_to_goal: [1, 2\n  b: }')
@@ -84,7 +84,7 @@ def test_drive_to_gives_up_after_the_timeout(drives):
     assert late.last_line.startswith('not arrived (--timeout 0.5 s was too short): the robot')
 
 
-def test_drive_to_says_what_its_nodes_cannot_take(drives):
+def test_drive_to_reports_invalid_parameters_of_its_nodes(drives):
     refused = {'malformed': 'malformed.yaml', 'kp': "'kp' must be in (0, 100], got 0.0"}
     for name, words in refused.items():
         assert (drives[name].exit(), drives[name].stdout) == (2, '')
@@ -93,7 +93,7 @@ def test_drive_to_says_what_its_nodes_cannot_take(drives):
 
 
 @pytest.mark.parametrize('older', [{}, {'ROS_LOCALHOST_ONLY': '1'}], ids=['usual', 'localhost only'])
-def test_drive_to_is_not_seen(world, monkeypatch, older):
+def test_drive_to_is_not_discovered(world, monkeypatch, older):
     peer = world.harness.peer
     for name, value in older.items():
         monkeypatch.setenv(name, value)
@@ -106,13 +106,13 @@ def test_drive_to_is_not_seen(world, monkeypatch, older):
     assert seen == {'peer', '/parameter_events', '/rosout'}
 
 
-def test_drive_to_open_is_seen_and_tells_truly_where_the_robot_stopped(world):
+def test_drive_to_open_is_discovered_and_reports_where_the_robot_stopped(world):
     from geometry_msgs.msg import TwistStamped
     from nav_msgs.msg import Odometry
 
     odometry = world.harness.listen(Odometry, 'odom')
     applied = world.harness.listen(TwistStamped, 'cmd_vel_out')
-    # So slow that the robot drives already when the last odometry still says that it stands.
+    # So slow that the robot moves already while the last odometry has zero velocity.
     child = world.start(
         'drive_to', *FAR, '--no-record', '--open', '--ros-args', '-p', 'virtual_robot:publish_rate:=4.0'
     )
@@ -126,10 +126,10 @@ def test_drive_to_open_is_seen_and_tells_truly_where_the_robot_stopped(world):
         pose, twist = odometry[-1].pose.pose, odometry[-1].twist.twist
         return twist.linear.x == 0.0 and abs(pose.position.x - reported) < 0.001
 
-    world.harness.until(stands_there, 'it stands where it was said to', patience=3.0)
+    world.harness.until(stands_there, 'it stands at the reported position', patience=3.0)
 
 
-def test_drive_to_open_survives_what_strangers_publish(world):
+def test_drive_to_open_survives_invalid_messages_of_other_processes(world):
     from nav_msgs.msg import Odometry
     from sensor_msgs.msg import JointState
 
@@ -219,17 +219,17 @@ def test_drive_to_arrives_with_nothing_but_defaults(drives):
         (('1', '1', '--bogus'), '--bogus'),
         (
             ('1', '1', '--heading', '90'),
-            "must be in radians, at most 2 pi either way, got '90' (90 degrees",
+            "must be in radians, from -2 pi to 2 pi, got '90' (90 degrees",
         ),
         (('1', '1', '--heading', '-180'), '(-180 degrees are -3.14159 rad)'),
-        (('1', '1', '-o', 'x.png'), "must name a bag, which is a folder, got 'x.png'"),
+        (('1', '1', '-o', 'x.png'), "must name a bag, which is a directory, got 'x.png'"),
         (('1', '1', '-o', 'runs/x.CSV'), "did you mean 'runs/x'?"),
         (('1', '1', '-p', 'kp:=1'), 'ROS arguments come after --ros-args'),
         (('1', '1', 'kp:=1'), 'ROS arguments come after --ros-args'),
     ],
     ids=lambda value: ' '.join(value) if isinstance(value, tuple) else '',
 )
-def test_drive_to_says_what_it_cannot_take(capsys, arguments, words):
+def test_drive_to_reports_wrong_arguments(capsys, arguments, words):
     from diffdrive_jacobian.signals import Signals
     from diffdrive_jacobian.tools import drive_to
 
@@ -267,11 +267,36 @@ def test_ros_arguments_of_a_node_without_the_flag_get_a_hint(capsys, arguments):
     assert 'ROS arguments come after --ros-args' in line
 
 
+@pytest.mark.parametrize(
+    ('tool', 'arguments', 'hint'),
+    [
+        ('send_goal', ('1', '1', '-p', 'x:=1'), 'ROS arguments come after --ros-args'),
+        ('send_goal', ('1', '1', '-r', '__ns:=/a'), 'ROS arguments come after --ros-args'),
+        ('replay_run', ('bag', '--log-level', 'debug'), 'ROS arguments come after --ros-args'),
+        ('replay_run', ('bag', '-p', 'x:=1'), 'ROS arguments come after --ros-args'),
+        ('record_run', ('--param', 'x:=1'), 'ROS arguments come after --ros-args'),
+        ('sweep_gains', ('-p', 'x:=1'), 'sweep_gains takes no ROS arguments'),
+        ('sweep_gains', ('--ros-args', '-p', 'x:=1'), 'sweep_gains takes no ROS arguments'),
+    ],
+)
+def test_ros_arguments_of_a_tool_without_the_flag_get_a_hint(capsys, tool, arguments, hint):
+    import importlib
+
+    from diffdrive_jacobian.signals import Signals
+
+    with pytest.raises(SystemExit) as end:
+        importlib.import_module(f'diffdrive_jacobian.tools.{tool}').main(arguments, Signals())
+    assert end.value.code == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith(f'{tool}: error: unrecognized arguments: ')
+    assert hint in line
+
+
 @pytest.mark.parametrize('name', ['run.png', 'run.svg/', 'a/run.PDF', 'run.csv', 'run.txt', 'run.yaml'])
 def test_a_bag_is_not_named_like_a_file(name):
     import argparse
 
-    with pytest.raises(argparse.ArgumentTypeError, match='must name a bag, which is a folder'):
+    with pytest.raises(argparse.ArgumentTypeError, match='must name a bag, which is a directory'):
         _cli.bag_folder(name)
     for usual in ('run', 'run.2', 'runs.png/run', 'run_2026_01_01-10_00_00', '.png'):
         assert _cli.bag_folder(usual) == usual
@@ -300,5 +325,5 @@ ROS = ['--ros-args', '-p', 'x:=-1', '-r', '__ns:=/a']
         (['--ros-args', '--ros-args', '-1'], [], ['--ros-args', '--ros-args', '-1']),
     ],
 )
-def test_arguments_of_tool_and_ros_are_told_apart(arguments, own, ros):
+def test_arguments_of_tool_and_ros_are_separated(arguments, own, ros):
     assert _cli.split_arguments(arguments) == (own, ros)

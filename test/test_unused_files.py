@@ -1,4 +1,4 @@
-"""Files of ROS parameters that concern none of the nodes: recognized as rclpy matches names."""
+"""Parameter files for other nodes: recognized as rclpy matches names."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_the_names_in_a_file_are_found(tmp_path, text, names):
     assert node_names(written(tmp_path / 'p.yaml', text)) == names
 
 
-def test_files_that_cannot_be_read_or_are_large_have_no_names(tmp_path):
+def test_unreadable_and_large_files_have_no_names(tmp_path):
     assert node_names(str(tmp_path / 'missing.yaml')) == []
     (tmp_path / 'binary.yaml').write_bytes(b'\xff\xfe\x00')
     assert node_names(str(tmp_path / 'binary.yaml')) == []
@@ -79,13 +79,13 @@ def test_files_that_cannot_be_read_or_are_large_have_no_names(tmp_path):
     assert node_names(written(tmp_path / 'large.yaml', large)) == []
 
 
-def test_a_file_that_concerns_no_node_is_reported_with_the_names(tmp_path, capsys):
+def test_a_file_for_other_nodes_is_reported_with_the_names(tmp_path, capsys):
     file = written(tmp_path / 'p.yaml', '/robot1/virtual_robot:\n  ros__parameters:\n    x: 1.0\n')
     ros = ['--ros-args', '--params-file', file, '--']
     warn_of_unused_files('drive_to', ros, ['/robot1/virtual_robot', '/go_to_goal'])
     assert capsys.readouterr().err == ''
     warn_of_unused_files('drive_to', ros, ['/virtual_robot', '/go_to_goal'])
     assert capsys.readouterr().err == (
-        f'drive_to: warning: --params-file {file} concerns none of the nodes: the file names '
-        '/robot1/virtual_robot; the nodes are /virtual_robot, /go_to_goal\n'
+        f'drive_to: warning: --params-file {file} has no parameters of these nodes: '
+        'it is for /robot1/virtual_robot, the nodes are /virtual_robot, /go_to_goal\n'
     )

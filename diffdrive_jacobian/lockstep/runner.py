@@ -1,63 +1,49 @@
-"""The runner of the entry points (`ros.runner`) for those that live in lockstep."""
+"""The runner of nodes in simulated time; `ros.runner` has the one for real time."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TypeVar
 
-from rclpy.context import Context
 from rclpy.node import Node
 
 from diffdrive_jacobian.lockstep.world import Lockstep
-from diffdrive_jacobian.ros.node import ParameterizedNode
-from diffdrive_jacobian.ros.parameters import report_unknown
-from diffdrive_jacobian.ros.runner import made
-
-N = TypeVar('N', bound=Node)
+from diffdrive_jacobian.ros.node_runner import NodeRunner
 
 
 @contextmanager
 def running_in_lockstep(args: Sequence[str]) -> Iterator[LockstepRunner]:
-    """Hold a world, with ROS arguments, for a tool.
+    """Create a lockstep world with ROS arguments, and close it at the end.
 
     Raises:
-        LockstepError: The arguments cannot be.
+        LockstepError: The arguments are invalid.
     """
     with Lockstep(args) as world:
         yield LockstepRunner(world)
 
 
-class LockstepRunner:
-    """Nodes that live by simulated time."""
+class LockstepRunner(NodeRunner):
+    """Nodes in simulated time, which advances when every node has answered."""
 
     def __init__(self, world: Lockstep) -> None:
-        """Begin without nodes."""
-        self.context: Context = world.node.context
+        """Start without nodes."""
+        super().__init__(world.node.context)
         self._world = world
-        self._nodes: list[Node] = []
-        self._begun = False
 
     def seconds(self) -> float:
-        """Give the simulated time that has passed (s)."""
+        """Return the simulated time that has passed (s)."""
         return self._world.elapsed
 
-    def add(self, make: Callable[[], N]) -> N:
-        """Make a node and add it.
+    def _add(self, node: Node) -> None:
+        """Add a node.
 
         Raises:
-            UserError: The name, the parameters or the QoS that its user gave cannot be.
-            LockstepError: Its user had it run on wall time.
+            LockstepError: The node runs on wall time.
         """
-        node = made(make)
-        self._nodes.append(node)
-        return self._world.add(node)
+        self._world.add(node)
 
-    def spin(self, until: Callable[[], bool]) -> bool:
-        """Let time pass until a condition holds; it is looked at at each instant."""
-        if not self._begun:
-            self._begun = True
-            report_unknown([node for node in self._nodes if isinstance(node, ParameterizedNode)])
+    def _spin(self, until: Callable[[], bool]) -> bool:
+        # The condition is checked once at each simulated time.
         self._world.settle()
         while not until():
             self._world.step()

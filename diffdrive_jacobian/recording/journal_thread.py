@@ -13,7 +13,7 @@ FLUSH_PERIOD = 0.1
 SYNC_PERIOD = 0.3
 """Period at which they are synced to the disk (s)."""
 CAPACITY = 128 << 20
-"""Memory of the records that wait to be written (bytes): four seconds of 1 MB at 30 Hz."""
+"""Memory for records that wait to be written (bytes): four seconds of 1 MB at 30 Hz."""
 EARLY = 4 << 20
 """Waiting records of this size are written before the period is over (bytes)."""
 
@@ -23,7 +23,7 @@ class JournalGoneError(OSError):
 
 
 class JournalThread:
-    """Takes records without waiting for the disk, as far as memory is allowed to hold them."""
+    """Writes records to a journal in a thread. Until they are written they wait in bounded memory."""
 
     def __init__(
         self,
@@ -37,8 +37,8 @@ class JournalThread:
 
         Args:
             journal: Where the records are written.
-            capacity: Memory that waiting records may hold (bytes).
-            lossless: Whether `add` waits for room when that is used up. Otherwise it refuses messages.
+            capacity: Memory for records that wait to be written (bytes).
+            lossless: Whether `add` waits when that is used up. Otherwise it drops messages.
             before_sync: Called in the thread before each sync.
         """
         self._journal = journal
@@ -54,9 +54,11 @@ class JournalThread:
         self._thread.start()
 
     def add(self, record: Record) -> bool:
-        """Queue a record. Return False if it was dropped: the queue is full, or writing has failed.
+        """Queue a record.
 
-        Only messages are dropped for want of room.
+        Returns:
+            Whether it was queued. False: the queue is full, or writing has failed. Only messages are
+            dropped because the queue is full.
         """
         if isinstance(record, Message) and not self._has_room(len(record.data) + OVERHEAD):
             return False
@@ -70,7 +72,7 @@ class JournalThread:
         return True
 
     def close(self) -> None:
-        """Write everything that waits, however long the disk takes, and end the thread."""
+        """Write all queued records, however long the disk takes, and end the thread."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
@@ -79,7 +81,7 @@ class JournalThread:
     def _has_room(self, size: int) -> bool:
         def room() -> bool:
             waiting = self._journal.waiting
-            # A message larger than the capacity is taken when it is alone.
+            # A message larger than the capacity is accepted when nothing else waits.
             return waiting == 0 or waiting + size <= self._capacity or self.error is not None
 
         if self._lossless and not room():

@@ -1,4 +1,4 @@
-"""How many messages never reached a reader, by gaps in the numbers that the publishers give them."""
+"""The number of messages that a subscription missed, from gaps in their sequence numbers."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from collections.abc import Callable
 class MissedMessages:
     """Counts the missing messages of a topic.
 
-    Each publisher numbers its messages 1, 2, 3, ... A message does not name its publisher, so a number
-    is attributed to the publisher whose last number is closest below. To which of them a gap is
-    attributed does not change the sum of all gaps. What a publisher sent before its first message that
-    arrived is not counted.
+    Each publisher numbers its messages 1, 2, 3, ... A message does not identify its publisher. A number
+    is therefore attributed to the publisher whose last number is the closest below. The sum of all gaps
+    does not depend on this choice. Messages that a publisher sent before the first one that was received
+    are not counted.
     """
 
     def __init__(self, publishers: Callable[[], int]) -> None:
         """Start without messages.
 
         Args:
-            publishers: Returns how many publishers the topic has now. It is called for each gap.
+            publishers: Returns the current number of publishers of the topic. It is called for each gap.
         """
         self._publishers = publishers
-        # The last number of each publisher; the one heard last comes first.
+        # The last number of each publisher, most recently received first.
         self._last: list[int] = []
         self.count = 0
-        """Messages that are missing."""
+        """Number of missing messages."""
 
     def received(self, number: int) -> None:
-        """Note the number of a message."""
+        """Process the sequence number of a received message."""
         last = self._last
         if last and last[0] == number - 1:
             last[0] = number
@@ -40,6 +40,6 @@ class MissedMessages:
             if before and len(last) >= publishers:
                 last.remove(max(before))
                 self.count += number - max(before) - 1
-            # Otherwise it is the first one of another publisher; one of those before may be gone.
+            # Otherwise it is the first one of another publisher. An older publisher may be gone.
             del last[max(0, publishers - 1) :]
         last.insert(0, number)

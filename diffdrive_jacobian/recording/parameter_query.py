@@ -1,4 +1,4 @@
-"""Asks a node of whatever origin for all its parameters, and survives every answer."""
+"""Query of all parameters of any node, robust against invalid answers."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 
 PATIENCE = 5.0
-"""How long a node may take for each answer (s)."""
+"""Longest time for each answer of a node (s)."""
 MAX_PARAMETERS = 10_000
-"""More parameters of a node are not recorded."""
+"""Largest number of parameters of a node that are recorded."""
 MAX_TEXT = 1 << 20
-"""Size of the parameters of a node (characters); what does not fit is not recorded."""
+"""Largest total size of the parameters of a node that are recorded (characters)."""
 MAX_NAMED = 5
-"""How many missing parameters a message lists."""
+"""Largest number of missing parameters that a message lists."""
 
 
 class ParameterQuery:
-    """The parameters of one node, asked for once.
+    """The parameters of one node, queried once.
 
     A node may declare parameters without a value. It lists them, and rclcpp answers a request that
-    contains one with no values at all. So when there are not as many values as names, each half is asked
-    for alone, and so on down to the single parameters that cannot be had.
+    contains one of them without any values. If there are not as many values as names, each half of the
+    names is therefore requested alone, and so on down to the single parameters without a value.
     """
 
     def __init__(
@@ -39,13 +39,13 @@ class ParameterQuery:
         on_values: Callable[[dict[str, Any]], None],
         on_trouble: Callable[[str], None],
     ) -> None:
-        """Create the clients; `advance` asks when the services are there.
+        """Create the clients. `advance` sends the requests when the services are available.
 
         Args:
-            node: The node that asks.
-            target: Full name of the node that is asked.
-            on_values: Called once with the values by name that could be had.
-            on_trouble: Called at most once, before that, with what could not be had.
+            node: The node that sends the requests.
+            target: Fully qualified name of the node that is to answer.
+            on_values: Called once with the values by name that were received.
+            on_trouble: Called at most once, before that, with a description of what is missing.
         """
         self._target = target
         self._on_values = on_values
@@ -60,10 +60,10 @@ class ParameterQuery:
             self._list = node.create_client(ListParameters, f'{target}/list_parameters')
             self._get = node.create_client(GetParameters, f'{target}/get_parameters')
         except (RuntimeError, NameValidationException) as error:
-            self._finish(f'it cannot be asked: {_short(error)}')
+            self._finish(f'its services cannot be called: {_short(error)}')
 
     def advance(self) -> None:
-        """Ask, if that is possible now, and give up a node that does not answer; to be called often."""
+        """Send the request if the services are available, and end on a timeout; to be called often."""
         if self._done:
             return
         if self._deadline is None:
@@ -78,7 +78,7 @@ class ParameterQuery:
 
     def _on_done(self, on_answer: Callable[[Any], None], future: Any) -> None:
         if self._done:
-            # It comes too late.
+            # The answer is too late.
             return
         if future.cancelled() or future.exception() is not None:
             self._finish(f'its answer cannot be read: {_short(future.exception())}')
@@ -120,7 +120,7 @@ class ParameterQuery:
             size = len(json.dumps({name: found}, default=list))
             if self._size + size > MAX_TEXT:
                 raise ValueError('it is too large')
-        # RuntimeError is rclpy's for a type that it does not know.
+        # rclpy raises RuntimeError for an unknown type.
         except (RuntimeError, TypeError, ValueError):
             self._missing.append(name)
             return
@@ -143,6 +143,6 @@ class ParameterQuery:
 
 
 def _short(text: object) -> str:
-    """Return the beginning of a text of somebody else, in printable characters."""
+    """Return the beginning of an untrusted text, in printable characters."""
     line = str(text).split(', at /')[0]
     return ascii(line[:80])[1:-1] + ('...' if len(line) > 80 else '')

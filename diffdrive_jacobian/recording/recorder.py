@@ -1,4 +1,4 @@
-"""The node that records: it receives topics as raw CDR and hands them to a recording."""
+"""The node that records: it receives topics as raw CDR and adds them to a recording."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, Protocol
 
@@ -23,57 +23,31 @@ from diffdrive_jacobian.bags.qos import to_fields, to_hear_all
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.recording.missed import MissedMessages
 from diffdrive_jacobian.recording.parameter_query import ParameterQuery
+from diffdrive_jacobian.recording.selection import Selection as Selection
 from diffdrive_jacobian.ros.rclpy_internals import reason, waiting_messages
 
-RUN_TOPICS = (
-    'cmd_vel',
-    'cmd_vel_out',
-    'odom',
-    'start_pose',
-    'initialpose',
-    'goal_pose',
-    'goals',
-    'goal_status',
-    'joint_command',
-    'joint_states',
-    '/tf',
-    '/parameter_events',
-)
-"""What there is to know about a run."""
 DEPTH = 4000
-"""How many messages of a topic may wait in the middleware."""
+"""Depth of the queue of each subscription."""
 BURST = 0.01
-"""How long the waiting messages of a topic are taken before other topics have their turn (s)."""
+"""Longest time in which the queued messages of one topic are taken at once (s)."""
 DRAIN_PATIENCE = 3.0
-"""How long it may take to collect at the end what was sent before (s)."""
+"""Longest time at the end in which messages that were sent before are received (s)."""
 IN_TRANSIT = 0.1
-"""After so long without such a message none is expected any more (s)."""
+"""After this time without such a message no more is expected (s)."""
 
 
 class Sink(Protocol):
-    """What a recorder records to."""
+    """The recording of a recorder."""
 
     def add(self, record: Record) -> None:
-        """Record something."""
+        """Add a record."""
 
     def set_missed(self, topic: str, messages: int) -> None:
-        """Note how many messages of a topic are known never to have reached the recorder so far."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Selection:
-    """Which topics are recorded."""
-
-    topics: tuple[str, ...] = RUN_TOPICS
-    """Names, resolved by the recorder's namespace and remappings."""
-    everything: bool = False
-    """Every topic that is not hidden."""
-    pattern: str = ''
-    """Also topics in whose full name this regular expression is found."""
+        """Set the number of messages of a topic that are known to be missed so far."""
 
 
 class Recorder(Node):  # type: ignore[misc]
-    """Records the selected topics, each from the moment at which somebody publishes it."""
+    """Records the selected topics, each from the time at which its first publisher is discovered."""
 
     def __init__(
         self,
@@ -83,15 +57,15 @@ class Recorder(Node):  # type: ignore[misc]
         with_info: bool = False,
         **kwargs: Any,
     ) -> None:
-        """Start without topics; `discover` finds them.
+        """Create the node without subscriptions; `discover` creates them.
 
         Args:
             selection: Which topics.
-            sink: Where the messages go.
-            with_info: Whether the executor gives the information that comes with a message: all do
-                but the EventsExecutor of Jazzy. Then missed messages are counted, and a message is
-                recorded with the time at which the middleware received it. Otherwise, and always with
-                simulated time, it is recorded with the time of the node's clock when it is handled.
+            sink: The recording.
+            with_info: Whether the executor passes message info to callbacks. All do except the
+                EventsExecutor of Jazzy. Missed messages are then counted, and a message is recorded
+                with the time at which the middleware received it. Otherwise, and always with simulated
+                time, it is recorded with the time of the node's clock when its callback runs.
             kwargs: As for `rclpy.node.Node`.
 
         Raises:
@@ -114,7 +88,7 @@ class Recorder(Node):  # type: ignore[misc]
         self._end: int | None = None
         self._drain_deadline = self._last_added = 0.0
         self.messages = 0
-        """How many were received."""
+        """Number of messages received."""
 
     @property
     def topics(self) -> list[str]:
@@ -122,7 +96,7 @@ class Recorder(Node):  # type: ignore[misc]
         return list(self._channels)
 
     def discover(self) -> None:
-        """Find new topics, publishers and nodes; to be called often."""
+        """Subscribe to new topics, and query parameters of new nodes; to be called often."""
         for topic, types in self.get_topic_names_and_types():
             if not self._wants(topic) or topic in self._refused:
                 continue
@@ -141,24 +115,24 @@ class Recorder(Node):  # type: ignore[misc]
         self._report_missed()
 
     def end(self) -> None:
-        """Record from now on only what was sent or received before; spin until `drained`.
+        """Record from now on only messages that were sent or received before. Spin until `drained`.
 
-        For a recorder `with_info`.
+        Requires `with_info`.
         """
         self._end = time.time_ns()
         self._last_added = time.monotonic()
         self._drain_deadline = self._last_added + DRAIN_PATIENCE
 
     def drained(self) -> bool:
-        """Whether everything that was sent before `end` has arrived, as far as that can be known."""
+        """Return whether all messages sent before `end` were received, as far as can be determined."""
         self._report_missed()
         now = time.monotonic()
         return now - self._last_added > IN_TRANSIT or now > self._drain_deadline
 
     def _report_missed(self) -> None:
         for topic in self._channels:
-            # The numbers show what was overwritten while it waited, but not what was lost before the
-            # first message; the middleware's count shows the latter, but not the former.
+            # The sequence numbers show messages that were overwritten in the queue, but not those lost
+            # before the first message. The count of the middleware shows only the latter.
             if missed := max(self._missed[topic].count, self._reported[topic]):
                 self._sink.set_missed(topic, missed)
 
@@ -167,7 +141,7 @@ class Recorder(Node):  # type: ignore[misc]
             return str(self.resolve_topic_name(topic))
         except (RuntimeError, NameValidationException) as error:
             self.destroy_node()
-            raise ParameterError(f'no topic can be called {topic!r}: {reason(error)}') from error
+            raise ParameterError(f'invalid topic name {topic!r}: {reason(error)}') from error
 
     def _wants(self, topic: str) -> bool:
         if topic in self._names:
@@ -213,9 +187,9 @@ class Recorder(Node):  # type: ignore[misc]
             return
         self._takers[topic] = partial(self._record, channel.id, self._missed[topic])
         callback = partial(self._on_informed, topic)
-        # A callable with two arguments is given the information that comes with a message.
+        # rclpy passes message info to a callable with two arguments.
         create = partial(self.create_subscription, message, topic, callback, profile, raw=True)
-        # What a publisher overwrites while it sends its old messages to us would be reported as lost.
+        # Latched messages that a publisher overwrites before they are sent would be reported as lost.
         latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         on_lost = None if latched else partial(self._on_lost, topic)
         try:
@@ -248,7 +222,7 @@ class Recorder(Node):  # type: ignore[misc]
 
     def _on_informed(self, topic: str, data: bytes, info: dict[str, int]) -> None:
         self._takers[topic](data, info)
-        # The executor takes one message at a time, at many times the cost: a burst would overflow.
+        # The executor takes one message at a time, at many times the cost: the queue would overflow.
         subscription, end = self._subscriptions_by_topic[topic], time.monotonic() + BURST
         for taken in waiting_messages(subscription):
             self._takers[topic](*taken)
@@ -257,12 +231,12 @@ class Recorder(Node):  # type: ignore[misc]
 
     def _record(self, channel: int, missed: MissedMessages, data: bytes, info: dict[str, int]) -> None:
         if self._end is not None:
-            # Clocks of other machines may be ahead, so either time will do.
+            # Clocks of other machines may be ahead, so either time is sufficient.
             if min(info['received_timestamp'], info['source_timestamp'] or self._end + 1) > self._end:
                 return
             self._last_added = time.monotonic()
         number = info['publication_sequence_number']
-        # None: the middleware does not number them.
+        # None: the middleware has no sequence numbers.
         if number is not None:
             missed.received(number)
         self._add(channel, info['received_timestamp'] if self._stamped else self._now(), data)
@@ -271,7 +245,7 @@ class Recorder(Node):  # type: ignore[misc]
         self._reported[topic] = event.total_count
 
     def _now(self) -> int:
-        # No bag has room for a negative time.
+        # A bag cannot contain a negative time.
         return max(0, int(self.get_clock().now().nanoseconds))
 
     def _add(self, channel: int, stamp: int, data: bytes) -> None:
@@ -282,7 +256,7 @@ class Recorder(Node):  # type: ignore[misc]
 
     def _ask_for_parameters(self, namespace: str, name: str) -> None:
         node = f'{namespace.rstrip("/")}/{name}'
-        # Names are found out later than topics; without one there is nobody to ask.
+        # The name of a node may be discovered later than its topics.
         if name.startswith('_') or node in self._queries or node == self.get_fully_qualified_name():
             return
         self._queries[node] = ParameterQuery(
@@ -297,7 +271,7 @@ class Recorder(Node):  # type: ignore[misc]
 
 
 def _profiles(publishers: list[Any]) -> tuple[dict[str, Any], ...]:
-    """Give the profiles offered, each once."""
+    """Return the distinct offered QoS profiles."""
     profiles: list[dict[str, Any]] = []
     for publisher in publishers:
         fields = to_fields(publisher.qos_profile)

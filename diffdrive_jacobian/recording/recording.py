@@ -1,4 +1,4 @@
-"""A recording from its first message to the bag."""
+"""A recording, from its first message to the bag."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import json
 import time
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
-from datetime import datetime
-from itertools import count
 from pathlib import Path
 
 from diffdrive_jacobian import __version__
@@ -22,43 +21,44 @@ from diffdrive_jacobian.bags.journal import (
     journal_of,
     read_journal,
 )
+from diffdrive_jacobian.plots.output_files import names_by_time
 from diffdrive_jacobian.recording.journal_thread import CAPACITY, JournalThread
 
 LOST = 'messages lost'
-"""Key of the custom data with the number of messages that are known to be missing, by topic, as JSON."""
+"""Key of the custom data with the number of messages known to be lost, by topic, as JSON."""
 
 
 class RecordingError(Exception):
-    """A recording is not complete; the message says why, and where what was recorded is."""
+    """A recording is not complete. The message says why, and where the recorded messages are."""
 
     def __init__(self, message: str, summary: Summary | None = None) -> None:
         """Create the error.
 
         Args:
             message: What happened.
-            summary: What the bag holds; None: there is no bag.
+            summary: Content of the bag. None: there is no bag.
         """
         super().__init__(message)
         self.summary = summary
 
 
 class Recording:
-    """A journal that is on the disk within half a second, and becomes a bag at the end.
+    """A journal that is on the disk within half a second, and is converted to a bag at the end.
 
-    It is written in a thread of its own, so that a slow disk delays no callback. What that thread cannot
-    take any more is dropped and counted.
+    It is written in a separate thread, so that a slow disk delays no callback. Messages that exceed the
+    capacity of its queue are dropped and counted.
     """
 
     def __init__(
         self, bag: Path, storage: str, *, lossless: bool = False, capacity: int = CAPACITY
     ) -> None:
-        """Start to record; the bag's directory appears at the end.
+        """Start to record. The directory of the bag is created at the end.
 
         Args:
-            bag: The bag's directory; neither it nor its journal may exist.
+            bag: Directory of the bag. Neither it nor its journal may exist.
             storage: `mcap` or `sqlite3`.
             lossless: Whether `add` waits for a disk that is too slow. Otherwise messages are dropped.
-            capacity: Memory that messages may hold while they wait for the disk (bytes).
+            capacity: Memory for messages that wait to be written (bytes).
 
         Raises:
             FileExistsError: The bag or its journal exists.
@@ -68,7 +68,7 @@ class Recording:
         journal = journal_of(bag)
         if journal.exists():
             raise FileExistsError(
-                f'{journal} exists already: recover_run {journal} makes the bag of what is in it'
+                f'{journal} exists already: recover_run {journal} writes the bag from it'
             )
         self.bag = bag
         self.journal = JournalWriter(journal)
@@ -94,18 +94,16 @@ class Recording:
 
     @classmethod
     def named_by_time(cls, prefix: str, storage: str, *, lossless: bool = False) -> Recording:
-        """Start one in the present directory, named `prefix_DATE-TIME`, or that and a number.
+        """Start a recording in the current directory, named `PREFIX_DATE-TIME`, or that and a number.
 
         Raises:
             OSError: It cannot be written there.
         """
-        name = f'{prefix}_{datetime.now():%Y_%m_%d-%H_%M_%S}'
-        for number in count(2):
-            try:
+        for name in names_by_time(prefix):
+            # Other processes may take the same name.
+            with suppress(FileExistsError):
                 return cls(Path(name), storage, lossless=lossless)
-            except FileExistsError:
-                name = f'{name.split("__")[0]}__{number}'
-        raise AssertionError('there is always another number')
+        raise AssertionError('there is always another name')
 
     @property
     def error(self) -> OSError | None:
@@ -114,14 +112,14 @@ class Recording:
 
     @property
     def lost(self) -> dict[str, int]:
-        """Messages that are known to be lost so far, by topic."""
+        """Number of messages known to be lost so far, by topic."""
         lost = Counter(dict(self._missed))
         for channel, dropped in list(self._dropped.items()):
             lost[self._channels[channel]] += dropped
         return {topic: number for topic, number in sorted(lost.items()) if number}
 
     def add(self, record: Record) -> None:
-        """Record something. After the end of the recording this does nothing."""
+        """Add a record. After the end of the recording this does nothing."""
         if not self._open:
             return
         if isinstance(record, Channel):
@@ -131,15 +129,16 @@ class Recording:
             (self._added if added else self._dropped)[record.channel] += 1
 
     def set_missed(self, topic: str, messages: int) -> None:
-        """Note how many messages of a topic are known never to have reached the recorder so far."""
+        """Set the number of messages of a topic that are known to be missed so far."""
         self._missed[topic] = messages
 
     def finish(self) -> Summary:
-        """Make the bag, read it back, and remove the journal.
+        """Write the bag, read it back, and remove the journal.
 
         Raises:
             RecordingError: Messages are known to be lost, or the disk failed, or the bag cannot be
-                written. What was recorded is in the bag, if the error has a summary, or in a journal.
+                written. The recorded messages are in the bag, if the error has a summary, or in a
+                journal.
         """
         self._open = False
         self._thread.close()
@@ -149,25 +148,25 @@ class Recording:
         try:
             self._count_unwritten()
             summary = build_bag(self._records, self.bag, self._storage)
-        # Whatever rosbags raises: the journal is there, and the user must be told.
+        # Whatever rosbags raises: the user must know that the journal exists.
         except Exception as error:
             why = getattr(error, 'strerror', None) or str(error) or repr(error)
             raise RecordingError(
-                f'{self.bag} cannot be written: {why}. What was recorded is in {journal}: '
-                f'recover_run {journal} makes the bag of it, where there is room'
+                f'{self.bag} cannot be written: {why}. The recorded messages are in {journal}: '
+                f'recover_run {journal} writes the bag from it, where there is space'
             ) from error
         finally:
             self.journal.close()
         summary = replace(summary, lost=self.lost)
         if self.error is not None:
             raise RecordingError(
-                f'the recording broke off: {self.error.strerror or self.error}. {self.bag} holds what '
-                f'was recorded before, and so does {journal}',
+                f'the recording was aborted: {self.error.strerror or self.error}. {self.bag} contains '
+                f'the messages recorded before, and so does {journal}',
                 summary,
             )
         if summary.messages != self._added.total():
             raise RecordingError(
-                f'{self._added.total()} messages were recorded, but {self.bag} holds '
+                f'{self._added.total()} messages were recorded, but {self.bag} contains '
                 f'{summary.messages}. The journal {journal} is kept',
                 summary,
             )
@@ -177,7 +176,7 @@ class Recording:
         return summary
 
     def discard(self) -> None:
-        """Remove what was recorded."""
+        """Remove the recording."""
         self._open = False
         self._thread.close()
         ours = self.journal.in_place()
@@ -191,13 +190,13 @@ class Recording:
             yield Text(LOST, json.dumps(lost))
 
     def _note_losses(self) -> None:
-        """Write what is lost so far into the journal, for recover_run."""
+        """Write the losses so far into the journal, for recover_run."""
         if (lost := self.lost) != self._noted:
             self._noted = lost
             self.journal.add(Text(LOST, json.dumps(lost)))
 
     def _count_unwritten(self) -> None:
-        """Count what was taken, but could not be written, as dropped."""
+        """Count messages that were queued, but could not be written, as dropped."""
         if self.error is None:
             return
         records = read_journal(self.journal.path)
@@ -207,9 +206,9 @@ class Recording:
     def _describe_losses(self) -> str:
         causes = []
         if dropped := self._dropped.total():
-            causes.append(f'{dropped} came faster than the disk could write them')
+            causes.append(f'{dropped} were received faster than the disk could write them')
         if missed := sum(self._missed.values()):
-            causes.append(f'{missed} never reached the recorder')
+            causes.append(f'{missed} were not received by the recorder')
         topics = ', '.join(f'{topic} {number}' for topic, number in self.lost.items())
         return f'messages are lost: {"; ".join(causes)} ({topics})'
 
@@ -223,5 +222,5 @@ class Recording:
         finally:
             self.journal.close()
         raise RecordingError(
-            f'{what}. What was recorded is in {found}: recover_run {found} makes the bag of it'
+            f'{what}. The recorded messages are in {found}: recover_run {found} writes the bag from it'
         )

@@ -32,9 +32,7 @@ class Lateness:
         self.maximum = max(self.maximum, delay)
 
     def percentile(self, percent: float) -> float:
-        """Return the delay (ns) that so many percent do not exceed, at most 1/16 too small.
-
-        NaN without any delay.
+        """Return a percentile of the delays (ns), at most 1/16 too small. NaN without any delay.
 
         Raises:
             ValueError: `percent` is not in [0, 100].

@@ -1,4 +1,4 @@
-"""The node that replays: it publishes a bag's messages as they were recorded, in their rhythm."""
+"""The node that replays: it publishes the messages of a bag at the times of the recording."""
 
 from __future__ import annotations
 
@@ -25,35 +25,36 @@ from diffdrive_jacobian.ros.rclpy_internals import restart_timer
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 DEPTH = 1000
-COMMANDED = ('cmd_vel',)
-"""What a robot was told."""
-TOLD = ('goal_pose', 'goals')
-"""What its controller was told."""
+COMMANDS = ('cmd_vel',)
+"""Topics of the commands to a robot."""
+GOALS = ('goal_pose', 'goals')
+"""Topics of the goals of its controller."""
 
 
 class NothingToPlayError(BagError):
-    """The bag is readable, but has no message of what was chosen."""
+    """The bag is readable, but has no message of the selected topics."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Playback:
-    """What of a bag is played, and how."""
+    """Which messages of a bag are played, and how."""
 
-    names: tuple[str, ...] | None = COMMANDED
+    names: tuple[str, ...] | None = COMMANDS
     """Base names of the topics; None: all."""
     topics: tuple[str, ...] = ()
-    """Full names of the topics, in the place of `names`."""
+    """Fully qualified names of the topics, instead of `names`."""
     remap: Mapping[str, str] = field(default_factory=dict)
-    """Topics that are published under another name."""
+    """Topics to the other names under which they are published."""
     rate: float = 1.0
-    """How much faster than it was recorded."""
+    """Factor on the speed."""
     start_offset: float = 0.0
-    """How much of the beginning is left out (s)."""
+    """Time after the beginning of the bag at which playback starts (s)."""
     loop: bool = False
+    """Whether to start again at the end of the bag."""
     clock: float | None = None
-    """How often the bag's time is published on /clock (Hz); None: not."""
+    """Rate at which the time of the bag is published on /clock (Hz). None: it is not."""
     paused: bool = False
-    """Whether it waits for somebody to resume it."""
+    """Whether to start in the paused state."""
 
     def choose(self, reader: Reader) -> list[Connection]:
         """Return the connections of a bag that are played.
@@ -102,22 +103,22 @@ class Playback:
 
 
 class Replayer(Node):  # type: ignore[misc]
-    """Publishes, from `begin` on, each message when it is due.
+    """Publishes each message when it is due, from `begin` on.
 
-    With `loop` the next round starts when the end of the bag has come, also where what is played ends
-    sooner: every round takes as long as the recording did, divided by the rate.
+    With `loop` the next round starts at the end of the bag, also if the selected messages end sooner:
+    every round takes as long as the recording, divided by the rate.
     """
 
     def __init__(self, reader: Reader, playback: Playback, **kwargs: Any) -> None:
-        """Advertise the topics.
+        """Create the publishers.
 
         Args:
             reader: An open bag.
-            playback: What of it is played.
+            playback: Which of its messages are played, and how.
             kwargs: As for `rclpy.node.Node`.
 
         Raises:
-            NothingToPlayError: The bag has no message of what is chosen, or none after the offset.
+            NothingToPlayError: The bag has no message of the selected topics, or none after the offset.
             BagError: The bag cannot be played: it is too short for the offset, lacks a topic, or has
                 messages of a type that is not installed.
         """
@@ -137,16 +138,17 @@ class Replayer(Node):  # type: ignore[misc]
         self.end = reader.end_time
         """Time in the bag after its last message (ns)."""
         self.sent = 0
-        """Number of messages that were published."""
+        """Number of messages published."""
         self.lateness = Lateness()
-        """How late the messages were published."""
+        """Delays of the messages."""
         self.done = False
+        """Whether all messages were published."""
         self.position = self.start
-        """Time in the bag that is being played (ns)."""
-        self._outlets = {one.id: self._advertise(one) for one in self._connections}
-        self._clock_outlet: Publisher | None = None
+        """Current time in the bag (ns)."""
+        self._publishers_by_connection = {one.id: self._advertise(one) for one in self._connections}
+        self._clock_publisher: Publisher | None = None
         if playback.clock:
-            self._clock_outlet = self.create_publisher(ClockMessage, '/clock', 10)
+            self._clock_publisher = self.create_publisher(ClockMessage, '/clock', 10)
         self._coming: Iterator[tuple[Connection, int, bytes]] = iter(())
         self._next: tuple[Connection, int, bytes] | None = None
         self._wall = 0
@@ -154,7 +156,7 @@ class Replayer(Node):  # type: ignore[misc]
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(1.0, self._on_timer, clock=steady, autostart=False)
         if playback.clock:
-            self._ticks = self.create_timer(1.0 / playback.clock, self._tell_time, clock=steady)
+            self._ticks = self.create_timer(1.0 / playback.clock, self._publish_time, clock=steady)
 
     def _advertise(self, connection: Connection) -> Publisher:
         topic = self._playback.remap.get(connection.topic, connection.topic)
@@ -165,27 +167,27 @@ class Replayer(Node):  # type: ignore[misc]
         except UnknownTypeError as error:
             raise BagError(f'{connection.topic} cannot be played: {error}') from error
 
-    # --- Who listens
+    # --- Subscriptions
 
     @property
-    def unheard(self) -> list[str]:
-        """The topics without a matched reader."""
+    def unmatched(self) -> list[str]:
+        """The topics without a matched subscription."""
         return [topic for topic, readers in self.readers().items() if not readers]
 
     def readers(self) -> dict[str, int]:
-        """Return the number of matched readers of each topic."""
+        """Return the number of matched subscriptions of each topic."""
         found: dict[str, int] = {}
-        for outlet in self._outlets.values():
-            # Several connections of a bag can have one topic; each has a publisher of its own.
-            count = outlet.get_subscription_count()
-            found[outlet.topic_name] = min(count, found.get(outlet.topic_name, count))
+        for publisher in self._publishers_by_connection.values():
+            # Several connections of a bag can have the same topic. Each has a publisher of its own.
+            count = publisher.get_subscription_count()
+            found[publisher.topic_name] = min(count, found.get(publisher.topic_name, count))
         return found
 
-    def rivals(self) -> dict[str, list[str]]:
-        """Name the others that publish on the same topics."""
+    def other_publishers(self) -> dict[str, list[str]]:
+        """Return the names of other nodes that publish on the same topics, by topic."""
         ours = self.get_fully_qualified_name()
         found = {}
-        for publisher in self._outlets.values():
+        for publisher in self._publishers_by_connection.values():
             infos = self.get_publishers_info_by_topic(publisher.topic_name)
             names = [f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in infos]
             others = sorted(name for name in names if name != ours)
@@ -194,19 +196,19 @@ class Replayer(Node):  # type: ignore[misc]
         return found
 
     def unacknowledged(self) -> list[str]:
-        """Return the topics with a reliable reader that has not acknowledged all messages yet."""
+        """Return the topics with a reliable subscription that has not acknowledged all messages."""
         return sorted(
             {
                 one.topic_name
-                for one in self._outlets.values()
+                for one in self._publishers_by_connection.values()
                 if not one.wait_for_all_acked(Duration(seconds=0))
             }
         )
 
-    # --- Playing
+    # --- Playback
 
     def begin(self) -> None:
-        """Start to play."""
+        """Start playback."""
         self._rewind(time.monotonic_ns())
         if self._playback.paused:
             self._paused_at = self._wall
@@ -214,7 +216,7 @@ class Replayer(Node):  # type: ignore[misc]
         self._arm()
 
     def _rewind(self, wall: int) -> None:
-        """Return to the start, which is due at a wall time (ns)."""
+        """Return to the start, which is due at a monotonic time (ns)."""
         self._coming = _messages_from(self._reader, self._connections, self.start)
         self._next = next(self._coming, None)
         self._wall = wall
@@ -222,11 +224,11 @@ class Replayer(Node):  # type: ignore[misc]
 
     @property
     def paused(self) -> bool:
-        """Whether it waits to be resumed."""
+        """Whether playback is paused."""
         return self._paused_at is not None
 
     def toggle(self) -> None:
-        """Pause it, or go on."""
+        """Pause or resume playback."""
         now = time.monotonic_ns()
         if self._paused_at is None:
             self._paused_at = now
@@ -238,7 +240,7 @@ class Replayer(Node):  # type: ignore[misc]
         self._arm()
 
     def _due(self, stamp: int) -> int:
-        """Return the wall time at which a time in the bag is due (ns)."""
+        """Return the monotonic time at which a time in the bag is due (ns)."""
         return self._wall + round((stamp - self.start) / self._playback.rate)
 
     def _bag_time(self, wall: int) -> int:
@@ -251,7 +253,7 @@ class Replayer(Node):  # type: ignore[misc]
             late = time.monotonic_ns() - self._due(stamp)
             if late < 0:
                 break
-            self._outlets[connection.id].publish(data)
+            self._publishers_by_connection[connection.id].publish(data)
             self.sent += 1
             self.lateness.add(late)
             self.position = stamp
@@ -268,13 +270,13 @@ class Replayer(Node):  # type: ignore[misc]
         due = self._due(self.end if self._next is None else self._next[1])
         restart_timer(self._timer, max(due - time.monotonic_ns(), 1))
 
-    def _tell_time(self) -> None:
-        if self._clock_outlet is None or not self._wall or self.done:
+    def _publish_time(self) -> None:
+        if self._clock_publisher is None or not self._wall or self.done:
             return
         now = self.position if self.paused else self._bag_time(time.monotonic_ns())
         message = ClockMessage()
         set_time(message.clock, now)
-        self._clock_outlet.publish(message)
+        self._clock_publisher.publish(message)
 
 
 def _messages_from(

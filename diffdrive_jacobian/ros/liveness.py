@@ -1,7 +1,7 @@
 """Detection of nodes in other processes that were killed or hang, within seconds.
 
-DDS takes a participant that was killed for alive until its lease ends, 20 s with Fast DDS. A node that
-serves its callbacks answers requests; every node of rclpy and rclcpp has a service for its parameters,
+DDS regards a participant that was killed as alive until its lease ends, 20 s with Fast DDS. A node whose
+callbacks are executed answers requests. Every node of rclpy and rclcpp has a service for its parameters,
 unless it was created without.
 """
 
@@ -10,65 +10,90 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Any
 
 from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
 
 PERIOD = 0.5
 """Time between two requests (s)."""
 LONGEST_STEP = 0.2
-"""At most so much time counts from one look to the next (s)."""
+"""At most so much time counts between two calls of `silence` (s)."""
 PENDING = 20
-"""Requests without an answer that are kept: a late answer counts as well."""
+"""Requests without an answer that are kept. A late answer counts as well."""
 
 
 class Liveness:
-    """Asks nodes for none of their parameters, again and again, and measures how long none answers.
+    """Requests parameters of nodes periodically, and measures the time since any of them answered.
 
-    `silence` must be called several times a second while the asking node is spun.
+    `silence` must be called several times a second while the requesting node is spun.
     """
 
-    def __init__(self, node: Node, names: Iterable[str]) -> None:
+    def __init__(self, node: Node, names: Iterable[str], parameters: Sequence[str] = ()) -> None:
         """Create the clients.
 
         Args:
-            node: The node that asks.
-            names: Fully qualified names of the nodes that are asked.
+            node: The node that sends the requests.
+            names: Fully qualified names of the nodes that are to answer.
+            parameters: Names of the parameters that are requested.
         """
-        self._clients = [node.create_client(GetParameters, f'{name}/get_parameters') for name in names]
+        self._clients = {
+            name: node.create_client(GetParameters, f'{name}/get_parameters') for name in names
+        }
+        self._parameters = tuple(parameters)
         self._pending: deque[tuple[Any, Any]] = deque()
         self._silence = 0.0
         self._answered = False
-        self._looked = time.monotonic()
-        self._asked = -math.inf
+        self._updated = time.monotonic()
+        self._requested = -math.inf
+        self.values: dict[str, dict[str, Any]] = {}
+        """Last values of the parameters, by node and name. Nodes that lack one of them are missing."""
+
+    @property
+    def answered(self) -> bool:
+        """Whether any of the nodes has answered."""
+        return self._answered
 
     def silence(self) -> float:
-        """Return the time since any of the nodes answered (s), and ask again if that is due.
+        """Return the time since any of the nodes answered (s), and send requests if they are due.
 
-        It is 0 until the first answer: nodes without the service do not count as silent. Time during
-        which this process was held up itself does not count either.
+        It is 0 until the first answer: a node without the service does not count as silent. Time during
+        which this process itself was held up does not count either.
         """
         now = time.monotonic()
         if self._answered:
-            self._silence += min(now - self._looked, LONGEST_STEP)
-        self._looked = now
-        if now - self._asked >= PERIOD:
-            self._asked = now
-            self._ask()
+            self._silence += min(now - self._updated, LONGEST_STEP)
+        self._updated = now
+        if now - self._requested >= PERIOD:
+            self._requested = now
+            self._request()
         return self._silence
 
-    def _ask(self) -> None:
-        for client in self._clients:
+    def _request(self) -> None:
+        for name, client in self._clients.items():
             if client.service_is_ready():
-                future = client.call_async(GetParameters.Request())
-                future.add_done_callback(self._on_answer)
+                future = client.call_async(GetParameters.Request(names=self._parameters))
+                future.add_done_callback(partial(self._on_answer, name))
                 self._pending.append((client, future))
         while len(self._pending) > PENDING:
             client, future = self._pending.popleft()
             client.remove_pending_request(future)
 
-    def _on_answer(self, _: Any) -> None:
+    def _on_answer(self, name: str, future: Any) -> None:
         self._answered = True
         self._silence = 0.0
+        if future.cancelled() or future.exception() is not None:
+            return
+        values = future.result().values
+        # A node that lacks one of the parameters sends no values at all.
+        if len(values) != len(self._parameters):
+            return
+        try:
+            converted = [parameter_value_to_python(value) for value in values]
+        except (RuntimeError, TypeError, ValueError):
+            # A type that rclpy does not know.
+            return
+        self.values[name] = dict(zip(self._parameters, converted, strict=True))

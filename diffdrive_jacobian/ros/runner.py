@@ -1,7 +1,7 @@
-"""The one way in which every entry point runs its nodes: context, executor, loop, orderly end.
+"""The runner of nodes in real time: context, executor, loop, shutdown.
 
-Signals are counted by our own handlers (`signals`), not by rclpy's, which end the context before a
-node could send its last zero.
+Signals are counted by the handlers of `signals`. Those of rclpy would shut the context down before a
+node can publish its last zero.
 """
 
 from __future__ import annotations
@@ -11,44 +11,31 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
-from typing import TypeVar
 
 import rclpy
 from rclpy.context import Context
-from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.logging import get_logger_level, set_logger_level
 from rclpy.node import Node
-from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.signals import SignalHandlerOptions
 
 from diffdrive_jacobian.errors import UserError as UserError
-from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.node import ParameterizedNode
-from diffdrive_jacobian.ros.parameters import report_unknown
-from diffdrive_jacobian.ros.rclpy_internals import (
-    RCLError,
-    UnknownROSArgsError,
-    events_executor,
-    reason,
-)
+from diffdrive_jacobian.ros.node_runner import MAX_NAME_LENGTH, NodeRunner
+from diffdrive_jacobian.ros.rclpy_internals import UnknownROSArgsError, events_executor, reason
 from diffdrive_jacobian.text import printable
 
-N = TypeVar('N', bound=Node)
-
 MAX_DOMAIN_ID = 232
-"""Beyond it a domain's ports do not exist."""
-MAX_NAME_LENGTH = 247
-"""Longest name of a topic or service, with its leading slash, that Fast DDS can have (characters)."""
-LOOK_PERIOD = 0.1
-"""How long the loop may wait before it looks at its condition again (s)."""
+"""Largest domain id. The ports of larger ones do not exist."""
+CHECK_PERIOD = 0.1
+"""Longest time between two checks of the condition of the loop (s)."""
 
 
 @contextmanager
 def closed_world() -> Iterator[None]:
-    """Make contexts that no other process can reach, nor another context of this one."""
-    # The first is what counts; the others would be obeyed before it.
+    """Isolate contexts that are created: no other context, in whatever process, can reach them."""
+    # The first is set. The others would take precedence over it.
     names = (
         'ROS_AUTOMATIC_DISCOVERY_RANGE',
         'ROS_LOCALHOST_ONLY',
@@ -66,14 +53,14 @@ def closed_world() -> Iterator[None]:
 
 @contextmanager
 def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[Context]:
-    """Hold a ROS context without signal handlers of rclpy.
+    """Create a ROS context without the signal handlers of rclpy, and shut it down at the end.
 
     Args:
-        arguments: The command line with the program's name; what follows `--ros-args` counts.
-        default: Whether it is rclpy's default context, which nodes take that name none.
+        arguments: The command line with the name of the program. What follows `--ros-args` is used.
+        default: Whether to initialize the default context of rclpy, which nodes use by default.
 
     Raises:
-        UserError: rcl does not understand the arguments or the environment.
+        UserError: The arguments or the environment are invalid.
     """
     domain = os.environ.get('ROS_DOMAIN_ID', '')
     if domain and not (domain.isdecimal() and int(domain) <= MAX_DOMAIN_ID):
@@ -84,7 +71,7 @@ def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[
         if flag == '--params-file' and not os.access(value, os.R_OK):
             raise UserError(f'--params-file must name a file that can be read, got {value!r}')
     context = rclpy.get_default_context() if default else Context()
-    # `--log-level` is for the whole process, and would outlast the context.
+    # `--log-level` applies to the process, so it is restored with the context.
     log_level = get_logger_level('')
     try:
         rclpy.init(
@@ -102,16 +89,16 @@ def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[
     try:
         yield context
     finally:
-        # Of the default context rclpy makes a new one then.
+        # Without an argument rclpy also replaces the default context by a new one.
         rclpy.try_shutdown(context=None if default else context)
         set_logger_level('', log_level)
 
 
 def _check_name_length(rule: str) -> None:
-    """Check the new name of a remap rule; rcl reports one that is too long without naming it.
+    """Check the length of the new name in a remap rule. The error of rcl does not contain the name.
 
     Raises:
-        UserError: It is longer than a topic, a service, a node or a namespace can be.
+        UserError: The name is longer than that of a topic, service, node or namespace can be.
     """
     name = rule.rpartition(':=')[2]
     length = len(name) + (not name.startswith('/'))
@@ -123,13 +110,13 @@ def _check_name_length(rule: str) -> None:
 
 
 def make_executor(context: Context, *, closed_world: bool) -> Executor:
-    """Choose the executor.
+    """Return an executor.
 
     Args:
         context: The context of its nodes.
-        closed_world: No stranger can reach the nodes. Then the EventsExecutor, which takes a third of
-            the time per message, is safe; its queue knows no bound and no fairness, so a node that
-            strangers can flood needs the SingleThreadedExecutor. Older Jazzy has only that one.
+        closed_world: Whether the nodes are isolated from other processes. Then it is an EventsExecutor,
+            if rclpy has it, which takes a third of the time per message. Its queue is unbounded and
+            first in, first out, so nodes that others can flood need the SingleThreadedExecutor.
     """
     executor = events_executor(context) if closed_world else None
     return executor or SingleThreadedExecutor(context=context)
@@ -137,7 +124,7 @@ def make_executor(context: Context, *, closed_world: bool) -> Executor:
 
 @contextmanager
 def running(context: Context, *, closed_world: bool) -> Iterator[Runner]:
-    """Hold an executor and the nodes that are added to it; at the end each is stopped and destroyed."""
+    """Create a runner. At the end stop and destroy its nodes."""
     runner = Runner(context, make_executor(context, closed_world=closed_world))
     try:
         yield runner
@@ -145,74 +132,36 @@ def running(context: Context, *, closed_world: bool) -> Iterator[Runner]:
         runner.close()
 
 
-def made(make: Callable[[], N]) -> N:
-    """Make a node.
-
-    Raises:
-        UserError: The name, the parameters or the QoS that its user gave cannot be.
-    """
-    try:
-        return make()
-    except NameValidationException as error:
-        # Its lines: the kind of name and the rule, the name, a mark under the place.
-        rule, name, *_ = str(error).splitlines()
-        raise UserError(f'{rule} {printable(name.strip())}') from error
-    except (ParameterError, ParameterException, InvalidQosOverridesError) as error:
-        raise UserError(str(error)) from error
-    except RCLError as error:
-        why = reason(error)
-        if 'length should not exceed' in why:
-            # Each part was short enough, see _check_name_length.
-            why += f'; a name with its namespace must have at most {MAX_NAME_LENGTH} characters'
-        raise UserError(why) from error
-
-
-class Runner:
-    """An executor with its nodes."""
+class Runner(NodeRunner):
+    """Nodes in real time: an executor with its nodes."""
 
     def __init__(self, context: Context, executor: Executor) -> None:
-        """Begin without nodes."""
-        self.context = context
+        """Start without nodes."""
+        super().__init__(context)
         self._executor = executor
-        self._nodes: list[Node] = []
-        self._begun = False
 
     def seconds(self) -> float:
-        """Give the time by which the nodes live, from an arbitrary beginning (s)."""
+        """Return the monotonic time (s)."""
         return time.monotonic()
 
-    def add(self, make: Callable[[], N]) -> N:
-        """Make a node and add it.
-
-        Raises:
-            UserError: The name, the parameters or the QoS that its user gave cannot be.
-        """
-        node = made(make)
+    def _add(self, node: Node) -> None:
         if not isinstance(node, ParameterizedNode):
             guard_inputs(node)
-        self._nodes.append(node)
         self._executor.add_node(node)
-        return node
 
-    def spin(self, until: Callable[[], bool]) -> bool:
-        """Serve the nodes until a condition holds; False if the context was shut down before.
-
-        The condition is looked at after every callback and at least every LOOK_PERIOD.
-        """
-        if not self._begun:
-            self._begun = True
-            report_unknown([node for node in self._nodes if isinstance(node, ParameterizedNode)])
+    def _spin(self, until: Callable[[], bool]) -> bool:
+        # The condition is checked after every callback and at least every CHECK_PERIOD.
         try:
             while not until():
                 if not self.context.ok():
                     return False
-                self._executor.spin_once(timeout_sec=LOOK_PERIOD)
+                self._executor.spin_once(timeout_sec=CHECK_PERIOD)
         except ExternalShutdownException:
             return False
         return True
 
     def close(self) -> None:
-        """Stop the nodes while they can still speak, then take everything down."""
+        """Stop the nodes while they can still publish, then destroy them."""
         if self.context.ok():
             for node in self._nodes:
                 if isinstance(node, ParameterizedNode):

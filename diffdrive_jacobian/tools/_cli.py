@@ -1,4 +1,4 @@
-"""What the command-line tools share: arguments and exit codes."""
+"""Arguments and exit codes of the command-line tools."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 
 DONE, FAILED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
-"""Exit codes: done as asked, not done, a user's mistake, interrupted by a signal."""
+"""Exit codes: done, not done, wrong arguments, interrupted by a signal."""
 
 
 def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Tell a tool's own arguments from what stands between `--ros-args` and `--`.
+    """Separate a tool's own arguments from those between `--ros-args` and `--`.
 
-    Negative numbers get a leading space, for argparse takes `-1e3` for an option otherwise.
+    Returns:
+        The tool's own arguments and the ROS arguments. Negative numbers of the former get a leading
+        space: argparse regards `-1e3` as an option otherwise.
     """
     own: list[str] = []
     ros: list[str] = []
@@ -35,19 +37,29 @@ def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     return own, ros
 
 
-def parse(parser: argparse.ArgumentParser, own: Sequence[str]) -> argparse.Namespace:
-    """Parse a tool's own arguments; say where ROS arguments belong if there are some among them."""
+def parse(
+    parser: argparse.ArgumentParser, own: Sequence[str], *, ros: bool = True
+) -> argparse.Namespace:
+    """Parse a tool's own arguments.
+
+    An error message about ROS arguments among them says where these belong.
+
+    Args:
+        parser: The parser.
+        own: The arguments.
+        ros: Whether the tool takes ROS arguments.
+    """
     options, unknown = parser.parse_known_args(own)
     if unknown:
         hint = ''
         if any(word in _ROS_OPTIONS or ':=' in word for word in unknown):
-            hint = f' ({ROS_HINT})'
+            hint = f' ({ROS_HINT})' if ros else f' ({parser.prog} takes no ROS arguments)'
         parser.error(f'unrecognized arguments: {" ".join(word.strip() for word in unknown)}{hint}')
     return options
 
 
 ROS_HINT = 'ROS arguments come after --ros-args, as in --ros-args -p NAME:=VALUE'
-_ROS_OPTIONS = ('-p', '--param', '-r', '--remap', '--log-level', '--enclave', '-e')
+_ROS_OPTIONS = ('--ros-args', '-p', '--param', '-r', '--remap', '--log-level', '--enclave', '-e')
 
 
 def _is_number(text: str) -> bool:
@@ -62,7 +74,7 @@ def _is_number(text: str) -> bool:
 
 
 def number(text: str) -> float:
-    """Read a finite number."""
+    """Parse a finite number."""
     text = text.strip()
     if not _is_number(text) or not math.isfinite(float(text)):
         hint = f' ({ROS_HINT})' if ':=' in text else ''
@@ -71,22 +83,22 @@ def number(text: str) -> float:
 
 
 def heading(text: str) -> float:
-    """Read a heading (rad); what is more than a turn is taken for degrees and refused."""
+    """Parse a heading (rad). More than one turn is rejected: it is probably in degrees."""
     value = number(text)
     if abs(value) > math.tau:
         raise argparse.ArgumentTypeError(
-            f'must be in radians, at most 2 pi either way, got {text.strip()!r} '
+            f'must be in radians, from -2 pi to 2 pi, got {text.strip()!r} '
             f'({value:g} degrees are {math.radians(value):.6g} rad)'
         )
     return value
 
 
 def bag_folder(text: str) -> str:
-    """Read the name of a bag, which becomes a folder; that of a picture or a table is refused."""
+    """Parse the name of a bag, which is a directory. A name with the ending of a file is rejected."""
     stem, ending = os.path.splitext(text.rstrip('/'))
     if ending.lower() in _FILE_ENDINGS:
         raise argparse.ArgumentTypeError(
-            f'must name a bag, which is a folder, got {text!r}, the name of a file; '
+            f'must name a bag, which is a directory, got {text!r}, the name of a file; '
             f'did you mean {stem!r}?'
         )
     return text
@@ -96,7 +108,7 @@ _FILE_ENDINGS = ('.png', '.svg', '.pdf', '.jpg', '.jpeg', '.csv', '.txt', '.yaml
 
 
 def coordinate(text: str) -> float:
-    """Read a coordinate that a robot can be sent to (m)."""
+    """Parse a coordinate of a goal (m)."""
     value = number(text)
     if abs(value) > MAX_POSITION:
         raise argparse.ArgumentTypeError(
@@ -106,7 +118,7 @@ def coordinate(text: str) -> float:
 
 
 def positive(text: str) -> float:
-    """Read a positive finite number."""
+    """Parse a positive finite number."""
     value = number(text)
     if value <= 0.0:
         raise argparse.ArgumentTypeError(f'must be positive, got {text.strip()!r}')
@@ -114,19 +126,19 @@ def positive(text: str) -> float:
 
 
 def count(text: str) -> int:
-    """Read how many there are to be, at least one."""
+    """Parse a whole number of at least one."""
     if not (text.isascii() and text.isdigit()) or int(text) < 1:
         raise argparse.ArgumentTypeError(f'must be a whole number of at least 1, got {text!r}')
     return int(text)
 
 
-def add_wait_matching(parser: argparse.ArgumentParser, what: str, otherwise: str) -> None:
-    """Add the option that `ros2 topic pub` has for readers that are discovered late.
+def add_wait_matching(parser: argparse.ArgumentParser, what: str, default: str) -> None:
+    """Add the option of `ros2 topic pub` for subscriptions that are discovered late.
 
     Args:
         parser: The parser.
-        what: What must have the readers, with its verb.
-        otherwise: What is done without the option.
+        what: What must have the subscriptions, with its verb.
+        default: What is done without the option.
     """
     parser.add_argument(
         '-w',
@@ -134,12 +146,12 @@ def add_wait_matching(parser: argparse.ArgumentParser, what: str, otherwise: str
         dest='readers',
         metavar='N',
         type=count,
-        help=f'wait until {what} N readers; {otherwise}',
+        help=f'wait until {what} N subscriptions (default: {default})',
     )
 
 
 def tolerance(text: str) -> float:
-    """Read a distance that go_to_goal takes as xy_goal_tolerance (m)."""
+    """Parse a distance that is a valid xy_goal_tolerance (m)."""
     value = number(text)
     try:
         GoToGoalParameters(xy_goal_tolerance=value)
@@ -149,7 +161,7 @@ def tolerance(text: str) -> float:
 
 
 def readable_file(text: str) -> str:
-    """Read the name of a file that can be read."""
+    """Parse the name of a readable file."""
     if not os.path.isfile(text):
         raise argparse.ArgumentTypeError(f'no such file: {text!r}')
     if not os.access(text, os.R_OK):
@@ -158,14 +170,14 @@ def readable_file(text: str) -> str:
 
 
 def add_params_file(parser: argparse.ArgumentParser) -> None:
-    """Add the option that spares `--ros-args` for the commonest of ROS arguments."""
+    """Add the option for a parameter file without `--ros-args`."""
     parser.add_argument(
-        '--params-file', metavar='FILE', type=readable_file, help='ROS parameters (YAML)'
+        '--params-file', metavar='FILE', type=readable_file, help='file of ROS parameters (YAML)'
     )
 
 
 def with_params_file(ros: list[str], options: argparse.Namespace) -> list[str]:
-    """Give the ROS arguments with what that option says; what the user gave there comes later."""
+    """Return the ROS arguments with that parameter file. Those that the user gave take precedence."""
     if options.params_file is None:
         return ros
     return ['--ros-args', '--params-file', options.params_file, '--', *ros]
@@ -177,6 +189,6 @@ def counted(number: int, noun: str) -> str:
 
 
 def complain(program: str, message: object, code: int = USER_ERROR) -> int:
-    """Print an error as argparse does, a user's mistake unless told otherwise; return its exit code."""
+    """Print an error as argparse does; return the exit code."""
     print(f'{program}: error: {message}', file=sys.stderr)
     return code

@@ -1,4 +1,4 @@
-"""The progress of a drive, for those who watch. Apart from `_cli`, for rich is slow to import."""
+"""Progress bars on a terminal. Not in `_cli`, because rich is slow to import."""
 
 from __future__ import annotations
 
@@ -14,7 +14,11 @@ class Drive:
     """The progress of a drive: a bar on a terminal, a line per second elsewhere."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Begin without a goal; elsewhere the second is one of this clock (s)."""
+        """Start without a goal.
+
+        Args:
+            clock: Returns the time by which the lines are printed (s).
+        """
         self._console = Console()
         self._clock = time.monotonic if self._console.is_terminal else clock
         self._progress = Progress(
@@ -30,18 +34,22 @@ class Drive:
         self._shown = -math.inf
 
     def __enter__(self) -> Drive:
-        """Show the bar, where there is a terminal."""
-        if self._console.is_terminal:
-            self._progress.start()
+        """Return the progress. The bar appears with the first call of `show`."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Take the bar away."""
+        """Remove the bar."""
         if self._console.is_terminal:
             self._progress.stop()
 
     def show(self, what: str, distance: float, wheels: tuple[float, float] | None = None) -> None:
-        """Show how far it still is (m) and how fast the wheels turn, `(right, left)` (rad/s)."""
+        """Show the distance to the goal and the speeds of the wheels.
+
+        Args:
+            what: The goal.
+            distance: Distance to it (m).
+            wheels: Speeds of the right and the left wheel (rad/s). None: they are not shown.
+        """
         period = 0.1 if self._console.is_terminal else 1.0
         now = self._clock()
         if now - self._shown < period:
@@ -55,21 +63,22 @@ class Drive:
             print(f'{what} {state}', flush=True)
             return
         if self._task is None:
+            self._progress.start()
             self._task = self._progress.add_task(what, total=1.0, state=state)
         done = 1.0 - distance / self._farthest if self._farthest else 1.0
         self._progress.update(self._task, description=what, completed=done, state=state)
         self._progress.refresh()
 
     def next(self) -> None:
-        """Begin the bar anew, for another waypoint."""
+        """Restart the bar for another goal."""
         self._farthest = 0.0
 
 
 class Playing:
-    """How far a bag is played: a bar on a terminal, nothing elsewhere."""
+    """The progress of a replay: a bar on a terminal, nothing elsewhere."""
 
     def __init__(self, seconds: float) -> None:
-        """Begin a bag of so many seconds."""
+        """Start a bar for a length (s)."""
         self._console = Console()
         self._progress = Progress(
             TextColumn('{task.description}'),
@@ -82,19 +91,19 @@ class Playing:
         self._shown = -math.inf
 
     def __enter__(self) -> Playing:
-        """Show the bar, where there is a terminal."""
+        """Show the bar on a terminal."""
         if self._console.is_terminal:
             self._progress.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave it as it is."""
+        """Stop the bar and leave it visible."""
         if self._console.is_terminal:
             self._progress.refresh()
             self._progress.stop()
 
     def show(self, seconds: float, *, paused: bool) -> None:
-        """Show how far it came (s)."""
+        """Show the position (s)."""
         if self._console.is_terminal and time.monotonic() - self._shown >= 0.1:
             self._shown = time.monotonic()
             what = 'paused (Enter)' if paused else 'playing'
@@ -103,10 +112,15 @@ class Playing:
 
 
 class Batch:
-    """How many of a batch are done: a bar on a terminal, nothing elsewhere."""
+    """The progress of a batch: a bar on a terminal, nothing elsewhere."""
 
     def __init__(self, what: str, count: int) -> None:
-        """Begin a batch of so many."""
+        """Start a bar.
+
+        Args:
+            what: What is done.
+            count: Number of items.
+        """
         self._console = Console()
         self._progress = Progress(
             TextColumn('{task.description}'),
@@ -121,18 +135,18 @@ class Batch:
         self._shown = -math.inf
 
     def __enter__(self) -> Batch:
-        """Show the bar, where there is a terminal."""
+        """Show the bar on a terminal."""
         if self._console.is_terminal:
             self._progress.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Take the bar away."""
+        """Remove the bar."""
         if self._console.is_terminal:
             self._progress.stop()
 
     def show(self, done: int) -> None:
-        """Show how many are done."""
+        """Show the number of items that are done."""
         if self._console.is_terminal and time.monotonic() - self._shown >= 0.1:
             self._shown = time.monotonic()
             self._progress.update(self._task, completed=done)

@@ -1,4 +1,4 @@
-"""Files of ROS parameters that concern none of the nodes of a process."""
+"""Parameter files that contain parameters of none of the nodes of a process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 
 def warn_of_unused_files(program: str, ros: Sequence[str], nodes: Sequence[str]) -> None:
-    """Print a warning for each parameter file that concerns none of the nodes.
+    """Print a warning for each parameter file without parameters of any of the nodes.
 
     Args:
         program: Name of the program.
@@ -24,14 +24,17 @@ def warn_of_unused_files(program: str, ros: Sequence[str], nodes: Sequence[str])
         names = node_names(path)
         if names and not any(concerns(name, node) for name in names for node in nodes):
             print(
-                f'{program}: warning: --params-file {path} concerns none of the nodes: '
-                f'the file names {", ".join(names)}; the nodes are {", ".join(nodes)}',
+                f'{program}: warning: --params-file {path} has no parameters of these nodes: '
+                f'it is for {", ".join(names)}, the nodes are {", ".join(nodes)}',
                 file=sys.stderr,
             )
 
 
 def node_names(path: str) -> list[str]:
-    """Read the names of nodes, with wildcards, that have parameters in a file; none if it is invalid."""
+    """Return the names of the nodes, with wildcards, that have parameters in a file.
+
+    The list is empty if the file is invalid.
+    """
     # Slow to import, and a node without such a file does not need it.
     from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, load_yaml
 
@@ -51,8 +54,11 @@ def _node_names(section: Any, prefix: str) -> Iterator[str]:
 
 
 def concerns(name: str, node: str) -> bool:
-    """Return whether a name in a parameter file, where `*` stands for one token and `**` for any number
-    of them, is that of a node, as rcl understands it.
+    """Return whether rcl applies the parameters under a name to a node.
+
+    Args:
+        name: Name in a parameter file. `*` stands for one token, `**` for any number of tokens.
+        node: Fully qualified name of the node.
     """
     tokens = {'*': '/[^/]+', '**': '(/[^/]+)*'}
     pattern = ''.join(tokens.get(token, '/' + re.escape(token)) for token in name.strip('/').split('/'))

@@ -1,4 +1,4 @@
-"""Messages about what a tool waits for."""
+"""Messages that say what a tool is waiting for."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ FIRST = 1.0
 
 
 class Waiting:
-    """Prints what is waited for, after a second and then every few seconds."""
+    """Prints what the tool is waiting for, after a second and then every few seconds."""
 
     def __init__(self) -> None:
-        """Start to wait."""
+        """Start the time to the first message."""
         self._due = time.monotonic() + FIRST
 
     def show(self, what: str) -> None:
-        """Print what is waited for if a message is due."""
+        """Print what the tool is waiting for if a message is due."""
         if time.monotonic() >= self._due:
             self._due = time.monotonic() + PERIOD
             print(f'waiting: {what}', flush=True)

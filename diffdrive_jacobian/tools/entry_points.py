@@ -1,4 +1,8 @@
-"""The commands that an installation offers. Signals are caught before anything slow is imported."""
+"""The programs of an installation, as functions. Signals are caught before anything slow is imported.
+
+Each node in `NODES` is a program, and each other public module of this package, which must define
+`main(arguments, signals)`. `entry_points.drive_to()` runs drive_to and returns the exit code.
+"""
 
 from __future__ import annotations
 
@@ -6,30 +10,65 @@ import importlib
 import os
 import select
 import sys
+from collections.abc import Callable
 from functools import partial
 
 from diffdrive_jacobian.signals import Signals
 
 INTERRUPTED = 130
+NODES = ('virtual_robot', 'go_to_goal', 'wheel_bridge')
+"""Programs that run a node."""
 ROS_MODULES = (
     *('rclpy', 'action_msgs', 'builtin_interfaces', 'geometry_msgs', 'nav_msgs', 'rcl_interfaces'),
     *('rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs', 'unique_identifier_msgs'),
 )
-"""Modules that come with a ROS installation, or with the extra `jazzy`."""
+"""Modules of a ROS installation, or of the extra `jazzy`."""
+_NO_TOOLS = ('__init__', 'entry_points', 'run_node')
 
 
-def _run_tool(module: str) -> int:
-    """Run a tool; a second signal ends it even if it does not react."""
-    return _run(module, 'main', watched=True)
+def __getattr__(name: str) -> Callable[[], int]:
+    """Return the function that runs a program.
+
+    Raises:
+        AttributeError: There is no such program.
+    """
+    if name in NODES:
+        return partial(_run, 'run_node', 'run_node', name)
+    if name in tools():
+        return partial(_run, name, 'main', watched=True)
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+
+
+def __dir__() -> list[str]:
+    """Return the names of the module, with those of the programs."""
+    return sorted({*globals(), *NODES, *tools()})
+
+
+def tools() -> list[str]:
+    """Return the names of the tools: those of the public modules beside this one."""
+    files = (os.path.splitext(file) for file in os.listdir(os.path.dirname(__file__)))
+    return sorted(
+        name
+        for name, ending in files
+        if ending == '.py' and not name.startswith('_') and name not in _NO_TOOLS
+    )
 
 
 def _run(module: str, function: str, *arguments: str, watched: bool = False) -> int:
+    """Run a function of a module of this package; return the exit code.
+
+    Args:
+        module: The module.
+        function: The function. It takes the arguments, the command line and the signals.
+        arguments: The first of them is the name of the program (default: the module's).
+        watched: Whether a second signal ends the process even if the function does not react.
+    """
     program = arguments[0] if arguments else module
     signals = Signals()
     signals.catch()
     for name in ('stdout', 'stderr'):
         if getattr(sys, name) is None:
-            # Started without it, as by cron; what we load writes there all the same.
+            # Started without it, as by cron. Imported modules write to it.
             setattr(sys, name, open(os.devnull, 'w'))  # noqa: SIM115
     try:
         run = getattr(importlib.import_module(f'diffdrive_jacobian.tools.{module}'), function)
@@ -38,7 +77,7 @@ def _run(module: str, function: str, *arguments: str, watched: bool = False) -> 
         code: int = run(*arguments, sys.argv[1:], signals)
         sys.stdout.flush()
     except BrokenPipeError:
-        # Who read our output went away (as `head` does): nobody is left to tell.
+        # The reader of the output is gone, as `head` when it has enough.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
     except ModuleNotFoundError as error:
@@ -60,60 +99,10 @@ def _run(module: str, function: str, *arguments: str, watched: bool = False) -> 
 
 
 def _exit(program: str) -> None:
-    """End the process without clean-up, and report that."""
+    """End the process without clean-up, and print that."""
     line = f'{program}: ended by a second signal, before it could finish\n'
     error = sys.stderr.fileno()
-    # Whoever should read it may have stopped reading.
+    # Whoever reads it may have stopped reading.
     if select.select([], [error], [], 0.0)[1]:
         os.write(error, line.encode())
     os._exit(INTERRUPTED)
-
-
-def virtual_robot() -> int:
-    """Run the node virtual_robot."""
-    return _run('run_node', 'run_node', 'virtual_robot')
-
-
-def go_to_goal() -> int:
-    """Run the node go_to_goal."""
-    return _run('run_node', 'run_node', 'go_to_goal')
-
-
-def wheel_bridge() -> int:
-    """Run the node wheel_bridge."""
-    return _run('run_node', 'run_node', 'wheel_bridge')
-
-
-def drive_to() -> int:
-    """Run the tool drive_to."""
-    return _run_tool('drive_to')
-
-
-def send_goal() -> int:
-    """Run the tool send_goal."""
-    return _run_tool('send_goal')
-
-
-def record_run() -> int:
-    """Run the tool record_run."""
-    return _run_tool('record_run')
-
-
-def replay_run() -> int:
-    """Run the tool replay_run."""
-    return _run_tool('replay_run')
-
-
-def recover_run() -> int:
-    """Run the tool recover_run."""
-    return _run_tool('recover_run')
-
-
-def plot_run() -> int:
-    """Run the tool plot_run."""
-    return _run_tool('plot_run')
-
-
-def sweep_gains() -> int:
-    """Run the tool sweep_gains."""
-    return _run_tool('sweep_gains')

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import math
+import select
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,10 +20,11 @@ from diffdrive_jacobian.tools import _cli
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.reading.verification import Verification
+    from diffdrive_jacobian.replay import ReplayResult
 
 PROGRAM = 'replay_run'
 MATCH_PATIENCE = 5.0
-"""How long readers are waited for without -w (s): an older participant is announced every 3 s."""
+"""Longest wait for subscriptions without -w (s): an older participant is announced every 3 s."""
 
 
 def report(verification: Verification, tolerance: float, yaw_tolerance: float) -> str:
@@ -63,11 +66,10 @@ def _verify(bag: Path, options: argparse.Namespace) -> int:
 
 
 def _replay(bag: Path, options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> int:
-    from diffdrive_jacobian.replay.replayer import COMMANDED, TOLD, NothingToPlayError, Playback
-    from diffdrive_jacobian.tools._playing import replay
+    from diffdrive_jacobian.replay import COMMANDS, GOALS, NothingToPlayError, Playback, replay
 
     playback = Playback(
-        names=None if options.all_topics else TOLD if options.goals else COMMANDED,
+        names=None if options.all_topics else GOALS if options.goals else COMMANDS,
         topics=tuple(options.topics or ()),
         remap=dict(options.remap),
         rate=options.rate,
@@ -78,28 +80,88 @@ def _replay(bag: Path, options: argparse.Namespace, ros: Sequence[str], signals:
     )
     acked = options.wait_for_all_acked
     try:
-        return replay(
+        result = replay(
             bag,
             playback,
-            ros,
-            signals,
             patience=MATCH_PATIENCE,
-            acked=None if acked is None else acked / 1000.0,
             readers=options.readers,
             timeout=math.inf if options.timeout is None else options.timeout,
+            acknowledgement_timeout=None if acked is None else acked / 1000.0,
+            ros_arguments=ros,
+            signals=signals,
+            progress=_Progress(),
         )
     except NothingToPlayError as error:
         return _cli.complain(PROGRAM, error, _cli.FAILED)
+    return _report(result, options)
+
+
+class _Progress:
+    """Prints the progress of a replay, and pauses it by Enter."""
+
+    def __init__(self) -> None:
+        # Slow to import.
+        from diffdrive_jacobian.tools._progress import Playing
+        from diffdrive_jacobian.tools._waiting import Waiting
+
+        self._bar_of = Playing
+        self._bar: Playing | None = None
+        self._waiting_of = Waiting
+        self._waiting = Waiting()
+
+    def waiting(self, reason: str) -> None:
+        self._waiting.show(reason)
+
+    def started(self, seconds: float) -> None:
+        self._bar = self._bar_of(seconds).__enter__()
+
+    def playing(self, seconds: float, *, paused: bool) -> None:
+        if self._bar is not None:
+            self._bar.show(seconds, paused=paused)
+
+    def toggled(self) -> bool:
+        if not sys.stdin or not sys.stdin.isatty():
+            return False
+        ready, _, _ = select.select([sys.stdin], [], [], 0.0)
+        return bool(ready) and sys.stdin.readline() != ''
+
+    def ended(self) -> None:
+        if self._bar is not None:
+            self._bar.__exit__()
+        # The acknowledgements come next.
+        self._waiting = self._waiting_of()
+
+
+def _report(result: ReplayResult, options: argparse.Namespace) -> int:
+    """Print what became of a replay; return the exit code."""
+    from diffdrive_jacobian.replay import describe_too_few
+
+    if not result.started:
+        counts = describe_too_few(result.too_few, options.readers)
+        if result.interrupted:
+            print(f'interrupted: nothing was played, {counts}')
+            return _cli.INTERRUPTED
+        print(f'nothing was played: {counts} after --timeout {options.timeout:g} s')
+        return _cli.FAILED
+    print(f'{result.messages} messages played')
+    if result.interrupted:
+        return _cli.INTERRUPTED
+    if result.unacknowledged:
+        topics = ', '.join(result.unacknowledged)
+        seconds = options.wait_for_all_acked / 1000.0
+        reason = f'not all subscriptions to {topics} have acknowledged all messages within {seconds:g} s'
+        return _cli.complain(PROGRAM, reason, _cli.FAILED)
+    return _cli.DONE if result.played else _cli.FAILED
 
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
     own, ros = _cli.split_arguments(arguments)
     parser = _parser()
-    options = parser.parse_args(own)
+    options = _cli.parse(parser, own)
     if options.timeout is not None and options.readers is None:
-        parser.error('--timeout is the time to wait for the readers of -w, which is missing')
-    # Now, for --help needs no ROS.
+        parser.error('--timeout needs -w: it is the longest wait for the subscriptions of -w')
+    # Not above: --help needs no ROS.
     from diffdrive_jacobian.reading.reader import BagError
 
     bag = Path(options.bag)
@@ -127,23 +189,30 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=PROGRAM,
         usage=f'{PROGRAM} BAG [options] [--ros-args ...]',
-        description='Replay a recorded run: what was commanded (cmd_vel), unless something else is '
-        'asked for. On a terminal, Enter pauses and resumes. With --verify nothing is published: the '
-        'robot is driven again in memory and its path compared with the odometry. Exit code 0: played, '
-        'or as recorded; 1: not, or nothing to play; 2: wrong arguments or no bag; 130: interrupted.',
+        description='Replay a recorded run: the commands (cmd_vel), unless an option selects other '
+        'topics. On a terminal, Enter pauses and resumes. With --verify nothing is published: the '
+        'robot is simulated again in memory and its path compared with the odometry. Exit code 0: '
+        'played, or as recorded; 1: not played to the end, or not as recorded, or nothing to play; '
+        '2: wrong arguments or no bag; 130: interrupted.',
     )
-    parser.add_argument('bag', metavar='BAG', help='the directory of a rosbag2 bag')
+    parser.add_argument('bag', metavar='BAG', help='directory of a rosbag2 bag')
     what = parser.add_mutually_exclusive_group()
-    what.add_argument('--goals', action='store_true', help='what the controller was told')
-    what.add_argument('--all-topics', action='store_true', help='everything')
-    what.add_argument('--topics', nargs='+', metavar='TOPIC', help='these, by their full names')
-    what.add_argument('--verify', action='store_true', help='compare the robot with the odometry')
-    parser.add_argument('-r', '--rate', type=_cli.positive, default=1.0, help='how much faster; 1')
-    parser.add_argument(
-        '-l', '--loop', action='store_true', help='start again when the end of the bag is reached'
+    what.add_argument('--goals', action='store_true', help='play the goals of the controller')
+    what.add_argument('--all-topics', action='store_true', help='play all topics')
+    what.add_argument(
+        '--topics', nargs='+', metavar='TOPIC', help='play these topics (fully qualified names)'
     )
+    what.add_argument('--verify', action='store_true', help='compare the robot with the odometry')
     parser.add_argument(
-        '--start-offset', type=_not_negative, default=0.0, help='begin so late in the bag (s)'
+        '-r', '--rate', type=_cli.positive, default=1.0, help='factor on the speed (default: 1.0)'
+    )
+    parser.add_argument('-l', '--loop', action='store_true', help='start again at the end of the bag')
+    parser.add_argument(
+        '--start-offset',
+        metavar='SECONDS',
+        type=_not_negative,
+        default=0.0,
+        help='start this long after the beginning of the bag (s) (default: 0.0)',
     )
     parser.add_argument(
         '-m',
@@ -161,26 +230,25 @@ def _parser() -> argparse.ArgumentParser:
         const=40.0,
         type=_cli.positive,
         metavar='HZ',
-        help="publish the bag's time on /clock (40)",
+        help='publish the time of the bag on /clock at this rate (Hz) (default: 40.0 if HZ is left '
+        'out, not at all without the option)',
     )
-    parser.add_argument('-p', '--start-paused', action='store_true', help='begin with a pause')
+    parser.add_argument('-p', '--start-paused', action='store_true', help='start in the paused state')
     _cli.add_wait_matching(
-        parser,
-        'each topic has',
-        f'without it, playing starts with the readers that are discovered within {MATCH_PATIENCE:g} s',
+        parser, 'each topic has', f'those that are discovered within {MATCH_PATIENCE:g} s'
     )
     parser.add_argument(
         '--timeout',
         type=_cli.positive,
         metavar='SECONDS',
-        help='with -w: give up after this time and play nothing (default: wait for ever)',
+        help='with -w: give up after this time (s) and play nothing (default: never)',
     )
     parser.add_argument(
         '--wait-for-all-acked',
         type=_not_negative,
         metavar='MS',
-        help='at the end wait up to this time (ms) until all reliable readers have acknowledged all '
-        'messages, 0: for ever; exit code 1 if they have not (default: do not wait)',
+        help='at the end wait up to this time (ms) until all reliable subscriptions have acknowledged '
+        'all messages, 0: no limit; exit code 1 if they have not (default: do not wait)',
     )
     parser.add_argument('--tolerance', type=_cli.positive, help='with --verify: position (m)')
     parser.add_argument('--yaw-tolerance', type=_cli.positive, help='with --verify: heading (rad)')

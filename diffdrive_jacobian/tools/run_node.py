@@ -1,4 +1,4 @@
-"""Run one node as its own process: what `virtual_robot`, `go_to_goal` and `wheel_bridge` start."""
+"""Run one node in a process of its own: the programs virtual_robot, go_to_goal and wheel_bridge."""
 
 from __future__ import annotations
 
@@ -29,57 +29,59 @@ class Program(NamedTuple):
     parameters: type[NodeParameters]
     """Its parameters."""
     description: str
-    """What --help says; the node's own module is imported only when the node runs."""
+    """Description for --help. The module of the node is imported only when the node runs."""
 
 
 NODES: dict[str, Program] = {
     'virtual_robot': Program(
         'VirtualRobot',
         VirtualRobotParameters,
-        'Simulate a differential-drive robot: cmd_vel or joint_command in; odom, joint_states, '
-        'cmd_vel_out, start_pose and TF out; initialpose and reset_odometry place it. A command takes '
-        'effect on receipt, or at its stamp if it has one. cmd_vel_out is each command as applied, '
-        'start_pose where and when the odometry was last reset: together the whole motion.',
+        'Simulate a differential-drive robot. Subscribes to cmd_vel or joint_command. Publishes odom, '
+        'joint_states, cmd_vel_out, start_pose and TF. initialpose and reset_odometry set its pose. A '
+        'command takes effect on receipt, or at its stamp if it has one. cmd_vel_out is each command '
+        'as applied, start_pose is the pose and time of the last reset of the odometry. Together they '
+        'determine the whole motion.',
     ),
     'go_to_goal': Program(
         'GoToGoal',
         GoToGoalParameters,
-        'Drive a robot to goals: odom, goal_pose and goals in; cmd_vel and goal_status out; '
-        'cancel_goal stops. While a goal is active, every odometry message is answered by one '
-        'command; without a goal nothing is published, so that others may drive.',
+        'Drive a robot to goals. Subscribes to odom, goal_pose and goals. Publishes cmd_vel and '
+        'goal_status. The service cancel_goal cancels a goal. While a goal is active, each odometry '
+        'message is answered by one command. Without a goal nothing is published on cmd_vel, so that '
+        'other nodes can drive.',
     ),
     'wheel_bridge': Program(
         'WheelBridge',
         WheelBridgeParameters,
-        'Convert body twists to wheel speeds: cmd_vel in, joint_command out. Each command gives one '
-        'message with the same stamp (without a stamp: the time of receipt). When commands cease, one '
-        'zero follows after the timeout.',
+        'Convert body twists to wheel speeds. Subscribes to cmd_vel. Publishes joint_command. Each '
+        'command gives one message with the same stamp, or with the time of receipt if it has none. '
+        'When no more commands are received, one zero command follows after the timeout.',
     ),
 }
-"""Name of a node, which is that of its module, to its program."""
+"""Name of a node and of its module to its program."""
 
 
 def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
-    """Run a node until a signal comes; return the exit code.
+    """Run a node until a signal is caught; return the exit code.
 
     Args:
-        name: One of NODES; also the program's name in messages.
+        name: One of NODES, also the name of the program in messages.
         arguments: The command line without the program's name.
-        signals: Signals that were caught so far.
+        signals: Counter of the signals.
     """
     program = NODES[name]
     own, ros = _cli.split_arguments(arguments)
     ros = _cli.with_params_file(ros, _cli.parse(_parser(name, program), own))
-    # Now, for --help needs no ROS; and only the node that runs, for each costs time at the start.
+    # Not above: --help needs no ROS. Only the node that runs: each takes time to import.
     from diffdrive_jacobian.ros.runner import ros_context, running
 
-    make = getattr(importlib.import_module(f'diffdrive_jacobian.nodes.{name}'), program.class_name)
+    create = getattr(importlib.import_module(f'diffdrive_jacobian.nodes.{name}'), program.class_name)
     try:
         with (
             ros_context([name, *ros]) as context,
             running(context, closed_world=False) as runner,
         ):
-            node = runner.add(lambda: make(context=context))
+            node = runner.add(lambda: create(context=context))
             warn_of_unused_files(name, ros, [node.get_fully_qualified_name()])
             runner.spin(lambda: signals.count > 0)
     except UserError as error:
@@ -92,8 +94,9 @@ def _parser(name: str, program: Program) -> argparse.ArgumentParser:
     defaults = {field.name: field.default for field in fields(parameters)}
     lines = []
     for ros_name, (field, specification) in specifications(parameters).items():
-        text = f'{specification.description} Default {defaults[field]}'
-        text += f'; {specification.allowed}.' if specification.allowed else '.'
+        text = specification.description
+        text += f' Must be {specification.allowed}.' if specification.allowed else ''
+        text += f' (default: {defaults[field]})'
         lines += [
             f'  {ros_name}',
             *textwrap.wrap(text, 90, initial_indent='      ', subsequent_indent='      '),

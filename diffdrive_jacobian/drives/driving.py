@@ -1,0 +1,343 @@
+"""Drives of the virtual robot to goals: robot, controller and wheel bridge in one process.
+
+    from diffdrive_jacobian.drives import drive
+
+    outcome = drive([[1.0, 1.0]], lockstep=True)
+    print(outcome.arrived, outcome.pose, outcome.seconds)
+
+The robot is driven by its wheels, so that the whole Jacobian chain is in use:
+goal -> control law -> body twist -> J_w^-1 -> wheel speeds -> J_w -> body twist -> S(theta) -> pose.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from action_msgs.msg import GoalStatus
+from numpy.typing import ArrayLike, NDArray
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+
+from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.messages import conversion as messages
+from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.recording.recorder import Recorder
+from diffdrive_jacobian.recording.recording import Recording
+from diffdrive_jacobian.recording.selection import Selection
+from diffdrive_jacobian.ros.goal_client import GoalClient
+from diffdrive_jacobian.ros.node_runner import NodeRunner
+from diffdrive_jacobian.ros.runner import Runner, closed_world, ros_context, running
+from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.time_units import nanoseconds
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.lockstep.runner import LockstepRunner
+
+NAME = 'drive_to'
+"""Name of the node that sends the goals."""
+TIMEOUT = 300.0
+"""Default of the longest duration of a drive (s)."""
+SETTLING = 0.1
+"""Odometry this much later than the last command shows its effect (s)."""
+DISCOVERY_PERIOD = 0.5
+"""Time between two searches for new topics to record (s)."""
+STOP_PATIENCE = 2.0
+"""Longest time in which the robot may come to rest at the end, and report that (s)."""
+
+
+class DriveError(Exception):
+    """A drive in simulated time was aborted. The message says why."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Outcome:
+    """The end of a drive."""
+
+    status: int
+    """Status of the goals, as in action_msgs/GoalStatus."""
+    interrupted: bool
+    """Whether a signal ended the drive."""
+    pose: NDArray[np.float64] | None
+    """`[x, y, theta]` where the robot stopped, shape (3,) (m, m, rad). None: there was no odometry."""
+    distance: float
+    """Distance from the driven point to the last goal (m)."""
+    offset: float
+    """x of the driven point in the body frame (m). 0: the axle centre."""
+    seconds: float
+    """Duration (s), in lockstep of simulated time."""
+
+    @property
+    def arrived(self) -> bool:
+        """Whether the robot arrived at the last goal."""
+        return bool(self.status == GoalStatus.STATUS_SUCCEEDED)
+
+
+class DriveProgress(Protocol):
+    """Receives the progress of a drive."""
+
+    def nodes_created(self, names: Sequence[str]) -> None:
+        """Receive the fully qualified names of the nodes, once."""
+
+    def driving(self, seconds: float, index: int, distance: float, wheels: tuple[float, float]) -> None:
+        """Receive the state of the drive, many times a second.
+
+        Args:
+            seconds: Time since the start (s), in lockstep simulated time.
+            index: Index of the current goal.
+            distance: Distance from the driven point to that goal (m).
+            wheels: Speeds of the right and the left wheel (rad/s).
+        """
+
+
+class _Silent:
+    """A progress that is not shown."""
+
+    def nodes_created(self, names: Sequence[str]) -> None:
+        pass
+
+    def driving(self, seconds: float, index: int, distance: float, wheels: tuple[float, float]) -> None:
+        pass
+
+
+def waypoints_through(places: ArrayLike, heading: float = 0.0) -> NDArray[np.float64]:
+    """Return waypoints with a heading at each place.
+
+    Args:
+        places: `[x, y]` of each place, shape (n, 2) (m).
+        heading: Heading at the last place (rad).
+
+    Returns:
+        `[x, y, theta]`, shape (n, 3) (m, m, rad). theta is the direction to the next place.
+
+    Raises:
+        ValueError: `places` has another shape, or is empty.
+    """
+    places = np.asarray(places, dtype=np.float64)
+    if places.ndim != 2 or places.shape[1] != 2 or not len(places):
+        raise ValueError(f'places must have shape (n, 2) with n > 0, got {places.shape}')
+    dx, dy = np.diff(places, axis=0).T
+    return np.column_stack([places, [*np.arctan2(dy, dx), heading]])
+
+
+def drive(
+    goals: ArrayLike,
+    *,
+    lockstep: bool = False,
+    isolated: bool = True,
+    timeout: float = TIMEOUT,
+    parameters: Mapping[str, Any] | None = None,
+    recording: Recording | None = None,
+    ros_arguments: Sequence[str] = (),
+    signals: Signals | None = None,
+    progress: DriveProgress | None = None,
+) -> Outcome:
+    """Drive the virtual robot to goals, in order, with all three nodes in this process.
+
+    Args:
+        goals: `[x, y]` of each goal, shape (n, 2), or `[x, y, theta]`, shape (n, 3) (m, m, rad). theta
+            matters for controllers that use the heading, and with the parameter `use_goal_heading`.
+        lockstep: Whether to drive in simulated time, as fast as possible and with the same result each
+            time. rclpy must not be initialised then.
+        isolated: Whether no other process can communicate with the nodes. Always so in lockstep.
+        timeout: Longest duration, of all goals together (s).
+        parameters: Parameters of go_to_goal, by name. They take precedence over `ros_arguments`.
+        recording: Recording of what the nodes publish. The caller must finish it. None: none.
+        ros_arguments: ROS arguments of all nodes, such as `['--ros-args', '-p', 'kp:=4.0']`.
+        signals: Counter of the signals that end the drive. None: no signal does.
+        progress: Receives the progress. None: nothing does.
+
+    Raises:
+        UserError: A node cannot run with the parameters or ROS arguments given.
+        DriveError: In lockstep, a callback blocks, or simulated time cannot advance.
+        ValueError: `goals` has another shape, or `lockstep` is not isolated.
+    """
+    goals = np.asarray(goals, dtype=np.float64)
+    if goals.ndim != 2 or goals.shape[1] != 3:
+        goals = waypoints_through(goals)
+    if lockstep and not isolated:
+        raise ValueError('a drive in lockstep is always isolated: other processes have another clock')
+    stage = in_lockstep(ros_arguments) if lockstep else in_real_time(ros_arguments, isolated=isolated)
+    with stage as runner:
+        return drive_in(
+            runner,
+            goals,
+            timeout=timeout,
+            parameters=parameters,
+            recording=recording,
+            signals=signals,
+            progress=progress,
+        )
+
+
+def drive_in(
+    runner: NodeRunner,
+    goals: NDArray[np.float64],
+    *,
+    timeout: float = TIMEOUT,
+    parameters: Mapping[str, Any] | None = None,
+    recording: Recording | None = None,
+    signals: Signals | None = None,
+    progress: DriveProgress | None = None,
+) -> Outcome:
+    """Drive as `drive` does, in a runner that exists: `in_real_time` or `in_lockstep`.
+
+    Args:
+        runner: Runs the nodes, and may run others.
+        goals: `[x, y, theta]` of each goal, shape (n, 3) (m, m, rad).
+        timeout: As for `drive`.
+        parameters: As for `drive`.
+        recording: As for `drive`.
+        signals: As for `drive`.
+        progress: As for `drive`.
+
+    Raises:
+        UserError: A node cannot run with the parameters given.
+        ValueError: `goals` has another shape.
+    """
+    signals = signals or Signals()
+    progress = progress or _Silent()
+    context = runner.context
+    wheels_drive = Parameter('command_interface', value='wheels')
+    robot = runner.add(lambda: VirtualRobot(context=context, parameter_overrides=[wheels_drive]))
+    bridge = runner.add(lambda: WheelBridge(context=context))
+    overrides = [Parameter(name, value=value) for name, value in (parameters or {}).items()]
+    controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=overrides))
+    client = runner.add(lambda: GoalClient(NAME, goals, context))
+    client.arrival = controller.arrival
+    wheels = WheelSpeeds(client, robot.parameters.wheel_names)
+    nodes = (robot, bridge, controller, client)
+    progress.nodes_created([node.get_fully_qualified_name() for node in nodes])
+    discover = _recorder(runner, recording)
+    client.send_on_odometry()
+    started = runner.seconds()
+
+    def over() -> bool:
+        discover()
+        if client.robot is not None and not client.ended:
+            index = controller.waypoint
+            if index is not None:
+                client.index = index
+            seconds = runner.seconds() - started
+            progress.driving(seconds, client.index, client.distance, wheels.speeds)
+        return bool(client.ended or signals.count or runner.seconds() - started > timeout)
+
+    runner.spin(over)
+    seconds, status = runner.seconds() - started, client.status
+    client.withdraw()
+    reason = 'interrupted' if signals.count else 'timeout'
+    if not client.ended:
+        controller.stop(reason)
+    settled = robot.now() + nanoseconds(SETTLING)
+    before = signals.count
+    patience = runner.seconds() + STOP_PATIENCE + 1.0 / robot.parameters.publish_rate
+
+    def settled_or_late() -> bool:
+        discover()
+        if controller.waypoint is not None:
+            # The goals were received only now.
+            controller.stop(reason)
+        state = client.robot
+        still = state is not None and state.stamp >= settled and not state.moving
+        return bool(still or runner.seconds() > patience or signals.count > before)
+
+    runner.spin(settled_or_late)
+    client.index = len(goals) - 1
+    return Outcome(
+        status=status,
+        interrupted=signals.count > 0,
+        pose=None if client.robot is None else client.robot.pose,
+        distance=client.distance,
+        offset=controller.arrival.offset,
+        seconds=seconds,
+    )
+
+
+class WheelSpeeds:
+    """The speeds of the wheels, from `joint_states`."""
+
+    def __init__(self, node: GoalClient, names: tuple[str, str]) -> None:
+        """Subscribe with a node.
+
+        Args:
+            node: The node.
+            names: Joints of the left and the right wheel.
+        """
+        self._names = names
+        self.speeds = (0.0, 0.0)
+        """Speeds of the right and the left wheel (rad/s)."""
+        node.create_subscription(JointState, 'joint_states', self._on_joint_states, 10)
+
+    def _on_joint_states(self, message: JointState) -> None:
+        # Other processes may publish, and anything.
+        with suppress(MessageError):
+            self.speeds = messages.from_joint_state(message, self._names)
+
+
+def _recorder(runner: NodeRunner, recording: Recording | None) -> Callable[[], None]:
+    """Record what the nodes publish. Return a function that finds new topics, to be called often."""
+    if recording is None:
+        return lambda: None
+    recorder = runner.add(lambda: Recorder(Selection(), recording, context=runner.context))
+    discovered = -math.inf
+
+    def discover() -> None:
+        nonlocal discovered
+        if runner.seconds() - discovered >= DISCOVERY_PERIOD:
+            discovered = runner.seconds()
+            recorder.discover()
+
+    discover()
+    return discover
+
+
+@contextmanager
+def in_real_time(ros_arguments: Sequence[str] = (), *, isolated: bool = True) -> Iterator[Runner]:
+    """Create a runner of nodes in real time, and close it at the end.
+
+    Args:
+        ros_arguments: ROS arguments of all nodes.
+        isolated: Whether no other process can communicate with the nodes.
+
+    Raises:
+        UserError: The ROS arguments are invalid.
+    """
+    with (
+        closed_world() if isolated else nullcontext(),
+        ros_context([NAME, *ros_arguments]) as context,
+        running(context, closed_world=isolated) as runner,
+    ):
+        yield runner
+
+
+@contextmanager
+def in_lockstep(ros_arguments: Sequence[str] = ()) -> Iterator[LockstepRunner]:
+    """Create a runner of nodes in simulated time, and close it at the end.
+
+    Args:
+        ros_arguments: ROS arguments of all nodes.
+
+    Raises:
+        UserError: The ROS arguments are invalid.
+        DriveError: A callback blocks, or simulated time cannot advance for another reason.
+    """
+    # Slow to import.
+    from diffdrive_jacobian.lockstep import LockstepError
+    from diffdrive_jacobian.lockstep.runner import running_in_lockstep
+
+    with ExitStack() as stack:
+        try:
+            runner = stack.enter_context(running_in_lockstep(ros_arguments))
+        except LockstepError as error:
+            raise UserError(str(error)) from error
+        try:
+            yield runner
+        except LockstepError as error:
+            raise DriveError(str(error)) from error

@@ -1,0 +1,163 @@
+"""Recording of topics of other processes until a signal, a time or an error."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from diffdrive_jacobian.bags.bag_writer import Summary
+from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.recording.recorder import Recorder
+from diffdrive_jacobian.recording.recording import Recording, RecordingError
+from diffdrive_jacobian.recording.selection import Selection
+from diffdrive_jacobian.ros.runner import ros_context, running
+from diffdrive_jacobian.signals import Signals
+
+NAME = 'record_run'
+"""Name of the node."""
+DISCOVERY_PERIOD = 0.2
+"""Time between two searches for new topics (s)."""
+
+
+class Status(NamedTuple):
+    """The state of a recording."""
+
+    messages: int
+    """Number of messages received."""
+    topics: int
+    """Number of topics."""
+    size: int
+    """Size of the journal (bytes)."""
+    seconds: float
+    """Time since the start (s)."""
+    lost: int
+    """Number of messages that are known to be lost."""
+
+
+def open_recording(
+    prefix: str, output: str | None, storage: str, *, lossless: bool = False
+) -> Recording:
+    """Start a recording to a path of the user, or to a new one that is named by the time.
+
+    Args:
+        prefix: Beginning of the name where the user gave none.
+        output: Path of the bag. None: `PREFIX_DATE-TIME` in the current directory.
+        storage: `mcap` or `sqlite3`.
+        lossless: Whether to wait for a slow disk, as in simulated time, or to drop messages.
+
+    Raises:
+        OSError: The bag exists or cannot be written. The message names it.
+    """
+    try:
+        if output is None:
+            return Recording.named_by_time(prefix, storage, lossless=lossless)
+        return Recording(Path(output), storage, lossless=lossless)
+    except OSError as error:
+        where = output or 'this directory'
+        raise OSError(f'cannot record to {where}: {(error.strerror or str(error)).lower()}') from error
+
+
+@contextmanager
+def saved_on_error(recording: Recording | None) -> Iterator[None]:
+    """Finish a recording if an exception is raised; discard it if that is a `UserError`.
+
+    Without an exception the recording stays open.
+    """
+    try:
+        yield
+    except UserError:
+        # Nothing ran.
+        if recording is not None:
+            recording.discard()
+        raise
+    except BaseException:
+        # The first error is the one to report.
+        if recording is not None:
+            with suppress(RecordingError):
+                recording.finish()
+        raise
+
+
+def record(
+    recording: Recording,
+    selection: Selection | None = None,
+    *,
+    max_duration: float | None = None,
+    ros_arguments: Sequence[str] = (),
+    signals: Signals | None = None,
+    on_status: Callable[[Status], object] | None = None,
+) -> Summary:
+    """Record until a signal is caught, the time is over, ROS is shut down or the disk fails.
+
+    Args:
+        recording: Where to record. It is finished, or discarded on a `UserError`.
+        selection: Which topics. None: those of a run.
+        max_duration: Longest duration (s). None: no limit.
+        ros_arguments: ROS arguments of the node.
+        signals: Counter of the signals that end the recording. None: no signal does.
+        on_status: Receives the status, several times a second.
+
+    Returns:
+        What the bag contains.
+
+    Raises:
+        UserError: The ROS arguments are invalid.
+        RecordingError: The recording is not complete.
+    """
+    signals = signals or Signals()
+    with saved_on_error(recording):
+        if not signals.count:
+            _receive(
+                recording,
+                selection or Selection(),
+                ros_arguments,
+                signals,
+                max_duration,
+                on_status or (lambda status: None),
+            )
+    return recording.finish()
+
+
+def _receive(
+    recording: Recording,
+    selection: Selection,
+    ros_arguments: Sequence[str],
+    signals: Signals,
+    max_duration: float | None,
+    on_status: Callable[[Status], object],
+) -> None:
+    with (
+        ros_context([NAME, *ros_arguments]) as context,
+        running(context, closed_world=False) as runner,
+    ):
+        recorder = runner.add(lambda: Recorder(selection, recording, with_info=True, context=context))
+        discovered = -DISCOVERY_PERIOD
+
+        def over() -> bool:
+            nonlocal discovered
+            now = time.monotonic()
+            if now - discovered >= DISCOVERY_PERIOD:
+                discovered = now
+                recorder.discover()
+                on_status(_status(recorder, recording))
+            late = max_duration is not None and now - recording.started >= max_duration
+            return bool(signals.count or late or recording.error)
+
+        if runner.spin(over) and recording.error is None:
+            recorder.end()
+            # A second signal does not wait.
+            before = signals.count
+            runner.spin(lambda: recorder.drained() or signals.count > before)
+
+
+def _status(recorder: Recorder, recording: Recording) -> Status:
+    return Status(
+        messages=recorder.messages,
+        topics=len(recorder.topics),
+        size=recording.journal.size,
+        seconds=time.monotonic() - recording.started,
+        lost=sum(recording.lost.values()),
+    )

@@ -1,0 +1,264 @@
+"""A client of the controller go_to_goal: it sends goals, and follows their status and the odometry."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Goals, Odometry
+from numpy.typing import NDArray
+from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_srvs.srv import Trigger
+
+from diffdrive_jacobian.control import Arrival
+from diffdrive_jacobian.messages import conversion as messages
+from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.ros.node import THROTTLE
+
+SILENCE = 3.0
+"""A controller that has not answered for this long was killed or hangs (s)."""
+DRIVEN_POINT_PARAMETERS = ('controller', 'offset')
+"""Parameters of a controller that determine which point of the robot it drives."""
+ENDED = (GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED)
+"""Status of goals that are not driven to any more."""
+MESSAGES: dict[str, type] = {'goal_pose': PoseStamped, 'goals': Goals}
+"""Topic of goals to its type."""
+
+
+class RobotState(NamedTuple):
+    """What an odometry message says about the robot."""
+
+    pose: NDArray[np.float64]
+    """`[x, y, theta]`, shape (3,) (m, m, rad)."""
+    moving: bool
+    """Whether its twist is not zero."""
+    stamp: int
+    """Timestamp of the message (ns)."""
+
+
+class GoalClient(Node):  # type: ignore[misc]
+    """Sends goals and follows their status and the odometry of the robot."""
+
+    def __init__(
+        self,
+        name: str,
+        goals: NDArray[np.float64],
+        context: Context,
+        *,
+        topic: Literal['goal_pose', 'goals'] = 'goals',
+        frame: str = '',
+        readers: int = 1,
+        **kwargs: Any,
+    ) -> None:
+        """Create the publisher, the subscriptions and the client of cancel_goal.
+
+        Args:
+            name: Name of the node.
+            goals: `[x, y, theta]` of each goal in order, shape (n, 3) (m, m, rad).
+            context: Context of the node.
+            topic: Where they are published. goal_pose takes one goal.
+            frame: Frame of the goals. Empty: the frame of the odometry.
+            readers: Number of subscriptions that the topic must have before the goals can be sent.
+            kwargs: Passed on to `rclpy.node.Node`.
+
+        Raises:
+            ValueError: `goals` has another shape than the topic takes.
+        """
+        if goals.ndim != 2 or goals.shape[1] != 3 or not len(goals):
+            raise ValueError(f'goals must have shape (n, 3) with n > 0, got {goals.shape}')
+        if topic == 'goal_pose' and len(goals) != 1:
+            raise ValueError(f'goal_pose takes one goal, got {len(goals)}')
+        super().__init__(name, context=context, **kwargs)
+        self.goals = goals
+        self.index = 0
+        """Index of the goal that is being driven to."""
+        self.arrival = Arrival()
+        """Determines which point of the robot is to arrive. The default is the axle centre."""
+        self.status = GoalStatus.STATUS_UNKNOWN
+        self.robot: RobotState | None = None
+        """State in the last odometry. None: no odometry was received."""
+        self.seen = time.monotonic()
+        """Time of the last odometry, or since when it is expected (s, monotonic)."""
+        self._frame = frame
+        self._readers = readers
+        self._topic = topic
+        self._send_on_odometry = False
+        self._message: PoseStamped | Goals | None = None
+        self._publisher = self.create_publisher(MESSAGES[topic], topic, 10)
+        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.create_subscription(GoalStatus, 'goal_status', self._on_status, latched)
+        self.create_subscription(Odometry, 'odom', self._on_odometry, 10)
+        # rclpy reports a name that is too long only here.
+        self.resolve_service_name('cancel_goal')
+        self._cancel = self.create_client(Trigger, 'cancel_goal')
+
+    @property
+    def distance(self) -> float:
+        """Distance from the point that is to arrive to the current goal (m). Infinite before the first
+        odometry.
+        """
+        if self.robot is None:
+            return math.inf
+        return float(self.arrival.distance(*self.robot.pose, *self.goals[self.index, :2]))
+
+    @property
+    def ended(self) -> bool:
+        """Whether the controller has finished with the goals, in whatever way."""
+        return self.status in ENDED
+
+    # --- Goals
+
+    def send(self) -> None:
+        """Publish the goals. Their stamp distinguishes them from older ones."""
+        self._send_on_odometry = False
+        message = self._goals()
+        messages.set_time(message.header.stamp, self.get_clock().now().nanoseconds)
+        message.header.frame_id = self._frame
+        self._message = message
+        self._publisher.publish(message)
+        self.seen = time.monotonic()
+
+    def send_on_odometry(self) -> None:
+        """Publish the goals when the next odometry is received."""
+        self._send_on_odometry = True
+
+    def withdraw(self) -> None:
+        """Do not send goals that wait for odometry."""
+        self._send_on_odometry = False
+
+    def cancel(self) -> None:
+        """Request the controller to cancel its goal."""
+        self._cancel.call_async(Trigger.Request())
+
+    def confirmed(self, timeout: float) -> bool:
+        """Wait until the goals are acknowledged by every subscription.
+
+        Args:
+            timeout: Longest wait (s).
+
+        Returns:
+            Whether they are.
+        """
+        acknowledged: bool = self._publisher.wait_for_all_acked(Duration(seconds=timeout))
+        return acknowledged
+
+    def _goals(self) -> PoseStamped | Goals:
+        poses = [PoseStamped() for _ in self.goals]
+        for pose, goal in zip(poses, self.goals, strict=True):
+            messages.set_pose(pose.pose, goal)
+        return Goals(goals=poses) if self._topic == 'goals' else poses[0]
+
+    # --- Controllers
+
+    def controllers(self) -> dict[bytes, str]:
+        """Map the publishers of goal_status, by GID, to the fully qualified names of their nodes.
+
+        Not every node that is subscribed to the goals is a controller. A name is empty while it is
+        unknown.
+        """
+        topic = self.resolve_topic_name('goal_status')
+        return {
+            bytes(info.endpoint_gid): ''.join(map(_full_name, _nodes([info])))
+            for info in self.get_publishers_info_by_topic(topic)
+        }
+
+    def set_controller_parameters(self, values: Mapping[str, Any]) -> None:
+        """Set the point that is to arrive from the controller's `DRIVEN_POINT_PARAMETERS`."""
+        self.arrival = Arrival(offset=driven_offset(values))
+
+    def obstacle(self) -> str | None:
+        """Describe what is missing before goals can be sent. None: nothing."""
+        if self.get_clock().now().nanoseconds == 0:
+            return 'use_sim_time is true, but nothing is published on /clock'
+        topic, status = self.resolve_topic_name(self._topic), self.resolve_topic_name('goal_status')
+        readers = [
+            reader
+            for reader in self.get_subscriptions_info_by_topic(topic)
+            # A subscription with transient local durability is never matched with this publisher.
+            if reader.qos_profile.durability != DurabilityPolicy.TRANSIENT_LOCAL
+        ]
+        matched = self._publisher.get_subscription_count()
+        if readers and matched < self._readers:
+            return f'{topic} has {matched} of {self._readers} subscriptions'
+        publishers = self.get_publishers_info_by_topic(status)
+        if matched < len(readers) or not _nodes(readers) & _nodes(publishers):
+            return (
+                f'no node is subscribed to {topic} and publishes {status}; is go_to_goal running, in '
+                'the same namespace and the same ROS_DOMAIN_ID?'
+            )
+        return None
+
+    # --- Messages
+
+    def _on_status(self, message: GoalStatus) -> None:
+        # The status of an older goal is latched and comes first.
+        if self._message is not None and message.goal_info.stamp == self._message.header.stamp:
+            self.status = message.status
+
+    def _on_odometry(self, message: Odometry) -> None:
+        # Other processes may publish, and anything.
+        try:
+            pose = messages.from_pose(message.pose.pose)
+            stamp = messages.from_time(message.header.stamp)
+        except MessageError as error:
+            self.get_logger().warning(f'odometry dropped: {error}', throttle_duration_sec=THROTTLE)
+            return
+        twist = message.twist.twist
+        self.robot = RobotState(pose, (twist.linear.x, twist.angular.z) != (0.0, 0.0), stamp)
+        self.seen = time.monotonic()
+        if self._send_on_odometry:
+            self.send()
+
+
+def driven_offset(values: Mapping[str, Any]) -> float:
+    """Return x of the point that a controller drives, in the body frame (m). 0: the axle centre.
+
+    Args:
+        values: Values of `DRIVEN_POINT_PARAMETERS`, of any node. Invalid values count as missing.
+    """
+    offset = values.get('offset')
+    if values.get('controller') != 'offset_point' or not isinstance(offset, float):
+        return 0.0
+    return offset if math.isfinite(offset) else 0.0
+
+
+def _nodes(endpoints: Iterable[Any]) -> set[tuple[str, str]]:
+    """Return the nodes of endpoints. The name of a node may be discovered later than its topics."""
+    return {
+        (endpoint.node_namespace, endpoint.node_name)
+        for endpoint in endpoints
+        if not endpoint.node_name.startswith('_')
+    }
+
+
+def _full_name(node: tuple[str, str]) -> str:
+    namespace, name = node
+    return f'{namespace.rstrip("/")}/{name}'
+
+
+def loss(sent_to: Mapping[bytes, str], present: Mapping[bytes, str], silence: float) -> str | None:
+    """Describe why the controller of a goal is lost. None: it is not.
+
+    Args:
+        sent_to: The controllers to which the goal was sent, as from `GoalClient.controllers`.
+        present: The controllers that are present now.
+        silence: Time since any of them answered (s).
+    """
+    if not sent_to.keys() & present.keys():
+        return 'the controller is gone'
+    # DDS may list one that was killed for 20 s more, beside its successor.
+    successors = {present[gid] for gid in present.keys() - sent_to.keys()}
+    if restarted := sorted(successors & set(sent_to.values()) - {''}):
+        return f'the controller {restarted[0]} was restarted'
+    if silence >= SILENCE:
+        names = ', '.join(sorted(set(sent_to.values()) - {''}))
+        return f'the controller {names} has not answered for {SILENCE:g} s: it was killed or hangs'
+    return None

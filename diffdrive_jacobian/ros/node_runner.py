@@ -1,0 +1,102 @@
+"""The interface of the two runners of nodes, in real time (`ros.runner`) and in simulated time
+(`lockstep.runner`), and the code that they share.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import TypeVar
+
+from rclpy.context import Context
+from rclpy.exceptions import NameValidationException, ParameterException
+from rclpy.node import Node
+from rclpy.qos_overriding_options import InvalidQosOverridesError
+
+from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.parameters.declaration import ParameterError
+from diffdrive_jacobian.ros.node import ParameterizedNode
+from diffdrive_jacobian.ros.parameters import report_unknown
+from diffdrive_jacobian.ros.rclpy_internals import RCLError, reason
+from diffdrive_jacobian.text import printable
+
+N = TypeVar('N', bound=Node)
+
+MAX_NAME_LENGTH = 247
+"""Longest name of a topic or service, with its leading slash, that Fast DDS can have (characters)."""
+
+
+class NodeRunner(ABC):
+    """Nodes of one context, and the loop that executes their callbacks."""
+
+    def __init__(self, context: Context) -> None:
+        """Start without nodes.
+
+        Args:
+            context: The context in which the nodes must be created.
+        """
+        self.context = context
+        self._nodes: list[Node] = []
+        self._unknown_reported = False
+
+    @abstractmethod
+    def seconds(self) -> float:
+        """Return the time of the nodes, from an arbitrary zero (s)."""
+
+    def add(self, create: Callable[[], N]) -> N:
+        """Create a node and add it.
+
+        Args:
+            create: Creates the node in `context`.
+
+        Raises:
+            UserError: The user gave an invalid name, parameter or quality of service.
+        """
+        node = created(create)
+        self._nodes.append(node)
+        self._add(node)
+        return node
+
+    def spin(self, until: Callable[[], bool]) -> bool:
+        """Execute callbacks until a condition is true.
+
+        Args:
+            until: The condition. It is called often.
+
+        Returns:
+            Whether the condition became true. False: the context was shut down before.
+        """
+        if not self._unknown_reported:
+            self._unknown_reported = True
+            report_unknown([node for node in self._nodes if isinstance(node, ParameterizedNode)])
+        return self._spin(until)
+
+    @abstractmethod
+    def _add(self, node: Node) -> None:
+        """Execute the callbacks of a node from now on."""
+
+    @abstractmethod
+    def _spin(self, until: Callable[[], bool]) -> bool:
+        """Do what `spin` describes."""
+
+
+def created(create: Callable[[], N]) -> N:
+    """Create a node.
+
+    Raises:
+        UserError: The user gave an invalid name, parameter or quality of service.
+    """
+    try:
+        return create()
+    except NameValidationException as error:
+        # Its lines: the kind of name and the rule, the name, a mark under the place.
+        rule, name, *_ = str(error).splitlines()
+        raise UserError(f'{rule} {printable(name.strip())}') from error
+    except (ParameterError, ParameterException, InvalidQosOverridesError) as error:
+        raise UserError(str(error)) from error
+    except RCLError as error:
+        why = reason(error)
+        if 'length should not exceed' in why:
+            # Each part was short enough, see `ros_context`.
+            why += f'; a name with its namespace must have at most {MAX_NAME_LENGTH} characters'
+        raise UserError(why) from error

@@ -1,0 +1,297 @@
+"""A goal that is sent to a controller in another process, and followed until it has ended."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Protocol
+
+import numpy as np
+from action_msgs.msg import GoalStatus
+from numpy.typing import ArrayLike
+
+from diffdrive_jacobian.ros.goal_client import DRIVEN_POINT_PARAMETERS, GoalClient, loss
+from diffdrive_jacobian.ros.liveness import Liveness
+from diffdrive_jacobian.ros.node_runner import NodeRunner
+from diffdrive_jacobian.ros.runner import ros_context, running
+from diffdrive_jacobian.signals import Signals
+
+NAME = 'send_goal'
+"""Name of the node."""
+PATIENCE = 10.0
+"""Default of the longest wait for a controller (s)."""
+ANSWER_PATIENCE = 5.0
+"""Longest time in which a controller may accept a goal, or confirm that it canceled (s)."""
+PARAMETER_PATIENCE = 1.0
+"""Longest time in which a controller may report its parameters (s)."""
+DISCOVERY_PERIOD = 1.0
+"""Time between two queries of the publishers of goal_status (s)."""
+
+
+class Result(Enum):
+    """The end of a goal, as its client sees it."""
+
+    NOT_SENT = auto()
+    """No controller was discovered in time."""
+    UNCONFIRMED = auto()
+    """It was sent, but not acknowledged by every subscription."""
+    SENT = auto()
+    """It was sent and acknowledged. It was not followed."""
+    NO_ANSWER = auto()
+    """The controller did not report whether it accepts the goal."""
+    ENDED = auto()
+    """The controller reported the end; `GoalResult.status` says which."""
+    LOST = auto()
+    """The controller was killed, was restarted or hangs."""
+    TIMEOUT = auto()
+    """It did not end in time, and was canceled."""
+    INTERRUPTED = auto()
+    """A signal came: it was not sent, or was canceled."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class GoalResult:
+    """What became of a goal."""
+
+    result: Result
+    topic: str
+    """Fully qualified name of the topic on which the goal is published."""
+    status: int = GoalStatus.STATUS_UNKNOWN
+    """Last status that the controller reported, as in action_msgs/GoalStatus."""
+    distance: float | None = None
+    """Distance from the driven point to the goal at the end (m). None: no odometry was received."""
+    reason: str = ''
+    """For NOT_SENT what is missing, for LOST what happened to the controller."""
+    canceled: bool | None = None
+    """Whether the controller confirmed that it canceled the goal. None: it was not asked to."""
+
+    @property
+    def arrived(self) -> bool:
+        """Whether the robot arrived at the goal."""
+        return self.result is Result.ENDED and self.status == GoalStatus.STATUS_SUCCEEDED
+
+    @property
+    def acknowledged(self) -> bool:
+        """Whether the goal was sent and acknowledged, and not followed."""
+        return self.result is Result.SENT
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether a signal ended the wait."""
+        return self.result is Result.INTERRUPTED
+
+
+class RemoteProgress(Protocol):
+    """Receives the progress of a goal."""
+
+    def waiting(self, reason: str) -> None:
+        """Receive what is missing before the goal can be sent, many times a second."""
+
+    def driving(self, distance: float) -> None:
+        """Receive the distance from the driven point to the goal (m), many times a second."""
+
+    def no_odometry(self, topic: str, seconds: float) -> None:
+        """Receive that no odometry was received on a topic for so long (s), once."""
+
+
+def send_goal(
+    goal: ArrayLike,
+    *,
+    frame: str = '',
+    readers: int = 1,
+    patience: float = PATIENCE,
+    timeout: float = math.inf,
+    follow: bool = True,
+    ros_arguments: Sequence[str] = (),
+    signals: Signals | None = None,
+    progress: RemoteProgress | None = None,
+) -> GoalResult:
+    """Send a goal to a controller in another process, and follow it until it has ended.
+
+    Args:
+        goal: `[x, y, theta]`, shape (3,) (m, m, rad).
+        frame: Frame of the goal. Empty: the frame of the odometry.
+        readers: Number of subscriptions that goal_pose must have before the goal is sent.
+        patience: Longest wait for the controller and for the subscriptions (s).
+        timeout: Time after which the goal is canceled (s).
+        follow: Whether to wait for the end. Otherwise for the acknowledgement only.
+        ros_arguments: ROS arguments of the node.
+        signals: Counter of the signals that cancel the goal. None: no signal does.
+        progress: Receives the progress. None: nothing does.
+
+    Raises:
+        UserError: The ROS arguments are invalid.
+        ValueError: `goal` has another shape.
+    """
+    goals = np.asarray(goal, dtype=np.float64)[np.newaxis]
+    with (
+        ros_context([NAME, *ros_arguments]) as context,
+        running(context, closed_world=False) as runner,
+    ):
+        client = runner.add(
+            lambda: GoalClient(
+                NAME,
+                goals,
+                context,
+                topic='goal_pose',
+                frame=frame,
+                readers=readers,
+                start_parameter_services=False,
+            )
+        )
+        session = _Session(client, runner, signals or Signals(), progress or _Silent())
+        return session.run(patience, timeout, follow=follow)
+
+
+class _Silent:
+    """A progress that is not shown."""
+
+    def waiting(self, reason: str) -> None:
+        pass
+
+    def driving(self, distance: float) -> None:
+        pass
+
+    def no_odometry(self, topic: str, seconds: float) -> None:
+        pass
+
+
+class _Session:
+    """The exchange with a controller about one goal."""
+
+    def __init__(
+        self, client: GoalClient, runner: NodeRunner, signals: Signals, progress: RemoteProgress
+    ) -> None:
+        self._client = client
+        self._runner = runner
+        self._signals = signals
+        self._progress = progress
+        self._lost: str | None = None
+
+    def run(self, patience: float, timeout: float, *, follow: bool) -> GoalResult:
+        client, signals = self._client, self._signals
+        if not self._spin(patience, self._ready):
+            if signals.count:
+                return self._result(Result.INTERRUPTED)
+            return self._result(Result.NOT_SENT, reason=client.obstacle() or '')
+        controllers = client.controllers()
+        client.send()
+        if not follow:
+            acknowledged = client.confirmed(ANSWER_PATIENCE)
+            return self._result(Result.SENT if acknowledged else Result.UNCONFIRMED)
+        names = sorted(set(controllers.values()) - {''})
+        liveness = Liveness(client, names, DRIVEN_POINT_PARAMETERS)
+
+        def accepted() -> bool:
+            liveness.silence()
+            return bool(client.status != GoalStatus.STATUS_UNKNOWN)
+
+        if not self._spin(ANSWER_PATIENCE, accepted):
+            if signals.count:
+                return self._cancel(Result.INTERRUPTED)
+            return self._result(Result.NO_ANSWER)
+        self._learn_driven_point(liveness)
+        self._follow(liveness, controllers, timeout)
+        if client.ended:
+            return self._result(Result.ENDED)
+        if self._lost is not None:
+            # A controller that only hangs receives it when it resumes: nobody follows the goal then.
+            client.cancel()
+            return self._result(Result.LOST, reason=self._lost)
+        return self._cancel(Result.INTERRUPTED if signals.count else Result.TIMEOUT)
+
+    def _ready(self) -> bool:
+        obstacle = self._client.obstacle()
+        if obstacle is not None:
+            self._progress.waiting(obstacle)
+        return obstacle is None
+
+    def _learn_driven_point(self, liveness: Liveness) -> None:
+        """Wait until the controller has reported which point of the robot it drives."""
+
+        def known() -> bool:
+            liveness.silence()
+            return liveness.answered
+
+        self._spin(PARAMETER_PATIENCE, known)
+        self._use(liveness)
+
+    def _use(self, liveness: Liveness) -> None:
+        """Use the parameters that the first controller has reported last."""
+        for name in sorted(liveness.values)[:1]:
+            self._client.set_controller_parameters(liveness.values[name])
+
+    def _follow(self, liveness: Liveness, controllers: Mapping[bytes, str], timeout: float) -> None:
+        """Wait until the goal has ended or the controller is lost, for a time (s) or until a signal."""
+        client = self._client
+        queried = time.monotonic()
+        reported = False
+        present = controllers
+
+        def over() -> bool:
+            nonlocal queried, reported, present
+            now = time.monotonic()
+            missing = now - client.seen > ANSWER_PATIENCE
+            if missing and not reported:
+                self._progress.no_odometry(client.resolve_topic_name('odom'), ANSWER_PATIENCE)
+            reported = missing
+            silence = liveness.silence()
+            # They may change while the robot drives.
+            self._use(liveness)
+            if client.robot is not None and not missing:
+                self._progress.driving(client.distance)
+            if client.ended:
+                return True
+            if now - queried >= DISCOVERY_PERIOD:
+                queried, present = now, client.controllers()
+            self._lost = loss(controllers, present, silence)
+            return self._lost is not None
+
+        self._spin(timeout, over)
+
+    def _cancel(self, result: Result) -> GoalResult:
+        """Cancel the goal, and wait until that is confirmed, or for another signal."""
+        client, signals = self._client, self._signals
+        distance = self._distance()
+        client.cancel()
+        before = signals.count
+        deadline = time.monotonic() + ANSWER_PATIENCE
+        self._runner.spin(lambda: client.ended or signals.count > before or time.monotonic() > deadline)
+        return self._result(result, distance=distance, canceled=client.ended)
+
+    def _distance(self) -> float | None:
+        return None if self._client.robot is None else self._client.distance
+
+    def _result(
+        self,
+        result: Result,
+        *,
+        reason: str = '',
+        distance: float | None = None,
+        canceled: bool | None = None,
+    ) -> GoalResult:
+        client = self._client
+        return GoalResult(
+            result=result,
+            topic=client.resolve_topic_name('goal_pose'),
+            status=client.status,
+            distance=self._distance() if distance is None else distance,
+            reason=reason,
+            canceled=canceled,
+        )
+
+    def _spin(self, seconds: float, until: Callable[[], bool]) -> bool:
+        """Spin until a condition is true; return False after a time (s) or a signal."""
+        deadline = time.monotonic() + seconds
+        reached = False
+
+        def over() -> bool:
+            nonlocal reached
+            reached = until()
+            return reached or self._signals.count > 0 or time.monotonic() > deadline
+
+        self._runner.spin(over)
+        return reached
