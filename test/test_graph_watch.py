@@ -25,7 +25,7 @@ def test_other_type_in_another_process_is_reported_once(monkeypatch, capfd, endp
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     monkeypatch.setenv('ROS_DOMAIN_ID', str(os.getpid() % 100 + 1))
     with ros_context(['test']) as context, ros_context(['other']) as other:
-        harness = Harness(context, make_executor(context, closed_world=False))
+        harness = Harness(context, make_executor(context, isolated=False))
         harness.add(VirtualRobot if endpoint == 'publishes' else GoToGoal)
         peer = Node('mismatched', context=other)
         if endpoint == 'publishes':

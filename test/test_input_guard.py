@@ -164,7 +164,7 @@ def plain(context):
 
 @pytest.mark.parametrize('make', [client_of_drive_to, client_of_send_goal])
 def test_goal_client_drops_odometry_with_a_negative_stamp(capfd, make):
-    with ros_context(['test']) as context, running(context, closed_world=True) as runner:
+    with ros_context(['test']) as context, running(context, isolated=True) as runner:
         node = runner.add(lambda: make(context))
         message = odometry(1.0, 2.0, 0.5)
         message.header.stamp.sec = -1
@@ -180,7 +180,7 @@ def test_goal_client_drops_odometry_with_a_negative_stamp(capfd, make):
 @pytest.mark.parametrize('make', [client_of_drive_to, client_of_send_goal, plain])
 def test_runner_guards_the_nodes_of_the_tools(capfd, make, isolated):
     arguments = ['test', '--ros-args', '-p', 'use_sim_time:=true']
-    with ros_context(arguments) as context, running(context, closed_world=isolated) as runner:
+    with ros_context(arguments) as context, running(context, isolated=isolated) as runner:
         node = runner.add(lambda: make(context))
         peer = runner.add(lambda: Node('peer', context=context))
         time = peer.create_publisher(Clock, '/clock', 10)

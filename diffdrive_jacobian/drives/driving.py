@@ -34,7 +34,7 @@ from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.recording.selection import Selection
 from diffdrive_jacobian.ros.goal_client import GoalClient
 from diffdrive_jacobian.ros.node_runner import NodeRunner
-from diffdrive_jacobian.ros.runner import Runner, closed_world, ros_context, running
+from diffdrive_jacobian.ros.runner import Runner, discovery_off, ros_context, running
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.time_units import nanoseconds
 
@@ -310,9 +310,9 @@ def in_real_time(ros_arguments: Sequence[str] = (), *, isolated: bool = True) ->
         UserError: The ROS arguments are invalid.
     """
     with (
-        closed_world() if isolated else nullcontext(),
+        discovery_off() if isolated else nullcontext(),
         ros_context([NAME, *ros_arguments]) as context,
-        running(context, closed_world=isolated) as runner,
+        running(context, isolated=isolated) as runner,
     ):
         yield runner
 

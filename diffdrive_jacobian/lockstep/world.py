@@ -24,7 +24,7 @@ from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
 from diffdrive_jacobian.lockstep._guard import Guard
 from diffdrive_jacobian.lockstep._simulated_time import SimulatedTime, checked_nanoseconds
 from diffdrive_jacobian.ros.rclpy_internals import SERVICES_OF_RCLPY, wrap_sleep
-from diffdrive_jacobian.ros.runner import UserError, closed_world, ros_context
+from diffdrive_jacobian.ros.runner import UserError, discovery_off, ros_context
 
 N = TypeVar('N', bound=Node)
 
@@ -85,7 +85,7 @@ class Lockstep(SimulatedTime):
     def _enter(self, args: Sequence[str], patience: float) -> None:
         arguments = ['lockstep', *args, '--ros-args', '-p', 'use_sim_time:=true']
         try:
-            with closed_world():
+            with discovery_off():
                 context = self._closing.enter_context(ros_context(arguments, default=True))
         except UserError as error:
             raise LockstepError(str(error)) from error

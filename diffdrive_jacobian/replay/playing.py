@@ -128,7 +128,7 @@ def replay(
         open_bag(bag) as reader,
         nullcontext() if acknowledgement_timeout is None else fast_heartbeats(),
         ros_context([NAME, *ros_arguments]) as context,
-        running(context, closed_world=False) as runner,
+        running(context, isolated=False) as runner,
     ):
         player = runner.add(lambda: Replayer(reader, playback, context=context))
         session = _Session(player, runner, signals, progress)

@@ -33,7 +33,7 @@ CHECK_PERIOD = 0.1
 
 
 @contextmanager
-def closed_world() -> Iterator[None]:
+def discovery_off() -> Iterator[None]:
     """Isolate contexts that are created: no other context, in whatever process, can reach them."""
     # The first is set. The others would take precedence over it.
     names = (
@@ -109,23 +109,23 @@ def _check_name_length(rule: str) -> None:
         )
 
 
-def make_executor(context: Context, *, closed_world: bool) -> Executor:
+def make_executor(context: Context, *, isolated: bool) -> Executor:
     """Return an executor.
 
     Args:
         context: The context of its nodes.
-        closed_world: Whether the nodes are isolated from other processes. Then it is an EventsExecutor,
+        isolated: Whether the nodes are isolated from other processes. Then it is an EventsExecutor,
             if rclpy has it, which takes a third of the time per message. Its queue is unbounded and
             first in, first out, so nodes that others can flood need the SingleThreadedExecutor.
     """
-    executor = events_executor(context) if closed_world else None
+    executor = events_executor(context) if isolated else None
     return executor or SingleThreadedExecutor(context=context)
 
 
 @contextmanager
-def running(context: Context, *, closed_world: bool) -> Iterator[Runner]:
+def running(context: Context, *, isolated: bool) -> Iterator[Runner]:
     """Create a runner. At the end stop and destroy its nodes."""
-    runner = Runner(context, make_executor(context, closed_world=closed_world))
+    runner = Runner(context, make_executor(context, isolated=isolated))
     try:
         yield runner
     finally:
