@@ -89,8 +89,8 @@ def test_refused_name_is_quoted_in_short_and_without_control_characters(lockstep
     add(GoToGoal)
     request = SetParameters.Request(parameters=[of_type('\x1b[2J' + 100_000 * 'n', 10)])
     (result,) = lockstep.call(SetParameters, 'go_to_goal/set_parameters', request).results
-    written = capfd.readouterr().err
-    assert 'parameter request refused: ' in written
+    lines = capfd.readouterr().err.splitlines()
+    (written,) = (line for line in lines if 'parameter request refused: ' in line)
     for text in (result.reason, written):
         assert len(text) < 300
         assert '\x1b' not in text
@@ -210,7 +210,7 @@ def test_exception_of_our_own_callbacks_is_not_caught(lockstep, add):
         lockstep.call(SetParameters, 'go_to_goal/set_parameters', request)
 
 
-def test_names_of_rclpy_that_the_guard_relies_on(ros):
+def test_rclpy_still_raises_for_what_the_guard_refuses(ros):
     node = ros.add(Node, node_name='bare', parameters={'use_sim_time': True})
     source = node._time_source
     assert source._clock_sub.callback == source.clock_callback
