@@ -104,16 +104,16 @@ class _Progress:
         from diffdrive_jacobian.tools._progress import Playing
         from diffdrive_jacobian.tools._waiting import Waiting
 
-        self._bar_of = Playing
+        self._create_bar = Playing
         self._bar: Playing | None = None
-        self._waiting_of = Waiting
+        self._create_waiting = Waiting
         self._waiting = Waiting()
 
     def waiting(self, reason: str) -> None:
         self._waiting.show(reason)
 
     def started(self, seconds: float) -> None:
-        self._bar = self._bar_of(seconds).__enter__()
+        self._bar = self._create_bar(seconds).__enter__()
 
     def playing(self, seconds: float, *, paused: bool) -> None:
         if self._bar is not None:
@@ -129,7 +129,7 @@ class _Progress:
         if self._bar is not None:
             self._bar.__exit__()
         # The acknowledgements come next.
-        self._waiting = self._waiting_of()
+        self._waiting = self._create_waiting()
 
 
 def _report(result: ReplayResult, options: argparse.Namespace) -> int:
