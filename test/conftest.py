@@ -106,7 +106,7 @@ def ros(request):
         'executor_kind' in request.fixturenames and request.getfixturevalue('executor_kind') == 'single'
     )
     with ros_context(['test']) as context:
-        harness = Harness(context, make_executor(context, closed_world=not single))
+        harness = Harness(context, make_executor(context, isolated=not single))
         yield harness
         harness.close()
 

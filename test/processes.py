@@ -138,7 +138,7 @@ class World:
         from diffdrive_jacobian.ros.runner import make_executor, ros_context
 
         context = self._stack.enter_context(ros_context(['test']))
-        harness = Harness(context, make_executor(context, closed_world=False))
+        harness = Harness(context, make_executor(context, isolated=False))
         self._stack.callback(harness.close)
         return harness
 

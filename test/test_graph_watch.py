@@ -16,8 +16,8 @@ from diffdrive_jacobian.ros import node as ros_node
 from diffdrive_jacobian.ros.runner import make_executor, ros_context
 
 
-@pytest.mark.parametrize('stranger', ['publishes', 'reads'])
-def test_other_type_in_another_process_is_said_once(monkeypatch, capfd, stranger):
+@pytest.mark.parametrize('endpoint', ['publishes', 'subscribes'])
+def test_other_type_in_another_process_is_reported_once(monkeypatch, capfd, endpoint):
     from conftest import Harness
 
     # Two contexts are two participants, as two processes are; they meet on this machine only.
@@ -25,10 +25,10 @@ def test_other_type_in_another_process_is_said_once(monkeypatch, capfd, stranger
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     monkeypatch.setenv('ROS_DOMAIN_ID', str(os.getpid() % 100 + 1))
     with ros_context(['test']) as context, ros_context(['other']) as other:
-        harness = Harness(context, make_executor(context, closed_world=False))
-        harness.add(VirtualRobot if stranger == 'publishes' else GoToGoal)
-        peer = Node('stranger', context=other)
-        if stranger == 'publishes':
+        harness = Harness(context, make_executor(context, isolated=False))
+        harness.add(VirtualRobot if endpoint == 'publishes' else GoToGoal)
+        peer = Node('mismatched', context=other)
+        if endpoint == 'publishes':
             peer.create_publisher(TwistStamped, 'cmd_vel', 10)
         else:
             peer.create_subscription(TwistStamped, 'cmd_vel', lambda _: None, 10)
@@ -38,17 +38,19 @@ def test_other_type_in_another_process_is_said_once(monkeypatch, capfd, stranger
         harness.until(lambda: len(looks) == 5, 'more looks')
         harness.close()
         peer.destroy_node()
-    theirs, ours = ('publishes', 'reads') if stranger == 'publishes' else ('reads', 'publishes')
-    assert (
-        f'/stranger {theirs} geometry_msgs/msg/TwistStamped on /cmd_vel, but this node {ours} '
-        'geometry_msgs/msg/Twist: nothing will arrive' in said
+    theirs, ours = (
+        ('publishes', 'subscribes to') if endpoint == 'publishes' else ('subscribes to', 'publishes')
     )
-    assert 'nothing will arrive' not in ''.join(looks)
+    assert (
+        f'/mismatched {theirs} /cmd_vel as geometry_msgs/msg/TwistStamped, but this node {ours} it as '
+        'geometry_msgs/msg/Twist: no message will arrive' in said
+    )
+    assert 'no message will arrive' not in ''.join(looks)
 
 
 @pytest.mark.parametrize('node_class', [GoToGoal, WheelBridge])
 def test_two_types_in_one_process_are_a_clear_error(add, node_class):
     add(VirtualRobot)
-    with pytest.raises(ParameterError, match='is enable_stamped_cmd_vel the same for all'):
+    with pytest.raises(ParameterError, match='is enable_stamped_cmd_vel the same for both'):
         add(node_class, enable_stamped_cmd_vel=True)
     add(node_class, 'elsewhere', enable_stamped_cmd_vel=True)

@@ -367,7 +367,7 @@ BAD = [
     (iv.joint_limit_gradient, {'q': [0.0]}, r'^(q|lower|upper)\b.* must .*got'),
     (iv.manipulability_gradient, {'jacobian': lambda q: np.eye(2)}, r'^jacobian must give'),
     (iv.manipulability_gradient, {'q': 0.0}, r'^q must have shape'),
-    (iv.prioritized, {'tasks': []}, r'^tasks must hold at least one'),
+    (iv.prioritized, {'tasks': []}, r'^tasks must contain at least one'),
     (iv.prioritized, {'tasks': [TWO, THREE]}, r'^tasks must all be about the same joints.*2, 3'),
     (iv.prioritized, {'tasks': [(J, [1.0, np.nan])]}, r'^x_dot of task 0 must be finite'),
     (iv.prioritized, {'tasks': [TWO, (RAGGED, [1.0])]}, r'^J of task 1 must be an array'),

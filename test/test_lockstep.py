@@ -230,7 +230,7 @@ def test_tasks_of_a_node_run_at_once(lockstep):
     assert done == [1]
     assert task.done()
     with pytest.raises(
-        LockstepError, match=r'cannot call executor.spin_once: the world does the spinning'
+        LockstepError, match=r'cannot call executor.spin_once: lockstep executes its callbacks'
     ):
         lockstep.node.executor.spin_once()
 
@@ -272,7 +272,7 @@ def test_what_is_made_in_a_callback_is_served_from_then_on(lockstep):
     lockstep.publish('b', Vector3(x=2.0))
     assert [message.x for message in heard] == [2.0]
     node.destroy_subscription(list(node.subscriptions)[-1])
-    with pytest.raises(LockstepError, match='nobody reads /b'):
+    with pytest.raises(LockstepError, match='/b has no subscription'):
         lockstep.publish('b', Vector3())
 
 
@@ -284,7 +284,7 @@ def test_removed_node_is_gone(lockstep):
     blinks.clear()
     lockstep.run_for(0.1)
     assert blinks == []
-    with pytest.raises(LockstepError, match='is not in this world'):
+    with pytest.raises(LockstepError, match='was not added'):
         lockstep.remove(blinker)
 
 

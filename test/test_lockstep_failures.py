@@ -25,7 +25,7 @@ def impatient():
         yield world
 
 
-def test_condition_that_never_holds_is_named_with_the_last_messages(lockstep):
+def test_condition_that_is_never_true_is_named_with_the_last_messages(lockstep):
     lockstep.add(Echo('parrot', 'a', 'b'))
     lockstep.publish('a', Vector3(x=0.5))
     with pytest.raises(LockstepError) as caught:
@@ -42,9 +42,9 @@ def never():
     return False
 
 
-def test_report_tells_topics_that_nobody_spoke_on(lockstep):
+def test_report_contains_topics_without_messages(lockstep):
     lockstep.add(Echo('parrot', 'a', 'b'))
-    assert '  /a: nothing; read by /parrot' in lockstep.report().splitlines()
+    assert '  /a: no message; subscribed by /parrot' in lockstep.report().splitlines()
 
 
 def test_report_shortens_messages(lockstep):
@@ -112,7 +112,7 @@ def test_callback_that_blocks_is_named(impatient, wait):
     assert time.monotonic() - begun < 60.0
     first = str(caught.value).splitlines()[0]
     assert first.startswith('at 1 s: Blocking.on_tick (timer of 0.1 s, node /blocking, ')
-    assert 'has not returned for 0.5 s of wall time; it stands at ' in first
+    assert 'has not returned for 0.5 s of wall time; it is at ' in first
     assert 'innocent' not in first
 
 
@@ -126,24 +126,24 @@ def test_service_that_calls_another_and_waits_is_named(impatient):
         impatient.call(Trigger, 'ask')
 
 
-def test_nodes_that_answer_each_other_for_ever_are_named(impatient):
+def test_endless_callbacks_are_named(impatient):
     impatient.add(Echo('ping', 'a', 'b'))
     impatient.add(Echo('pong', 'b', 'a'))
-    with pytest.raises(LockstepError, match='no end of callbacks for') as caught:
+    with pytest.raises(LockstepError, match='callbacks without end: for') as caught:
         impatient.publish('a', Vector3())
     first, *rest = str(caught.value).splitlines()
-    assert 'Echo.on_message (reads /a, node /ping' in first
-    assert 'Echo.on_message (reads /b, node /pong' in first
+    assert 'Echo.on_message (subscribed to /a, node /ping' in first
+    assert 'Echo.on_message (subscribed to /b, node /pong' in first
     assert any('/a: ' in line and 'from /pong' in line for line in rest)
 
 
 def test_timer_without_a_period_is_named(impatient):
     impatient.node.create_timer(0.0, lambda: None)
-    with pytest.raises(LockstepError, match=r'no end of callbacks .*timer of 0 s, node /lockstep'):
+    with pytest.raises(LockstepError, match=r'callbacks without end: .*timer of 0 s, node /lockstep'):
         impatient.run_for(1.0)
 
 
-def test_the_world_goes_on_after_a_failure(impatient):
+def test_lockstep_continues_after_a_failure(impatient):
     blocking = impatient.node.create_timer(0.1, lambda: time.sleep(1000))
     with pytest.raises(LockstepError):
         impatient.run_for(1.0)

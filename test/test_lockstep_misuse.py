@@ -33,15 +33,15 @@ def test_times_that_cannot_be_are_refused(lockstep, seconds):
 
 
 @pytest.mark.parametrize(
-    ('seconds', 'words'), [(0.0, 'not zero'), (-1.0, 'time 0'), (float('nan'), 'nan')]
+    ('seconds', 'words'), [(0.0, 'not zero'), (-1.0, 'a time after 0'), (float('nan'), 'nan')]
 )
-def test_jumps_that_cannot_be_are_refused(lockstep, seconds, words):
+def test_invalid_jumps_are_refused(lockstep, seconds, words):
     with pytest.raises(ValueError, match=words):
         lockstep.jump(seconds)
 
 
-def test_worlds_that_cannot_be_are_refused(lockstep):
-    with pytest.raises(LockstepError, match='another world is open in this process'):
+def test_invalid_use_is_refused(lockstep):
+    with pytest.raises(LockstepError, match='another Lockstep is open in this process'):
         Lockstep()
     lockstep.close()
     for wrong in ({'start': 0.0}, {'start': -1.0}, {'patience': 0.0}):
@@ -51,7 +51,7 @@ def test_worlds_that_cannot_be_are_refused(lockstep):
         Lockstep(['--ros-args', '--no-such-option'])
     rclpy.init()
     try:
-        with pytest.raises(LockstepError, match='rclpy is initialised already'):
+        with pytest.raises(LockstepError, match='rclpy is already initialized'):
             Lockstep()
     finally:
         rclpy.shutdown()
@@ -66,14 +66,14 @@ def test_worlds_that_cannot_be_are_refused(lockstep):
     thread = threading.Thread(target=in_a_thread)
     thread.start()
     thread.join()
-    assert failures == ['a world must be made and used in the main thread']
+    assert failures == ['Lockstep must be created and used in the main thread']
     with Lockstep() as world:
         world.add(Blinker())
 
 
-def test_nodes_that_do_not_belong_are_refused(lockstep):
+def test_nodes_that_cannot_be_added_are_refused(lockstep):
     blinker = lockstep.add(Blinker())
-    with pytest.raises(LockstepError, match='node /blinker was added already'):
+    with pytest.raises(LockstepError, match='node /blinker was already added'):
         lockstep.add(blinker)
     with Context() as context:
         stranger = Node('stranger', context=context)
@@ -87,7 +87,7 @@ def test_nodes_that_do_not_belong_are_refused(lockstep):
     taken = Node('taken')
     executor = SingleThreadedExecutor()
     executor.add_node(taken)
-    with pytest.raises(LockstepError, match='node /taken is served by an executor of its own'):
+    with pytest.raises(LockstepError, match='node /taken is in another executor'):
         lockstep.add(taken)
     executor.shutdown()
     taken.destroy_node()
@@ -96,7 +96,7 @@ def test_nodes_that_do_not_belong_are_refused(lockstep):
         lockstep.run_for(1.0)
 
 
-def test_closed_world_is_of_no_use(lockstep):
+def test_closed_lockstep_cannot_be_used(lockstep):
     blinker = lockstep.add(Blinker())
     lockstep.close()
     lockstep.close()
@@ -107,33 +107,37 @@ def test_closed_world_is_of_no_use(lockstep):
         lambda: lockstep.publish('a', Vector3()),
         lambda: lockstep.jump(1.0),
     ):
-        with pytest.raises(LockstepError, match='this world is closed'):
+        with pytest.raises(LockstepError, match='this Lockstep is closed'):
             use()
 
 
-def test_topics_and_services_that_are_not_there_are_named(lockstep):
+def test_missing_topics_and_services_are_named(lockstep):
     lockstep.listen(Twist, 'cmd_vel')
-    with pytest.raises(LockstepError, match='nobody reads /cmd_vell as geometry_msgs/msg/Twist'):
+    with pytest.raises(
+        LockstepError, match='/cmd_vell has no subscription of type geometry_msgs/msg/Twist'
+    ):
         lockstep.publish('cmd_vell', Twist())
     with pytest.raises(
-        LockstepError, match=r'/cmd_vel is geometry_msgs/msg/Twist, not geometry_msgs/msg/V'
+        LockstepError, match=r'/cmd_vel is of type geometry_msgs/msg/Twist, not geometry_msgs/msg/V'
     ):
         lockstep.publish('cmd_vel', Vector3())
     with pytest.raises(
-        LockstepError, match=r'/cmd_vel is geometry_msgs/msg/Twist, not geometry_msgs/msg/V'
+        LockstepError, match=r'/cmd_vel is of type geometry_msgs/msg/Twist, not geometry_msgs/msg/V'
     ):
         lockstep.listen(Vector3, 'cmd_vel')
     lockstep.add(Blinker())
-    words = r'no service /nowhere of std_srvs/srv/Trigger; there are: /blinker/forget$'
+    words = r'no service /nowhere of type std_srvs/srv/Trigger; services: /blinker/forget$'
     with pytest.raises(LockstepError, match=words):
         lockstep.call(Trigger, 'nowhere')
-    with pytest.raises(LockstepError, match=r'/forget is std_srvs/srv/Trigger, not std_srvs/srv/Empty'):
+    with pytest.raises(
+        LockstepError, match=r'/forget is of type std_srvs/srv/Trigger, not std_srvs/srv/Empty'
+    ):
         lockstep.call(Empty, 'blinker/forget')
 
 
 def test_two_nodes_of_one_name_are_refused(lockstep, robot_at):
     robot_at()
-    with pytest.raises(LockstepError, match='another node is called /virtual_robot: give one'):
+    with pytest.raises(LockstepError, match='another node has the name /virtual_robot: give one'):
         robot_at(x=1.0)
     robot_at(namespace='other')
 
@@ -143,9 +147,9 @@ def test_robot_without_such_a_parameter_is_refused(robot_at):
         robot_at(max_speed=3.0)
 
 
-def test_node_that_was_forgotten_is_told(lockstep):
+def test_node_that_was_not_added_is_reported(lockstep):
     forgotten = Blinker('forgotten')
-    assert '  made, but not added to the world: /forgotten' in lockstep.report().splitlines()
+    assert '  created, but not added to lockstep: /forgotten' in lockstep.report().splitlines()
     lockstep.add(forgotten)
     assert 'forgotten' not in lockstep.report().replace('from /forgotten', '')
 
@@ -156,16 +160,16 @@ def test_arguments_that_ros_would_pass_over_are_refused(lockstep):
         Lockstep(['-p', 'side:=0.5'])
 
 
-def test_node_that_is_spun_by_somebody_else_is_named(lockstep):
-    with pytest.raises(LockstepError, match='node /blinker cannot be spun by somebody else'):
+def test_node_that_another_executor_spins_is_named(lockstep):
+    with pytest.raises(LockstepError, match='node /blinker is in lockstep and cannot be spun'):
         rclpy.spin_once(lockstep.add(Blinker()), timeout_sec=0.0)
     waiting = lockstep.add(Blinker('waiting'))
     waiting.create_timer(0.1, lambda: rclpy.spin_until_future_complete(waiting, Future()))
-    with pytest.raises(LockstepError, match='node /waiting cannot be spun by somebody else'):
+    with pytest.raises(LockstepError, match='node /waiting is in lockstep and cannot be spun'):
         lockstep.run_for(1.0)
 
 
-def test_world_that_is_called_within_a_callback_says_so(lockstep):
+def test_use_within_a_callback_is_refused(lockstep):
     heard = lockstep.listen(Vector3, 'a')
     ticking = lockstep.node.create_timer(0.1, lambda: lockstep.publish('a', Vector3()))
     lockstep.run_for(0.2)
@@ -179,12 +183,12 @@ def test_world_that_is_called_within_a_callback_says_so(lockstep):
         lambda: lockstep.add(Node('new')),
     ):
         timer = lockstep.node.create_timer(0.1, call)
-        with pytest.raises(LockstepError, match='within a callback'):
+        with pytest.raises(LockstepError, match='a callback'):
             lockstep.run_for(0.1)
         lockstep.node.destroy_timer(timer)
 
 
-def test_world_in_another_thread_says_so(lockstep):
+def test_use_in_another_thread_is_refused(lockstep):
     failures = []
 
     def in_a_thread():
@@ -196,7 +200,7 @@ def test_world_in_another_thread_says_so(lockstep):
     thread = threading.Thread(target=in_a_thread)
     thread.start()
     thread.join()
-    assert failures == ['a world must be made and used in the main thread']
+    assert failures == ['Lockstep must be created and used in the main thread']
 
 
 def test_shutdown_of_rclpy_is_named(lockstep):
@@ -208,11 +212,11 @@ def test_shutdown_of_rclpy_is_named(lockstep):
 def test_second_clock_is_named(lockstep):
     node = Node('rival')
     node.create_publisher(ClockMessage, '/clock', 10)
-    with pytest.raises(LockstepError, match='node /rival publishes /clock, which the world does'):
+    with pytest.raises(LockstepError, match='node /rival publishes /clock, which only lockstep may do'):
         lockstep.add(node)
 
 
-def test_what_the_executor_of_the_world_lacks_is_an_attribute_error(lockstep):
+def test_missing_methods_of_the_executor_are_attribute_errors(lockstep):
     executor = lockstep.add(Node('asking')).executor
     assert not hasattr(executor, 'spin_once')
     assert getattr(executor, 'context', 'none') == 'none'

@@ -148,7 +148,7 @@ def test_unknown_parameters_are_named_with_what_was_meant(add, capfd):
     report_unknown([add(GoToGoal, kpp=1.0, colour='red')])
     said = capfd.readouterr().err
     assert "unknown parameter 'kpp' is ignored; did you mean 'kp'?" in said
-    assert "unknown parameter 'colour' is ignored; there are: " in said
+    assert "unknown parameter 'colour' is ignored; known parameters: " in said
     assert 'qos_overrides' not in said
 
 

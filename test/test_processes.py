@@ -29,7 +29,7 @@ def test_nodes_exit_0_on_a_signal(world):
     signals = [(signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT, signal.SIGINT)]
     children = [(world.start(name), numbers) for name in NODES for numbers in signals]
     for child, numbers in children:
-        child.until_says('ready: ')
+        child.until_says('subscribed to ')
         for number in numbers:
             child.signal(number)
     for child, _ in children:

@@ -198,5 +198,5 @@ def test_without_a_clock_the_bridge_stops_the_wheels(ros, capfd, monkeypatch):
     ros.until(lambda: len(out) == 2, 'the stop')
     assert list(out[1].velocity) == [0.0, 0.0]
     commands.publish(twist(0.2, 0.0))
-    ros.until_said(capfd, 'command dropped: simulated time has not begun')
+    ros.until_said(capfd, 'command dropped: simulated time has not started')
     assert len(out) == 2

@@ -14,25 +14,25 @@ from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.ros.runner import UserError, make_executor, ros_context, running
 
 
-def test_strangers_meet_the_fair_executor_and_a_closed_world_has_the_fast_one(ros):
-    open_to_all = make_executor(ros.context, closed_world=False)
+def test_isolated_nodes_have_the_events_executor_and_others_the_single_threaded_one(ros):
+    open_to_all = make_executor(ros.context, isolated=False)
     assert isinstance(open_to_all, SingleThreadedExecutor)
     open_to_all.shutdown()
-    closed = make_executor(ros.context, closed_world=True)
+    closed = make_executor(ros.context, isolated=True)
     assert type(closed).__name__ == 'EventsExecutor'
     closed.shutdown()
 
 
-def test_older_jazzy_has_only_the_fair_one(ros, monkeypatch):
+def test_without_the_events_executor_all_have_the_single_threaded_one(ros, monkeypatch):
     monkeypatch.setitem(sys.modules, 'rclpy.experimental.events_executor', None)
-    executor = make_executor(ros.context, closed_world=True)
+    executor = make_executor(ros.context, isolated=True)
     assert isinstance(executor, SingleThreadedExecutor)
     executor.shutdown()
 
 
-@pytest.mark.parametrize('closed_world', [False, True])
-def test_loop_ends_when_its_condition_holds_or_ros_shuts_down(closed_world):
-    with ros_context(['test']) as context, running(context, closed_world=closed_world) as runner:
+@pytest.mark.parametrize('isolated', [False, True])
+def test_loop_ends_when_its_condition_holds_or_ros_shuts_down(isolated):
+    with ros_context(['test']) as context, running(context, isolated=isolated) as runner:
         node = runner.add(lambda: Node('ticking', context=context))
         ticks = []
         node.create_timer(0.01, lambda: ticks.append(1))
@@ -49,7 +49,7 @@ def test_every_node_is_stopped_before_any_is_destroyed():
             told.append((why, self.context.ok(), len(self.get_node_names())))
 
     with ros_context(['test']) as context:
-        with running(context, closed_world=True) as runner:
+        with running(context, isolated=True) as runner:
             runner.add(lambda: VirtualRobot(context=context))
             runner.add(lambda: Telling(context=context))
         assert told == [('shutting down', True, 2)]
@@ -59,7 +59,7 @@ def test_mistakes_of_the_user_are_named():
     with (
         pytest.raises(UserError, match=r"'wheel_radius' must be in \[0.001, 10\], got 0.0"),
         ros_context(['test', '--ros-args', '-p', 'wheel_radius:=0.0']) as context,
-        running(context, closed_world=True) as runner,
+        running(context, isolated=True) as runner,
     ):
         runner.add(lambda: VirtualRobot(context=context))
     with (
@@ -98,7 +98,7 @@ def test_names_that_are_too_long_are_mistakes_of_the_user(arguments, words):
     with (
         pytest.raises(UserError) as caught,
         ros_context(['test', '--ros-args', *arguments]) as context,
-        running(context, closed_world=True) as runner,
+        running(context, isolated=True) as runner,
     ):
         runner.add(lambda: VirtualRobot(context=context))
     message = str(caught.value)
@@ -119,7 +119,7 @@ def test_names_that_are_too_long_are_mistakes_of_the_user(arguments, words):
 def test_names_of_the_greatest_length_are_accepted(arguments):
     with (
         ros_context(['test', '--ros-args', *arguments]) as context,
-        running(context, closed_world=True) as runner,
+        running(context, isolated=True) as runner,
     ):
         runner.add(lambda: VirtualRobot(context=context))
 

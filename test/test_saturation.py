@@ -207,3 +207,11 @@ def test_a_twist_whose_wheel_speeds_overflow_is_slowed_down_to_its_limit(fast):
 
 def fastest_wheel_of(v, omega, r, separation):
     return max(map(abs, body_to_wheel(v, omega, r, separation)))
+
+
+def test_wheel_geometry_is_needed_only_for_a_limit_of_the_wheels():
+    limits = VelocityLimits(max_v=0.5)
+    assert saturate(1.0, 2.0, limits) == saturate(1.0, 2.0, limits, R, L) == (0.5, 1.0)
+    for missing in ((), (R,), (None, L)):
+        with pytest.raises(ValueError, match='limits have a max_wheel_speed, so r and L must be given'):
+            saturate(1.0, 2.0, VelocityLimits(max_wheel_speed=1.0), *missing)

@@ -116,13 +116,13 @@ def test_stamps_that_cannot_be_are_dropped(lockstep, robot_at, timeout):
 @pytest.mark.parametrize(
     ('offset', 'words'),
     [
-        (1, 'its stamp lies 0.000000 s in the future'),
-        (SECOND, 'its stamp lies 1.000000 s in the future'),
-        (-SECOND // 2 - 1, 's back, allowed is the timeout of 0.5 s'),
-        (-SECOND // 5, 'its stamp lies 0.100000 s before the last command, stop, placement'),
+        (1, 'its stamp is 0.000000 s in the future'),
+        (SECOND, 'its stamp is 1.000000 s in the future'),
+        (-SECOND // 2 - 1, 's old, more than the timeout of 0.5 s'),
+        (-SECOND // 5, 'its stamp is 0.100000 s older than the last command, stop, reset'),
     ],
 )
-def test_stamp_that_cannot_be_is_named(lockstep, robot_at, capfd, offset, words):
+def test_invalid_stamp_is_reported(lockstep, robot_at, capfd, offset, words):
     robot_at(enable_stamped_cmd_vel=True)
     lockstep.run_for(1.0)
     now = lockstep.now
@@ -167,14 +167,14 @@ def test_commands_late_by_less_than_their_distance_give_the_path_of_their_stamps
 # --- Placements
 
 
-def test_reset_while_driving_begins_anew_and_drives_on(lockstep, robot_at):
+def test_reset_while_driving_resets_the_pose_and_keeps_the_command(lockstep, robot_at):
     topics = Topics(lockstep)
     robot_at(0.5, -1.0, 2.0)
     lockstep.publish('cmd_vel', twist(1.0, 1.0))
     lockstep.run_for(0.25)
     assert covariance_of(topics.odom[-1])[0, 0] > 0.0
     response = lockstep.call(Trigger, 'reset_odometry')
-    assert (response.success, response.message[:22]) == (True, 'odometry begins anew a')
+    assert (response.success, response.message[:21]) == (True, 'odometry was reset to')
     assert topics.starts[1].pose == topics.starts[0].pose
     assert instants(topics.starts) == [SECOND, lockstep.now]
     lockstep.run_for(1.0)
@@ -205,7 +205,7 @@ def test_initialpose_while_driving_carries_its_covariance(lockstep, robot_at, fr
 @pytest.mark.parametrize(
     ('field', 'value', 'words'),
     [
-        ('header.frame_id', 'map', "frame 'odom', got 'map'"),
+        ('header.frame_id', 'map', "frame must be 'odom', got 'map'"),
         ('pose.pose.position.x', math.nan, 'position must be finite'),
         ('pose.pose.position.y', -math.inf, 'y -inf'),
         ('pose.pose.position.x', 1.1e6, 'x 1.1e+06'),

@@ -149,8 +149,8 @@ def test_without_a_timeout_the_wheels_turn_for_ever(lockstep, add, out):
         (math.inf, 0, 'twist must be finite'),
         (1e4, 0, 'twist must be within 1000 m/s'),
         (0.1, 1, 'in the future'),
-        (0.1, -SECOND // 2 - 1, 'allowed is the timeout of 0.5 s'),
-        (0.1, -6, 'before the last command'),
+        (0.1, -SECOND // 2 - 1, 'more than the timeout of 0.5 s'),
+        (0.1, -6, 'older than the last command'),
     ],
 )
 def test_rubbish_and_old_commands_are_dropped_and_named(lockstep, add, out, capfd, v, offset, words):
@@ -200,7 +200,7 @@ def test_jump_puts_the_stop_off_by_a_timeout_at_most(lockstep, add, out, seconds
     add(WheelBridge)
     lockstep.publish('cmd_vel', twist(0.2, 0.0))
     lockstep.jump(seconds)
-    # After a jump back the timeout begins anew.
+    # After a jump back the timeout is restarted.
     left = 0.5 - max(seconds, 0.0)
     assert list(comes_after(lockstep, out, left).velocity) == [0.0, 0.0]
 

@@ -13,7 +13,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 
-NANOSECONDS = 1_000_000_000
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 
 def to_rosbags(fields: dict[str, Any]) -> Qos:

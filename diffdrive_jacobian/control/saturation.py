@@ -105,7 +105,9 @@ class VelocityLimits:
         return 'min_v', 'max_v', 'min_omega', 'max_omega', 'max_wheel_speed'
 
 
-def saturate(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tuple[Any, Any]:
+def saturate(
+    v: Any, omega: Any, limits: VelocityLimits, r: Any = None, L: Any = None
+) -> tuple[Any, Any]:
     """Scale a twist by the largest factor, at most 1, that meets every limit; `v : omega` is kept.
 
     A direction whose limit is zero is forbidden: its component is set to zero first, because no other
@@ -118,8 +120,8 @@ def saturate(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tupl
         v: Forward speed, shape (...) (m/s).
         omega: Yaw rate, shape (...) (rad/s).
         limits: The limits.
-        r: Wheel radius, shape (...) (m); used only if the wheels have a limit.
-        L: Wheel separation, shape (...) (m); likewise.
+        r: Wheel radius, shape (...) (m). Required if the limits have a `max_wheel_speed`.
+        L: Wheel separation, shape (...) (m). Required if the limits have a `max_wheel_speed`.
 
     Returns:
         The limited `(v, omega)`, each of shape (...).
@@ -139,6 +141,8 @@ def saturate(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any) -> tupl
         return np.array(v), np.array(omega)
     wheels = type(limits.max_wheel_speed) is not float or limits.max_wheel_speed < np.inf
     if wheels:
+        if r is None or L is None:
+            raise ValueError('limits have a max_wheel_speed, so r and L must be given')
         r, L = operand('r', r, positive), operand('L', L, positive)
         single = single and type(r) is type(L) is float
     else:

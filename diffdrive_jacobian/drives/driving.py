@@ -29,14 +29,14 @@ from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.parameters.nodes import nanoseconds
 from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.recording.selection import Selection
 from diffdrive_jacobian.ros.goal_client import GoalClient
 from diffdrive_jacobian.ros.node_runner import NodeRunner
-from diffdrive_jacobian.ros.runner import Runner, closed_world, ros_context, running
+from diffdrive_jacobian.ros.runner import Runner, discovery_off, ros_context, running
 from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.time_units import nanoseconds
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.lockstep.runner import LockstepRunner
@@ -212,7 +212,7 @@ def drive_in(
     controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=overrides))
     client = runner.add(lambda: GoalClient(NAME, goals, context))
     client.arrival = controller.arrival
-    wheels = WheelSpeeds(client, (robot.parameters.left_wheel_name, robot.parameters.right_wheel_name))
+    wheels = WheelSpeeds(client, robot.parameters.wheel_names)
     nodes = (robot, bridge, controller, client)
     progress.nodes_created([node.get_fully_qualified_name() for node in nodes])
     discover = _recorder(runner, recording)
@@ -310,9 +310,9 @@ def in_real_time(ros_arguments: Sequence[str] = (), *, isolated: bool = True) ->
         UserError: The ROS arguments are invalid.
     """
     with (
-        closed_world() if isolated else nullcontext(),
+        discovery_off() if isolated else nullcontext(),
         ros_context([NAME, *ros_arguments]) as context,
-        running(context, closed_world=isolated) as runner,
+        running(context, isolated=isolated) as runner,
     ):
         yield runner
 

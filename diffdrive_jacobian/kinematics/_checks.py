@@ -1,4 +1,4 @@
-"""Checks of arguments; every error names the argument, what was got and what is allowed."""
+"""Checks of arguments. Errors name the argument, its value and the values allowed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_NANOSECONDS = 2**63 - 1
-"""Largest time in nanoseconds, which is that of ROS clocks."""
+"""Largest time of ROS clocks (ns)."""
 _FLOAT64 = np.dtype(np.float64)
 
 
@@ -22,7 +22,7 @@ def positive(name: str, value: Any) -> None:
     Raises:
         ValueError: An entry is zero, negative, infinite or NaN.
     """
-    # A plain float takes the first test alone: this runs for every message.
+    # A float needs the first test only. This runs for every message.
     inside = (value > 0.0) & (value < np.inf)
     if inside is not True and not np.all(inside):
         raise ValueError(f'{name} must be positive and finite, got {_first(value, inside)}')
@@ -40,7 +40,7 @@ def not_negative(name: str, value: Any) -> None:
 
 
 def offset(name: str, value: Any) -> None:
-    """Require a control point beside the axle.
+    """Require a control point off the axle.
 
     Raises:
         ValueError: An entry is zero, infinite or NaN.
@@ -48,13 +48,13 @@ def offset(name: str, value: Any) -> None:
     inside = (value != 0.0) & (abs(value) < np.inf)
     if inside is not True and not np.all(inside):
         raise ValueError(
-            f'{name} must be finite and not 0, for the Jacobian of the axle centre itself has rank 1; '
+            f'{name} must be finite and not 0, because the Jacobian of the axle centre has rank 1; '
             f'got {_first(value, inside)}'
         )
 
 
 def finite(name: str, value: Any) -> None:
-    """Require numbers.
+    """Require finite numbers.
 
     Raises:
         ValueError: An entry is infinite or NaN.
@@ -69,16 +69,16 @@ def finite(name: str, value: Any) -> None:
 
 
 def floats(name: str, value: Any) -> NDArray[np.float64]:
-    """Make a float array of a value.
+    """Convert a value to a float array.
 
     Raises:
-        ValueError: It holds something else than real numbers, or rows of several lengths.
+        ValueError: An entry is not a real number, or rows differ in length.
     """
     if type(value) is np.ndarray and value.dtype is _FLOAT64:
         return value
     try:
         array = np.asarray(value)
-        # Objects may be numbers, too, such as fractions.
+        # Objects may be numbers, such as fractions.
         known = array.dtype.kind in 'biuf'
         if not known and not (
             array.dtype.kind == 'O' and all(isinstance(entry, Real) for entry in array.flat)
@@ -92,41 +92,41 @@ def floats(name: str, value: Any) -> NDArray[np.float64]:
 
 
 def number(name: str, value: Any, check: Callable[[str, Any], None]) -> float:
-    """Make a float of a single number that passes a check.
+    """Convert a single number to a float, and check it.
 
     Raises:
-        ValueError: It does not, or it is something else.
+        ValueError: The check fails, or the value is not a single number.
     """
-    made = floats(name, value)
-    if made.ndim:
-        raise ValueError(f'{name} must be a single number, got shape {made.shape}')
-    check(name, float(made))
-    return float(made)
+    result = floats(name, value)
+    if result.ndim:
+        raise ValueError(f'{name} must be a single number, got shape {result.shape}')
+    check(name, float(result))
+    return float(result)
 
 
 def array(name: str, value: Any, *trailing: int | str) -> NDArray[np.float64]:
-    """Make a finite float array with these last axes; a letter stands for any length but zero.
+    """Convert a value to a finite float array with given last axes. A letter is any length but zero.
 
     Raises:
-        ValueError: The shape is another one, or an entry is infinite, NaN or no number.
+        ValueError: The shape differs, or an entry is infinite, NaN or not a number.
     """
-    made = floats(name, value)
-    shape = made.shape[made.ndim - len(trailing) :] if made.ndim >= len(trailing) else None
+    result = floats(name, value)
+    shape = result.shape[result.ndim - len(trailing) :] if result.ndim >= len(trailing) else None
     if shape is None or any(
         got == 0 if isinstance(wanted, str) else got != wanted
         for got, wanted in zip(shape, trailing, strict=True)
     ):
         axes = ', '.join(['...', *map(str, trailing)])
-        raise ValueError(f'{name} must have shape ({axes}), got {made.shape}')
-    finite(name, made)
-    return made
+        raise ValueError(f'{name} must have shape ({axes}), got {result.shape}')
+    finite(name, result)
+    return result
 
 
 def nanoseconds(name: str, value: Any) -> int:
     """Return a time or a duration in nanoseconds as an int.
 
     Raises:
-        ValueError: It is no integer, as seconds are not, or does not fit into 64 bits.
+        ValueError: The value is not an integer, or does not fit into 64 bits.
     """
     if type(value) is not int:
         try:
@@ -146,7 +146,7 @@ def boolean(name: str, value: Any) -> bool:
     """Return a Boolean.
 
     Raises:
-        ValueError: It is something else.
+        ValueError: The value is not a Boolean.
     """
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f'{name} must be True or False, got {short(value)}')
@@ -157,36 +157,36 @@ def instance(name: str, value: Any, wanted: type) -> None:
     """Require an object of a class.
 
     Raises:
-        ValueError: It is of another one.
+        ValueError: The value is of another class.
     """
     if not isinstance(value, wanted):
         raise ValueError(f'{name} must be of class {wanted.__name__}, got {short(value)}')
 
 
 def function(name: str, value: Any) -> None:
-    """Require something that can be called.
+    """Require a callable object.
 
     Raises:
-        ValueError: It cannot be called.
+        ValueError: The value is not callable.
     """
     if not callable(value):
         raise ValueError(f'{name} must be a function, got {short(value)}')
 
 
 def read_only(value: Any) -> NDArray[np.float64]:
-    """Return a copy of an array that cannot be changed, for objects that are values."""
+    """Return a read-only copy of an array, for immutable objects."""
     copy = np.array(value, dtype=np.float64)
     copy.setflags(write=False)
     return copy
 
 
 def equal(first: Any, second: Any) -> bool:
-    """Return whether numbers or arrays have equal shapes and entries; NaN equals NaN."""
+    """Return whether numbers or arrays have equal shapes and entries. NaN equals NaN."""
     return bool(np.array_equal(first, second, equal_nan=True))
 
 
 def hashable(value: Any) -> Any:
-    """Return what equal numbers and arrays have in common, for a hash."""
+    """Return a hashable object that is equal for equal numbers or arrays."""
     return value if isinstance(value, float) else (value.shape, *value.ravel().tolist())
 
 
@@ -194,10 +194,10 @@ def leading(**shapes: tuple[int, ...]) -> tuple[int, ...]:
     """Broadcast the leading axes of arguments.
 
     Args:
-        shapes: For each argument the axes that are left when those of one robot are taken away.
+        shapes: For each argument its shape without the axes of a single robot.
 
     Returns:
-        The axes of the whole batch.
+        Shape of the batch.
 
     Raises:
         ValueError: They do not broadcast.
@@ -205,16 +205,16 @@ def leading(**shapes: tuple[int, ...]) -> tuple[int, ...]:
     try:
         return np.broadcast_shapes(*shapes.values())
     except ValueError:
-        # A single value goes with everything.
+        # A single value broadcasts with any shape.
         several = {name: shape for name, shape in shapes.items() if shape}
-        told = ', '.join(f'{name} {shape}' for name, shape in several.items())
+        shown = ', '.join(f'{name} {shape}' for name, shape in several.items())
         raise ValueError(
-            f'{" and ".join(several)} must have leading axes that broadcast, got {told}'
+            f'{" and ".join(several)} must have leading axes that broadcast, got {shown}'
         ) from None
 
 
 def short(value: Any) -> str:
-    """Return how a value is written, in at most 60 characters."""
+    """Return a value as text of at most 60 characters."""
     try:
         got = str(value)
     except ValueError:  # of an integer with thousands of digits
@@ -223,7 +223,7 @@ def short(value: Any) -> str:
 
 
 def _first(value: Any, inside: Any) -> str:
-    """Tell the first entry that is not inside, and where it stands."""
+    """Return the first invalid entry and its index, for an error message."""
     if np.ndim(value) == 0:
         return f'{value}'
     index = tuple(int(i) for i in np.argwhere(~np.asarray(inside))[0])

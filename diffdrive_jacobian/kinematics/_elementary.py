@@ -2,8 +2,8 @@
 
 A formula written with them serves a batch of thousands of robots, and serves one robot ten times
 faster than NumPy's scalars would: that matters where it runs for every message. Where a formula
-overflows, Python raises or gives infinity, and NumPy warns and gives infinity or NaN: with `evaluated`
-single and batched calls raise the same ValueError.
+overflows, Python raises or returns infinity, and NumPy warns and returns infinity or NaN: with
+`evaluated` single and batched calls raise the same ValueError.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ TURN = 2.0 * math.pi
 
 
 def components(name: str, value: Any, size: int) -> list[Any]:
-    """Split vectors along their last axis of `size` entries; a single vector gives floats.
+    """Split vectors along their last axis of `size` entries. A single vector is split into floats.
 
     Raises:
         ValueError: The last axis has another length, or there is none, or an entry is infinite, NaN
@@ -58,10 +58,10 @@ def operand(name: str, value: Any, check: Callable[[str, Any], None] = finite) -
 
 
 def agree(**values: Any) -> bool:
-    """Require arrays to broadcast; return whether there are none, but floats only.
+    """Require arrays to broadcast. Return whether all arguments are floats.
 
     Raises:
-        ValueError: They do not broadcast; all are named.
+        ValueError: They do not broadcast. The message names all of them.
     """
     for value in values.values():
         if type(value) is not float:
@@ -100,8 +100,8 @@ def evaluated(
             if all(np.isfinite(result).all() for result in results):
                 return alike(*results)
     except (OverflowError, ValueError, ZeroDivisionError):
-        # Floats raise where arrays give infinity or NaN: in `x**2`, `math.sin(inf)`, and where a divisor
-        # underflows to zero.
+        # Floats raise where arrays become infinity or NaN: in `x**2`, `math.sin(inf)`, and where a
+        # divisor underflows to zero.
         pass
     raise ValueError(f'{names} must give a finite result, but it overflows')
 
@@ -118,7 +118,7 @@ def wrapped(angle: Any) -> Any:
     if type(angle) is float:
         if -math.pi < angle <= math.pi:
             return angle
-        # math.fmod raises where NumPy gives NaN.
+        # math.fmod raises where NumPy returns NaN.
         angle = math.fmod(angle, TURN) if math.isfinite(angle) else math.nan
     elif not np.abs(angle).max(initial=0.0) < 1.5 * TURN:
         # Nearer than that, one subtraction below is enough, exact and faster.
@@ -157,7 +157,7 @@ def hypot(x: Any, y: Any) -> Any:
 
 def sinc(angle: Any) -> Any:
     """Compute sin(angle) / angle without a hole at zero (not NumPy's sin(pi x) / (pi x))."""
-    # A tiny angle in the place of zero gives exactly 1.
+    # The result is exactly 1 for a tiny angle, which replaces zero.
     angle = angle + (angle == 0.0) * 1e-20
     return sin(angle) / angle
 
@@ -178,7 +178,7 @@ def minimum(x: Any, y: Any) -> Any:
 
 
 def where(condition: Any, x: Any, y: Any) -> Any:
-    """X where the condition holds, else y."""
+    """Return x where the condition is true, otherwise y."""
     if type(condition) is bool:
         return x if condition else y
     return np.where(condition, x, y)

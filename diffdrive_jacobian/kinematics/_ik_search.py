@@ -20,7 +20,7 @@ STATIONARY = {'newton': 1e-6, 'transpose': 1e-6, 'levenberg_marquardt': 1e-7}
 
 The last one converges quadratically, to about the square root of the precision."""
 RELAXED = 0.9
-"""Share of the way to the least error that the line search goes: all of it, the path would zigzag."""
+"""Fraction of the step to the minimum that the line search takes. The full step would zigzag."""
 SECOND_ORDER_AFTER = 10
 """Steps of a search after which `levenberg_marquardt` adds the second derivatives of forward."""
 STALLED_AFTER = 30
@@ -32,14 +32,14 @@ Not with limits: these leave local minima, in which many searches may end before
 SAME = 1e-6
 """Relative difference up to which two errors are the same."""
 NUDGE = 0.1
-"""Share of the way to the restart point that a search goes which could not take a single step."""
+"""Fraction of the step to the restart point after a search that could not take a single step."""
 STEP = EPS**0.25
 """Of central differences of Jacobians, which may be differences themselves."""
 
 
 @dataclass
 class Outcome:
-    """What was found for each target, and the state of its search; shapes (k,), q (k, n)."""
+    """Best result for each target, and the state of its search. Shapes (k,), q (k, n)."""
 
     q: Floats
     error: Floats
@@ -65,7 +65,7 @@ class Outcome:
 
 
 class _Open(NamedTuple):
-    """The targets that are still searched for, one row each; e and J as `Task` gives them."""
+    """The targets that are not reached yet, one row each. e and J as `Task` returns them."""
 
     which: Integers
     q: Floats
@@ -122,7 +122,7 @@ class Search:
     def _advance(
         self, still: _Open, found: Outcome, J: Floats, gradient: Floats, again: Flags | None, count: int
     ) -> tuple[_Open, Flags]:
-        """Try a step for every row, or restart it; return the open rows, and whose search ended."""
+        """Try a step for every row, or restart it. Return the open rows, and whose search ended."""
         tried = still.q + self._step(still, found, J, gradient, count)
         if self.task.limits is not None:
             tried = np.clip(tried, *self.task.limits)
@@ -140,7 +140,8 @@ class Search:
         taken = finite & (change < 0.0) if self._descends() else finite
         if self.method == 'levenberg_marquardt':
             predicted = slope + still.factor * length**2
-            # A decrease that rounding would hide is none; cut off at limits, a step may lead uphill.
+            # A decrease below the rounding error does not count. A step cut off at limits may increase
+            # it.
             ended |= ~taken & (slope >= 0.0) & (predicted <= 4.0 * EPS * still.error**2)
             still.factor[:] = self._damped(still, predicted, change, taken)
         elif self._descends():
@@ -178,9 +179,9 @@ class Search:
     # --- Restarts
 
     def _may_restart(self, still: _Open, ended: Flags, found: Outcome) -> Flags:
-        """Note at which errors searches ended; return which targets, shape (k,), are worth another."""
+        """Store the errors at which searches ended. Return which targets to restart, shape (k,)."""
         which, error = still.which[ended], still.error[ended]
-        # A search without a single step may have began at a saddle point: its error says nothing.
+        # A search without a single step may have started at a saddle point, so its error is ignored.
         moved = found.iterations[which] > found.began[which]
         level = found.level[which]
         lower, same = moved & (error < (1.0 - SAME) * level), moved & (error <= (1.0 + SAME) * level)
@@ -201,7 +202,7 @@ class Search:
         moved = (found.iterations[which] > found.began[which])[:, np.newaxis]
         found.restarts[which] += 1
         found.began[which] = found.lowered[which] = found.iterations[which] + 1
-        # From a singular start a little aside is enough, and solutions near q0 are preferred.
+        # A small offset from a singular start is enough, and solutions near q0 are preferred.
         return np.where(moved, starts, q + NUDGE * (starts - q))
 
     def _sampled(self, n: int) -> Floats:
@@ -244,10 +245,10 @@ class Search:
     def _second_order(self, step: Floats, late: Flags, still: _Open, gradient: Floats) -> None:
         """Write the steps of these rows, with the second derivatives of forward in the Hessian.
 
-        `H = J^T M J - sum (M e)_i d^2 forward_i / dq^2`, its eigenvalues made positive, so that the step
-        `(|H| + lambda I)^-1 J^T M e` goes downhill. J^T M J alone is wrong by more than its smallest
-        eigenvalues where J is nearly singular: lambda would have to make up for that in all directions,
-        and hundreds of steps would be needed along the others.
+        `H = J^T M J - sum (M e)_i d^2 forward_i / dq^2`, with its eigenvalues made positive, so that the
+        step `(|H| + lambda I)^-1 J^T M e` is a descent direction. The error of J^T M J alone exceeds its
+        smallest eigenvalues where J is nearly singular. A lambda that compensates for it would shorten
+        the step in all directions, and hundreds of steps would be needed.
         """
         around, width = self.task.around(still.q, STEP)
         k, n = still.q.shape
@@ -290,7 +291,7 @@ class Search:
         return np.where(blocked[:, np.newaxis], 0.0, still.J), np.where(blocked, 0.0, gradient)
 
     def _movable(self, still: _Open, J: Floats, gradient: Floats) -> Flags:
-        """Return where a joint lowers the error to first order; nowhere if a Jacobian is not finite."""
+        """Return which joints lower the error to first order. None if a Jacobian is not finite."""
         # Joint by joint, so that their units do not matter.
         most = np.sqrt(np.einsum('kmn,kmn->kn', J, J)) * still.error[:, np.newaxis]
         movable: Flags = (np.abs(gradient) > STATIONARY[self.method] * most).any(axis=-1)

@@ -27,7 +27,7 @@ STEP = EPS ** (1.0 / 3.0)
 
 @dataclass(frozen=True)
 class Task:
-    """Targets, and the functions that say how far joints are from them."""
+    """Targets, and the functions that compute the errors of joint positions."""
 
     forward: Function
     jacobian: Function | None

@@ -32,14 +32,14 @@ Array = NDArray[np.float64]
 
 
 def gain(value: Any, damping: Any, least: Any) -> Any:
-    """Compute g(s), of floats or arrays; without damping singular values up to `least` count as zero."""
+    """Compute g(s) of floats or arrays. Without damping, singular values up to `least` count as zero."""
     kept = value > where(damping > 0.0, TINY, least)
     safe = where(kept, value, 1.0)
     return where(kept, 1.0 / (safe + damping * (damping / safe)), 0.0)
 
 
 def removal(value: Any, damping: Any, least: Any) -> Any:
-    """Compute f(s), of floats or arrays; without damping singular values up to `least` count as zero."""
+    """Compute f(s) of floats or arrays. Without damping, singular values up to `least` count as zero."""
     damped = damping > 0.0
     # Divided one after the other: the product may be too small for a number.
     filtered = minimum(value / where(damped, damping, 1.0) / FILTER, 1.0)
@@ -96,7 +96,7 @@ def joint_velocities(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | No
         q_dot_0: Secondary joint velocities, shape (..., n), or None.
 
     Returns:
-        Joint velocities, shape (..., n); infinite where a number cannot represent them.
+        Joint velocities, shape (..., n). Infinite where they overflow.
     """
     method = _two_rows if J.shape[-2] == 2 else _by_svd
     with np.errstate(all='ignore'):
@@ -246,7 +246,7 @@ def _two_rows(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None) -> 
 def _rotation(first: Any, second: Any, both: Any) -> tuple[Any, Any]:
     """Return cosine and sine of the angle that makes two rows orthogonal, the first the longer one.
 
-    Only with operations that are correctly rounded: floats and arrays give the same.
+    All operations are correctly rounded, so floats and arrays have equal results.
     """
     difference = first - second
     double = sqrt(difference * difference + 4.0 * both * both)

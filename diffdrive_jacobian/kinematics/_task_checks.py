@@ -41,8 +41,8 @@ def weighted(J: Array, weights: ArrayLike) -> tuple[Array, Array]:
     Raises:
         ValueError: A weight is not positive and finite, or the shape is wrong.
     """
-    given = array('weights', weights, J.shape[-1])
-    positive('weights', given)
-    leading(J=J.shape[:-2], weights=given.shape[:-1])
-    roots = np.sqrt(given)
+    values = array('weights', weights, J.shape[-1])
+    positive('weights', values)
+    leading(J=J.shape[:-2], weights=values.shape[:-1])
+    roots = np.sqrt(values)
     return J / roots[..., np.newaxis, :], roots

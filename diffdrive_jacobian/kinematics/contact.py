@@ -9,7 +9,7 @@ the rolling condition is the null space of the contact's Jacobian there: `x_dot 
 Everything broadcasts over leading axes. A radius that is not positive and finite, other values that
 are not finite, and shapes that do not broadcast raise ValueError.
 
-Source: document C, "Kinematic structure of mobile robots"; MATH.md, "Differential drive".
+Source: document C, "Kinematic structure of mobile robots"; doc/mathematics.md, "Differential drive".
 """
 
 from __future__ import annotations

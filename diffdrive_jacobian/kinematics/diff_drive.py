@@ -2,7 +2,7 @@
 
 State: pose `q = [x, y, theta]` (m, m, rad). Inputs: wheel speeds `w = [omega_R, omega_L]` (rad/s,
 positive drives forward) or the body twist `u = [v, omega]` (m/s, rad/s). Wheel radius `r` and wheel
-separation `L` in m. **Wheels stand right, left everywhere.**
+separation `L` in m. **The order of wheels is right, left.**
 
     w --J_w--> u --S(theta)--> q_dot
 
@@ -10,7 +10,7 @@ Everything broadcasts over leading axes. A radius or separation that is not posi
 angle or speed that is not finite, shapes that do not broadcast, and results that overflow raise
 ValueError, in single and in batched calls.
 
-Source: document A, equations (4)-(8); documents B and E; MATH.md, "Differential drive".
+Source: document A, equations (4)-(8); documents B and E; doc/mathematics.md, "Differential drive".
 """
 
 from __future__ import annotations
@@ -140,8 +140,8 @@ def wheel_to_position_jacobian(theta: ArrayLike, r: ArrayLike, L: ArrayLike) -> 
     """Map wheel speeds to the velocity of the axle centre alone: `[x_dot, y_dot] = S[:2] J_w w` (B).
 
     **It has rank 1 for every heading, radius and separation**: the axle centre moves along the
-    heading only, whatever the wheels do. No controller of the position can be made by inverting it;
-    a point beside the axle can be controlled, see `offset_point_jacobian`.
+    heading only, for all wheel speeds. It has no inverse that could control the position. A point off
+    the axle can be controlled, see `offset_point_jacobian`.
 
     Args:
         theta: Headings, shape (...) (rad).
@@ -158,11 +158,11 @@ def wheel_to_position_jacobian(theta: ArrayLike, r: ArrayLike, L: ArrayLike) -> 
 
 
 def offset_point(pose: ArrayLike, d: ArrayLike) -> NDArray[np.float64]:
-    """Give the point at distance d ahead of the axle centre: `[x + d cos, y + d sin]` (B).
+    """Return the point at x = d in the body frame: `[x + d cos, y + d sin]` in the world (B).
 
     Args:
         pose: `[x, y, theta]`, shape (..., 3).
-        d: Distance of the point, negative for one behind the axle, shape (...) (m).
+        d: Coordinate x of the point in the body frame, negative behind the axle, shape (...) (m).
 
     Returns:
         The points in the world, shape (..., 2) (m).
@@ -185,14 +185,14 @@ def offset_point_jacobian(
 ) -> NDArray[np.float64]:
     """Map wheel speeds to the velocity of the offset point (B).
 
-    `J_d = R(theta) [[r/2, r/2], [d r/L, -d r/L]]`. Its determinant is `-d r^2 / L`: it inverts for
-    every heading, because d is not 0.
+    `J_d = R(theta) [[r/2, r/2], [d r/L, -d r/L]]`. Its determinant is `-d r^2 / L`, so it is
+    invertible for every heading if d is not 0.
 
     Args:
         theta: Headings, shape (...) (rad).
         r: Wheel radius, shape (...) (m).
         L: Wheel separation, shape (...) (m).
-        d: Distance of the point ahead of the axle centre, not 0, shape (...) (m).
+        d: Coordinate x of the point in the body frame, not 0, shape (...) (m).
 
     Returns:
         The Jacobian, shape (..., 2, 2), over `[omega_R, omega_L]`.
@@ -220,7 +220,7 @@ def offset_point_jacobian(
 
 
 def body_to_wheel(v: Any, omega: Any, r: Any, L: Any) -> tuple[Any, Any]:
-    """Give the wheel speeds of a body twist: `J_w^-1 u`, written out (A, inverse of (8)).
+    """Return the wheel speeds of a body twist, `J_w^-1 u` in scalar form (A, inverse of (8)).
 
     Args:
         v: Forward speed, shape (...) (m/s).
@@ -248,7 +248,7 @@ def _wheel_speeds(v: Any, omega: Any, r: Any, L: Any) -> tuple[Any, Any]:
 
 
 def wheel_to_body(omega_R: Any, omega_L: Any, r: Any, L: Any) -> tuple[Any, Any]:
-    """Give the body twist of the wheel speeds: `J_w w`, written out (A(8)).
+    """Return the body twist of wheel speeds, `J_w w` in scalar form (A(8)).
 
     Args:
         omega_R: Speed of the right wheel, shape (...) (rad/s).
@@ -275,7 +275,7 @@ def _body_twist(omega_R: Any, omega_L: Any, r: Any, L: Any) -> tuple[Any, Any]:
 
 
 def no_lateral_slip_constraint(theta: ArrayLike) -> NDArray[np.float64]:
-    """Give the row `A(q) = [sin, -cos, 0]` with `A(q) q_dot = 0`: no motion sideways (A, E).
+    """Return the row `A(q) = [sin, -cos, 0]` with `A(q) q_dot = 0`, no lateral slip (A, E).
 
     Args:
         theta: Headings, shape (...) (rad).
@@ -293,7 +293,7 @@ def no_lateral_slip_constraint(theta: ArrayLike) -> NDArray[np.float64]:
 def rolling_constraints(
     theta: ArrayLike, r: ArrayLike, L: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Give the constraints of two rolling wheels as a pair with `A_q q_dot = A_w w` (E).
+    """Return the constraints of two rolling wheels, a pair with `A_q q_dot = A_w w` (E).
 
     Rows: no lateral slip, pure rolling of the right wheel, pure rolling of the left one. `A_q` is
     invertible, and `A_q^-1 A_w` is the chain `S(theta) J_w`.
@@ -324,9 +324,9 @@ def rolling_constraints(
 
 def _angles(theta: ArrayLike, **lengths: NDArray[np.float64]) -> NDArray[np.float64]:
     """Take headings that broadcast with the other arguments."""
-    made = array('theta', theta)
-    leading(theta=made.shape, **{name: length.shape for name, length in lengths.items()})
-    return made
+    angles = array('theta', theta)
+    leading(theta=angles.shape, **{name: length.shape for name, length in lengths.items()})
+    return angles
 
 
 def _geometry(r: ArrayLike, L: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

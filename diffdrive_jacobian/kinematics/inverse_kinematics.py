@@ -16,7 +16,7 @@ A search ends unsuccessfully where to first order no joint lowers the error: at 
 point, in a local minimum, or at a singular start, such as a stretched arm with the target on its own
 line. It is then restarted from random joints. Thousands of targets are solved at once, each with an
 outcome of its own, which does not depend on the others. A target that is not reached is a result, not an
-exception. Units are those of forward and q; q may hold rad and m.
+exception. Units are those of forward and q. q may contain rad and m.
 
 Source: document C, "Inverse kinematics" (its update lost the minus of `r_goal - r_i`); document D, 6.
 How lambda is lowered: H. B. Nielsen, *Damping Parameter in Marquardt's Method*, IMM-REP-1999-05. Why the
@@ -42,13 +42,13 @@ METHODS = ('newton', 'transpose', 'levenberg_marquardt')
 
 
 class IKResult(NamedTuple):
-    """What was found for each target; the leading axes are those of targets and starts.
+    """Result for each target. The leading axes are those of targets and starts.
 
     Attributes:
         q: The joints with the lowest error, shape (..., n).
         converged: Whether the error is within the tolerance, shape (...).
         iterations: Steps that were tried, over all starts, shape (...).
-        error: `sqrt(e^T M e)` at q, shape (...); not finite where forward(q0) is not.
+        error: `sqrt(e^T M e)` at q, shape (...). Not finite where forward(q0) is not.
         restarts: How often the search was restarted, shape (...).
         start: The start that led to q, shape (...): 0 for q0, i for the i-th restart.
     """
@@ -104,14 +104,15 @@ def solve(
     A search ends when the target is reached, when to first order no joint lowers its error, when a step
     is too small, and, where steps may raise the error (`newton`, `transpose` with alpha), after 30 steps
     in a row without a lower one. It is then restarted: from random joints within the limits, or, if it
-    could not take a single step, a tenth of the way from there. All targets use the same restart points.
+    could not take a single step, a tenth of the distance from there. All targets use the same restart
+    points.
 
-    A target is given up after `max_iterations` steps over all its searches, after `restarts` restarts,
-    when a function returns something that is not finite, and, without limits, when three searches ended
-    at the same lowest error: that is taken for the distance of the nearest reachable point. (Limits
-    leave local minima, in which many searches end alike.) `levenberg_marquardt`, and `transpose` without
-    alpha, never let the error grow within a search, and end at a point without a nearer one around it if
-    the steps suffice. The result is the best q of all searches.
+    The search for a target ends after `max_iterations` steps over all its searches, after `restarts`
+    restarts, when a function returns something that is not finite, and, without limits, when three
+    searches ended at the same lowest error: that is taken for the distance of the nearest reachable
+    point. (Limits leave local minima, in which many searches end alike.) `levenberg_marquardt`, and
+    `transpose` without alpha, never let the error grow within a search, and end at a point without a
+    nearer one around it if the steps suffice. The result is the best q of all searches.
 
     Args:
         forward: Maps joints of shape (k, n) to what they reach, shape (k, m). Called only for the
@@ -119,9 +120,9 @@ def solve(
         jacobian: Maps joints of shape (k, n) to the derivative of forward, shape (k, m, n). None takes
             central differences of forward (2 n calls of it in one batch).
         target: What is to be reached, shape (..., m).
-        q0: Where the search begins, shape (..., n); moved to the limits if it is beyond them.
+        q0: Start of the search, shape (..., n). Moved to the limits if it is beyond them.
         method: `newton`, `transpose` or `levenberg_marquardt`.
-        mask: Weights of the task's entries, the diagonal of M, shape (m,); zero leaves an entry out.
+        mask: Weights of the task's entries, the diagonal of M, shape (m,). Zero omits an entry.
             None weighs all of them 1.
         tolerance: The error `sqrt(e^T M e)` at which a target counts as reached.
         max_iterations: How many steps are tried at the most, over all starts of a target.
@@ -134,10 +135,10 @@ def solve(
         step_tolerance: A search ends after a step `|dq|` of this or less (D), in the unit of q; whether
             the target is reached depends on the error alone. Zero ends it when q does not change in
             double precision.
-        limits: Lower and upper limits of the joints, each of shape (n,) or one for all; infinite for
+        limits: Lower and upper limits of the joints, each of shape (n,) or one for all. Infinite for
             none. Steps end at them.
-        restarts: How often a search is restarted at the most; 0 searches from q0 alone.
-        seed: Seed or NumPy generator of the restart points; None draws others in every call. Joints
+        restarts: Largest number of restarts. 0: the search starts from q0 only.
+        seed: Seed or NumPy generator of the restart points. None: they differ in every call. Joints
             without limits are drawn from (-pi, pi], those with one limit from 2 pi next to it: give
             limits for joints that are not angles.
 
@@ -186,7 +187,7 @@ def solve(
         found = search.run(np.broadcast_to(q0, (*batch, n)).reshape(-1, n), int(max_iterations))
         converged = found.error <= search.tolerance
     fields = (found.q, converged, found.iterations, found.error, found.restarts, found.start)
-    # [()] makes a scalar of what a single target gives.
+    # [()] converts the result of a single target to a scalar.
     return IKResult._make(values.reshape((*batch, *values.shape[1:]))[()] for values in fields)
 
 
@@ -209,13 +210,13 @@ def _weights(mask: ArrayLike | None, m: int) -> Floats:
 def _limits(limits: tuple[ArrayLike, ArrayLike], n: int) -> tuple[Floats, Floats]:
     """Return lower and upper limits, shape (n,) each."""
     try:
-        given = [floats(name, side) for name, side in zip(('lower', 'upper'), limits, strict=True)]
+        sides = [floats(name, side) for name, side in zip(('lower', 'upper'), limits, strict=True)]
     except (TypeError, ValueError) as error:
         raise ValueError(f'limits must be a pair (lower, upper): {error}') from None
-    for side in given:
+    for side in sides:
         if side.shape not in ((), (n,)):
             raise ValueError(f'limits must have shape () or ({n},), as q0 has n = {n}, got {side.shape}')
-    lower, upper = (np.broadcast_to(side, n) for side in given)
+    lower, upper = (np.broadcast_to(side, n) for side in sides)
     # Not for NaN either.
     if not np.all((lower <= upper) & (lower < np.inf) & (upper > -np.inf)):
         raise ValueError(

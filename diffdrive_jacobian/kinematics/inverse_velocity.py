@@ -13,7 +13,7 @@ singular value s becomes 0. Here, with `J = sum s_i u_i v_i^T`,
 
     N = I - sum_i f_i v_i v_i^T,    f_i = 1 without damping, min(s_i / (FILTER lambda), 1) with damping.
 
-So nothing leaks from the null space into the task, `J N = 0`, without damping, and with damping wherever
+So null-space velocities do not disturb the task, `J N = 0`, without damping, and with damping wherever
 each singular value is 0 or at least `FILTER lambda`, a tenth of lambda. Elsewhere
 `|J N q_dot_0| <= FILTER lambda / 4 |q_dot_0|`, and N is continuous in J:
 `|dN| <= sqrt(2) / (FILTER lambda) |dJ|` in the Frobenius norm.
@@ -23,7 +23,7 @@ joint with a larger weight moves less. In the formulas and bounds J then stands 
 for `W^1/2 q_dot`, and lambda has the units of `J W^-1/2`.
 
 Source: document A, 3.2.1 and 3.2.5; document C, "Redundancy and singularity" and "Contact constraints";
-document D, 3; MATH.md, "Manipulators and inverse velocity". Filtering by singular direction: A. A.
+document D, 3; doc/mathematics.md, "Manipulators". Filtering by singular direction: A. A.
 Maciejewski, C. A. Klein, "Numerical filtering for the operation of robotic manipulators through
 kinematically singular configurations", 1988. Weights: D. E. Whitney, "Resolved motion rate control of
 manipulators and human prostheses", 1969; B. Siciliano et al., *Robotics: Modelling, Planning and
@@ -83,7 +83,7 @@ def adjugate_inverse(J: ArrayLike) -> Array:
 
     Raises:
         LinAlgError: A Jacobian is singular to working precision: the entries of an inverse would be
-            rounding errors. The message gives its determinant.
+            rounding errors. The message contains its determinant.
         ValueError: J has another shape.
     """
     J = array('J', J, 2, 2)
@@ -111,7 +111,7 @@ def pseudoinverse(J: ArrayLike, *, weights: ArrayLike | None = None) -> Array:
 
     Args:
         J: Jacobians, shape (..., m, n).
-        weights: Weights of the joints, positive, shape (..., n); None: all 1.
+        weights: Weights of the joints, positive, shape (..., n). None: all 1.
 
     Returns:
         The pseudo-inverses, shape (..., n, m).
@@ -156,10 +156,10 @@ def damped_least_squares(
         J: Jacobians, shape (..., m, n).
         x_dot: Task velocities, shape (..., m).
         damping: lambda, zero or positive, in the units of J, shape (...).
-        weights: Weights of the joints, positive, shape (..., n); None: all 1.
+        weights: Weights of the joints, positive, shape (..., n). None: all 1.
 
     Returns:
-        Joint velocities, shape (..., n); infinite where they exceed the largest number.
+        Joint velocities, shape (..., n). Infinite where they overflow.
     """
     J, x_dot = checked_task(J, x_dot)
     factor = checked_damping(damping)
@@ -182,10 +182,10 @@ def null_space_projector(
     Args:
         J: Jacobians, shape (..., m, n).
         damping: lambda, zero or positive, in the units of J, shape (...).
-        weights: Weights of the joints, positive, shape (..., n); None: all 1.
+        weights: Weights of the joints, positive, shape (..., n). None: all 1.
 
     Returns:
-        N, shape (..., n, n), symmetric; with weights `W N` is.
+        N, shape (..., n, n), symmetric. With weights `W N` is symmetric.
     """
     J, factor = array('J', J, 'm', 'n'), checked_damping(damping)
     if weights is None:
@@ -217,7 +217,7 @@ def redundant(
         x_dot: Task velocities, shape (..., m).
         q_dot_0: Secondary joint velocities, shape (..., n).
         damping: lambda, zero or positive, in the units of J, shape (...).
-        weights: Weights of the joints, positive, shape (..., n); None: all 1. To go uphill along the
+        weights: Weights of the joints, positive, shape (..., n). None: all 1. To go uphill along the
             gradient of a function with them, divide the gradient by the weights.
 
     Returns:

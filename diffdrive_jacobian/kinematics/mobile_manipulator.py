@@ -8,7 +8,7 @@ Everything broadcasts over leading axes: q has shape (..., 3 + n). Wrong shapes 
 finite raise ValueError. There are more inputs than task velocities: `inverse_velocity` chooses among
 them, with weights between wheels and joints, and with secondary tasks.
 
-Source: document A, 3.2.4, "Mobile Manipulators"; MATH.md, "Manipulators and inverse velocity".
+Source: document A, 3.2.4, "Mobile Manipulators"; doc/mathematics.md, "Manipulators".
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class MobileManipulator:
         return jacobian
 
     def integrate(self, q: ArrayLike, q_dot: ArrayLike, dt: ArrayLike) -> NDArray[np.float64]:
-        """Return the configuration after a time at constant input; the base drives an exact arc.
+        """Return the configuration after a time at constant input. The base follows an exact arc.
 
         Args:
             q: Configurations at the start, shape (..., 3 + n).

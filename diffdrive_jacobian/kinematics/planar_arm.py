@@ -7,7 +7,7 @@ Everything broadcasts over leading axes: q has shape (..., n). Wrong shapes and 
 finite raise ValueError.
 
 Source: document A, 3.2.1 (two links) and 3.2.5 (more than the task needs); document D, 2 and 5;
-MATH.md, "Manipulators and inverse velocity".
+doc/mathematics.md, "Manipulators".
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class PlanarArm:
     """
 
     lengths: NDArray[np.float64]
-    """From joint to joint, the last to the tip, shape (n,) (m); read-only."""
+    """Distances from joint to joint, the last to the tip, shape (n,) (m). Read-only."""
 
     def __init__(self, lengths: ArrayLike) -> None:
         """Take the lengths of the links, shape (n,), n >= 1 (m)."""
@@ -55,7 +55,7 @@ class PlanarArm:
             q: Joint angles, shape (..., n) (rad).
 
         Returns:
-            Positions in the arm's frame, shape (..., n + 1, 2) (m); the first is the base, [0, 0].
+            Positions in the frame of the arm, shape (..., n + 1, 2) (m). The first is the base, [0, 0].
         """
         angles = np.cumsum(self._angles(q), axis=-1)
         positions = np.zeros((*angles.shape[:-1], self.joints + 1, 2))
@@ -191,7 +191,7 @@ class PlanarArm:
             dt: Duration, shape (...) (s).
 
         Returns:
-            Joint angles at the end, shape (..., n) (rad); not wrapped, for a joint may have turned.
+            Joint angles at the end, shape (..., n) (rad). They are not wrapped.
         """
         q, q_dot, dt = self._angles(q), array('q_dot', q_dot, self.joints), array('dt', dt)
         leading(q=q.shape[:-1], q_dot=q_dot.shape[:-1], dt=dt.shape)

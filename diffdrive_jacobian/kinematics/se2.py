@@ -7,7 +7,7 @@ rad/s) is a velocity in B.
 Everything broadcasts over leading axes: a pose has shape (..., 3). Wrong shapes, values that are not
 finite, and results that overflow raise ValueError, in single and in batched calls.
 
-Source: MATH.md, "Motion of a virtual robot"; document B for the homogeneous transform.
+Source: doc/mathematics.md, "Motion"; document B for the homogeneous transform.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from diffdrive_jacobian.kinematics._elementary import (
 def wrap_angle(angle: ArrayLike) -> Any:
     """Wrap angles to (-pi, pi].
 
-    The result is exact with respect to the double nearest to 2 pi; an angle that is already inside
-    keeps its value to the last bit.
+    The result is exact with respect to the double nearest to 2 pi. An angle in the interval is returned
+    unchanged.
 
     Args:
         angle: Angles, any shape (rad).
@@ -64,7 +64,7 @@ def sinc(angle: ArrayLike) -> Any:
 
 
 def exp(twist: ArrayLike) -> NDArray[np.float64]:
-    """Move from the identity with a constant twist for unit time.
+    """Return the pose after motion from the identity with a constant twist for unit time.
 
     Args:
         twist: `[vx, vy, omega]`, shape (..., 3): velocity in B times time (m, m, rad).
@@ -83,7 +83,7 @@ def _exp(vx: Any, vy: Any, turn: Any) -> tuple[Any, ...]:
 
 
 def log(pose: ArrayLike) -> NDArray[np.float64]:
-    """Find the constant twist that reaches a pose from the identity in unit time: inverse of `exp`.
+    """Return the twist that reaches a pose from the identity in unit time, the inverse of `exp`.
 
     Args:
         pose: `[x, y, theta]`, shape (..., 3).
@@ -102,7 +102,7 @@ def _log(x: Any, y: Any, theta: Any) -> tuple[Any, ...]:
 
 
 def compose(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
-    """Place `second`, given in the frame of `first`, in the frame in which `first` is given.
+    """Return the composition of two poses: `second`, given in the frame B of `first`, in the frame W.
 
     Args:
         first: Pose of B in W, shape (..., 3).
@@ -134,7 +134,7 @@ def _inverse(x: Any, y: Any, theta: Any) -> tuple[Any, ...]:
 
 
 def homogeneous(pose: ArrayLike) -> NDArray[np.float64]:
-    """Write a pose as the homogeneous transform `H_B^W` (document B).
+    """Return the homogeneous transform `H_B^W` of a pose (document B).
 
     Args:
         pose: `[x, y, theta]`, shape (..., 3).
@@ -152,7 +152,9 @@ def homogeneous(pose: ArrayLike) -> NDArray[np.float64]:
 
 
 def integrate(pose: ArrayLike, twist: ArrayLike, dt: ArrayLike) -> NDArray[np.float64]:
-    """Hold a unicycle's twist for a time: `q * Exp(u dt)`, the exact arc (MATH.md, "Motion").
+    """Return the pose after a constant twist of a unicycle, the exact arc `q * Exp(u dt)`.
+
+    Source: doc/mathematics.md, "Motion".
 
     The chord `v dt sin(a/2)/(a/2)` along the heading `theta + a/2`, `a = omega dt`, loses no digits
     for small turns.
@@ -160,7 +162,7 @@ def integrate(pose: ArrayLike, twist: ArrayLike, dt: ArrayLike) -> NDArray[np.fl
     Args:
         pose: `[x, y, theta]` at the start, shape (..., 3).
         twist: `[v, omega]` (m/s, rad/s), shape (..., 2).
-        dt: Time for which the twist is held (s), shape (...); negative goes back.
+        dt: Duration of the twist (s), shape (...). Negative: backward in time.
 
     Returns:
         The pose at the end, shape (..., 3), theta wrapped.

@@ -7,7 +7,7 @@ configuration q. A mobile manipulator's inputs are fewer than its coordinates: w
 Everything broadcasts over leading axes. Wrong shapes, shapes that do not broadcast and values that are
 not finite raise ValueError.
 
-Source: document A, 3.2.3 and 3.2.5; document D, 3; MATH.md, "Manipulators and inverse velocity".
+Source: document A, 3.2.3 and 3.2.5; document D, 3; doc/mathematics.md, "Manipulators".
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def manipulability(J: ArrayLike) -> Array:
 
     Returns:
         w, shape (...): the product of the singular values, 0 where J is singular. Also 0 where it has
-        more rows than columns, because then some velocity cannot be produced.
+        more rows than columns, because some velocities cannot be produced then.
     """
     J = array('J', J, 'm', 'n')
     rows, columns = J.shape[-2:]
@@ -45,8 +45,8 @@ def manipulability_gradient(jacobian: Callable[[Array], ArrayLike], q: ArrayLike
     """Return the gradient of the manipulability, `dw / dq`: a motion away from singularities.
 
     It is computed by central differences, which are accurate to about ten digits. At a singular
-    configuration, where w has an edge, they give the mean of both sides. As a secondary task:
-    `redundant(J, x_dot, k * manipulability_gradient(arm.jacobian, q))`, k > 0 (A, 3.2.5).
+    configuration, where w is not differentiable, they return the mean of both sides. As a secondary
+    task: `redundant(J, x_dot, k * manipulability_gradient(arm.jacobian, q))`, k > 0 (A, 3.2.5).
 
     Args:
         jacobian: Returns the Jacobians, shape (..., m, inputs), of configurations of shape (..., n).
@@ -61,7 +61,7 @@ def manipulability_gradient(jacobian: Callable[[Array], ArrayLike], q: ArrayLike
     above, below = (manipulability(jacobian(around + sign * steps)) for sign in (1.0, -1.0))
     if above.shape != q.shape:
         raise ValueError(
-            f'jacobian must give one Jacobian for each configuration, shape (*{q.shape}, m, n), got '
+            f'jacobian must return one Jacobian for each configuration, shape (*{q.shape}, m, n), got '
             f'manipulabilities of shape {above.shape}'
         )
     gradient: Array = (above - below) / (2.0 * _STEP)

@@ -4,7 +4,7 @@ Models, damping, weights and null-space projectors are those of `inverse_velocit
 these functions. Everything broadcasts over leading axes. Wrong shapes, shapes that do not broadcast and
 values that are not finite raise ValueError.
 
-Source: document C, "Contact constraints"; MATH.md, "Manipulators and inverse velocity". B. Siciliano,
+Source: document C, "Contact constraints"; doc/mathematics.md, "Manipulators". B. Siciliano,
 J.-J. Slotine, "A general framework for managing multiple tasks in highly redundant robotic systems",
 1991.
 """
@@ -54,8 +54,8 @@ def prioritized(
         damping: lambda for all tasks, zero or positive, in the units of the J_k, shape (...).
         cutoff: Without damping, singular values of `J_k N` below this, relative to the norm of J_k,
             count as zero: what a task demands there is dropped. Must be above rounding error.
-        weights: Weights of the joints, positive, shape (..., n); None: all 1.
-        max_velocity: Largest joint speeds, see `limit_velocity`; None: no limits.
+        weights: Weights of the joints, positive, shape (..., n). None: all 1.
+        max_velocity: Largest joint speeds, see `limit_velocity`. None: no limits.
 
     Returns:
         Joint velocities, shape (..., n).
@@ -129,7 +129,7 @@ def _checked(tasks: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[tuple[Array, 
     except (TypeError, ValueError):
         raise ValueError(f'tasks must be pairs (J, x_dot), got {tasks!r:.60}') from None
     if not pairs:
-        raise ValueError('tasks must hold at least one (J, x_dot), got none')
+        raise ValueError('tasks must contain at least one (J, x_dot), got none')
     checked = [
         checked_task(J, x_dot, f'J of task {k}', f'x_dot of task {k}')
         for k, (J, x_dot) in enumerate(pairs)

@@ -1,4 +1,7 @@
-"""ROS nodes in simulated time that advances only when every node has answered."""
+"""ROS nodes in simulated time, which advances only when every node has processed its inputs.
+
+from diffdrive_jacobian.lockstep import Lockstep, LockstepError
+"""
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep.world import Lockstep

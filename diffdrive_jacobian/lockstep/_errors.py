@@ -1,10 +1,10 @@
-"""What goes wrong in a lockstep world."""
+"""Errors of lockstep."""
 
 from __future__ import annotations
 
 
 class LockstepError(Exception):
-    """A condition did not come true, time could not pass, or the world was misused.
+    """A condition was not met in time, simulated time could not advance, or lockstep was misused.
 
-    The first line of the message names it; the last messages of every topic follow where they help.
+    The first line of the message describes the error. The last messages of all topics may follow.
     """

@@ -1,9 +1,9 @@
-"""An executor that knows when nothing is left to do, and does everything in a reproducible order.
+"""An executor that detects when all work is done, and does it in a reproducible order.
 
-Messages, service calls and tasks run on rclpy's EventsExecutor, in the order in which they were sent:
-within one process Fast DDS hands a message to its readers before publish() returns. The timers are
-kept from it, for it fires them from a second thread, at an instant and in an order of that thread's
-own; here they are called one by one, the most overdue first, each after all messages were handled.
+Messages, service calls and tasks run on the EventsExecutor of rclpy, in the order in which they were
+sent. Within a process Fast DDS delivers a message before `publish` returns. The EventsExecutor would
+call timers from a second thread, at times and in an order that vary. Timers are therefore hidden from it
+and called here one by one, the most overdue first, each after all messages are processed.
 """
 
 from __future__ import annotations
@@ -15,28 +15,33 @@ from typing import Any
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.task import Task
 from rclpy.timer import Timer
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._served import Served, is_latched
-from diffdrive_jacobian.ros.runner import events_executor
+from diffdrive_jacobian.ros.rclpy_internals import (
+    RCLError,
+    TimerHandle,
+    events_executor,
+    new_task,
+    timer_handle,
+)
 
 LATCHED_PATIENCE = Duration(seconds=5.0)
-"""How long a latched message may take to reach a late reader (s); it takes microseconds."""
+"""Longest time for a latched message to reach a later subscription (s). It takes microseconds."""
 
 
 class QuiescentExecutor:
-    """Serves nodes until nothing is left to do at the present instant."""
+    """Executes the callbacks of nodes until none is left at the current simulated time."""
 
     def __init__(self, context: Context, on_registered: Callable[[Node], None]) -> None:
-        """Begin without nodes.
+        """Start without nodes.
 
         Args:
             context: The context of the nodes.
-            on_registered: Called with each node whose entities are new or changed.
+            on_registered: Called with each node when it is new or has created or destroyed an entity.
 
         Raises:
             LockstepError: This rclpy has no EventsExecutor.
@@ -44,7 +49,7 @@ class QuiescentExecutor:
         events: Any = events_executor(context)
         if events is None:
             raise LockstepError(
-                'lockstep needs the EventsExecutor of rclpy, which this ROS installation is too old for'
+                'lockstep needs the EventsExecutor of rclpy, which this ROS installation does not have'
             )
         self._events = events
         self._on_registered = on_registered
@@ -52,26 +57,26 @@ class QuiescentExecutor:
         self._facade = _Facade(self)
         self._changed = False
         self._tasks: list[_Task] = []
-        # Handles with their timers: asking the handle for its time costs a third of asking the timer.
-        self._sim_timers: list[tuple[Any, Timer]] = []
-        self._wall_timers: list[tuple[Any, Timer]] = []
+        # With their handles, whose methods take a third of the time of those of the timers.
+        self._sim_timers: list[tuple[TimerHandle, Timer]] = []
+        self._wall_timers: list[tuple[TimerHandle, Timer]] = []
 
     # --- Nodes
 
     @property
     def nodes(self) -> list[Node]:
-        """The nodes served, in the order in which they were added."""
+        """The nodes, in the order in which they were added."""
         return list(self._served)
 
     def add(self, node: Node) -> None:
-        """Serve a node."""
+        """Add a node."""
         self._served[node] = Served(node, self.create_task)
         node.executor = self._facade
         self._events.add_node(self._served[node])
         self._changed = True
 
     def remove(self, node: Node) -> None:
-        """Serve a node no longer."""
+        """Remove a node."""
         served = self._served.pop(node)
         self._release(node)
         self._events.remove_node(served)
@@ -80,7 +85,7 @@ class QuiescentExecutor:
         self.settle()
 
     def close(self) -> None:
-        """Serve nobody any more."""
+        """Remove all nodes and shut down."""
         for task in self._tasks:
             task.future.cancel()
         for node in self.nodes:
@@ -95,10 +100,10 @@ class QuiescentExecutor:
     # --- Work
 
     def settle(self) -> int | None:
-        """Handle what there is to handle at this instant, and all that follows from it.
+        """Execute all callbacks that are due at the current time, and all that they cause.
 
         Returns:
-            The time until the next timer of simulated time is due (ns); None: there is no such timer.
+            Time until the next timer in simulated time expires (ns); None: there is no such timer.
         """
         self._handle_all()
         while True:
@@ -111,15 +116,15 @@ class QuiescentExecutor:
                     self._handle_all()
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
-        """Run a function or a coroutine at this instant, or as far as it comes; gives its future."""
+        """Schedule a function or a coroutine for the current time. Return its future."""
         if _is_async(callback):
             callback, args, kwargs = callback(*args, **kwargs), (), {}
-        task = _Task(callback, Task(callback, args, kwargs, executor=self._facade))
+        task = _Task(callback, new_task(callback, args, kwargs, self._facade))
         self._tasks.append(task)
         return task.future
 
     def _handle_all(self) -> None:
-        """Handle messages, service calls and tasks until none is left that can go on."""
+        """Process messages, service calls and tasks until none is left that can continue."""
         while True:
             self._drain()
             if self._changed:
@@ -128,9 +133,9 @@ class QuiescentExecutor:
                 return
 
     def _run_tasks(self) -> bool:
-        """Let each task go on once; whether any of them did.
+        """Continue each task once. Return whether any made progress.
 
-        A coroutine does not tell what it waits for, so it is asked to go on and may wait again.
+        It is not known what a coroutine waits for, so it is continued and may wait again.
         """
         progress = False
         tasks, self._tasks = self._tasks, []
@@ -138,7 +143,7 @@ class QuiescentExecutor:
         try:
             while tasks:
                 task = tasks.pop(0)
-                progress |= task.go_on()
+                progress |= task.proceed()
                 if (error := task.future.exception()) is not None:
                     raise error
                 if not (task.future.done() or task.future.cancelled()):
@@ -148,10 +153,10 @@ class QuiescentExecutor:
         return progress
 
     def _drain(self) -> None:
-        """Handle events until none is left.
+        """Process events until none is left.
 
-        A task runs after all that was in the queue before it: if it is the first to run, there was
-        nothing else.
+        A task runs after all events that were queued before it. If it is the first event, the queue was
+        empty.
         """
         create_task, spin_once = self._events.create_task, self._events.spin_once
         while True:
@@ -163,8 +168,8 @@ class QuiescentExecutor:
             if events == 1:
                 return
 
-    def _due_timers(self) -> tuple[list[tuple[Any, Timer]], int | None]:
-        """Find the timers that are due, the most overdue first, and the time until the next one (ns)."""
+    def _due_timers(self) -> tuple[list[tuple[TimerHandle, Timer]], int | None]:
+        """Return the due timers, the most overdue first, and the time until the next one (ns)."""
         due, until_next = [], None
         for pair in self._sim_timers:
             left = pair[0].time_until_next_call()
@@ -178,11 +183,11 @@ class QuiescentExecutor:
             left = pair[0].time_until_next_call()
             if left is not None and left <= 0:
                 due.append((left, pair))
-        # Sorting is stable: equals stay in the order of their creation.
-        due.sort(key=lambda one: one[0])
+        # Sorting is stable: timers that are due at the same time stay in the order of their creation.
+        due.sort(key=lambda item: item[0])
         return [pair for _, pair in due], until_next
 
-    def _call(self, handle: Any, timer: Timer) -> None:
+    def _call(self, handle: TimerHandle, timer: Timer) -> None:
         handle.call_timer()
         result = timer.callback()
         if inspect.iscoroutine(result):
@@ -191,21 +196,21 @@ class QuiescentExecutor:
     # --- Entities
 
     def changed(self) -> None:
-        """Take note that a node has made or destroyed something."""
+        """Note that a node has created or destroyed an entity."""
         self._changed = True
 
     def _register(self) -> None:
-        """Look for what the nodes have made or destroyed since the last time.
+        """Register entities that the nodes have created since the last call, and forget destroyed ones.
 
-        A latched message reaches a late reader from another thread: it is waited for, and the readers
-        of latched topics are registered one by one, so that their messages come in one order.
+        Another thread delivers latched messages to later subscriptions. This waits for them, and
+        registers the subscriptions of latched topics one by one, which fixes the order of the messages.
         """
         self._changed = False
         for node, served in self._served.items():
             if list(node.guards):
                 raise LockstepError(
-                    f'{node.get_fully_qualified_name()} has a guard condition, which the executor of '
-                    'this world cannot serve'
+                    f'{node.get_fully_qualified_name()} has a guard condition, which lockstep does not '
+                    'support'
                 )
             for publisher in node.publishers:
                 if is_latched(publisher):
@@ -219,12 +224,14 @@ class QuiescentExecutor:
                 self._events.wake()
                 self._drain()
         timers = [timer for node in self._served for timer in node.timers]
-        self._sim_timers = [(timer.handle, timer) for timer in timers if _follows_sim_time(timer)]
-        self._wall_timers = [(timer.handle, timer) for timer in timers if not _follows_sim_time(timer)]
+        self._sim_timers = [(timer_handle(timer), timer) for timer in timers if _follows_sim_time(timer)]
+        self._wall_timers = [
+            (timer_handle(timer), timer) for timer in timers if not _follows_sim_time(timer)
+        ]
 
 
 def _nothing() -> None:
-    """Be a task."""
+    """Do nothing, as a task."""
 
 
 def _follows_sim_time(timer: Timer) -> bool:
@@ -232,33 +239,33 @@ def _follows_sim_time(timer: Timer) -> bool:
     return clock.clock_type == ClockType.ROS_TIME and bool(clock.ros_time_is_active)
 
 
-def _is_due(handle: Any) -> bool:
+def _is_due(handle: TimerHandle) -> bool:
     try:
         left = handle.time_until_next_call()
-    except rclpy_implementation.RCLError:
-        # A callback has destroyed it.
+    except RCLError:
+        # A callback has destroyed the timer.
         return False
     return left is not None and left <= 0
 
 
 class _Task:
-    """A task and how far its coroutine came."""
+    """A task and the point at which its coroutine waits."""
 
     def __init__(self, handler: Any, future: Task) -> None:
         self.future = future
         self._handler = handler
-        # Kept, so that no later one can take its identity.
+        # A reference is kept so that no later object has the same identity.
         self._waits_for: Any = self
 
-    def go_on(self) -> bool:
-        """Run it as far as it comes; whether it came any farther."""
+    def proceed(self) -> bool:
+        """Continue the task. Return whether it made progress."""
         before = self._waits_for
         self.future()
         self._waits_for = self._innermost()
         return bool(self.future.done()) or self._waits_for is not before
 
     def _innermost(self) -> Any:
-        """Follow the coroutine through all that it awaits."""
+        """Return the innermost object that the coroutine awaits."""
         point = self._handler
         while (
             inner := getattr(point, 'cr_await', None) or getattr(point, 'gi_yieldfrom', None)
@@ -274,37 +281,41 @@ def _is_async(callback: Any) -> bool:
 
 
 class _Facade:
-    """What a node takes for its executor."""
+    """The executor of the nodes, as they see it."""
 
     def __init__(self, executor: QuiescentExecutor) -> None:
         self._executor = executor
         self.released: Node | None = None
 
     def add_node(self, node: Node) -> bool:
-        """Accept what `Node.executor` announces; the world added the node before."""
+        """Accept a node. It was added before its `executor` is set."""
         return True
 
     def remove_node(self, node: Node) -> None:
-        """Accept it from the world only: else another executor is about to take the node."""
+        """Accept the removal of a node by lockstep.
+
+        Raises:
+            LockstepError: Another executor is about to add the node.
+        """
         if node is not self.released:
             raise LockstepError(
-                f'node {node.get_fully_qualified_name()} cannot be spun by somebody else: it is in '
-                'lockstep, and the world does the spinning'
+                f'node {node.get_fully_qualified_name()} is in lockstep and cannot be spun by another '
+                'executor'
             )
 
     def wake(self) -> None:
-        """Hear that a node has made or destroyed something."""
+        """Note that a node has created or destroyed an entity."""
         self._executor.changed()
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
-        """Run a function or a coroutine."""
+        """Schedule a function or a coroutine. Return its future."""
         return self._executor.create_task(callback, *args, **kwargs)
 
     def __getattr__(self, name: str) -> Any:
         raise _NoAttributeError(
-            f'a node in lockstep cannot call executor.{name}: the world does the spinning'
+            f'a node in lockstep cannot call executor.{name}: lockstep executes its callbacks'
         )
 
 
 class _NoAttributeError(LockstepError, AttributeError):
-    """What the executor does not have; `hasattr` gives False."""
+    """The executor has no such attribute. `hasattr` returns False."""

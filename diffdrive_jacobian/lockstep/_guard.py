@@ -1,8 +1,8 @@
-"""What ends a test when simulated time cannot pass: a callback that blocks, or callbacks without end.
+"""Detection of callbacks that block, or that cause each other without end.
 
-After `patience` seconds of wall time at one instant a second thread sends the main thread a signal. Its
-handler runs between two steps of the interpreter, also within a sleeping callback, looks for a moment at
-which callbacks are called, and raises.
+When one simulated time takes more than `patience` seconds of wall time, a second thread sends a signal
+to the main thread. Its handler also runs within a callback that sleeps. It observes for a moment which
+callbacks are called, then raises an error that names them.
 """
 
 from __future__ import annotations
@@ -23,33 +23,34 @@ import rclpy
 from rclpy.node import Node
 
 from diffdrive_jacobian.lockstep import _executor
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 SIGNAL = signal.SIGUSR2
-"""Neither pytest nor its plugins use it; pytest-timeout uses SIGALRM."""
-LOOK = 0.25
-"""For how long the callbacks are looked at, and how often the guard looks at the clock (s)."""
+"""Signal that neither pytest nor its plugins use: pytest-timeout uses SIGALRM."""
+PERIOD = 0.25
+"""Period of the checks, and the time for which callbacks are observed (s)."""
 UNANSWERED = 20
-"""After how many signals without effect the tracebacks of all threads are written to stderr."""
-MOST_NAMED = 8
-"""How many callbacks are named at most."""
+"""Number of signals without effect after which the tracebacks of all threads are written to stderr."""
+MAX_NAMED = 8
+"""Largest number of callbacks that are named."""
 _STANDARD = sysconfig.get_path('stdlib') + os.sep
 _PACKAGES = sysconfig.get_path('platlib') + os.sep
 _INFRASTRUCTURE = (os.path.dirname(rclpy.__file__) + os.sep, os.path.dirname(__file__) + os.sep)
 
 
 class Stuck(BaseException):
-    """Raised within the callback that does not let time pass; `except Exception` does not hold it."""
+    """Raised within a callback that blocks. `except Exception` does not catch it."""
 
 
 class Guard:
-    """Watches over the wall time that passes while simulated time stands."""
+    """Measures the wall time for which simulated time does not advance."""
 
     def __init__(self, patience: float, nodes: Callable[[], Iterable[Node]]) -> None:
-        """Begin to watch.
+        """Start the thread.
 
         Args:
-            patience: Wall time that one instant may take (s).
-            nodes: Gives the nodes whose callbacks may be to blame.
+            patience: Longest wall time for one simulated time (s).
+            nodes: Returns the nodes whose callbacks can be named.
         """
         self._patience = patience
         self._nodes = nodes
@@ -63,17 +64,17 @@ class Guard:
         self._thread.start()
 
     def arm(self) -> None:
-        """Let an instant begin."""
+        """Start the measurement."""
         self._since = time.monotonic()
 
     def disarm(self) -> None:
-        """Let it end."""
+        """Stop the measurement."""
         self._since = None
         if self._seen is not None:
-            self._stop_looking()
+            self._stop_observing()
 
     def close(self) -> None:
-        """Watch no longer."""
+        """Stop the thread."""
         self._closed.set()
         self._thread.join()
         signal.signal(SIGNAL, self._previous)
@@ -83,34 +84,34 @@ class Guard:
 
     def _watch(self) -> None:
         unanswered = 0
-        while not self._closed.wait(LOOK):
+        while not self._closed.wait(PERIOD):
             if not self._overdue():
                 unanswered = 0
                 continue
             signal.pthread_kill(self._main, SIGNAL)
             unanswered += 1
             if unanswered == UNANSWERED:
-                # Blocked outside of Python, where no signal is heard: say at least where.
+                # Blocked outside of Python, where signal handlers do not run.
                 faulthandler.dump_traceback()
 
     def _on_signal(self, _: int, frame: FrameType | None) -> None:
-        if not self._overdue() or any(one.f_code.co_name == '__del__' for one in _stack(frame)):
-            # What is raised while an object is destroyed is lost: the next signal comes soon.
+        if not self._overdue() or any(caller.f_code.co_name == '__del__' for caller in _stack(frame)):
+            # An exception in __del__ would be lost. The next signal follows soon.
             return
         if self._seen is None:
             self._seen = {}
             self._profiler = sys.getprofile()
             sys.setprofile(self._on_call)
             return
-        raise Stuck(self._diagnose(self._stop_looking(), frame))
+        raise Stuck(self._diagnose(self._stop_observing(), frame))
 
-    def _stop_looking(self) -> list[str]:
+    def _stop_observing(self) -> list[str]:
         sys.setprofile(self._profiler)
         seen, self._seen = list(self._seen or ()), None
         return seen
 
     def _on_call(self, frame: FrameType, event: str, _: Any) -> None:
-        if event == 'call' and self._seen is not None and len(self._seen) < MOST_NAMED:
+        if event == 'call' and self._seen is not None and len(self._seen) < MAX_NAMED:
             below = iter(_stack(frame))
             if _is_user(next(below, None)) and not any(map(_is_user, below)) and not _is_standard(frame):
                 self._seen[describe(frame, self._nodes())] = None
@@ -122,16 +123,16 @@ class Guard:
             callback = describe(outer, self._nodes())
             return (
                 f'{callback} has not returned for {self._patience:g} s of wall time; it '
-                f'stands at {inner.f_code.co_filename}:{inner.f_lineno} in {inner.f_code.co_name}'
+                f'is at {inner.f_code.co_filename}:{inner.f_lineno} in {inner.f_code.co_name}'
             )
         return (
-            f'no end of callbacks for {self._patience:g} s of wall time without time passing: '
-            f'{"; ".join(seen) or "none that is known"}'
+            f'callbacks without end: for {self._patience:g} s of wall time simulated time did not '
+            f'advance, called: {"; ".join(seen) or "unknown"}'
         )
 
 
 def _stack(frame: FrameType | None) -> Iterator[FrameType]:
-    """Give the frames of the callback that runs, the innermost first, down to the executor's own."""
+    """Yield the frames of the running callback, innermost first, without those of the executor."""
     while frame is not None and frame.f_code.co_filename != _executor.__file__:
         yield frame
         frame = frame.f_back
@@ -142,22 +143,22 @@ def _is_user(frame: FrameType | None) -> bool:
 
 
 def _is_standard(frame: FrameType) -> bool:
-    """Whether it is the standard library's, that is, Python's own."""
+    """Return whether a frame is of the standard library."""
     name = frame.f_code.co_filename
     return name.startswith(_STANDARD) and not name.startswith(_PACKAGES)
 
 
 def describe(frame: FrameType, nodes: Iterable[Node]) -> str:
-    """Name the callback that a frame runs: its function, what calls it, its node."""
+    """Return a description of the callback that a frame runs: function, entity, node."""
     where = f'{frame.f_code.co_filename}:{frame.f_code.co_firstlineno}'
     for node in nodes:
         named = f'node {node.get_fully_qualified_name()}, {where}'
         for subscription in node.subscriptions:
             if name := _runs(frame, subscription.callback):
-                return f'{name} (reads {subscription.topic_name}, {named})'
+                return f'{name} (subscribed to {subscription.topic_name}, {named})'
         for timer in node.timers:
             if name := _runs(frame, timer.callback):
-                return f'{name} (timer of {timer.timer_period_ns / 1e9:g} s, {named})'
+                return f'{name} (timer of {timer.timer_period_ns / NANOSECONDS:g} s, {named})'
         for service in node.services:
             if name := _runs(frame, service.callback):
                 return f'{name} (service {node.resolve_service_name(service.srv_name)}, {named})'
@@ -165,7 +166,7 @@ def describe(frame: FrameType, nodes: Iterable[Node]) -> str:
 
 
 def _runs(frame: FrameType, callback: Any) -> str:
-    """Give the name of a callback if a frame runs it."""
+    """Return the name of a callback if a frame runs it, otherwise an empty string."""
     while isinstance(callback, partial):
         callback = callback.func
     function = getattr(callback, '__func__', callback)

@@ -1,4 +1,4 @@
-"""What was said on the topics of a world, for the one who reads why a test has failed."""
+"""The last messages of all topics, for the reports of failed tests."""
 
 from __future__ import annotations
 
@@ -10,18 +10,20 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-NANOSECONDS = 1_000_000_000
-LONGEST_ARRAY = 4
-"""Longer ones are told by their length and their first elements."""
-LONG_ARRAY = 100
-"""Longer ones are told without a look at whether they are all zero."""
-SILENT = ('/clock', '/parameter_events', '/rosout')
-"""Topics that tell nothing of a run."""
+from diffdrive_jacobian.ros.rclpy_internals import wrap_publish
+from diffdrive_jacobian.time_units import NANOSECONDS
+
+MAX_SHOWN = 4
+"""Number of elements that are shown of an array."""
+MAX_CHECKED = 100
+"""Length up to which arrays of zeros are omitted. Longer ones are not searched."""
+OMITTED = ('/clock', '/parameter_events', '/rosout')
+"""Topics that are not reported."""
 
 
 @dataclass(slots=True)
-class _Line:
-    """What one publisher said."""
+class _Record:
+    """Messages of one publisher."""
 
     topic: str
     count: int = 0
@@ -30,77 +32,82 @@ class _Line:
 
 
 class Traffic:
-    """Counts the messages of every publisher and remembers the last one.
+    """Counts the messages of every publisher and stores the last one.
 
-    rclpy's `Publisher.publish` is wrapped for that while the world is open: a reader for each topic
-    would cost as much as the run, and change the counts of readers that nodes may look at. The message
-    is not copied: one that its node changes after publishing is told as changed.
+    It wraps `Publisher.publish`. A subscription for each topic would cost as much as the run, and change
+    the number of subscriptions, which nodes may query. Messages are not copied, so one that its node
+    modifies after publishing is reported as modified.
     """
 
     def __init__(self, now: Callable[[], int]) -> None:
-        """Begin without messages; `now` gives the instant (ns)."""
+        """Start without messages. `now` returns the simulated time (ns)."""
         self._now = now
-        self._lines: dict[Publisher, _Line] = {}
-        self._publish = Publisher.publish
+        self._records: dict[Publisher, _Record] = {}
+        self._restore: Callable[[], None] | None = None
 
-    def listen(self) -> None:
-        """Count from here on."""
-        lines, publish, now = self._lines, self._publish, self._now
+    def start(self) -> None:
+        """Start counting."""
+        records, now = self._records, self._now
 
-        def counted(self: Publisher, msg: Any) -> None:
-            line = lines.get(self)
-            if line is None:
-                line = lines[self] = _Line(self.topic_name)
-            line.count += 1
-            line.at = now()
-            line.message = msg
-            publish(self, msg)
+        def counting(publish: Callable[..., None]) -> Callable[..., None]:
+            def counted(self: Publisher, msg: Any) -> None:
+                record = records.get(self)
+                if record is None:
+                    record = records[self] = _Record(self.topic_name)
+                record.count += 1
+                record.at = now()
+                record.message = msg
+                publish(self, msg)
 
-        Publisher.publish = counted
+            return counted
+
+        self._restore = wrap_publish(counting)
 
     def close(self) -> None:
-        """Count no longer."""
-        Publisher.publish = self._publish
+        """Stop counting."""
+        if self._restore is not None:
+            self._restore()
 
     def describe(self, nodes: list[Node]) -> str:
-        """Tell the last message of every topic, and the topics that are read but were silent."""
+        """Return the last message of each publisher, and the subscribed topics without messages."""
         names = {
             publisher: node.get_fully_qualified_name() for node in nodes for publisher in node.publishers
         }
-        said = [
-            (line.topic, names.get(publisher, 'a node that is gone'), line)
-            for publisher, line in self._lines.items()
-            if line.topic not in SILENT
+        published = [
+            (record.topic, names.get(publisher, 'a removed node'), record)
+            for publisher, record in self._records.items()
+            if record.topic not in OMITTED
         ]
         lines = [
-            f'  {topic}: {line.count} from {node}, last at {line.at / NANOSECONDS:g} s: '
-            f'{brief(line.message)}'
-            for topic, node, line in sorted(said, key=lambda one: one[:2])
+            f'  {topic}: {record.count} from {node}, last at {record.at / NANOSECONDS:g} s: '
+            f'{brief(record.message)}'
+            for topic, node, record in sorted(published, key=lambda item: item[:2])
         ]
-        spoken = {topic for topic, _, _ in said}
-        readers: dict[str, list[str]] = {}
+        active = {topic for topic, _, _ in published}
+        subscribers: dict[str, list[str]] = {}
         for node in nodes:
             for subscription in node.subscriptions:
                 topic = subscription.topic_name
-                if topic not in spoken and topic not in SILENT:
-                    readers.setdefault(topic, []).append(node.get_fully_qualified_name())
+                if topic not in active and topic not in OMITTED:
+                    subscribers.setdefault(topic, []).append(node.get_fully_qualified_name())
         lines += [
-            f'  {topic}: nothing; read by {", ".join(names)}' for topic, names in sorted(readers.items())
+            f'  {topic}: no message; subscribed by {", ".join(names)}'
+            for topic, names in sorted(subscribers.items())
         ]
-        if strangers := _not_served(nodes):
-            lines.append(f'  made, but not added to the world: {", ".join(strangers)}')
+        if missing := _not_served(nodes):
+            lines.append(f'  created, but not added to lockstep: {", ".join(missing)}')
         return '\n'.join([f'last messages, at {self._now() / NANOSECONDS:g} s:', *(lines or ['  none'])])
 
 
 def _not_served(nodes: list[Node]) -> list[str]:
-    """Name the nodes of the context that are not in the world: what they should do they do not."""
+    """Return the names of nodes that were created but not added. Their callbacks are not executed."""
     served = {node.get_fully_qualified_name() for node in nodes}
-    there = nodes[0].get_node_names_and_namespaces() if nodes else []
-    return sorted({f'{space.rstrip("/")}/{name}' for name, space in there} - served)
+    created = nodes[0].get_node_names_and_namespaces() if nodes else []
+    return sorted({f'{space.rstrip("/")}/{name}' for name, space in created} - served)
 
 
 def brief(message: Any) -> str:
-    """Write a message in one line: those of its fields that are not zero."""
+    """Return a message as one line with its nonzero fields."""
     if isinstance(message, bytes):
         return f'{len(message)} serialized bytes'
     fields = ', '.join(f'{name}={value}' for name, value in _fields(message, ''))
@@ -120,7 +127,7 @@ def _fields(message: Any, prefix: str) -> Iterator[tuple[str, str]]:
             if value:
                 yield path, repr(value)
         elif hasattr(value, '__len__'):
-            if len(value) > LONG_ARRAY or any(not _is_zero(one) for one in value):
+            if len(value) > MAX_CHECKED or any(not _is_zero(element) for element in value):
                 yield path, _array(value)
         elif not _is_zero(value):
             yield path, _scalar(value)
@@ -139,6 +146,6 @@ def _scalar(value: Any) -> str:
 
 
 def _array(values: Any) -> str:
-    first = values[:LONGEST_ARRAY]
+    first = values[:MAX_SHOWN]
     shown = ', '.join(map(_scalar, first.tolist() if hasattr(first, 'tolist') else first))
-    return f'[{shown}]' if len(values) <= LONGEST_ARRAY else f'[{shown}, ... {len(values)} in all]'
+    return f'[{shown}]' if len(values) <= MAX_SHOWN else f'[{shown}, ... {len(values)} in all]'

@@ -1,7 +1,9 @@
-"""Nodes, subscriptions and services as the EventsExecutor gets to see them.
+"""Wrappers of nodes, subscriptions and services for the EventsExecutor.
 
-It asks them for attributes only, so that stand-ins can do for it what the one of Jazzy cannot: leave the
-timers to others, await coroutines, and hand a message with its info over as two arguments.
+The EventsExecutor uses their attributes only, not their types. The wrappers add what that of Jazzy
+cannot
+do: to leave timers to another executor, to await coroutines, and to pass a message and its info as two
+arguments.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from rclpy.timer import Timer
 
 
 class Served:
-    """A node as the EventsExecutor sees it: without timers, and with what was registered so far."""
+    """A node for the EventsExecutor, without timers and with the entities that are registered."""
 
     def __init__(self, node: Node, create_task: Callable[..., Any]) -> None:
         self.node = node
@@ -26,7 +28,7 @@ class Served:
         self.timers: tuple[Timer, ...] = ()
         self.subscriptions: list[Any] = []
         self.services: list[Any] = []
-        self._latecomers: list[Any] = []
+        self._latched: list[Any] = []
         self._create_task = create_task
         self._readers: dict[Any, Any] = {}
         self._servers: dict[Any, Any] = {}
@@ -35,31 +37,31 @@ class Served:
         return getattr(self.node, name)
 
     def update(self) -> None:
-        """Take over the node's subscriptions and services; those of latched topics wait."""
+        """Register new subscriptions and services, except subscriptions of latched topics."""
         known, self._readers = self._readers, {}
         for reader in self.node.subscriptions:
             self._readers[reader] = known.get(reader) or _Subscription(reader, self._create_task)
         readers = list(self._readers.values())
         new = [reader for reader in readers if reader not in self.subscriptions]
-        self._latecomers = [reader for reader in new if is_latched(reader)]
-        self.subscriptions = [reader for reader in readers if reader not in self._latecomers]
+        self._latched = [reader for reader in new if is_latched(reader)]
+        self.subscriptions = [reader for reader in readers if reader not in self._latched]
         known, self._servers = self._servers, {}
         for server in self.node.services:
             self._servers[server] = known.get(server) or _Service(server, self._create_task)
         self.services = list(self._servers.values())
 
     def admit_latched(self) -> bool:
-        """Add one reader of a latched topic; False if none waits."""
-        if not self._latecomers:
+        """Register one subscription of a latched topic. Return False if there is none."""
+        if not self._latched:
             return False
-        self.subscriptions = [*self.subscriptions, self._latecomers.pop(0)]
+        self.subscriptions = [*self.subscriptions, self._latched.pop(0)]
         return True
 
 
 class _Subscription:
-    """A subscription that the EventsExecutor of Jazzy cannot serve as it is.
+    """A subscription for the EventsExecutor.
 
-    It never awaits coroutines, and hands a message with its info over as one argument.
+    That of Jazzy does not await coroutines, and passes a message and its info as one argument.
     """
 
     CallbackType = Subscription.CallbackType
@@ -67,8 +69,8 @@ class _Subscription:
     def __init__(self, subscription: Subscription, create_task: Callable[..., Any]) -> None:
         self._subscription = subscription
         self._create_task = create_task
-        # What is asked for with every message, without a detour. The EventsExecutor only borrows the
-        # callback: it must be an attribute that lasts.
+        # Attributes that are accessed for each message. The EventsExecutor holds no reference to the
+        # callback, so it must be an attribute.
         self.handle = subscription.handle
         self.msg_type, self.raw = subscription.msg_type, subscription.raw
         self.callback = self._on_message
@@ -85,7 +87,7 @@ class _Subscription:
 
 
 class _Service:
-    """A service whose callback may be a coroutine: its answer is sent when that has ended."""
+    """A service whose callback may be a coroutine. The response is sent when it ends."""
 
     def __init__(self, service: Service, create_task: Callable[..., Any]) -> None:
         self._service = service
@@ -95,7 +97,7 @@ class _Service:
         return getattr(self._service, name)
 
     def send_response(self, response: Any, header: Any) -> None:
-        """Send what the callback answers in the end."""
+        """Send the result of the callback."""
         if not inspect.iscoroutine(response):
             self._service.send_response(response, header)
             return
@@ -107,4 +109,5 @@ class _Service:
 
 
 def is_latched(endpoint: Any) -> bool:
+    """Return whether a publisher or subscription is transient local."""
     return bool(endpoint.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)

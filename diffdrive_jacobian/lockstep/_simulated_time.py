@@ -1,4 +1,4 @@
-"""Simulated time that passes from one due timer to the next."""
+"""Simulated time that advances from one timer to the next."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
 from diffdrive_jacobian.lockstep._guard import Guard, Stuck
 from diffdrive_jacobian.lockstep._report import Traffic
+from diffdrive_jacobian.messages.conversion import set_time
+from diffdrive_jacobian.time_units import NANOSECONDS
 
-NANOSECONDS = 1_000_000_000
 MAX_SECONDS = 2**31 - 1
-"""What a stamp can hold."""
+"""Largest time that fits into a stamp (s)."""
 
 
 class SimulatedTime:
-    """The time of a world. `Lockstep` documents and builds it."""
+    """Simulated time. Base class of `Lockstep`."""
 
     _executor: QuiescentExecutor
     _guard: Guard
     _clock_publisher: Publisher
 
     def __init__(self, start: int) -> None:
-        """Begin at an instant (ns)."""
+        """Start at a time (ns)."""
         self._now = self._start = start
         self._clock = Clock()
         self._until_next: int | None = None
@@ -37,7 +38,7 @@ class SimulatedTime:
         self._traffic = Traffic(lambda: self._now)
 
     def _check_open(self) -> None:
-        """Refuse to go on in a world that was closed."""
+        """Raise LockstepError after `close`."""
         raise NotImplementedError
 
     @property
@@ -47,56 +48,56 @@ class SimulatedTime:
 
     @property
     def elapsed(self) -> float:
-        """How much of it has passed (s)."""
+        """Simulated time since the start (s)."""
         return (self._now - self._start) / NANOSECONDS
 
     def settle(self) -> None:
-        """Let every node handle what there is to handle, without time passing."""
+        """Execute all callbacks that are due at the current time."""
         self._check_open()
         with self._watched():
             self._until_next = self._executor.settle()
 
     def step(self, at_most: float | None = None) -> None:
-        """Advance to the instant at which the next timer is due.
+        """Advance to the time at which the next timer expires.
 
         Args:
-            at_most: Advance no further than this (s).
+            at_most: Largest duration of the step (s).
 
         Raises:
             ValueError: `at_most` is not positive, or too long.
-            LockstepError: No timer is running and `at_most` is not given; or time cannot pass.
+            LockstepError: No timer is running and `at_most` is not given, or time cannot advance.
         """
-        end = math.inf if at_most is None else self._now + nanoseconds('at_most', at_most)
+        end = math.inf if at_most is None else self._now + checked_nanoseconds('at_most', at_most)
         self.settle()
         if self._until_next is None and at_most is None:
-            raise LockstepError('no timer is running that a step could lead to: give at_most')
+            raise LockstepError('no timer is running, so step needs at_most')
         self._advance(end)
 
     def run_for(self, seconds: float) -> None:
-        """Advance by so much simulated time, from one due timer to the next.
+        """Advance by a duration (s), from one timer to the next.
 
         Raises:
             ValueError: `seconds` is not positive, or too long.
-            LockstepError: Time cannot pass.
+            LockstepError: Time cannot advance.
         """
-        end = self._now + nanoseconds('seconds', seconds)
+        end = self._now + checked_nanoseconds('seconds', seconds)
         self.settle()
         while self._now < end:
             self._advance(end)
 
     def run_until(self, condition: Callable[[], object], timeout: float, what: str = '') -> None:
-        """Advance until a condition holds. It is looked at once at each instant, when all is handled.
+        """Advance until a condition is true.
 
         Args:
-            condition: What must become true.
-            timeout: In how much simulated time (s).
-            what: What the condition means, for the message of the error.
+            condition: The condition. It is called once at each simulated time, after all callbacks.
+            timeout: Longest simulated time (s).
+            what: Description of the condition for the error message.
 
         Raises:
             ValueError: `timeout` is not positive, or too long.
-            LockstepError: It did not come true in time; or time cannot pass.
+            LockstepError: The condition did not become true in time, or time cannot advance.
         """
-        end = self._now + nanoseconds('timeout', timeout)
+        end = self._now + checked_nanoseconds('timeout', timeout)
         self.settle()
         while not condition():
             if self._now >= end:
@@ -104,40 +105,38 @@ class SimulatedTime:
                 raise LockstepError(
                     f'not within {timeout:g} s of simulated time: {what}\n{self.report()}'
                 )
-            # The condition may have changed something, too.
+            # The condition may have published something.
             self.settle()
             self._advance(end)
 
     def jump(self, seconds: float) -> None:
-        """Let time jump, also back: as when a simulator is reset, a bag looped, or a clock set.
+        """Let time jump by a duration (s), forward or back, as when a simulator is reset.
 
-        The timers in between do not tick one by one; what they do about it is up to rcl.
+        Timers do not expire one by one in between. rcl determines how they react to the jump.
 
         Raises:
-            ValueError: `seconds` is zero or not finite, or time would begin before it exists.
+            ValueError: `seconds` is zero or not finite, or the new time is not positive.
         """
         if not math.isfinite(seconds) or seconds == 0.0:
             raise ValueError(f'seconds must be finite and not zero, got {seconds!r}')
         now = self._now + round(seconds * NANOSECONDS)
         if now <= 0:
             raise ValueError(
-                f'seconds must not lead to time 0 or before it, got {seconds!r} '
-                f'at {self._now / NANOSECONDS:g} s'
+                f'seconds must lead to a time after 0, got {seconds!r} at {self._now / NANOSECONDS:g} s'
             )
         self.settle()
         self._now = now
-        self._tell_time()
+        self._publish_clock()
 
     def _advance(self, end: float) -> None:
-        """Go on to the next due timer, but not past an end (ns)."""
+        """Advance to the next timer, but not beyond an end (ns)."""
         until_next = math.inf if self._until_next is None else self._until_next
-        # Of integers, which are exact, the lesser.
+        # The minimum of integers is exact, also beside infinity.
         self._now = int(min(self._now + until_next, end))
-        self._tell_time()
+        self._publish_clock()
 
-    def _tell_time(self) -> None:
-        stamp = self._clock.clock
-        stamp.sec, stamp.nanosec = divmod(self._now, NANOSECONDS)
+    def _publish_clock(self) -> None:
+        set_time(self._clock.clock, self._now)
         self._clock_publisher.publish(self._clock)
         with self._watched():
             self._until_next = self._executor.settle()
@@ -145,15 +144,13 @@ class SimulatedTime:
     @contextmanager
     def _watched(self) -> Iterator[None]:
         if self._busy:
-            raise LockstepError(
-                'time cannot pass and nodes cannot come or go within a callback of theirs'
-            )
+            raise LockstepError('a callback cannot advance time, and cannot add or remove nodes')
         self._busy = True
         self._guard.arm()
         try:
             yield
         except ExternalShutdownException:
-            raise LockstepError('rclpy was shut down: leave that to the world') from None
+            raise LockstepError('rclpy was shut down: only lockstep may do that') from None
         except Stuck as stuck:
             raise LockstepError(f'at {self._now / NANOSECONDS:g} s: {stuck}\n{self.report()}') from stuck
         finally:
@@ -161,15 +158,15 @@ class SimulatedTime:
             self._busy = False
 
     def report(self) -> str:
-        """Tell the last message of every topic."""
+        """Return the last messages of all topics as text."""
         return self._traffic.describe(self._executor.nodes)
 
 
-def nanoseconds(name: str, seconds: float) -> int:
-    """Convert a positive time (s).
+def checked_nanoseconds(name: str, seconds: float) -> int:
+    """Return a positive duration (s) in nanoseconds.
 
     Raises:
-        ValueError: It is not positive, or longer than a stamp can tell; `name` is what it is called.
+        ValueError: It is not positive or does not fit into a stamp. `name` is its name in the message.
     """
     if not (seconds <= MAX_SECONDS and round(seconds * NANOSECONDS) > 0):
         raise ValueError(

@@ -1,8 +1,8 @@
-"""A world in which simulated time advances only when every node has answered.
+"""Lockstep: simulated time that advances only when every node has processed its inputs.
 
-One step: publish /clock, let every node handle all messages, service calls and due timers, and all that
-follows from them; then go on to the instant at which the next timer is due. Nothing waits for the wall
-clock and nothing depends on it, so a run is as fast as the machine, and gives the same bits each time.
+One step publishes /clock and executes the callbacks of all messages, service calls and timers that are
+due, and of all that they cause. Then time advances to the next timer. Nothing waits for the wall clock,
+so a run is as fast as the machine. Its results are the same each time, bit for bit.
 """
 
 from __future__ import annotations
@@ -22,53 +22,55 @@ from rosgraph_msgs.msg import Clock
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
 from diffdrive_jacobian.lockstep._guard import Guard
-from diffdrive_jacobian.lockstep._simulated_time import SimulatedTime, nanoseconds
-from diffdrive_jacobian.ros.runner import UserError, closed_world, ros_context
+from diffdrive_jacobian.lockstep._simulated_time import SimulatedTime, checked_nanoseconds
+from diffdrive_jacobian.ros.rclpy_internals import SERVICES_OF_RCLPY, wrap_sleep
+from diffdrive_jacobian.ros.runner import UserError, discovery_off, ros_context
 
 N = TypeVar('N', bound=Node)
 
 LISTENING_DEPTH = 1000
-"""How many messages of a topic may come at one instant until `listen` loses one."""
+"""Queue size of `listen`: the number of messages of a topic at one simulated time."""
 
 
 class Lockstep(SimulatedTime):
-    """Nodes in the default context of rclpy, with simulated time that this world drives.
+    """Executes nodes in the default context of rclpy, in simulated time.
 
-    Nodes are made as always, after the world, and added to it; `use_sim_time` is true for all of them.
-    No other process hears them, nor another world in another process.
+    Nodes are created as usual, after the `Lockstep`, and added to it. `use_sim_time` is true for all of
+    them. They are isolated: no other process receives their messages.
 
         with Lockstep() as world:
             controller = world.add(MyController())
             world.run_for(2.0)
 
-    What a callback raises is raised by the call during which it ran. Nodes must not start threads that
-    send messages, for nobody could tell when those are done; timers on another clock than the node's own
-    run on wall time. Only for the main thread, and on systems with POSIX signals.
+    An exception in a callback is raised by the method that executed it. Nodes must not publish from
+    threads of their own, because the end of their work cannot be detected. Timers on another clock than
+    that of the node run on wall time. Only for the main thread, and on systems with POSIX signals.
     """
 
     _open: ClassVar[Lockstep | None] = None
 
     def __init__(self, args: Sequence[str] = (), *, start: float = 1.0, patience: float = 10.0) -> None:
-        """Begin a world without nodes but its own.
+        """Initialize rclpy and start without nodes.
 
         Args:
             args: ROS arguments for all nodes, as for `rclpy.init`: `['--ros-args', '-p', 'x:=1.0']`.
-            start: Simulated time at the beginning (s).
-            patience: Wall time that one instant may take before it is called stuck (s).
+            start: Simulated time at the start (s).
+            patience: Longest wall time for one simulated time (s). Beyond it an error names the
+                callbacks.
 
         Raises:
-            LockstepError: rclpy is initialised already, by another world for example, or does not
-                understand the arguments, or this is not the main thread.
+            LockstepError: rclpy is already initialized, for example by another `Lockstep`, the arguments
+                are invalid, or this is not the main thread.
             ValueError: `start` or `patience` is not positive, or too long.
         """
-        super().__init__(nanoseconds('start', start))
-        nanoseconds('patience', patience)
+        super().__init__(checked_nanoseconds('start', start))
+        checked_nanoseconds('patience', patience)
         if args and args[0] != '--ros-args':
             raise LockstepError(f"args must begin with '--ros-args', got {args[0]!r}")
         if Lockstep._open is not None:
-            raise LockstepError('another world is open in this process: close it first')
+            raise LockstepError('another Lockstep is open in this process: close it first')
         if rclpy.ok():
-            raise LockstepError('rclpy is initialised already: the world does that, leave it to it')
+            raise LockstepError('rclpy is already initialized: only lockstep may do that')
         self._thread = threading.get_ident()
         self._publishers: dict[tuple[type, str], Publisher] = {}
         self._on_new: list[Callable[[], None]] = []
@@ -83,7 +85,7 @@ class Lockstep(SimulatedTime):
     def _enter(self, args: Sequence[str], patience: float) -> None:
         arguments = ['lockstep', *args, '--ros-args', '-p', 'use_sim_time:=true']
         try:
-            with closed_world():
+            with discovery_off():
                 context = self._closing.enter_context(ros_context(arguments, default=True))
         except UserError as error:
             raise LockstepError(str(error)) from error
@@ -92,29 +94,29 @@ class Lockstep(SimulatedTime):
         try:
             self._guard = Guard(patience, lambda: self._executor.nodes)
         except ValueError as error:
-            raise LockstepError('a world must be made and used in the main thread') from error
+            raise LockstepError('Lockstep must be created and used in the main thread') from error
         self._closing.callback(self._guard.close)
-        self._traffic.listen()
+        self._traffic.start()
         self._closing.callback(self._traffic.close)
         self.node = Node('lockstep', start_parameter_services=False, enable_rosout=False)
-        """The world's own node, for the publishers, subscriptions and clients of a test."""
+        """Node for the publishers, subscriptions and clients of a test."""
         self._clock_publisher = self.node.create_publisher(Clock, '/clock', 1)
         self._executor.add(self.node)
         Lockstep._open = self
-        self._tell_time()
+        self._publish_clock()
 
     # --- Life
 
     def __enter__(self) -> Lockstep:
-        """Hold the world."""
+        """Return this object."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End it."""
+        """Close it."""
         self.close()
 
     def close(self) -> None:
-        """Destroy the nodes and shut rclpy down; a second time it does nothing."""
+        """Destroy the nodes and shut rclpy down. Further calls have no effect."""
         if Lockstep._open is self:
             Lockstep._open = None
             self._closing.close()
@@ -126,11 +128,14 @@ class Lockstep(SimulatedTime):
             node.destroy_node()
 
     def add(self, node: N) -> N:
-        """Serve a node; it learns the time and does at once what it has to do.
+        """Add a node. It receives the time, and its callbacks that are due are executed.
+
+        Returns:
+            The node.
 
         Raises:
-            LockstepError: It is in this world already, in another context, served by another executor,
-                or runs on wall time.
+            LockstepError: The node was already added, is in another context or executor, or runs on wall
+                time.
         """
         self._check_open()
         try:
@@ -138,73 +143,76 @@ class Lockstep(SimulatedTime):
         except InvalidHandle as error:
             raise LockstepError('the node was destroyed before it was added') from error
         if node in self._executor.nodes:
-            raise LockstepError(f'node {name} was added already')
-        if any(one.get_fully_qualified_name() == name for one in self._executor.nodes):
-            raise LockstepError(f'another node is called {name}: give one of them a namespace')
+            raise LockstepError(f'node {name} was already added')
+        if any(other.get_fully_qualified_name() == name for other in self._executor.nodes):
+            raise LockstepError(f'another node has the name {name}: give one of them a namespace')
         if node.context is not self.node.context:
             raise LockstepError(
-                f'node {name} is in another context: make it without context=, after the world'
+                f'node {name} is in another context: create it without context=, after Lockstep()'
             )
         if node.executor is not None:
-            raise LockstepError(f'node {name} is served by an executor of its own: remove it from there')
+            raise LockstepError(f'node {name} is in another executor: remove it from there')
         self._check_sim_time(node)
         if self._busy:
             raise LockstepError(f'node {name} cannot be added within a callback')
         self._executor.add(node)
-        self._tell_time()
+        self._publish_clock()
         return node
 
     def remove(self, node: Node) -> None:
-        """Let a node vanish, as one that was killed; it is destroyed.
+        """Remove and destroy a node without stopping it, as if its process was killed.
 
         Raises:
-            LockstepError: It is not in this world.
+            LockstepError: The node was not added.
         """
         self._check_open()
         if node is self.node or node not in self._executor.nodes:
-            raise LockstepError('the node to remove is not in this world')
+            raise LockstepError('the node to remove was not added')
         with self._watched():
             self._executor.remove(node)
             node.destroy_node()
 
     def _check_open(self) -> None:
         if Lockstep._open is not self:
-            raise LockstepError('this world is closed')
+            raise LockstepError('this Lockstep is closed')
         if threading.get_ident() != self._thread:
-            raise LockstepError('a world must be made and used in the main thread')
+            raise LockstepError('Lockstep must be created and used in the main thread')
 
     def _on_registered(self, node: Node) -> None:
         self._check_sim_time(node)
-        if node is not self.node and any(one.topic_name == '/clock' for one in node.publishers):
+        if node is not self.node and any(
+            publisher.topic_name == '/clock' for publisher in node.publishers
+        ):
             name = node.get_fully_qualified_name()
-            raise LockstepError(f'node {name} publishes /clock, which the world does')
+            raise LockstepError(f'node {name} publishes /clock, which only lockstep may do')
         self._refuse_sleep(node)
         for callback in self._on_new:
             callback()
 
     def on_new_topics(self, callback: Callable[[], None]) -> None:
-        """Have a function called whenever nodes come, or make or destroy something."""
+        """Call a function whenever a node is added, or has created or destroyed an entity."""
         self._on_new.append(callback)
 
     def _refuse_sleep(self, node: Node) -> None:
-        """Let no callback sleep until an instant that cannot come before it returns.
+        """Let `sleep_until` of a node's clock raise an error within callbacks.
 
-        rclpy would wait for that where no signal reaches it.
+        The time could not come before the callback returns, and rclpy would wait where no signal handler
+        runs.
         """
-        clock = node.get_clock()
-        if 'sleep_until' in vars(clock):
-            return
-        sleep_until, name = clock.sleep_until, node.get_fully_qualified_name()
+        name = node.get_fully_qualified_name()
 
-        def refuse(until: Any, *args: Any, **kwargs: Any) -> Any:
-            if threading.get_ident() == self._thread:
-                raise LockstepError(
-                    f'node {name} sleeps on its clock within a callback: simulated time cannot pass '
-                    'before the callback returns'
-                )
-            return sleep_until(until, *args, **kwargs)
+        def refusing(sleep_until: Callable[..., Any]) -> Callable[..., Any]:
+            def refuse(until: Any, *args: Any, **kwargs: Any) -> Any:
+                if threading.get_ident() == self._thread:
+                    raise LockstepError(
+                        f'node {name} sleeps on its clock within a callback: simulated time cannot '
+                        'advance before the callback returns'
+                    )
+                return sleep_until(until, *args, **kwargs)
 
-        clock.sleep_until = refuse
+            return refuse
+
+        wrap_sleep(node.get_clock(), refusing)
 
     @staticmethod
     def _check_sim_time(node: Node) -> None:
@@ -214,13 +222,13 @@ class Lockstep(SimulatedTime):
                 'its parameter use_sim_time must be true'
             )
 
-    # --- Talking to the nodes
+    # --- Messages and services
 
     def publish(self, topic: str, message: Any) -> None:
-        """Publish a message, reliably, and let every node answer it (within a callback: later).
+        """Publish a message and execute all callbacks that it causes (within a callback: later).
 
         Raises:
-            LockstepError: Nobody reads the topic, or it is of another type.
+            LockstepError: The topic has no subscription, or another type.
         """
         self._check_open()
         key = type(message), topic
@@ -231,21 +239,22 @@ class Lockstep(SimulatedTime):
         self._settle_unless_busy()
         if publisher.get_subscription_count() == 0:
             raise LockstepError(
-                f'nobody reads {publisher.topic_name} as {_type_name(type(message))}\n{self.report()}'
+                f'{publisher.topic_name} has no subscription of type {_type_name(type(message))}\n'
+                f'{self.report()}'
             )
         publisher.publish(message)
         self._settle_unless_busy()
 
     def listen(self, message_type: type, topic: str, *, latched: bool = False) -> list[Any]:
-        """Collect the messages of a topic in the list that is returned.
+        """Return a list to which the messages of a topic are appended.
 
         Args:
             message_type: Type of the topic.
-            topic: Its name.
-            latched: Also those that were sent before, if it is a latched topic.
+            topic: Name of the topic.
+            latched: Whether to include earlier messages of a latched topic.
 
         Raises:
-            LockstepError: The topic is of another type.
+            LockstepError: The topic has another type.
         """
         self._check_open()
         received: list[Any] = []
@@ -253,7 +262,7 @@ class Lockstep(SimulatedTime):
         if latched:
             profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
         else:
-            # It matches every publisher, and within a process nothing is lost.
+            # Matches every publisher. Within a process no message is lost.
             profile.reliability = ReliabilityPolicy.BEST_EFFORT
         create = self.node.create_subscription
         self._with_type(topic, create, message_type, topic, received.append, profile)
@@ -261,27 +270,27 @@ class Lockstep(SimulatedTime):
         return received
 
     def call(self, service_type: Any, name: str, request: Any = None, *, timeout: float = 10.0) -> Any:
-        """Call a service and give its response.
+        """Call a service and return the response.
 
         Args:
             service_type: Type of the service.
-            name: Its name.
+            name: Name of the service.
             request: The request; None: an empty one.
-            timeout: Simulated time that the response may take (s); most take none.
+            timeout: Longest simulated time for the response (s).
 
         Raises:
-            LockstepError: There is no such service, or no response in time.
+            LockstepError: There is no such service, or it does not respond in time.
         """
         self._check_open()
         name = self.node.resolve_service_name(name)
         services = dict(self.node.get_service_names_and_types())
         wanted = _type_name(service_type, 'srv')
         if wanted not in services.get(name, []):
-            others = ', '.join(one for one, kinds in services.items() if not _is_of_rclpy(kinds))
+            others = ', '.join(other for other, kinds in services.items() if not _is_of_rclpy(kinds))
             raise LockstepError(
-                f'there is no service {name} of {wanted}; there are: {others or "none"}'
+                f'there is no service {name} of type {wanted}; services: {others or "none"}'
                 if name not in services
-                else f'{name} is {services[name][0]}, not {wanted}'
+                else f'{name} is of type {services[name][0]}, not {wanted}'
             )
         client = self.node.create_client(service_type, name)
         try:
@@ -292,7 +301,7 @@ class Lockstep(SimulatedTime):
             self.node.destroy_client(client)
 
     def _settle_unless_busy(self) -> None:
-        """Settle; within a callback that follows anyway."""
+        """Settle, except within a callback, after which it happens anyway."""
         if not self._busy:
             self.settle()
 
@@ -304,7 +313,7 @@ class Lockstep(SimulatedTime):
             name = self.node.resolve_topic_name(topic)
             types = dict(self.node.get_topic_names_and_types()).get(name, [])
             raise LockstepError(
-                f'{name} is {", ".join(types) or "not to be had"}, not {_type_name(args[0])}'
+                f'{name} is of type {", ".join(types) or "unknown"}, not {_type_name(args[0])}'
             ) from error
 
 
@@ -313,5 +322,5 @@ def _type_name(interface: Any, kind: str = 'msg') -> str:
 
 
 def _is_of_rclpy(types: list[str]) -> bool:
-    """Whether it is a service that every node has."""
-    return types[0].startswith(('rcl_interfaces/', 'type_description_interfaces/'))
+    """Return whether a service is one that rclpy provides for every node."""
+    return types[0].startswith(SERVICES_OF_RCLPY)

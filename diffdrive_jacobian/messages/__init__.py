@@ -1,1 +1,1 @@
-"""ROS messages as numbers, checked; no ROS is imported."""
+"""Checked conversion between ROS messages and numbers. Imports no ROS."""

@@ -1,11 +1,12 @@
-"""Between ROS messages and what the mathematics speaks: the one place where either knows the other.
+"""Conversion between ROS messages and the quantities of the mathematics.
 
-Poses are `[x, y, theta]` (m, m, rad), twists `(v, omega)` (m/s, rad/s), instants integer nanoseconds.
-Wheel joints stand left, right in messages (ROS habit) and right, left in the mathematics.
+Poses are `[x, y, theta]` (m, m, rad), twists `(v, omega)` (m/s, rad/s), times integer nanoseconds.
+Wheels are ordered left, right in messages, as is usual in ROS, and right, left in the mathematics. Only
+this module converts between these orders, and only it writes stamps.
 
-Writing fills a message that is there: a node keeps one for each topic, for making the nested messages
-of ROS in Python costs more than sending them. Reading a message never trusts it: what cannot be meant
-raises MessageError, which says what was got and what is allowed.
+The `set_` functions fill an existing message. A node keeps one message per topic, because creating
+nested messages in Python costs more than publishing them. The `from_` functions check what they read.
+They raise MessageError, which reports the value and the range allowed.
 """
 
 from __future__ import annotations
@@ -18,25 +19,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    # Fields are read and written by name: the messages of rosbags serve as well as those of rclpy.
+    # Fields are accessed by name only, so messages of rosbags work as well as those of rclpy.
     from builtin_interfaces.msg import Time
     from geometry_msgs.msg import Pose, PoseWithCovariance, Twist, TwistStamped
     from nav_msgs.msg import Odometry
     from sensor_msgs.msg import JointState
+    from std_msgs.msg import Float64MultiArray
 
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION as MAX_POSITION
 from diffdrive_jacobian.messages.plausibility import MAX_SPEED as MAX_SPEED
 from diffdrive_jacobian.messages.plausibility import MAX_WHEEL_SPEED as MAX_WHEEL_SPEED
-from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot
+from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.time_units import NANOSECONDS
 
-# x, y and yaw, and forward and yaw, in the row-major 6x6 covariances of ROS.
+# Indices of (x, y, yaw) and of (v, omega) in the row-major 6x6 covariances of ROS.
 _PLANAR = np.array([6 * row + column for row in (0, 1, 5) for column in (0, 1, 5)])
 _FORWARD_AND_YAW = np.array([0, 5, 30, 35])
 
 
 class MessageError(ValueError):
-    """A message that cannot be meant."""
+    """A message with invalid content."""
 
 
 def quoted(texts: Iterable[str], most: int = 4) -> str:
@@ -49,15 +52,15 @@ def quoted(texts: Iterable[str], most: int = 4) -> str:
 
 
 def set_time(stamp: Time, nanoseconds: int) -> None:
-    """Write an instant into a stamp."""
+    """Write a time (ns) into a stamp."""
     stamp.sec, stamp.nanosec = divmod(nanoseconds, NANOSECONDS)
 
 
 def from_time(stamp: Time) -> int:
-    """Return a timestamp (ns).
+    """Return the time of a stamp (ns).
 
     Raises:
-        MessageError: Its seconds are negative, or its nanoseconds are a second or more.
+        MessageError: `sec` is negative, or `nanosec` is a second or more.
     """
     sec, nanosec = int(stamp.sec), int(stamp.nanosec)
     if sec < 0 or nanosec >= NANOSECONDS:
@@ -69,10 +72,10 @@ def from_time(stamp: Time) -> int:
 
 
 def from_twist(message: Twist) -> tuple[float, float]:
-    """Read `(v, omega)`; what a differential drive cannot do is passed over.
+    """Return `(v, omega)` (m/s, rad/s); the other components are ignored.
 
     Raises:
-        MessageError: A component is NaN or infinite, or v or omega is not plausible.
+        MessageError: A component is NaN or infinite, or v or omega is out of range.
     """
     linear, angular = message.linear, message.angular
     values = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
@@ -82,10 +85,10 @@ def from_twist(message: Twist) -> tuple[float, float]:
 
 
 def plausible_twist(v: float, omega: float) -> tuple[float, float]:
-    """Give back a twist that a robot can mean.
+    """Return a twist unchanged if it is plausible.
 
     Raises:
-        MessageError: It is not finite or not plausible.
+        MessageError: v or omega is not finite or exceeds `MAX_SPEED`.
     """
     if not (abs(v) <= MAX_SPEED and abs(omega) <= MAX_SPEED):
         raise MessageError(
@@ -101,45 +104,17 @@ def set_twist(message: Twist, twist: tuple[float, float]) -> None:
 
 
 def set_twist_stamped(message: TwistStamped, twist: tuple[float, float], stamp: int) -> None:
-    """Write `(v, omega)` and its instant into a message."""
+    """Write `(v, omega)` and its time (ns) into a message."""
     set_time(message.header.stamp, stamp)
     set_twist(message.twist, twist)
 
 
-def command_instant(stamp: int, now: int, last: int, timeout: int) -> int:
-    """Say when a stamped command takes effect (ns): at its stamp, or now if it has none (zero).
-
-    Args:
-        stamp: The command's stamp (ns).
-        now: The present (ns).
-        last: When the last command took effect (ns).
-        timeout: How old a command may be (ns); 0: any age.
-
-    Raises:
-        MessageError: The stamp lies in the future, before the last command, or too far back.
-    """
-    if stamp == 0:
-        return now
-    if stamp > now:
-        raise MessageError(f'its stamp lies {(stamp - now) / NANOSECONDS:.6f} s in the future')
-    if timeout and now - stamp > timeout:
-        raise MessageError(
-            f'its stamp lies {(now - stamp) / NANOSECONDS:.6f} s back, '
-            f'allowed is the timeout of {timeout / NANOSECONDS:g} s'
-        )
-    if stamp < last:
-        raise MessageError(
-            f'its stamp lies {(last - stamp) / NANOSECONDS:.6f} s before the last command, '
-            'stop, placement or change of parameters'
-        )
-    return stamp
-
-
 def from_pose(message: Pose) -> NDArray[np.float64]:
-    """Read `[x, y, theta]`; the height and any tilt are passed over.
+    """Return `[x, y, theta]`, shape (3,); z, roll and pitch are ignored.
 
     Raises:
-        MessageError: The position is not finite or not plausible, or the orientation is no rotation.
+        MessageError: The position is not finite or out of range, or the quaternion is not of unit
+            length.
     """
     x, y = message.position.x, message.position.y
     if not (abs(x) <= MAX_POSITION and abs(y) <= MAX_POSITION):
@@ -167,10 +142,10 @@ def set_pose(message: Pose, pose: NDArray[np.float64]) -> None:
 def from_pose_with_covariance(
     message: PoseWithCovariance,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Read `[x, y, theta]` and its covariance, shapes (3,) and (3, 3).
+    """Return `[x, y, theta]` and its covariance, shapes (3,) and (3, 3).
 
     Raises:
-        MessageError: As `from_pose`; or the covariance is not finite, symmetric and positive
+        MessageError: As `from_pose`, or the covariance is not finite, symmetric and positive
             semidefinite.
     """
     pose = from_pose(message.pose)
@@ -196,13 +171,19 @@ def from_pose_with_covariance(
 def set_pose_with_covariance(
     message: PoseWithCovariance, pose: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> None:
-    """Write a pose (3,) and its covariance (3, 3); what the plane fixes has no variance."""
+    """Write a pose, shape (3,), and its covariance, shape (3, 3). Other variances stay as they are."""
     set_pose(message.pose, pose)
     message.covariance[_PLANAR] = covariance.ravel()
 
 
 def set_odometry(message: Odometry, robot: Robot, interval: float) -> None:
-    """Write what a robot knows of its motion; its twist counts as measured over an interval (s)."""
+    """Write pose, twist and covariances of a robot.
+
+    Args:
+        message: The message to fill.
+        robot: The robot at the time of the message.
+        interval: Time over which the wheels measured the twist (s).
+    """
     set_time(message.header.stamp, robot.stamp)
     set_pose_with_covariance(message.pose, robot.pose, robot.covariance)
     set_twist(message.twist.twist, robot.twist)
@@ -212,18 +193,34 @@ def set_odometry(message: Odometry, robot: Robot, interval: float) -> None:
 def set_joint_state(
     message: JointState, stamp: int, speeds: tuple[float, float], angles: Any = None
 ) -> None:
-    """Write wheel speeds, and angles where known, given right, left; the names are left, right."""
+    """Write the motion of the wheels; the message names the joints left, right.
+
+    Args:
+        message: The message to fill.
+        stamp: Time of the motion (ns).
+        speeds: `(omega_R, omega_L)` (rad/s).
+        angles: Angles of the right and the left wheel (rad); None: not written.
+    """
     set_time(message.header.stamp, stamp)
     message.velocity = [speeds[1], speeds[0]]
     if angles is not None:
         message.position = [angles[1], angles[0]]
 
 
+def set_wheel_array(message: Float64MultiArray, speeds: tuple[float, float]) -> None:
+    """Write wheel speeds `(omega_R, omega_L)` (rad/s) as `[left, right]`."""
+    message.data = [speeds[1], speeds[0]]
+
+
 def from_joint_state(message: JointState, names: tuple[str, str]) -> tuple[float, float]:
-    """Read `(omega_R, omega_L)` of the joints `names`, which are left, right.
+    """Return `(omega_R, omega_L)` (rad/s).
+
+    Args:
+        message: The message to read.
+        names: Names of the left and the right wheel joint.
 
     Raises:
-        MessageError: A joint is missing, has no velocity, or one that is not finite or not plausible.
+        MessageError: A joint is missing, has no velocity, or its velocity is not finite or out of range.
     """
     if len(message.velocity) != len(message.name):
         raise MessageError(

@@ -1,9 +1,9 @@
-"""The largest values that messages, parameters and arguments may have."""
+"""Largest plausible values of messages, parameters and arguments."""
 
 MAX_SPEED = 1e3
-"""Twists beyond this are not plausible (m/s, rad/s)."""
+"""Largest plausible speed (m/s) and yaw rate (rad/s)."""
 MAX_POSITION = 1e6
-"""Positions beyond this are not plausible (m)."""
+"""Largest plausible coordinate of a position (m)."""
 MAX_WHEEL_SPEED = 1e6
-"""Wheel speeds beyond this are not plausible (rad/s): the rim of the smallest wheel that the nodes
-accept, 1e-3 m, then exceeds `MAX_SPEED`."""
+"""Largest plausible wheel speed (rad/s). It corresponds to `MAX_SPEED` at the smallest wheel radius that
+the nodes accept, 1e-3 m."""

@@ -13,11 +13,12 @@ from diffdrive_jacobian.control import Arrival, Controller, LawError, saturate
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.goal import MAX_WAYPOINTS, Goal, goal_info, read_goal
-from diffdrive_jacobian.parameters.nodes import GoToGoalParameters, nanoseconds
+from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 from diffdrive_jacobian.ros import serialization
 from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.time_units import nanoseconds
 
 
 class GoToGoal(ParameterizedNode[GoToGoalParameters]):
@@ -59,7 +60,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._message: Twist | TwistStamped = TwistStamped() if stamped else Twist()
         self._watchdog = Watchdog(self, self._on_stale_odometry)
         self._configure()
-        self.announce('goals on', 'goal_pose', 'goals')
+        self.announce(subscribed=['goal_pose', 'goals'], publishing=['cmd_vel'])
 
     @property
     def waypoint(self) -> int | None:
@@ -195,8 +196,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._publish_command(0.0, 0.0)
             self._end(GoalStatus.STATUS_SUCCEEDED, 'reached')
             return
-        # These limits contain no wheel speed, so wheel radius and separation do not matter.
-        self._publish_command(*saturate(*command, self._limits, 1.0, 1.0))
+        # Without wheels in the limits the geometry of the wheels does not matter.
+        self._publish_command(*saturate(*command, self._limits))
 
     def _begin(self, goal: Goal) -> bool:
         """Start executing a goal, now that the frame of the odometry is known."""
@@ -266,7 +267,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._controller = controller = parameters.chosen_controller()
         self._law = controller.bind(parameters)
         # Far from the goal a law may return more than what counts as a plausible command.
-        self._limits = parameters.limits(without=messages.MAX_SPEED)
+        self._limits = parameters.limits()
         self._arrival = Arrival(
             xy_tolerance=parameters.xy_goal_tolerance,
             yaw_tolerance=parameters.yaw_goal_tolerance,

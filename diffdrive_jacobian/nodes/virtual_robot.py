@@ -1,7 +1,7 @@
-"""A differential-drive robot that needs no simulator: commands in, odometry out.
+"""The node virtual_robot: a differential-drive robot that follows commands and publishes odometry.
 
-It integrates the unicycle model exactly: its motion is a function of the commands and their instants
-alone, whatever `publish_rate` is and however late a timer comes.
+The unicycle model is integrated exactly. The motion depends on the commands and their times only, not on
+`publish_rate` or on the jitter of timers.
 """
 
 from __future__ import annotations
@@ -26,27 +26,31 @@ from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters, nanoseconds
-from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
-from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot
+from diffdrive_jacobian.nodes.command_time import command_time
+from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
+from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
+from diffdrive_jacobian.ros.rclpy_internals import change_timer_period
+from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.time_units import nanoseconds, seconds
 
 
 class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
-    """Node virtual_robot: `cmd_vel` or `joint_command` in; `odom`, `joint_states`, `cmd_vel_out`,
-    `start_pose` and TF out; `initialpose` and `reset_odometry` place it.
+    """Node that subscribes to `cmd_vel` or `joint_command` and publishes `odom`, `joint_states`,
+    `cmd_vel_out`, `start_pose` and a transform. `initialpose` and `reset_odometry` set its pose.
 
-    A command takes effect on receipt, or at its stamp if it has one. `cmd_vel_out` tells each command
-    as it was applied, `start_pose` where and when the odometry last began: together the whole motion.
+    A command takes effect at its stamp, or on receipt if it has none. `cmd_vel_out` has each command as
+    it was applied, `start_pose` the pose and the time at which the odometry started. Together they
+    determine the motion.
     """
 
     def __init__(self, **kwargs: Any) -> None:
-        """Create the robot at its initial pose; `kwargs` as for `ParameterizedNode`."""
+        """Create the robot at its initial pose. `kwargs` as for `ParameterizedNode`."""
         super().__init__('virtual_robot', VirtualRobotParameters, **kwargs)
         self._robot: Robot | None = None
         self._latest = 0
         self._odometry, self._states, self._command = Odometry(), JointState(), TwistStamped()
-        self._name_messages()
+        self._set_names()
         self._odom = self.advertise(Odometry, 'odom')
         self._joint_states = self.advertise(JointState, 'joint_states')
         self._applied = self.advertise(TwistStamped, 'cmd_vel_out')
@@ -65,12 +69,12 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self._timer = self.create_timer(1.0 / self.parameters.publish_rate, self._on_tick)
         self._jumps = self._watch_jumps()
         self._advance()
-        self.announce('driven by and reporting on', source, 'odom')
+        self.announce(subscribed=[source], publishing=['odom'])
 
     # --- Time
 
     def _watch_jumps(self) -> list[JumpHandle]:
-        """Look at once when simulated time begins or time goes back, not with the next message."""
+        """Advance the robot when simulated time starts or time goes back, before the next message."""
         clock = self.get_clock()
         back = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1))
         handles = [clock.create_jump_callback(back, post_callback=lambda _: self._advance())]
@@ -80,27 +84,31 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         return handles
 
     def _on_first_clock(self, _: TimeJump) -> None:
-        # It stays registered: rcl skips a neighbour if one leaves while they are called.
+        # It stays registered: rcl skips a callback if another one is removed while they are called.
         if self._robot is None:
             self._advance()
 
     def _advance(self) -> tuple[int, Robot] | None:
-        """Bring the robot past what happened by now; None while simulated time has not begun."""
+        """Apply a timeout or a jump of time that happened since the last call.
+
+        Returns:
+            The current time (ns) and the robot. None: simulated time has not started.
+        """
         now = self.now()
         if now == 0:
             return None
         robot = self._robot
         if robot is None:
             robot = Robot(model=self.parameters.model(), stamp=now, pose=self._initial_pose())
-            self._begin(robot)
+            self._publish_start(robot)
         elif now < self._latest:
             self.log_event_warning(
                 'time went back',
-                f'time went back by {(self._latest - now) / NANOSECONDS:.3f} s: '
-                'the robot stands still where it is',
+                f'time went back by {seconds(self._latest - now):.3f} s: '
+                'the robot stops at its present pose',
             )
             robot = robot.at(self._latest).restarted(now)
-            self._begin(robot)
+            self._publish_start(robot)
             self._publish_applied(robot)
         elif (expiry := robot.expiry) is not None and expiry <= now:
             robot = robot.at(expiry)
@@ -108,8 +116,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self._robot, self._latest = robot, now
         return now, robot
 
-    def _begin(self, robot: Robot) -> None:
-        """Say where and when the odometry begins."""
+    def _publish_start(self, robot: Robot) -> None:
+        """Publish the pose and the time at which the odometry starts."""
         message = PoseWithCovarianceStamped()
         messages.set_time(message.header.stamp, robot.stamp)
         message.header.frame_id = self.parameters.odom_frame_id
@@ -132,90 +140,88 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
     # --- Commands
 
     def _on_twist(self, message: Twist) -> None:
-        self._take(lambda: (messages.from_twist(message), 0))
+        self._apply(lambda: (messages.from_twist(message), 0))
 
     def _on_twist_stamped(self, message: TwistStamped) -> None:
-        self._take(
+        self._apply(
             lambda: (messages.from_twist(message.twist), messages.from_time(message.header.stamp))
         )
 
     def _on_joint_command(self, message: JointState) -> None:
         def read() -> tuple[tuple[float, float], int]:
-            speeds = messages.from_joint_state(message, self._joint_names())
+            speeds = messages.from_joint_state(message, self.parameters.wheel_names)
             parameters = self.parameters
             v, omega = wheel_to_body(*speeds, parameters.wheel_radius, parameters.wheel_separation)
             return messages.plausible_twist(v, omega), messages.from_time(message.header.stamp)
 
-        self._take(read)
+        self._apply(read)
 
-    def _take(self, read: Callable[[], tuple[tuple[float, float], int]]) -> None:
-        """Apply a command, or log why not.
+    def _apply(self, read: Callable[[], tuple[tuple[float, float], int]]) -> None:
+        """Apply a command, or log why it is dropped.
 
         Args:
-            read: Returns its twist `(v, omega)` and its stamp (ns; 0: none).
+            read: Returns the twist `(v, omega)` (m/s, rad/s) and the stamp (ns; 0: none).
         """
         advanced = self._advance()
         try:
             if advanced is None:
-                raise MessageError('simulated time has not begun, nothing came on /clock')
+                raise MessageError(NO_CLOCK)
             now, robot = advanced
             twist, stamp = read()
             timeout = robot.model.command_timeout
-            instant = messages.command_instant(stamp, now, robot.stamp, timeout)
+            time = command_time(stamp, now, robot.stamp, timeout)
         except MessageError as error:
             self.get_logger().warning(f'command dropped: {error}', throttle_duration_sec=THROTTLE)
             return
-        self._robot = robot.commanded(twist, instant)
+        self._robot = robot.commanded(twist, time)
         self._publish_applied(self._robot)
 
     def _publish_applied(self, robot: Robot) -> None:
-        """Tell the command that drives the robot from its instant on."""
+        """Publish the command that the robot follows, with the time from which it does."""
         messages.set_twist_stamped(self._command, robot.twist, robot.stamp)
         self._applied.publish(self._command)
 
-    # --- Placement
+    # --- Pose
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         advanced = self._advance()
         frame, ours = message.header.frame_id, self.parameters.odom_frame_id
         try:
             if advanced is None:
-                raise MessageError('simulated time has not begun, nothing came on /clock')
+                raise MessageError(NO_CLOCK)
             if frame not in ('', ours):
-                raise MessageError(
-                    f"it must be given in frame '{printable(ours)}', got '{printable(frame)}'"
-                )
+                raise MessageError(f"its frame must be '{printable(ours)}', got '{printable(frame)}'")
             pose, covariance = messages.from_pose_with_covariance(message.pose)
         except MessageError as error:
             self.get_logger().warning(f'initialpose dropped: {error}', throttle_duration_sec=THROTTLE)
             return
         now, robot = advanced
-        self._place(robot.placed(pose, covariance, now))
+        self._set_pose(robot.placed(pose, covariance, now))
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         advanced = self._advance()
         if advanced is None:
-            response.message = 'simulated time has not begun, nothing came on /clock'
+            response.message = NO_CLOCK
             return response
         now, robot = advanced
-        self._place(robot.placed(self._initial_pose(), np.zeros((3, 3)), now))
-        response.success, response.message = True, f'odometry begins anew at {self._initial_pose()}'
+        self._set_pose(robot.placed(self._initial_pose(), np.zeros((3, 3)), now))
+        response.success, response.message = True, f'odometry was reset to {self._initial_pose()}'
         return response
 
-    def _place(self, robot: Robot) -> None:
+    def _set_pose(self, robot: Robot) -> None:
         self._robot = robot
-        self._begin(robot)
+        self._publish_start(robot)
         x, y, theta = robot.pose
-        self.log_event_info('placed', f'odometry begins at x {x:.3f}, y {y:.3f}, theta {theta:.3f}')
+        self.log_event_info('pose set', f'pose set to x {x:.3f}, y {y:.3f}, theta {theta:.3f}')
 
     # --- Parameters
 
     def parameters_changed(self, previous: VirtualRobotParameters) -> None:
-        """Drive on under the new parameters."""
+        """Continue with the new parameters."""
         parameters = self.parameters
-        self._name_messages()
+        self._set_names()
         if parameters.publish_rate != previous.publish_rate:
-            self._change_period(nanoseconds(1.0 / parameters.publish_rate))
+            change_timer_period(self._timer, nanoseconds(1.0 / parameters.publish_rate))
         model = self.parameters.model()
         advanced = self._advance()
         if advanced is not None and model != advanced[1].model:
@@ -225,39 +231,29 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             if self._robot.twist != robot.twist:
                 self._publish_applied(self._robot)
 
-    def _change_period(self, period: int) -> None:
-        """Tick at a new period (ns); a tick that is due sooner stays due."""
-        self._timer.timer_period_ns = period
-        due = self._timer.time_until_next_call()
-        if due is None or due > period:
-            self._timer.reset()
-
     def _initial_pose(self) -> Any:
         parameters = self.parameters
         return np.array([parameters.x, parameters.y, wrap_angle(parameters.theta)])
 
-    def _name_messages(self) -> None:
-        """Write the frames and joints, which only parameters change, into the messages kept."""
+    def _set_names(self) -> None:
+        """Write the names of frames and joints into the messages that are reused."""
         parameters = self.parameters
         self._odometry.header.frame_id = parameters.odom_frame_id
         self._odometry.child_frame_id = parameters.base_frame_id
         self._command.header.frame_id = parameters.base_frame_id
-        self._states.name = list(self._joint_names())
-
-    def _joint_names(self) -> tuple[str, str]:
-        return self.parameters.left_wheel_name, self.parameters.right_wheel_name
+        self._states.name = list(parameters.wheel_names)
 
     def _transform_broadcaster(self) -> Any | None:
         try:
             from tf2_ros import TransformBroadcaster
         except ImportError:
-            self.get_logger().info('tf2_ros is not installed: the pose is not sent as a transform')
+            self.get_logger().info('tf2_ros is not installed: no transform is published')
             return None
         return TransformBroadcaster(self)
 
 
 def transform_of(odometry: Odometry) -> TransformStamped:
-    """Return the transform from the frame of an odometry message to that of the robot."""
+    """Return the transform between the frames of an odometry message."""
     message = TransformStamped(header=odometry.header, child_frame_id=odometry.child_frame_id)
     position, translation = odometry.pose.pose.position, message.transform.translation
     translation.x, translation.y = position.x, position.y

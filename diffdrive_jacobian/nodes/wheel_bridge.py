@@ -1,4 +1,4 @@
-"""Body twists to wheel speeds through the inverse wheel Jacobian, for motors that know nothing else."""
+"""The node wheel_bridge: wheel speeds from body twists, by the inverse wheel Jacobian."""
 
 from __future__ import annotations
 
@@ -12,20 +12,22 @@ from std_msgs.msg import Float64MultiArray
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.parameters.nodes import WheelBridgeParameters, nanoseconds
-from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
+from diffdrive_jacobian.nodes.command_time import command_time
+from diffdrive_jacobian.parameters.nodes import WheelBridgeParameters
+from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
+from diffdrive_jacobian.time_units import nanoseconds
 
 
 class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
-    """Node wheel_bridge: `cmd_vel` in, `joint_command` out.
+    """Node that subscribes to `cmd_vel` and publishes `joint_command`.
 
-    Each command gives one message with the same stamp (an unstamped one: that of its receipt). When
-    commands cease, one zero follows after the timeout.
+    It publishes one message for each command, with its stamp, or the time of receipt if it has none. If
+    no command is received for the timeout, it publishes one zero.
     """
 
     def __init__(self, **kwargs: Any) -> None:
-        """Create the bridge; `kwargs` as for `ParameterizedNode`."""
+        """Create the bridge. `kwargs` as for `ParameterizedNode`."""
         super().__init__('wheel_bridge', WheelBridgeParameters, **kwargs)
         parameters = self.parameters
         self._message: JointState | Float64MultiArray = (
@@ -40,25 +42,25 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         self._moving = False
         self._watchdog = Watchdog(self, self._on_silence)
         self._watchdog.start(nanoseconds(parameters.cmd_vel_timeout))
-        self.announce('from and to', 'cmd_vel', 'joint_command')
+        self.announce(subscribed=['cmd_vel'], publishing=['joint_command'])
 
     def _on_twist(self, message: Twist) -> None:
-        self._take(message, None)
+        self._apply(message, None)
 
     def _on_twist_stamped(self, message: TwistStamped) -> None:
-        self._take(message.twist, message.header.stamp)
+        self._apply(message.twist, message.header.stamp)
 
-    def _take(self, twist: Twist, time: Time | None) -> None:
+    def _apply(self, twist: Twist, time: Time | None) -> None:
         now = self.now()
-        # After time went back the last command's instant means nothing any more.
+        # The time of the last command is meaningless after time went back.
         last = self._last if self._last <= now else 0
         try:
             if now == 0:
-                raise MessageError('simulated time has not begun, nothing came on /clock')
+                raise MessageError(NO_CLOCK)
             v, omega = messages.from_twist(twist)
             stamp = 0 if time is None else messages.from_time(time)
             timeout = nanoseconds(self.parameters.cmd_vel_timeout)
-            self._last = messages.command_instant(stamp, now, last, timeout)
+            self._last = command_time(stamp, now, last, timeout)
         except MessageError as error:
             self.get_logger().warning(f'command dropped: {error}', throttle_duration_sec=THROTTLE)
             return
@@ -66,23 +68,23 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         self._publish(self._wheel_speeds(v, omega), self._last)
 
     def _wheel_speeds(self, v: float, omega: float) -> tuple[Any, Any]:
-        """Give `(omega_R, omega_L)` of calibrated wheels, within their limit."""
+        """Return `(omega_R, omega_L)` of the calibrated wheels, within their limit (rad/s)."""
         parameters = self.parameters
         r, L = parameters.wheel_radius, parameters.wheel_separation
         L *= parameters.wheel_separation_multiplier
         right, left = body_to_wheel(v, omega, r, L)
         right /= parameters.right_wheel_radius_multiplier
         left /= parameters.left_wheel_radius_multiplier
-        excess = max(1.0, max(abs(right), abs(left)) / parameters.fastest_wheel)
+        excess = max(1.0, max(abs(right), abs(left)) / parameters.wheel_speed_limit)
         return right / excess, left / excess
 
     def _publish(self, speeds: tuple[Any, Any], stamp: int) -> None:
         self._moving = speeds != (0.0, 0.0)
         if isinstance(self._message, JointState):
-            self._message.name = [self.parameters.left_wheel_name, self.parameters.right_wheel_name]
+            self._message.name = list(self.parameters.wheel_names)
             messages.set_joint_state(self._message, stamp, speeds)
         else:
-            self._message.data = [speeds[1], speeds[0]]
+            messages.set_wheel_array(self._message, speeds)
         self._joint_command.publish(self._message)
 
     def _on_silence(self) -> None:
@@ -95,13 +97,13 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
             )
 
     def stop(self, why: str) -> None:
-        """Stop the wheels, if they turn."""
+        """Publish zero wheel speeds, unless they are zero."""
         if self._moving:
             self._publish((0.0, 0.0), self.now())
             self.get_logger().info(f'the wheels are stopped: {why}')
             self.flush(self._joint_command)
 
     def parameters_changed(self, previous: WheelBridgeParameters) -> None:
-        """Follow a new timeout; the rest counts from the next command on."""
+        """Start a new timeout. Other parameters apply from the next command on."""
         if self.parameters.cmd_vel_timeout != previous.cmd_vel_timeout:
             self._watchdog.start(nanoseconds(self.parameters.cmd_vel_timeout))

@@ -1,1 +1,1 @@
-"""Parameters of the nodes as checked dataclasses; no ROS is imported."""
+"""Parameters of the nodes as validated dataclasses. Imports no ROS."""

@@ -4,9 +4,9 @@
     class Parameters(NodeParameters):
         kp: float = parameter(3.0, 'Gain on the heading error [1/s].', above=0.0)
 
-The dataclass is the only place where name, type, default, description, unit and range stand. The
-descriptors that `ros2 param describe` shows are made from it, and it validates itself: an object of
-it is always a valid set. `ParameterizedNode` keeps one, and replaces it whole when parameters change.
+The dataclass defines name, type, default, description, unit and range of each parameter. The descriptors
+that `ros2 param describe` shows are derived from it. It validates its values when it is created. A
+`ParameterizedNode` has one instance, and replaces it when parameters change.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from typing import Any, Protocol, TypeVar
 from diffdrive_jacobian.text import printable
 
 MAX_LENGTH = 256
-"""Longest string that a parameter may be (characters)."""
+"""Largest length of a string parameter (characters)."""
 NOT_EMPTY = f'not empty and at most {MAX_LENGTH} characters'
 
 
 class ParameterError(ValueError):
-    """A set of parameters that a node cannot run with; the message names parameter, value and range."""
+    """Invalid parameters. The message names the parameter, its value and its range."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Specification:
-    """What is known of one parameter beside its type and default."""
+    """Properties of a parameter other than its type and its default."""
 
     name: str | None
     description: str
@@ -44,7 +44,7 @@ class Specification:
 
     @property
     def allowed(self) -> str:
-        """Say in words what is allowed."""
+        """The values allowed, in words."""
         words = []
         if self.choices:
             words.append('one of ' + ', '.join(repr(choice) for choice in self.choices))
@@ -57,7 +57,7 @@ class Specification:
         return ' '.join(words)
 
     def permits(self, value: Any) -> bool:
-        """Tell whether a value of the right type is allowed."""
+        """Return whether a value of the right type is allowed."""
         if self.choices:
             return value in self.choices
         if isinstance(value, str):
@@ -88,14 +88,14 @@ def parameter(
     Args:
         default: Default value; bool, int, float or str.
         description: One sentence with the unit in brackets.
-        name: ROS name where it differs from the field's (`linear.x.max_velocity`).
+        name: ROS name, if it differs from the name of the field (`linear.x.max_velocity`).
         bounds: Smallest and largest value allowed.
-        above: With `bounds`: the smallest value is itself not allowed, and stands here.
+        above: Lower bound that is itself not allowed. Replaces the smallest value of `bounds`.
         choices: The strings allowed.
         constraint: Text for the descriptor instead of the list of choices, where these are searched for.
-        nan_is_none: NaN is allowed and means: none. ROS ranges reject NaN, so the descriptor of such
-            a parameter carries no range; the description and the validation do.
-        read_only: Fixed once the node runs.
+        nan_is_none: Whether NaN is allowed and means "none". Ranges of ROS reject NaN, so the descriptor
+            of such a parameter has no range.
+        read_only: Whether the parameter cannot change while the node runs.
     """
     low, high = bounds if bounds else (None, None)
     specification = Specification(
@@ -114,7 +114,7 @@ def parameter(
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class NodeParameters:
-    """Base of the parameters of a node. An instance that exists is valid.
+    """Base class of the parameters of a node. Every instance is valid.
 
     Raises:
         ParameterError: A value has the wrong type or is out of range, or values contradict each other.
@@ -136,14 +136,14 @@ class NodeParameters:
         self.check()
 
     def check(self) -> None:
-        """Reject values that contradict each other; overridden where some can."""
+        """Raise ParameterError if values contradict each other. For subclasses."""
 
 
 P = TypeVar('P', bound=NodeParameters)
 
 
 def _got(value: object) -> str:
-    """Return a value as it is quoted in an error message, of limited length."""
+    """Return a value for an error message, with limited length."""
     if not isinstance(value, str):
         return printable(repr(value))
     length = f' ({len(value)} characters)' if len(value) > MAX_LENGTH else ''
@@ -173,7 +173,7 @@ def default_of(parameters: type[NodeParameters], field: str) -> Any:
 
 
 def as_declared(parameters: type[NodeParameters], name: str, value: Any) -> Any:
-    """Return a double for an integer, as `-p kp:=1` gives it."""
+    """Return a value, converted to a double if it is an integer for a double (`-p kp:=1`)."""
     known = specifications(parameters)
     if name in known and type(value) is int and type(default_of(parameters, known[name][0])) is float:
         return float(value)
@@ -181,10 +181,10 @@ def as_declared(parameters: type[NodeParameters], name: str, value: Any) -> Any:
 
 
 def from_ros(parameters: type[P], values: Mapping[str, Any]) -> P:
-    """Make the set that a node would have with values by their ROS names; others' are passed over.
+    """Return the parameters with values by their ROS names. Unknown names are ignored.
 
     Raises:
-        ParameterError: The set would not be valid.
+        ParameterError: The values are invalid.
     """
     known = specifications(parameters)
     return parameters(
@@ -197,25 +197,25 @@ def from_ros(parameters: type[P], values: Mapping[str, Any]) -> P:
 
 
 class Change(Protocol):
-    """A new value of a parameter, as `rclpy.parameter.Parameter`."""
+    """A new value of a parameter, for example a `rclpy.parameter.Parameter`."""
 
     @property
     def name(self) -> str:
-        """ROS name."""
+        """ROS name of the parameter."""
 
     @property
     def value(self) -> Any:
-        """The value in Python."""
+        """The new value."""
 
 
 def changed(parameters: P, changes: Iterable[Change]) -> P:
-    """Make the set that results from changes; parameters of others among them are passed over.
+    """Return the parameters after changes. Unknown names are ignored.
 
     Returns:
-        The new set; the very same one if nothing among the changes is of it.
+        New parameters, or the same object if no change applies.
 
     Raises:
-        ParameterError: The set would not be valid.
+        ParameterError: The new values are invalid.
     """
     known = specifications(type(parameters))
     values = {known[change.name][0]: change.value for change in changes if change.name in known}

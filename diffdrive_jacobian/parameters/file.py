@@ -1,4 +1,4 @@
-"""The robot's parameters from a file of ROS parameters, for tools that run no node."""
+"""Parameters of virtual_robot from a ROS parameter file, for tools that run no node."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from diffdrive_jacobian.text import printable
 
 
 def robot_parameters(path: str) -> dict[str, Any]:
-    """Read the robot's parameters from a file of ROS parameters.
+    """Return the parameters of virtual_robot in a ROS parameter file, by name.
 
     Raises:
-        UserError: The file is none of that kind.
+        UserError: The file cannot be read or is not a ROS parameter file.
     """
     try:
         content = load_yaml(Path(path))

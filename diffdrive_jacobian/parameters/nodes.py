@@ -1,11 +1,12 @@
-"""Every parameter of the three nodes: name, default, unit, range. What does not say read-only may
-change while the node runs.
+"""The parameters of the three nodes: names, defaults, units, ranges.
+
+A parameter may change while the node runs, unless its description says read-only.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 from diffdrive_jacobian.control.controller import Controller
@@ -14,81 +15,81 @@ from diffdrive_jacobian.control.controllers import CONTROLLERS as CONTROLLERS
 from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION, MAX_SPEED
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, parameter
-from diffdrive_jacobian.simulation.robot import NANOSECONDS, RobotModel
+from diffdrive_jacobian.simulation.robot import RobotModel
 from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.time_units import nanoseconds
 
 MIN_OFFSET = 1e-3
-"""Smallest distance of the driven point from the axle: the yaw rate grows like its inverse (m)."""
-_STAMPED = 'cmd_vel is a TwistStamped instead of a Twist. Read-only.'
+"""Smallest absolute offset (m). The yaw rate of the law is proportional to the inverse of the offset."""
+_STAMPED = 'Use TwistStamped instead of Twist for cmd_vel. Read-only.'
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LimitParameters(NodeParameters):
-    """Limits of the body twist, named as diff_drive_controller names them."""
+    """Limits of the body twist, with the names and the meaning of diff_drive_controller."""
 
     linear_x_max_velocity: float = parameter(
         math.nan,
-        'Fastest forward speed [m/s]; .nan: none.',
+        'Maximum forward velocity [m/s]; .nan: no limit.',
         name='linear.x.max_velocity',
         bounds=(0.0, MAX_SPEED),
         nan_is_none=True,
     )
     linear_x_min_velocity: float = parameter(
         math.nan,
-        'Fastest reverse speed, zero or negative [m/s]; .nan: as fast as forward.',
+        'Minimum velocity, zero or negative: the limit in reverse [m/s]; .nan: as forward.',
         name='linear.x.min_velocity',
         bounds=(-MAX_SPEED, 0.0),
         nan_is_none=True,
     )
     angular_z_max_velocity: float = parameter(
         math.nan,
-        'Fastest counter-clockwise yaw rate [rad/s]; .nan: none.',
+        'Maximum yaw rate, counter-clockwise [rad/s]; .nan: no limit.',
         name='angular.z.max_velocity',
         bounds=(0.0, MAX_SPEED),
         nan_is_none=True,
     )
     angular_z_min_velocity: float = parameter(
         math.nan,
-        'Fastest clockwise yaw rate, zero or negative [rad/s]; .nan: as fast as counter-clockwise.',
+        'Minimum yaw rate, zero or negative: the limit clockwise [rad/s]; .nan: as counter-clockwise.',
         name='angular.z.min_velocity',
         bounds=(-MAX_SPEED, 0.0),
         nan_is_none=True,
     )
 
-    def limits(self, *, without: float = math.inf, max_wheel_speed: float = math.nan) -> VelocityLimits:
-        """Gather the limits, as diff_drive_controller reads them.
+    def twist_limits(self, default: float = math.inf) -> VelocityLimits:
+        """Return the limits of the twist, without a limit of the wheel speed.
 
         Args:
-            without: In the place of a limit that is not set (m/s, rad/s).
-            max_wheel_speed: Limit of the wheels; NaN: none (rad/s).
+            default: The limit where none is set (m/s, rad/s).
         """
-        max_v = _or(self.linear_x_max_velocity, without)
-        max_omega = _or(self.angular_z_max_velocity, without)
+        max_v = _or(self.linear_x_max_velocity, default)
+        max_omega = _or(self.angular_z_max_velocity, default)
         return VelocityLimits(
             min_v=_or(self.linear_x_min_velocity, -max_v),
             max_v=max_v,
             min_omega=_or(self.angular_z_min_velocity, -max_omega),
             max_omega=max_omega,
-            max_wheel_speed=_or(max_wheel_speed, math.inf),
         )
 
 
 def _or(value: float, otherwise: float) -> float:
+    """Return a value, or another one if it is NaN."""
     return otherwise if math.isnan(value) else value
 
 
 def _wheel_radius() -> Any:
-    return parameter(0.033, 'Wheel radius [m].', bounds=(1e-3, 10.0))
+    return parameter(0.033, 'Radius of the wheels [m].', bounds=(1e-3, 10.0))
 
 
 def _wheel_separation() -> Any:
-    return parameter(0.16, 'Wheel separation, also called track width [m].', bounds=(1e-3, 100.0))
+    return parameter(0.16, 'Distance between the left and the right wheel [m].', bounds=(1e-3, 100.0))
 
 
 def _max_wheel_velocity() -> Any:
     return parameter(
         math.nan,
-        'Fastest speed of either wheel [rad/s]; both are slowed alike, so the path stays; .nan: none.',
+        'Maximum wheel speed [rad/s]; both are scaled alike, which keeps the curvature; .nan: no limit.',
         bounds=(1e-3, 1e6),
         nan_is_none=True,
     )
@@ -99,60 +100,74 @@ def _timeout(default: float, description: str) -> Any:
 
 
 def _multiplier(what: str) -> Any:
-    return parameter(1.0, f'Calibration factor on the {what} [-].', bounds=(0.1, 10.0))
+    return parameter(1.0, f'Correction factor for the {what} [-].', bounds=(0.1, 10.0))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class VirtualRobotParameters(LimitParameters):
     """Parameters of the node virtual_robot."""
 
-    publish_rate: float = parameter(50.0, 'Rate of odom and joint_states [Hz].', bounds=(0.1, 1000.0))
-    odom_frame_id: str = parameter('odom', 'Frame in which the pose is given.')
-    base_frame_id: str = parameter('base_link', 'Frame of the robot, on the axle centre.')
+    publish_rate: float = parameter(
+        50.0, 'Publishing rate of odom and joint_states [Hz].', bounds=(0.1, 1000.0)
+    )
+    odom_frame_id: str = parameter('odom', 'Name of the frame of the odometry.')
+    base_frame_id: str = parameter('base_link', 'Name of the frame of the robot, at the axle centre.')
     wheel_radius: float = _wheel_radius()
     wheel_separation: float = _wheel_separation()
     max_wheel_velocity: float = _max_wheel_velocity()
     cmd_vel_timeout: float = _timeout(
-        0.5, 'A command is held this long, then the robot stops [s]; 0: for ever.'
+        0.5, 'Time without a command after which the robot stops [s]; 0: never.'
     )
     x: float = parameter(
-        0.0, 'Position at the start and after a reset [m].', bounds=(-MAX_POSITION, MAX_POSITION)
+        0.0, 'Initial position x, also after a reset [m].', bounds=(-MAX_POSITION, MAX_POSITION)
     )
     y: float = parameter(
-        0.0, 'Position at the start and after a reset [m].', bounds=(-MAX_POSITION, MAX_POSITION)
+        0.0, 'Initial position y, also after a reset [m].', bounds=(-MAX_POSITION, MAX_POSITION)
     )
     theta: float = parameter(
-        0.0, 'Heading at the start and after a reset [rad].', bounds=(-math.tau, math.tau)
+        0.0, 'Initial heading, also after a reset [rad].', bounds=(-math.tau, math.tau)
     )
     wheel_travel_variance: float = parameter(
-        1e-5, 'Variance of each wheel, per way: m^2 for each m [m].', bounds=(0.0, 1.0)
+        1e-5,
+        'Variance of the distance travelled by a wheel, per distance [m^2/m].',
+        bounds=(0.0, 1.0),
     )
     command_interface: str = parameter(
         'twist',
-        'Drive from cmd_vel (twist) or from joint_command (wheels). Read-only.',
+        'Subscribe to cmd_vel (twist) or to joint_command (wheels). Read-only.',
         choices=('twist', 'wheels'),
         read_only=True,
     )
     enable_stamped_cmd_vel: bool = parameter(False, _STAMPED, read_only=True)
-    left_wheel_name: str = parameter('left_wheel_joint', 'Joint of the left wheel.')
-    right_wheel_name: str = parameter('right_wheel_joint', 'Joint of the right wheel.')
+    left_wheel_name: str = parameter('left_wheel_joint', 'Name of the joint of the left wheel.')
+    right_wheel_name: str = parameter('right_wheel_joint', 'Name of the joint of the right wheel.')
     enable_odom_tf: bool = parameter(
         True,
-        'Broadcast odom -> base on /tf, where tf2_ros is installed. Read-only.',
+        'Publish the transform from odom_frame_id to base_frame_id, if tf2_ros is installed. Read-only.',
         read_only=True,
     )
 
     def check(self) -> None:
-        """Wheels and frames must be told apart."""
+        """Raise ParameterError if the names of the wheels or of the frames are equal."""
         _differ('left_wheel_name', self.left_wheel_name, 'right_wheel_name', self.right_wheel_name)
         _differ('odom_frame_id', self.odom_frame_id, 'base_frame_id', self.base_frame_id)
 
+    @property
+    def wheel_names(self) -> tuple[str, str]:
+        """Names of the left and the right wheel joint, in the order of messages."""
+        return self.left_wheel_name, self.right_wheel_name
+
+    def limits(self) -> VelocityLimits:
+        """Return the limits of the twist and of the wheel speed."""
+        max_wheel_speed = _or(self.max_wheel_velocity, math.inf)
+        return replace(self.twist_limits(), max_wheel_speed=max_wheel_speed)
+
     def model(self) -> RobotModel:
-        """Give the robot that they describe."""
+        """Return the model of the robot with these parameters."""
         return RobotModel(
             wheel_radius=self.wheel_radius,
             wheel_separation=self.wheel_separation,
-            limits=self.limits(max_wheel_speed=self.max_wheel_velocity),
+            limits=self.limits(),
             command_timeout=nanoseconds(self.cmd_vel_timeout),
             wheel_travel_variance=self.wheel_travel_variance,
         )
@@ -177,7 +192,7 @@ class GoToGoalParameters(LimitParameters):
     """The controllers that can be chosen."""
 
     kp: float = parameter(
-        3.0, 'Gain on the heading error [1/s]; larger than kv.', bounds=(0.0, 100.0), above=0.0
+        3.0, 'Gain on the heading error [1/s]; should be larger than kv.', bounds=(0.0, 100.0), above=0.0
     )
     kv: float = parameter(0.5, 'Gain on the distance [1/s].', bounds=(0.0, 100.0), above=0.0)
     controller: str = _controller('go_to_goal', CONTROLLERS)
@@ -187,14 +202,17 @@ class GoToGoalParameters(LimitParameters):
         bounds=(-100.0, 100.0),
     )
     xy_goal_tolerance: float = parameter(
-        0.02, 'Distance to the goal that counts as arrived [m].', bounds=(1e-6, 100.0)
+        0.02, 'Tolerance on the distance to the goal [m].', bounds=(1e-6, 100.0)
     )
     yaw_goal_tolerance: float = parameter(
-        0.02, 'Heading error that counts as arrived [rad].', bounds=(1e-6, math.pi)
+        0.02, 'Tolerance on the heading error [rad].', bounds=(1e-6, math.pi)
     )
-    use_goal_heading: bool = parameter(False, 'Turn to the heading of the last waypoint at the end.')
+    use_goal_heading: bool = parameter(
+        False, 'Turn to the heading of the last goal after its position is reached.'
+    )
     odom_timeout: float = _timeout(
-        0.5, 'Without odometry for this long the robot is stopped [s]; 0: never.'
+        0.5,
+        'Time without odometry after which the robot stops, until it returns [s]; 0: never.',
     )
     enable_stamped_cmd_vel: bool = parameter(False, _STAMPED, read_only=True)
 
@@ -214,6 +232,10 @@ class GoToGoalParameters(LimitParameters):
             controller: str = choice
 
         return Parameters
+
+    def limits(self) -> VelocityLimits:
+        """Return the limits of the commands, at most the largest plausible twist."""
+        return self.twist_limits(MAX_SPEED)
 
     def check(self) -> None:
         """Check that the driven point is not on the axle, and that the controller can be loaded."""
@@ -247,10 +269,10 @@ class WheelBridgeParameters(NodeParameters):
     right_wheel_radius_multiplier: float = _multiplier('radius of the right wheel')
     max_wheel_velocity: float = _max_wheel_velocity()
     cmd_vel_timeout: float = _timeout(
-        0.5, 'Without a command for this long the wheels are stopped [s]; 0: never.'
+        0.5, 'Time without a command after which the wheels are stopped [s]; 0: never.'
     )
-    left_wheel_name: str = parameter('left_wheel_joint', 'Joint of the left wheel.')
-    right_wheel_name: str = parameter('right_wheel_joint', 'Joint of the right wheel.')
+    left_wheel_name: str = parameter('left_wheel_joint', 'Name of the joint of the left wheel.')
+    right_wheel_name: str = parameter('right_wheel_joint', 'Name of the joint of the right wheel.')
     joint_command_type: str = parameter(
         'JointState',
         'Type of joint_command: JointState, or Float64MultiArray with [left, right]. Read-only.',
@@ -260,12 +282,17 @@ class WheelBridgeParameters(NodeParameters):
     enable_stamped_cmd_vel: bool = parameter(False, _STAMPED, read_only=True)
 
     def check(self) -> None:
-        """Wheels must be told apart."""
+        """Raise ParameterError if the names of the wheels are equal."""
         _differ('left_wheel_name', self.left_wheel_name, 'right_wheel_name', self.right_wheel_name)
 
     @property
-    def fastest_wheel(self) -> float:
-        """The limit of the wheel speeds (rad/s), infinite if there is none."""
+    def wheel_names(self) -> tuple[str, str]:
+        """Names of the left and the right wheel joint, in the order of messages."""
+        return self.left_wheel_name, self.right_wheel_name
+
+    @property
+    def wheel_speed_limit(self) -> float:
+        """The limit of the wheel speeds (rad/s); infinite: none."""
         return _or(self.max_wheel_velocity, math.inf)
 
 
@@ -274,8 +301,3 @@ def _differ(first: str, value: str, second: str, other: str) -> None:
         raise ParameterError(
             f"parameters '{first}' and '{second}' must differ, both are '{printable(value)}'"
         )
-
-
-def nanoseconds(seconds: float) -> int:
-    """Turn a duration parameter (s) into nanoseconds; only zero becomes zero, which means never."""
-    return max(1, round(seconds * NANOSECONDS)) if seconds else 0

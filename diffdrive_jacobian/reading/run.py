@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-NANOSECONDS = 1_000_000_000
+from diffdrive_jacobian.time_units import NANOSECONDS
+
 MAX_NUMBER = 1e6
 """Largest magnitude of the numeric parameters of our nodes (m, m/s, rad/s)."""
 COLUMNS = {

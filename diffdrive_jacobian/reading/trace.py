@@ -17,6 +17,7 @@ from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 from diffdrive_jacobian.reading.reader import BagError
 from diffdrive_jacobian.reading.run import Run, Series
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -93,13 +94,13 @@ def seconds(run: Run, series: Series) -> Array:
         series.received - np.rint(delay).astype(np.int64),
         series.stamps,
     )
-    return np.asarray((stamps - odometry.stamps[0]) / 1e9, dtype=np.float64)
+    return np.asarray((stamps - odometry.stamps[0]) / NANOSECONDS, dtype=np.float64)
 
 
 def _breaks(run: Run) -> Indices:
     """Return where the odometry is reset: after a start_pose, back in time, or by a teleport."""
     stamps, values = run.odometry.stamps, run.odometry.values
-    dt, step = np.diff(stamps) / 1e9, np.hypot(*np.diff(values[:, :2], axis=0).T)
+    dt, step = np.diff(stamps) / NANOSECONDS, np.hypot(*np.diff(values[:, :2], axis=0).T)
     moving = (dt > 0.0) & (step > 0.0)
     usual = np.median(step[moving] / dt[moving]) if moving.any() else 0.0
     speed = np.abs(values[:, 3])

@@ -24,7 +24,8 @@ from diffdrive_jacobian.parameters.declaration import from_ros
 from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
 from diffdrive_jacobian.reading.reader import BagError
 from diffdrive_jacobian.reading.run import Run, Series
-from diffdrive_jacobian.simulation.robot import NANOSECONDS, Robot, RobotModel
+from diffdrive_jacobian.simulation.robot import Robot, RobotModel
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 ROBOT = 'virtual_robot'
 EXACT, BY_RECORDING_TIME = 1e-9, 0.02

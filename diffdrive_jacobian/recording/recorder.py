@@ -24,6 +24,7 @@ from diffdrive_jacobian.recording.missed import MissedMessages
 from diffdrive_jacobian.recording.parameter_query import ParameterQuery
 from diffdrive_jacobian.recording.selection import Selection as Selection
 from diffdrive_jacobian.ros.qos import subscription_profile, to_fields
+from diffdrive_jacobian.ros.rclpy_internals import reason, waiting_messages
 
 DEPTH = 4000
 """Depth of the queue of each subscription."""
@@ -140,8 +141,7 @@ class Recorder(Node):  # type: ignore[misc]
             return str(self.resolve_topic_name(topic))
         except (RuntimeError, NameValidationException) as error:
             self.destroy_node()
-            why = str(error).split(', at /')[0]
-            raise ParameterError(f'invalid topic name {topic!r}: {why}') from error
+            raise ParameterError(f'invalid topic name {topic!r}: {reason(error)}') from error
 
     def _wants(self, topic: str) -> bool:
         if topic in self._names:
@@ -176,7 +176,7 @@ class Recorder(Node):  # type: ignore[misc]
         try:
             self._create_subscription(channel, message, profile)
         except (RuntimeError, NameValidationException) as error:
-            self._refuse(topic, str(error).split(', at /')[0])
+            self._refuse(topic, reason(error))
 
     def _create_subscription(self, channel: Channel, message: Any, profile: QoSProfile) -> None:
         topic = channel.topic
@@ -224,12 +224,10 @@ class Recorder(Node):  # type: ignore[misc]
         self._takers[topic](data, info)
         # The executor takes one message at a time, at many times the cost: the queue would overflow.
         subscription, end = self._subscriptions_by_topic[topic], time.monotonic() + BURST
-        with subscription.handle:
-            while time.monotonic() < end:
-                taken = subscription.handle.take_message(subscription.msg_type, True)
-                if taken is None:
-                    break
-                self._takers[topic](*taken)
+        for taken in waiting_messages(subscription):
+            self._takers[topic](*taken)
+            if time.monotonic() >= end:
+                break
 
     def _record(self, channel: int, missed: MissedMessages, data: bytes, info: dict[str, int]) -> None:
         if self._end is not None:

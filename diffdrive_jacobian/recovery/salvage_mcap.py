@@ -21,6 +21,7 @@ from diffdrive_jacobian.bags.limits import (
     unpack,
 )
 from diffdrive_jacobian.text import format_size
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 Schemas = dict[int, tuple[str, str]]
 """Numbers of types to their names and definitions."""
@@ -155,7 +156,7 @@ def _read_chunk(
         note(f'a chunk of {len(payload)} bytes cannot be unpacked: {error}')
         return
     if not cut and (len(data) != size or (checksum and zlib.crc32(data) != checksum)):
-        note(f'a chunk of {size} bytes is damaged ({(end - start) / 1e9:.1f} s)')
+        note(f'a chunk of {size} bytes is damaged ({(end - start) / NANOSECONDS:.1f} s)')
         return
     for opcode, record, ending in _walk(BytesIO(data), len(data), note):
         if ending <= len(data):

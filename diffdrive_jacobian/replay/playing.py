@@ -24,6 +24,7 @@ from diffdrive_jacobian.ros.heartbeats import fast_heartbeats
 from diffdrive_jacobian.ros.node_runner import NodeRunner
 from diffdrive_jacobian.ros.runner import ros_context, running
 from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.time_units import seconds
 
 NAME = 'replay_run'
 """Name of the node."""
@@ -127,7 +128,7 @@ def replay(
         open_bag(bag) as reader,
         nullcontext() if acknowledgement_timeout is None else fast_heartbeats(),
         ros_context([NAME, *ros_arguments]) as context,
-        running(context, closed_world=False) as runner,
+        running(context, isolated=False) as runner,
     ):
         player = runner.add(lambda: Replayer(reader, playback, context=context))
         session = _Session(player, runner, signals, progress)
@@ -220,12 +221,12 @@ class _Session:
     def play(self) -> bool:
         """Play the bag; return whether it was played to its end."""
         player = self._player
-        self._progress.started((player.end - player.start) / 1e9)
+        self._progress.started(seconds(player.end - player.start))
 
         def over() -> bool:
             if self._progress.toggled():
                 player.toggle()
-            self._progress.playing((player.position - player.start) / 1e9, paused=player.paused)
+            self._progress.playing(seconds(player.position - player.start), paused=player.paused)
             return bool(player.done or self._signals.count)
 
         try:

@@ -18,10 +18,12 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 
 from diffdrive_jacobian.bags.bag_reader import BagError, base_name, messages
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, message_class
+from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.replay.lateness import Lateness
 from diffdrive_jacobian.ros.qos import publisher_profile
+from diffdrive_jacobian.ros.rclpy_internals import restart_timer
+from diffdrive_jacobian.time_units import NANOSECONDS
 
-NANOSECONDS = 1_000_000_000
 DEPTH = 1000
 COMMANDS = ('cmd_vel',)
 """Topics of the commands to a robot."""
@@ -266,15 +268,14 @@ class Replayer(Node):  # type: ignore[misc]
             self.done = True
             return
         due = self._due(self.end if self._next is None else self._next[1])
-        self._timer.timer_period_ns = max(due - time.monotonic_ns(), 1)
-        self._timer.reset()
+        restart_timer(self._timer, max(due - time.monotonic_ns(), 1))
 
     def _publish_time(self) -> None:
         if self._clock_publisher is None or not self._wall or self.done:
             return
         now = self.position if self.paused else self._bag_time(time.monotonic_ns())
         message = ClockMessage()
-        message.clock.sec, message.clock.nanosec = divmod(now, NANOSECONDS)
+        set_time(message.clock, now)
         self._clock_publisher.publish(message)
 
 

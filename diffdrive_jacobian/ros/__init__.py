@@ -1,1 +1,1 @@
-"""What the nodes share: parameters, message conversion, the node's base, the runner."""
+"""Common code of the nodes: base class, parameters, runner, watchdog, adapter to rclpy."""

@@ -120,7 +120,7 @@ class GoalClient(Node):  # type: ignore[misc]
         """Publish the goals. Their stamp distinguishes them from older ones."""
         self._send_on_odometry = False
         message = self._goals()
-        message.header.stamp = self.get_clock().now().to_msg()
+        messages.set_time(message.header.stamp, self.get_clock().now().nanoseconds)
         message.header.frame_id = self._frame
         self._message = message
         self._publisher.publish(message)

@@ -1,17 +1,14 @@
 """Guards for the two inputs that rclpy parses itself: parameter requests and /clock.
 
-rclpy lets an exception of its own parser out of the callback, which ends the node: a parameter value of
-an unknown type, and a clock message with a negative time. Both are refused here before rclpy sees them,
-with a throttled warning. Everything else is passed on as it is, and what other callbacks raise is not
-caught.
-
-The names of rclpy used for this: `Node.services`, `Service.srv_type` and `Service.callback`;
-`Node._time_source`, `TimeSource.clock_callback` and `TimeSource._clock_sub`.
+A parameter value of an unknown type or a clock message with a negative time raises an exception in
+rclpy, which ends the node. Both are refused before rclpy receives them, with a throttled warning. Other
+inputs are passed on unchanged, and exceptions of other callbacks are not caught.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from rcl_interfaces.msg import Parameter as ParameterMessage
@@ -22,29 +19,28 @@ from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 
 from diffdrive_jacobian.messages.conversion import MessageError, from_time
+from diffdrive_jacobian.ros.rclpy_internals import wrap_clock_callback, wrap_service_callback
 from diffdrive_jacobian.text import printable
 
 THROTTLE = 2.0
-"""Shortest time between two log lines about the same kind of input (s)."""
+"""Shortest time between two log lines about one kind of input (s)."""
 _TYPES = frozenset(member.value for member in Parameter.Type)
 
 
 def guard_inputs(node: Node) -> None:
-    """Make a node survive parameter requests and clock messages that rclpy cannot parse.
+    """Refuse parameter requests and clock messages that rclpy cannot parse.
 
-    The guard of /clock also holds when `use_sim_time` is switched on later.
+    /clock is also guarded when `use_sim_time` becomes true later.
     """
-    _guard_clock(node)
-    for service in node.services:
-        if service.srv_type is SetParameters:
-            service.callback = _guarded_set_parameters(node, service.callback)
-        elif service.srv_type is SetParametersAtomically:
-            service.callback = _guarded_set_parameters_atomically(node, service.callback)
+    wrap_clock_callback(node, partial(_guarded_clock, node))
+    wrap_service_callback(node, SetParameters, partial(_guarded_set_parameters, node))
+    wrap_service_callback(
+        node, SetParametersAtomically, partial(_guarded_set_parameters_atomically, node)
+    )
 
 
-def _guard_clock(node: Node) -> None:
-    source = node._time_source
-    accept, log = source.clock_callback, node.get_logger()
+def _guarded_clock(node: Node, accept: Callable[[Clock], None]) -> Callable[[Clock], None]:
+    log = node.get_logger()
 
     def on_clock(message: Clock) -> None:
         try:
@@ -54,9 +50,7 @@ def _guard_clock(node: Node) -> None:
             return
         accept(message)
 
-    source.clock_callback = on_clock
-    if source._clock_sub is not None:
-        source._clock_sub.callback = on_clock
+    return on_clock
 
 
 def _guarded_set_parameters(
@@ -109,7 +103,7 @@ def _guarded_set_parameters_atomically(
 
 
 def _refusal(parameter: ParameterMessage) -> SetParametersResult | None:
-    """Return why rclpy cannot handle a parameter of a request; None: it can."""
+    """Return the result for a parameter that rclpy cannot handle; None: it can."""
     if parameter.value.type not in _TYPES:
         return SetParametersResult(
             successful=False,
@@ -117,6 +111,6 @@ def _refusal(parameter: ParameterMessage) -> SetParametersResult | None:
             f'got type {parameter.value.type}',
         )
     if not parameter.name:
-        # rclpy does not notice that such a parameter is not declared, and sets it.
+        # rclpy would set it, although it is not declared.
         return SetParametersResult(successful=False, reason='a parameter must have a name, got none')
     return None

@@ -1,15 +1,14 @@
-"""The base of the nodes: parameters as one value, and eyes for what goes wrong in silence.
+"""Base class of the nodes: its parameters are one value, and it reports silent failures.
 
-Two things are silent in ROS and cost newcomers hours: a topic that carries another type than its
-reader wants, and simulated time without anybody who publishes /clock. Both are looked for once a
-second, on the wall clock, and said once.
+ROS reports neither a topic whose publisher and subscription differ in type, nor simulated time for which
+nobody publishes /clock. Nodes check for both once a second of wall time, and report each once.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 from weakref import WeakKeyDictionary
@@ -32,31 +31,34 @@ from diffdrive_jacobian.ros import parameters as ros_parameters
 from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.rate_limit import RateLimit
+from diffdrive_jacobian.ros.rclpy_internals import parameter_overrides, reason, time_reader
 from diffdrive_jacobian.text import printable
 
 P = TypeVar('P', bound=NodeParameters)
 
 EVENT_BURST = 10
-"""Number of log lines about one kind of event that are written at once."""
+"""Number of log lines about one kind of event that are written without a delay."""
 EVENT_PERIOD = 1.0
 """Shortest time between further log lines about that kind of event (s)."""
 FLUSH_PATIENCE = Duration(seconds=0.1)
-"""How long the last message may take to be acknowledged; it arrives long before (s)."""
+"""Longest wait for the acknowledgement of the last messages (s). They arrive long before."""
 WATCH_PERIOD = 1.0
-"""How often the graph and the clock are looked at (s)."""
+"""Period of the checks of the graph and of the clock (s)."""
 CLOCK_PATIENCE = 5
-"""How many looks find no /clock before that is said."""
+"""Number of checks without a message on /clock before that is reported."""
 NAME_PATIENCE = 3
-"""How many looks may find a node without a name before it is reported without one."""
+"""Number of checks for the name of a node before it is reported without one."""
+NO_CLOCK = 'simulated time has not started, nothing was received on /clock'
+"""Why a node with `use_sim_time` drops a message."""
 
 
 class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
-    """A node with a dataclass of parameters and reliable, overridable topics."""
+    """A node with a dataclass of parameters, and with reliable topics whose QoS users can override."""
 
     parameters: P
 
     def __init__(self, name: str, parameters: type[P], **kwargs: Any) -> None:
-        """Declare the parameters with the values their user gave.
+        """Declare the parameters with the values that the user gave.
 
         Args:
             name: Name of the node.
@@ -64,7 +66,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
             kwargs: Passed on to `rclpy.node.Node` (context, namespace, parameter_overrides, ...).
 
         Raises:
-            ParameterError: The values given are not a valid set; the node is destroyed.
+            ParameterError: The values are invalid. The node is destroyed.
         """
         super().__init__(name, **kwargs)
         try:
@@ -73,28 +75,38 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
             self.destroy_node()
             raise
         guard_inputs(self)
+        self._read_time = time_reader(self.get_clock())
         self._event_limits: dict[str, RateLimit] = {}
-        self.add_pre_set_parameters_callback(self._before_parameters)
-        self.add_on_set_parameters_callback(self._judge_parameters)
-        self.add_post_set_parameters_callback(self._after_parameters)
-        self._watched: list[tuple[str, str, bool]] = []
-        self._looks: dict[tuple[str, str, str], int] = {}
-        self._said: set[tuple[str, str, str]] = set()
-        self._looks_without_clock = 0
+        self.add_pre_set_parameters_callback(self._convert_parameters)
+        self.add_on_set_parameters_callback(self._validate_parameters)
+        self.add_post_set_parameters_callback(self._apply_parameters)
+        self._topics: list[tuple[str, str, bool]] = []
+        self._mismatches: dict[tuple[str, str, str], int] = {}
+        self._reported: set[tuple[str, str, str]] = set()
+        self._checks_without_clock = 0
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(WATCH_PERIOD, self._watch, clock=steady)
+        self.create_timer(WATCH_PERIOD, self._check_graph, clock=steady)
 
     def now(self) -> int:
-        """Give the time of the node's clock (ns); 0 while simulated time has not begun."""
-        return int(self.get_clock().handle.get_now().nanoseconds)
+        """Return the time of the node's clock (ns); 0: simulated time has not started."""
+        return self._read_time()
 
     def advertise(self, message: type, topic: str, *, latched: bool = False) -> Publisher:
-        """Create a publisher: reliable, keep last 10; latched: for those who come later, too."""
-        self._watched.append((topic, _type_name(message), False))
+        """Create a publisher with reliable QoS, keep last 10.
+
+        Args:
+            message: Type of the messages.
+            topic: Name of the topic.
+            latched: Whether later subscriptions receive the last messages (transient local).
+
+        Raises:
+            ParameterError: The topic has another type in this process, or `qos_overrides` are invalid.
+        """
+        self._topics.append((topic, _type_name(message), False))
         profile = QoSProfile(depth=10)
         if latched:
             profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
-        with self._naming_the_reason(message, topic):
+        with self._explaining_failure(message, topic):
             return self.create_publisher(
                 message,
                 topic,
@@ -105,9 +117,19 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
     def subscribe(
         self, message: type, topic: str, callback: Callable[[Any], None], *, raw: bool = False
     ) -> Subscription:
-        """Create a subscription: reliable, keep last 10; raw: the callback gets the serialized bytes."""
-        self._watched.append((topic, _type_name(message), True))
-        with self._naming_the_reason(message, topic):
+        """Create a subscription with reliable QoS, keep last 10.
+
+        Args:
+            message: Type of the messages.
+            topic: Name of the topic.
+            callback: Called with each message.
+            raw: Whether the callback receives the serialized bytes.
+
+        Raises:
+            ParameterError: As for `advertise`.
+        """
+        self._topics.append((topic, _type_name(message), True))
+        with self._explaining_failure(message, topic):
             return self.create_subscription(
                 message,
                 topic,
@@ -123,17 +145,23 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         Raises:
             RuntimeError: Its name is invalid.
         """
-        # rclpy resolves the name only after it failed, and then raises UnboundLocalError.
+        # create_service raises UnboundLocalError for an invalid name.
         self.resolve_service_name(name)
         return self.create_service(service, name, callback)
 
     def log_event_info(self, event: str, text: str) -> None:
-        """Log what a message caused: of one kind EVENT_BURST lines, then one per EVENT_PERIOD."""
+        """Log an event at level info, at a limited rate.
+
+        Args:
+            event: Kind of the event. Of each kind EVENT_BURST lines are written without a delay, then
+                one per EVENT_PERIOD.
+            text: The line.
+        """
         if self._may_log(event):
             self.get_logger().info(text)
 
     def log_event_warning(self, event: str, text: str) -> None:
-        """Log a problem that a message caused, as often as `log_event_info` does."""
+        """Log an event at level warning, at the rate of `log_event_info`."""
         if self._may_log(event):
             self.get_logger().warning(text)
 
@@ -142,11 +170,11 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         return limit.permits(time.monotonic())
 
     @contextmanager
-    def _naming_the_reason(self, message: type, topic: str) -> Iterator[None]:
-        """Say why a topic cannot be had; rclpy says "invalid allocator".
+    def _explaining_failure(self, message: type, topic: str) -> Iterator[None]:
+        """Raise an error that explains why a publisher or subscription cannot be created.
 
-        Within one process Fast DDS refuses a topic of two types; and users may ask for a quality of
-        service that does not exist.
+        Within a process Fast DDS refuses a topic of two types, which rclpy reports as "invalid
+        allocator". `qos_overrides` may be a combination that does not exist.
         """
         try:
             yield
@@ -155,114 +183,124 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
             types = dict(self.get_topic_names_and_types()).get(name, [])
             others = ', '.join(other for other in types if other != wanted)
             overridden = any(
-                key.startswith(f'qos_overrides.{name}.') for key in self._parameter_overrides
+                key.startswith(f'qos_overrides.{name}.') for key in parameter_overrides(self)
             )
             if overridden and not others:
                 raise ParameterError(
-                    f'the quality of service of {name} cannot be what qos_overrides say: '
-                    f'{str(error).split(", at /")[0]}'
+                    f'the qos_overrides of {name} are invalid: {reason(error)}'
                 ) from error
             if not others:
                 raise
             raise ParameterError(
-                f'{name} cannot be {wanted} in this node, it is {others} in another node of this '
-                'process (is enable_stamped_cmd_vel the same for all of them?)'
+                f'{name} must have one type within a process: this node uses {wanted}, another one '
+                f'{others} (is enable_stamped_cmd_vel the same for both?)'
             ) from error
 
     def parameters_changed(self, previous: P) -> None:
-        """Act on new parameters, which may equal the old; `parameters` was replaced before."""
+        """React to new values in `parameters`, which may equal the previous ones."""
 
     def stop(self, why: str) -> None:
-        """Leave what this node commands standing still: it is destroyed next, or time stands still."""
+        """Stop what this node commands. Called before it is destroyed, and while time does not advance.
 
-    def announce(self, what: str, *topics: str) -> None:
-        """Say that the node is ready, and on which topics."""
-        names = ', '.join(self.resolve_topic_name(topic) for topic in topics)
-        self.get_logger().info(f'ready: {what} {names}')
+        Args:
+            why: The reason, for the log.
+        """
+
+    def announce(self, *, subscribed: Iterable[str], publishing: Iterable[str]) -> None:
+        """Log that the node is ready, with its main topics."""
+        received, sent = (
+            ', '.join(self.resolve_topic_name(topic) for topic in topics)
+            for topics in (subscribed, publishing)
+        )
+        self.get_logger().info(f'subscribed to {received}, publishing {sent}')
 
     @staticmethod
     def flush(publisher: Publisher) -> None:
-        """Give the last message time to arrive: a publisher that is destroyed takes it along."""
+        """Wait until the last messages have arrived: destroying their publisher would drop them."""
         publisher.wait_for_all_acked(FLUSH_PATIENCE)
 
-    def _before_parameters(self, changes: list[Parameter]) -> list[Parameter]:
+    def _convert_parameters(self, changes: list[Parameter]) -> list[Parameter]:
         return ros_parameters.accept_integers(type(self.parameters), changes)
 
-    def _judge_parameters(self, changes: list[Parameter]) -> SetParametersResult:
-        return ros_parameters.judge(self.parameters, changes)
+    def _validate_parameters(self, changes: list[Parameter]) -> SetParametersResult:
+        return ros_parameters.validate(self.parameters, changes)
 
-    def _after_parameters(self, changes: list[Parameter]) -> None:
+    def _apply_parameters(self, changes: list[Parameter]) -> None:
         previous = self.parameters
         self.parameters = changed(previous, changes)
         if self.parameters is not previous:
             self.parameters_changed(previous)
 
-    def _watch(self) -> None:
-        self._watch_clock()
-        looks: dict[tuple[str, str, str], int] = {}
+    def _check_graph(self) -> None:
+        self._check_clock()
+        mismatches: dict[tuple[str, str, str], int] = {}
         types = _topic_types(self)
-        for topic, wanted, reading in self._watched:
+        for topic, wanted, subscribed in self._topics:
             name = self.resolve_topic_name(topic)
             if types.get(name) == [wanted]:
                 continue
-            look = self.get_publishers_info_by_topic if reading else self.get_subscriptions_info_by_topic
-            for other in look(name):
+            endpoints = (
+                self.get_publishers_info_by_topic if subscribed else self.get_subscriptions_info_by_topic
+            )
+            for other in endpoints(name):
                 mismatch = (name, wanted, other.topic_type)
-                if other.topic_type == wanted or mismatch in looks:
+                if other.topic_type == wanted or mismatch in mismatches:
                     continue
-                looks[mismatch] = self._looks.get(mismatch, 0) + 1
-                # The name of a node is found out later than its topics.
-                named = not other.node_name.startswith('_') or looks[mismatch] == NAME_PATIENCE
-                if named and mismatch not in self._said:
-                    self._said.add(mismatch)
-                    self._report_mismatch(mismatch, other, reading)
-        self._looks = looks
-        self._said &= looks.keys()
+                mismatches[mismatch] = self._mismatches.get(mismatch, 0) + 1
+                # The name of a node may be discovered later than its topics.
+                named = not other.node_name.startswith('_') or mismatches[mismatch] == NAME_PATIENCE
+                if named and mismatch not in self._reported:
+                    self._reported.add(mismatch)
+                    self._report_mismatch(mismatch, other, subscribed)
+        self._mismatches = mismatches
+        self._reported &= mismatches.keys()
 
-    def _report_mismatch(self, mismatch: tuple[str, str, str], other: Any, reading: bool) -> None:
+    def _report_mismatch(self, mismatch: tuple[str, str, str], other: Any, subscribed: bool) -> None:
         name, wanted, theirs = mismatch
-        who = printable(f'{other.node_namespace.rstrip("/")}/{other.node_name}')
-        they_do, we_do = ('publishes', 'reads') if reading else ('reads', 'publishes')
+        node = printable(f'{other.node_namespace.rstrip("/")}/{other.node_name}')
+        they_do, this_does = (
+            ('publishes', 'subscribes to') if subscribed else ('subscribes to', 'publishes')
+        )
         hint = ''
         if 'Twist' in wanted and 'Twist' in theirs:
-            hint = '; enable_stamped_cmd_vel chooses between Twist and TwistStamped'
+            hint = '; enable_stamped_cmd_vel selects Twist or TwistStamped'
         self.get_logger().error(
-            f'{who} {they_do} {printable(theirs)} on {name}, but this node {we_do} {wanted}: '
-            f'nothing will arrive{hint}'
+            f'{node} {they_do} {name} as {printable(theirs)}, but this node {this_does} it as {wanted}: '
+            f'no message will arrive{hint}'
         )
 
-    def _watch_clock(self) -> None:
+    def _check_clock(self) -> None:
         if self.now() != 0:
-            self._looks_without_clock = 0
+            self._checks_without_clock = 0
             return
-        # No timeout strikes while time stands still, so nothing may be left moving.
+        # Timeouts do not expire while time does not advance.
         self.stop('time stands still')
-        self._looks_without_clock += 1
-        if self._looks_without_clock == CLOCK_PATIENCE:
+        self._checks_without_clock += 1
+        if self._checks_without_clock == CLOCK_PATIENCE:
             self.get_logger().warning(
-                f'use_sim_time is true, but nothing came on /clock for {CLOCK_PATIENCE} s: '
-                'time stands still, and so does this node; publish /clock or set use_sim_time to false'
+                f'use_sim_time is true, but nothing came on /clock for {CLOCK_PATIENCE} s: this node '
+                'does nothing until it does; publish /clock or set use_sim_time to false'
             )
 
 
 def _topic_types(node: Node) -> dict[str, list[str]]:
-    """Give the types of all topics in the graph.
+    """Return the types of all topics in the graph, by name.
 
-    The nodes of a context share a look: with many of them in one process each would see the topics of
-    all, and the looks would cost more than the robots.
+    The nodes of a context share the result. A query takes time proportional to the number of topics, so
+    with many nodes in a process the queries would cost more than the nodes.
     """
     now = time.monotonic()
-    looked_at, types = _topic_types_seen.get(node.context, (-math.inf, {}))
-    if now - looked_at > WATCH_PERIOD / 2:
+    queried, types = _topic_types_of.get(node.context, (-math.inf, {}))
+    if now - queried > WATCH_PERIOD / 2:
         types = dict(node.get_topic_names_and_types())
-        _topic_types_seen[node.context] = now, types
+        _topic_types_of[node.context] = now, types
     return types
 
 
-_topic_types_seen: WeakKeyDictionary[Context, tuple[float, dict[str, list[str]]]] = WeakKeyDictionary()
+_topic_types_of: WeakKeyDictionary[Context, tuple[float, dict[str, list[str]]]] = WeakKeyDictionary()
 
 
 def _type_name(message: type) -> str:
-    """Name a message type as the graph does: package/msg/Name."""
+    """Return the name of a message type as it is in the graph: package/msg/Name."""
     package = message.__module__.split('.')[0]
     return f'{package}/msg/{message.__name__}'

@@ -10,7 +10,6 @@ from typing import TypeVar
 
 from rclpy.context import Context
 from rclpy.exceptions import NameValidationException, ParameterException
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 
@@ -18,6 +17,7 @@ from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.ros.node import ParameterizedNode
 from diffdrive_jacobian.ros.parameters import report_unknown
+from diffdrive_jacobian.ros.rclpy_internals import RCLError, reason
 from diffdrive_jacobian.text import printable
 
 N = TypeVar('N', bound=Node)
@@ -94,10 +94,9 @@ def created(create: Callable[[], N]) -> N:
         raise UserError(f'{rule} {printable(name.strip())}') from error
     except (ParameterError, ParameterException, InvalidQosOverridesError) as error:
         raise UserError(str(error)) from error
-    except rclpy_implementation.RCLError as error:
-        # rcl appends the place in its sources.
-        reason = str(error).split(', at /')[0]
-        if 'length should not exceed' in reason:
+    except RCLError as error:
+        why = reason(error)
+        if 'length should not exceed' in why:
             # Each part was short enough, see `ros_context`.
-            reason += f'; a name with its namespace must have at most {MAX_NAME_LENGTH} characters'
-        raise UserError(reason) from error
+            why += f'; a name with its namespace must have at most {MAX_NAME_LENGTH} characters'
+        raise UserError(why) from error

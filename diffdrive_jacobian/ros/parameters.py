@@ -1,4 +1,4 @@
-"""The parameters of a node declared to rclpy, and their changes: see `parameters.declaration`."""
+"""Declaration of the parameters of a node in rclpy, and the callbacks for their changes."""
 
 from __future__ import annotations
 
@@ -25,40 +25,47 @@ from diffdrive_jacobian.parameters.declaration import (
     from_ros,
     specifications,
 )
+from diffdrive_jacobian.ros.rclpy_internals import (
+    PARAMETERS_OF_RCLPY,
+    declared_parameters,
+    parameter_overrides,
+)
 
 P = TypeVar('P', bound=NodeParameters)
 
 
 def descriptor(specification: Specification, default: Any) -> ParameterDescriptor:
-    """Write a specification as the descriptor that ROS tools show."""
+    """Return the descriptor of a parameter, which `ros2 param describe` shows."""
     constraint = specification.constraint or specification.allowed
-    made = ParameterDescriptor(
+    result = ParameterDescriptor(
         description=specification.description,
         read_only=specification.read_only,
         additional_constraints=f'must be {constraint}' if constraint else '',
     )
     low = specification.low if specification.above is None else specification.above
     if low is None or specification.high is None or specification.nan_is_none:
-        return made
+        return result
     if isinstance(default, float):
-        made.floating_point_range = [
+        result.floating_point_range = [
             FloatingPointRange(from_value=float(low), to_value=float(specification.high))
         ]
     else:
-        made.integer_range = [
+        result.integer_range = [
             IntegerRange(from_value=int(low), to_value=int(specification.high), step=1)
         ]
-    return made
+    return result
 
 
 def declare(node: Node, parameters: type[P]) -> P:
-    """Declare all parameters of a node with the values that its user gave.
+    """Declare all parameters of a node with the values that the user gave.
+
+    Returns:
+        The parameters.
 
     Raises:
-        ParameterError: These values are not a valid set. Nothing is declared then.
+        ParameterError: The values are invalid. No parameter is declared.
     """
-    # rclpy has no public look at the overrides before a parameter is declared.
-    overrides = node._parameter_overrides
+    overrides = parameter_overrides(node)
     initial = from_ros(parameters, {name: given.value for name, given in overrides.items()})
     node.declare_parameters(
         '',
@@ -76,7 +83,10 @@ def declare(node: Node, parameters: type[P]) -> P:
 
 
 def accept_integers(parameters: type[NodeParameters], changes: list[Parameter]) -> list[Parameter]:
-    """Turn integers into doubles where doubles are declared: the callback before parameters are set."""
+    """Return changes with integers converted to doubles where doubles are declared.
+
+    For `Node.add_pre_set_parameters_callback`.
+    """
     return [
         Parameter(change.name, value=as_declared(parameters, change.name, change.value))
         if change.type_ == Parameter.Type.INTEGER
@@ -85,8 +95,11 @@ def accept_integers(parameters: type[NodeParameters], changes: list[Parameter]) 
     ]
 
 
-def judge(parameters: NodeParameters, changes: Iterable[Parameter]) -> SetParametersResult:
-    """Say whether changes lead to a valid set: the callback while parameters are set."""
+def validate(parameters: NodeParameters, changes: Iterable[Parameter]) -> SetParametersResult:
+    """Return whether parameters are valid after changes.
+
+    For `Node.add_on_set_parameters_callback`.
+    """
     try:
         changed(parameters, changes)
     except ParameterError as error:
@@ -95,20 +108,17 @@ def judge(parameters: NodeParameters, changes: Iterable[Parameter]) -> SetParame
 
 
 def report_unknown(nodes: Sequence[Node]) -> None:
-    """Warn of parameters that the user gave and that no node of this process has.
+    """Log a warning for each parameter that the user gave and that no node of this process declares.
 
-    The nodes of one process share its command line, so what one of them has is not a mistake.
+    The nodes of a process share its command line, so one of them must declare the parameter.
     """
-    declared = {name for node in nodes for name in node._parameters}
+    declared = {name for node in nodes for name in declared_parameters(node)}
     unknown: dict[str, Node] = {}
     for node in nodes:
-        for name in set(node._parameter_overrides) - declared:
+        for name in parameter_overrides(node).keys() - declared:
             unknown.setdefault(name, node)
-    known = sorted(name for name in declared if not name.startswith(_OF_RCLPY))
+    known = sorted(name for name in declared if not name.startswith(PARAMETERS_OF_RCLPY))
     for name, node in sorted(unknown.items()):
         close = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean '{close[0]}'?" if close else f'there are: {", ".join(known)}'
+        hint = f"did you mean '{close[0]}'?" if close else f'known parameters: {", ".join(known)}'
         node.get_logger().warning(f"unknown parameter '{name}' is ignored; {hint}")
-
-
-_OF_RCLPY = ('qos_overrides.', 'start_type_description_service', 'use_sim_time')

@@ -129,7 +129,7 @@ def send_goal(
     goals = np.asarray(goal, dtype=np.float64)[np.newaxis]
     with (
         ros_context([NAME, *ros_arguments]) as context,
-        running(context, closed_world=False) as runner,
+        running(context, isolated=False) as runner,
     ):
         client = runner.add(
             lambda: GoalClient(

@@ -1,22 +1,20 @@
-"""The one way in which every entry point runs its nodes: context, executor, loop, orderly end.
+"""The runner of nodes in real time: context, executor, loop, shutdown.
 
-Signals are counted by our own handlers (`signals`), not by rclpy's, which end the context before a
-node could send its last zero.
+Signals are counted by the handlers of `signals`. Those of rclpy would shut the context down before a
+node can publish its last zero.
 """
 
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr
+from contextlib import contextmanager
 from itertools import pairwise
 
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.logging import get_logger_level, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -25,18 +23,19 @@ from diffdrive_jacobian.errors import UserError as UserError
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.node import ParameterizedNode
 from diffdrive_jacobian.ros.node_runner import MAX_NAME_LENGTH, NodeRunner
+from diffdrive_jacobian.ros.rclpy_internals import UnknownROSArgsError, events_executor, reason
 from diffdrive_jacobian.text import printable
 
 MAX_DOMAIN_ID = 232
-"""Beyond it a domain's ports do not exist."""
-LOOK_PERIOD = 0.1
-"""How long the loop may wait before it looks at its condition again (s)."""
+"""Largest domain id. The ports of larger ones do not exist."""
+CHECK_PERIOD = 0.1
+"""Longest time between two checks of the condition of the loop (s)."""
 
 
 @contextmanager
-def closed_world() -> Iterator[None]:
-    """Make contexts that no other process can reach, nor another context of this one."""
-    # The first is what counts; the others would be obeyed before it.
+def discovery_off() -> Iterator[None]:
+    """Isolate contexts that are created: no other context, in whatever process, can reach them."""
+    # The first is set. The others would take precedence over it.
     names = (
         'ROS_AUTOMATIC_DISCOVERY_RANGE',
         'ROS_LOCALHOST_ONLY',
@@ -54,14 +53,14 @@ def closed_world() -> Iterator[None]:
 
 @contextmanager
 def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[Context]:
-    """Hold a ROS context without signal handlers of rclpy.
+    """Create a ROS context without the signal handlers of rclpy, and shut it down at the end.
 
     Args:
-        arguments: The command line with the program's name; what follows `--ros-args` counts.
-        default: Whether it is rclpy's default context, which nodes take that name none.
+        arguments: The command line with the name of the program. What follows `--ros-args` is used.
+        default: Whether to initialize the default context of rclpy, which nodes use by default.
 
     Raises:
-        UserError: rcl does not understand the arguments or the environment.
+        UserError: The arguments or the environment are invalid.
     """
     domain = os.environ.get('ROS_DOMAIN_ID', '')
     if domain and not (domain.isdecimal() and int(domain) <= MAX_DOMAIN_ID):
@@ -72,7 +71,7 @@ def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[
         if flag == '--params-file' and not os.access(value, os.R_OK):
             raise UserError(f'--params-file must name a file that can be read, got {value!r}')
     context = rclpy.get_default_context() if default else Context()
-    # `--log-level` is for the whole process, and would outlast the context.
+    # `--log-level` applies to the process, so it is restored with the context.
     log_level = get_logger_level('')
     try:
         rclpy.init(
@@ -80,27 +79,26 @@ def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[
             context=context,
             signal_handler_options=SignalHandlerOptions.NO,
         )
-    except rclpy_implementation.UnknownROSArgsError as error:
+    except UnknownROSArgsError as error:
         raise UserError(
             f'unknown ROS arguments: {error}; other arguments come before --ros-args, or after the -- '
             'that ends the ROS arguments'
         ) from error
     except (RuntimeError, UnicodeError) as error:
-        # rcl appends where in its sources it gave up.
-        raise UserError(f'ROS arguments: {str(error).split(", at /")[0].strip()}') from error
+        raise UserError(f'ROS arguments: {reason(error)}') from error
     try:
         yield context
     finally:
-        # Of the default context rclpy makes a new one then.
+        # Without an argument rclpy also replaces the default context by a new one.
         rclpy.try_shutdown(context=None if default else context)
         set_logger_level('', log_level)
 
 
 def _check_name_length(rule: str) -> None:
-    """Check the new name of a remap rule; rcl reports one that is too long without naming it.
+    """Check the length of the new name in a remap rule. The error of rcl does not contain the name.
 
     Raises:
-        UserError: It is longer than a topic, a service, a node or a namespace can be.
+        UserError: The name is longer than that of a topic, service, node or namespace can be.
     """
     name = rule.rpartition(':=')[2]
     length = len(name) + (not name.startswith('/'))
@@ -111,34 +109,23 @@ def _check_name_length(rule: str) -> None:
         )
 
 
-def make_executor(context: Context, *, closed_world: bool) -> Executor:
-    """Choose the executor.
+def make_executor(context: Context, *, isolated: bool) -> Executor:
+    """Return an executor.
 
     Args:
         context: The context of its nodes.
-        closed_world: No stranger can reach the nodes. Then the EventsExecutor, which takes a third of
-            the time per message, is safe; its queue knows no bound and no fairness, so a node that
-            strangers can flood needs the SingleThreadedExecutor. Older Jazzy has only that one.
+        isolated: Whether the nodes are isolated from other processes. Then it is an EventsExecutor,
+            if rclpy has it, which takes a third of the time per message. Its queue is unbounded and
+            first in, first out, so nodes that others can flood need the SingleThreadedExecutor.
     """
-    executor = events_executor(context) if closed_world else None
+    executor = events_executor(context) if isolated else None
     return executor or SingleThreadedExecutor(context=context)
 
 
-def events_executor(context: Context) -> Executor | None:
-    """Make an EventsExecutor; None if this rclpy has none."""
-    try:
-        from rclpy.experimental.events_executor import EventsExecutor
-    except ImportError:
-        return None
-    # It has the faulthandler write to sys.stderr, which then must be a file; in some tests it is none.
-    with redirect_stderr(sys.__stderr__):
-        return EventsExecutor(context=context)
-
-
 @contextmanager
-def running(context: Context, *, closed_world: bool) -> Iterator[Runner]:
-    """Hold an executor and the nodes that are added to it; at the end each is stopped and destroyed."""
-    runner = Runner(context, make_executor(context, closed_world=closed_world))
+def running(context: Context, *, isolated: bool) -> Iterator[Runner]:
+    """Create a runner. At the end stop and destroy its nodes."""
+    runner = Runner(context, make_executor(context, isolated=isolated))
     try:
         yield runner
     finally:
@@ -163,12 +150,12 @@ class Runner(NodeRunner):
         self._executor.add_node(node)
 
     def _spin(self, until: Callable[[], bool]) -> bool:
-        # The condition is checked after every callback and at least every LOOK_PERIOD.
+        # The condition is checked after every callback and at least every CHECK_PERIOD.
         try:
             while not until():
                 if not self.context.ok():
                     return False
-                self._executor.spin_once(timeout_sec=LOOK_PERIOD)
+                self._executor.spin_once(timeout_sec=CHECK_PERIOD)
         except ExternalShutdownException:
             return False
         return True

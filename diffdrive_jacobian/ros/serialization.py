@@ -1,4 +1,4 @@
-"""Serialized messages: deserialized whole, or read in part."""
+"""Deserialization of messages, in whole or in part."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ T = TypeVar('T')
 
 
 def deserialized(data: bytes, message_type: type[T]) -> T:
-    """Return the message that serialized bytes hold.
+    """Return the message in serialized bytes.
 
     Raises:
-        MessageError: They hold no such message.
+        MessageError: They are not a message of this type.
     """
     try:
         message: T = deserialize_message(data, message_type)
     except RuntimeError as error:
-        raise MessageError(f'it is no {message_type.__name__} message') from error
+        raise MessageError(f'it is not a {message_type.__name__} message') from error
     return message
 
 
 def goals_header(data: bytes) -> tuple[Time, int]:
-    """Return the stamp and the number of poses of a serialized Goals message, and convert nothing else.
+    """Return the stamp and the number of poses of a serialized Goals message without its poses.
 
-    The layout is that of CDR: 4 bytes of encapsulation, of which the second is odd for little-endian;
-    the stamp, the frame as length and text, and the number of poses, aligned to 4 bytes.
+    The layout is that of CDR. Of the 4 bytes of the encapsulation the second is odd for little-endian.
+    The stamp follows, then the frame as length and text, and aligned to 4 bytes the number of poses.
 
     Raises:
         MessageError: The bytes are too short.
@@ -40,5 +40,5 @@ def goals_header(data: bytes) -> tuple[Time, int]:
         sec, nanosec, length = struct.unpack_from(f'{order}iII', data, 4)
         (count,) = struct.unpack_from(f'{order}I', data, 16 + (length + 3) // 4 * 4)
     except (IndexError, struct.error) as error:
-        raise MessageError('it is no Goals message') from error
+        raise MessageError('it is not a Goals message') from error
     return Time(sec=sec, nanosec=nanosec), count

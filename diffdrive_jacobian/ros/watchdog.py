@@ -1,4 +1,4 @@
-"""A timer that strikes once nothing has fed it for a while."""
+"""A timeout on the input of a node."""
 
 from __future__ import annotations
 
@@ -8,60 +8,66 @@ from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.node import Node
 
+from diffdrive_jacobian.ros.rclpy_internals import restart_timer
+
 
 class Watchdog:
-    """Calls back when it was not fed for `timeout` on the node's clock; once, until fed again.
+    """Calls a function once when it was not fed for `timeout` on the node's clock, until fed again.
 
-    Feeding only notes the instant: resetting a timer for every message costs more than the message.
-    When the timer strikes, it is set again for what is left since the last meal.
+    Feeding stores the time only, because resetting a timer costs more than receiving a message. When the
+    timer expires early, it is restarted for the rest of the timeout.
     """
 
     def __init__(self, node: Node, callback: Callable[[], None]) -> None:
-        """Create it; `start` lets it watch."""
+        """Create it. `start` enables it.
+
+        Args:
+            node: The node whose clock counts.
+            callback: Called when the timeout expires.
+        """
         self._clock = node.get_clock()
         self._callback = callback
         self._timeout = 0
         self._fed_at = 0
-        self._awake = False
+        self._running = False
         self._timer = node.create_timer(1.0, self._on_timer, autostart=False)
         back = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1))
         self._jumps = self._clock.create_jump_callback(back, post_callback=self._on_jump_back)
 
     def start(self, timeout: int) -> None:
-        """Watch from now on with a timeout (ns); 0: never strike."""
+        """Start with a new timeout (ns); 0: it never expires."""
         self.stop()
         self._timeout = timeout
         self.feed(self._clock.now().nanoseconds)
 
     def feed(self, now: int) -> None:
-        """Put the strike off to `timeout` after now (ns)."""
+        """Restart the timeout at a time (ns)."""
         self._fed_at = now
-        if not self._awake and self._timeout:
-            self._sleep(self._timeout)
+        if not self._running and self._timeout:
+            self._wait(self._timeout)
 
     def stop(self) -> None:
-        """Watch no longer, until started again."""
+        """Disable it until `start`."""
         self._timeout = 0
-        self._awake = False
+        self._running = False
         self._timer.cancel()
 
-    def _sleep(self, duration: int) -> None:
-        self._awake = True
-        self._timer.timer_period_ns = duration
-        self._timer.reset()
+    def _wait(self, duration: int) -> None:
+        self._running = True
+        restart_timer(self._timer, duration)
 
     def _on_jump_back(self, _: TimeJump) -> None:
-        # rcl may leave the timer waiting for an instant of the old time line.
-        if self._awake:
+        # The timer of rcl may still wait for a time before the jump.
+        if self._running:
             self._fed_at = self._clock.now().nanoseconds
-            self._sleep(self._timeout)
+            self._wait(self._timeout)
 
     def _on_timer(self) -> None:
-        waited = self._clock.now().nanoseconds - self._fed_at
-        if 0 <= waited < self._timeout:
-            self._sleep(self._timeout - waited)
+        elapsed = self._clock.now().nanoseconds - self._fed_at
+        if 0 <= elapsed < self._timeout:
+            self._wait(self._timeout - elapsed)
             return
-        # Time that went back (waited < 0) is no proof of life.
-        self._awake = False
+        # If time went back (elapsed < 0), the timeout has expired as well.
+        self._running = False
         self._timer.cancel()
         self._callback()

@@ -37,8 +37,8 @@ from diffdrive_jacobian.simulation.odometry_noise import (
     propagate_checked,
     twist_covariance_checked,
 )
+from diffdrive_jacobian.time_units import NANOSECONDS
 
-NANOSECONDS = 1_000_000_000
 STANDSTILL = (0.0, 0.0)
 
 

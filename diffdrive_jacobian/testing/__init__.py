@@ -1,6 +1,8 @@
-"""Tests of ROS nodes without waiting: simulated time that passes only when every node has answered."""
+"""Tests of ROS nodes in simulated time: `fixtures` for pytest, and `Lockstep` for other frameworks.
 
-from diffdrive_jacobian.lockstep._errors import LockstepError
-from diffdrive_jacobian.lockstep.world import Lockstep
+`Lockstep` and `LockstepError` are also names of this package. Their own package is `lockstep`.
+"""
+
+from diffdrive_jacobian.lockstep import Lockstep, LockstepError
 
 __all__ = ['Lockstep', 'LockstepError']

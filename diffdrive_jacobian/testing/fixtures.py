@@ -1,9 +1,9 @@
-"""Fixtures of pytest: `pytest_plugins = ['diffdrive_jacobian.testing.fixtures']` in a conftest.py.
+"""Fixtures for pytest: `pytest_plugins = ['diffdrive_jacobian.testing.fixtures']` in a conftest.py.
 
-`lockstep` is a world of its own for each test, `robot_at(x, y, theta)` puts the virtual robot into it,
-`recorded_run` records it, as a bag and a picture that are kept where the test fails.
-The marker `lockstep(args=..., start=..., patience=...)` makes the world with these arguments. The report
-of a test that fails ends with the last messages of every topic.
+`lockstep` is a new `Lockstep` for each test. `robot_at(x, y, theta)` adds a virtual robot to it.
+`recorded_run` records the test as a bag and a figure, which are kept if it fails. The marker
+`lockstep(args=..., start=..., patience=...)` passes arguments to `Lockstep`. The report of a failed test
+ends with the last messages of all topics.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from rclpy.parameter import Parameter
 
+from diffdrive_jacobian.lockstep import Lockstep, LockstepError
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.parameters.declaration import specifications
 from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
@@ -22,13 +23,12 @@ from diffdrive_jacobian.plots.run_figure import draw
 from diffdrive_jacobian.reading import BagError, read_run
 from diffdrive_jacobian.recording.recorder import Recorder, Selection
 from diffdrive_jacobian.recording.recording import Recording, RecordingError
-from diffdrive_jacobian.testing import Lockstep, LockstepError
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Register the marker."""
     config.addinivalue_line(
-        'markers', 'lockstep(args, start, patience): make the world of this test so (see Lockstep)'
+        'markers', 'lockstep(args, start, patience): arguments of the Lockstep of this test'
     )
 
 
@@ -49,7 +49,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 
 
 def _or_error(describe: Callable[[], str]) -> str:
-    """Return a text, or the error that prevents it: what a hook raises ends the whole session."""
+    """Return a text, or the error instead: an exception in a hook would end the whole session."""
     try:
         return describe()
     except Exception as error:
@@ -58,7 +58,7 @@ def _or_error(describe: Callable[[], str]) -> str:
 
 @pytest.fixture
 def lockstep(request: pytest.FixtureRequest) -> Iterator[Lockstep]:
-    """A world without nodes."""
+    """Return a Lockstep without nodes."""
     marker = request.node.get_closest_marker('lockstep')
     with Lockstep(**(marker.kwargs if marker else {})) as world:
         yield world
@@ -66,7 +66,7 @@ def lockstep(request: pytest.FixtureRequest) -> Iterator[Lockstep]:
 
 @pytest.fixture
 def robot_at(lockstep: Lockstep) -> Callable[..., VirtualRobot]:
-    """Put virtual robots into the world: `robot_at(x, y, theta, namespace='', **parameters)`."""
+    """Return a function that adds a virtual robot with a pose, a namespace and parameters."""
 
     def place(
         x: float = 0.0, y: float = 0.0, theta: float = 0.0, *, namespace: str = '', **parameters: Any
@@ -86,7 +86,7 @@ class RecordedRun:
     """The recording of a test."""
 
     def __init__(self, world: Lockstep, directory: Path) -> None:
-        """Record all topics of a world from here on, into a directory."""
+        """Start to record all topics, into a directory."""
         self._recording = Recording(directory / 'run', 'mcap', lossless=True)
         self._finished = False
         self._error: RecordingError | None = None
@@ -97,10 +97,10 @@ class RecordedRun:
         recorder.discover()
 
     def keep(self) -> str:
-        """End the recording and keep it; return where it is, in two lines.
+        """End the recording and keep it. Return the paths of the bag and of the figure, in two lines.
 
-        That makes the bag and, where there is odometry and matplotlib, the picture. What is published
-        after the first call is not recorded; later calls return or raise the same.
+        The figure needs odometry and matplotlib. Messages after the first call are not recorded. Later
+        calls return or raise the same.
 
         Raises:
             RecordingError: The recording is not complete.
@@ -127,7 +127,7 @@ class RecordedRun:
         return f'{bag}\n{picture}'
 
     def close(self) -> None:
-        """Remove it, unless it was kept."""
+        """Delete the recording, unless it was kept."""
         if not self._finished:
             self._finished = True
             self._recording.discard()
@@ -135,7 +135,7 @@ class RecordedRun:
 
 @pytest.fixture
 def recorded_run(lockstep: Lockstep, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RecordedRun]:
-    """Record the test; `keep()` makes the bag, a failure does so by itself."""
+    """Record the test. `keep()` writes the bag. A failure of the test does so, too."""
     run = RecordedRun(lockstep, tmp_path_factory.mktemp('recorded'))
     yield run
     run.close()

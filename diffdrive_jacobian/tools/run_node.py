@@ -79,7 +79,7 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
     try:
         with (
             ros_context([name, *ros]) as context,
-            running(context, closed_world=False) as runner,
+            running(context, isolated=False) as runner,
         ):
             node = runner.add(lambda: create(context=context))
             warn_of_unused_files(name, ros, [node.get_fully_qualified_name()])

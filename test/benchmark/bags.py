@@ -77,7 +77,7 @@ def replay(bag):
     with (
         open_bag(bag) as reader,
         ros_context(['benchmark']) as context,
-        running(context, closed_world=False) as runner,
+        running(context, isolated=False) as runner,
     ):
         listener = runner.add(lambda: Node('listener', context=context))
         for topic in TOPICS:

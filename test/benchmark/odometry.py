@@ -100,7 +100,7 @@ def _spinning(name: str) -> Any:
     from diffdrive_jacobian.ros.runner import make_executor, ros_context
 
     with ros_context(['benchmark', '--ros-args', '--log-level', 'error']) as context:
-        executor = make_executor(context, closed_world=name == 'events')
+        executor = make_executor(context, isolated=name == 'events')
         assert isinstance(executor, SingleThreadedExecutor) == (name != 'events')
         nodes: list[Any] = []
 

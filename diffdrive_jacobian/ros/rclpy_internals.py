@@ -1,0 +1,231 @@
+"""Adapter to the parts of rclpy that are not public, or whose behaviour is not documented.
+
+No other module imports from `rclpy.impl` or `rclpy.experimental`, or accesses a private attribute of an
+object of rclpy. Each function names what it relies on. `test/test_rclpy_internals.py` has a test for
+each, so that a release of rclpy that differs fails there first. Tried with rclpy 7.1.6 (Jazzy).
+
+`lockstep._executor` and `lockstep._served` also rely on how the EventsExecutor accesses nodes.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import redirect_stderr
+from typing import Any, Protocol
+
+from rclpy.clock import Clock
+from rclpy.context import Context
+from rclpy.executors import Executor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+from rclpy.task import Task
+from rclpy.timer import Timer
+
+RCLError: type[Exception] = rclpy_implementation.RCLError
+"""Error of rcl, for example that a name is invalid or an object was destroyed. A RuntimeError."""
+UnknownROSArgsError: type[Exception] = rclpy_implementation.UnknownROSArgsError
+"""Error of `rclpy.init`: an argument after `--ros-args` is unknown."""
+PARAMETERS_OF_RCLPY = ('qos_overrides.', 'start_type_description_service', 'use_sim_time')
+"""Beginnings of the names of the parameters that rclpy itself declares."""
+SERVICES_OF_RCLPY = ('rcl_interfaces/', 'type_description_interfaces/')
+"""Packages of the types of the services that rclpy itself provides."""
+
+
+def reason(error: Exception) -> str:
+    """Return the message of an error of rcl without the place in its source files.
+
+    rcl writes "message, at /path/file.c:line".
+    """
+    return str(error).split(', at /')[0].strip()
+
+
+# --- Parameters
+
+
+def parameter_overrides(node: Node) -> Mapping[str, Parameter]:
+    """Return the values that a user gave for parameters of a node, declared or not.
+
+    Relies on `Node._parameter_overrides`. The public interface gives a value only by declaring its
+    parameter.
+    """
+    overrides: Mapping[str, Parameter] = node._parameter_overrides
+    return overrides
+
+
+def declared_parameters(node: Node) -> set[str]:
+    """Return the names of the declared parameters of a node.
+
+    Relies on `Node._parameters`.
+    """
+    return set(node._parameters)
+
+
+# --- Inputs that rclpy parses itself
+
+
+def wrap_clock_callback(
+    node: Node, wrap: Callable[[Callable[[Any], None]], Callable[[Any], None]]
+) -> None:
+    """Replace the function that receives /clock, now and after `use_sim_time` changes.
+
+    Relies on `Node._time_source`, `TimeSource.clock_callback` and `TimeSource._clock_sub`.
+
+    Args:
+        node: The node.
+        wrap: Receives the present function, returns its replacement.
+    """
+    source = node._time_source
+    source.clock_callback = wrap(source.clock_callback)
+    if source._clock_sub is not None:
+        source._clock_sub.callback = source.clock_callback
+
+
+def wrap_service_callback(
+    node: Node, service_type: Any, wrap: Callable[[Callable[[Any, Any], Any]], Callable[[Any, Any], Any]]
+) -> None:
+    """Replace the callbacks of the services of a type, including those that rclpy provides.
+
+    Relies on `Service.srv_type` and on `Service.callback`, which every executor reads for each request.
+
+    Args:
+        node: The node.
+        service_type: Type of the services.
+        wrap: Receives the present callback, returns its replacement.
+    """
+    for service in node.services:
+        if service.srv_type is service_type:
+            service.callback = wrap(service.callback)
+
+
+# --- Time
+
+
+def time_reader(clock: Clock) -> Callable[[], int]:
+    """Return a function that returns the time of a clock (ns).
+
+    Relies on `Clock.handle.get_now`, which takes a third of the time of `Clock.now`.
+    """
+    get_now = clock.handle.get_now
+
+    def read() -> int:
+        return int(get_now().nanoseconds)
+
+    return read
+
+
+def wrap_sleep(clock: Clock, wrap: Callable[[Callable[..., Any]], Callable[..., Any]]) -> None:
+    """Replace `sleep_until` of a clock, once.
+
+    Relies on `Clock.sleep_for` calling `sleep_until` of the instance.
+
+    Args:
+        clock: The clock.
+        wrap: Receives the present method, returns its replacement.
+    """
+    if 'sleep_until' not in vars(clock):
+        clock.sleep_until = wrap(clock.sleep_until)
+
+
+def restart_timer(timer: Timer, period: int) -> None:
+    """Let a timer expire one period (ns) from now, also if it was cancelled.
+
+    Relies on `Timer.timer_period_ns` being settable, and on `Timer.reset`, without which the timer would
+    still expire at the end of its old period.
+    """
+    timer.timer_period_ns = period
+    timer.reset()
+
+
+def change_timer_period(timer: Timer, period: int) -> None:
+    """Change the period of a timer (ns). It expires next after one new period, or earlier if it would.
+
+    Relies on `Timer.timer_period_ns` leaving the time of the next expiry as it is.
+    """
+    timer.timer_period_ns = period
+    due = timer.time_until_next_call()
+    if due is None or due > period:
+        timer.reset()
+
+
+class TimerHandle(Protocol):
+    """The timer of rcl. Its methods take a third of the time of those of `rclpy.timer.Timer`."""
+
+    def time_until_next_call(self) -> int | None:
+        """Return the time until the timer expires (ns); None: it is cancelled."""
+
+    def call_timer(self) -> None:
+        """Start the next period."""
+
+
+def timer_handle(timer: Timer) -> TimerHandle:
+    """Return the handle of a timer.
+
+    Relies on `Timer.handle`. Methods of a handle whose timer was destroyed raise RCLError.
+    """
+    handle: TimerHandle = timer.handle
+    return handle
+
+
+# --- Messages
+
+
+def wrap_publish(wrap: Callable[[Callable[..., None]], Callable[..., None]]) -> Callable[[], None]:
+    """Replace `publish` of all publishers.
+
+    Relies on `Publisher.publish` being looked up in the class for each message.
+
+    Args:
+        wrap: Receives the present function (publisher, message), returns its replacement.
+
+    Returns:
+        A function that restores the present one.
+    """
+    publish = Publisher.publish
+    Publisher.publish = wrap(publish)
+
+    def restore() -> None:
+        Publisher.publish = publish
+
+    return restore
+
+
+def waiting_messages(subscription: Subscription) -> Iterator[tuple[bytes, dict[str, Any]]]:
+    """Yield the serialized messages that wait in a subscription, with their message info.
+
+    Relies on `Subscription.handle.take_message`. Executors take one message for each call of their own.
+    """
+    handle, message_type = subscription.handle, subscription.msg_type
+    with handle:
+        while (taken := handle.take_message(message_type, True)) is not None:
+            yield taken
+
+
+# --- Executors
+
+
+def events_executor(context: Context) -> Executor | None:
+    """Return a new EventsExecutor. None: this rclpy has none.
+
+    Relies on `rclpy.experimental.events_executor.EventsExecutor`. Its `spin_once` handles one event. A
+    task that is created with `create_task` runs after all events that were queued before.
+    """
+    try:
+        from rclpy.experimental.events_executor import EventsExecutor
+    except ImportError:
+        return None
+    # It enables the faulthandler, for which sys.stderr must be a file. In some tests it is not.
+    with redirect_stderr(sys.__stderr__):
+        return EventsExecutor(context=context)
+
+
+def new_task(function: Any, arguments: tuple[Any, ...], keywords: dict[str, Any], executor: Any) -> Task:
+    """Return a task, which runs when it is called.
+
+    A function, or a coroutine, which runs to its next `await` at each call.
+    Relies on the constructor of `rclpy.task.Task`, which is meant for executors.
+    """
+    return Task(function, arguments, keywords, executor=executor)

@@ -1,0 +1,27 @@
+"""Units of time: seconds as floats in parameters and arguments, integer nanoseconds in timestamps."""
+
+from __future__ import annotations
+
+NANOSECONDS = 1_000_000_000
+"""Nanoseconds per second."""
+
+
+def nanoseconds(seconds: float) -> int:
+    """Return a duration in nanoseconds, rounded to the nearest.
+
+    A duration other than zero stays at least 1 ns long: a timeout of 0 means that there is none.
+
+    Args:
+        seconds: The duration; finite (s).
+    """
+    rounded = round(seconds * NANOSECONDS)
+    return rounded or (seconds > 0.0) - (seconds < 0.0)
+
+
+def seconds(nanoseconds: int) -> float:
+    """Return a duration in seconds.
+
+    Args:
+        nanoseconds: The duration (ns).
+    """
+    return nanoseconds / NANOSECONDS

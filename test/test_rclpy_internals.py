@@ -1,0 +1,357 @@
+"""The internals of rclpy that `ros.rclpy_internals` relies on, one by one.
+
+If a test fails with a new release of rclpy, the function that it names must change.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+from rcl_interfaces.srv import GetParameters
+from rclpy.clock import Clock
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message, serialize_message
+from rosgraph_msgs.msg import Clock as ClockMessage
+from std_msgs.msg import String
+
+import diffdrive_jacobian
+from diffdrive_jacobian.ros import rclpy_internals as internals
+from diffdrive_jacobian.ros.runner import UserError, ros_context
+
+SECOND = 1_000_000_000
+PACKAGE = Path(diffdrive_jacobian.__file__).parent
+
+
+@pytest.fixture
+def rcl_error(ros):
+    """An error of rcl: the new name of a topic is too long."""
+    node = ros.add(Node, node_name='remapped', cli_args=['--ros-args', '-r', f'odom:={300 * "a"}'])
+    with pytest.raises(internals.RCLError) as caught:
+        node.create_publisher(String, 'odom', 1)
+    return caught.value
+
+
+def test_rcl_error_is_raised_for_a_name_that_is_too_long(rcl_error):
+    assert isinstance(rcl_error, RuntimeError)
+
+
+def test_unknown_ros_args_error_is_raised_by_init():
+    with pytest.raises(UserError) as caught, ros_context(['test', '--ros-args', 'unknown']):
+        pass
+    assert isinstance(caught.value.__cause__, internals.UnknownROSArgsError)
+
+
+def test_reason_removes_the_place_in_the_sources_of_rcl(rcl_error):
+    assert ', at /' in str(rcl_error)
+    assert internals.reason(rcl_error).endswith("topic length should not exceed '255U - 8U'")
+    assert internals.reason(ValueError('no place')) == 'no place'
+
+
+# --- Parameters
+
+
+def test_parameter_overrides_are_known_before_the_declaration(ros):
+    node = ros.add(Node, node_name='undeclared', parameters={'gain': 2.5})
+    overrides = internals.parameter_overrides(node)
+    assert overrides['gain'].value == 2.5
+    assert not node.has_parameter('gain')
+
+
+def test_parameters_that_rclpy_declares_are_known(ros):
+    node = ros.add(Node, node_name='bare')
+    declared = internals.declared_parameters(node)
+    assert 'use_sim_time' in declared
+    assert all(name.startswith(internals.PARAMETERS_OF_RCLPY) for name in declared)
+    node.declare_parameter('gain', 1.0)
+    assert internals.declared_parameters(node) == {*declared, 'gain'}
+
+
+def test_services_that_rclpy_provides_are_known(ros):
+    node = ros.add(Node, node_name='bare')
+    services = node.get_service_names_and_types_by_node('bare', '/')
+    assert len(services) >= 6
+    assert all(types[0].startswith(internals.SERVICES_OF_RCLPY) for _, types in services)
+
+
+# --- Inputs that rclpy parses itself
+
+
+@pytest.mark.parametrize('later', [False, True], ids=['at the start', 'later'])
+def test_clock_callback_is_wrapped(ros, later):
+    node = ros.add(Node, node_name='clocked', parameters={'use_sim_time': not later})
+    received = []
+
+    def wrap(accept):
+        def on_clock(message):
+            received.append(message.clock.sec)
+            accept(message)
+
+        return on_clock
+
+    internals.wrap_clock_callback(node, wrap)
+    if later:
+        node.set_parameters([Parameter('use_sim_time', value=True)])
+    publisher = ros.talk(ClockMessage, '/clock')
+    message = ClockMessage()
+    message.clock.sec = 7
+    publisher.publish(message)
+    ros.until(lambda: received == [7], 'the wrapper receives the clock')
+    assert node.get_clock().now().nanoseconds == 7 * SECOND
+
+
+def test_service_callback_is_wrapped(ros, executor_kind):
+    node = ros.add(Node, node_name='served')
+    requests = []
+
+    def wrap(accept):
+        def on_request(request, response):
+            requests.append(list(request.names))
+            return accept(request, response)
+
+        return on_request
+
+    internals.wrap_service_callback(node, GetParameters, wrap)
+    client = ros.peer.create_client(GetParameters, 'served/get_parameters')
+    ros.until(client.service_is_ready, 'the service')
+    future = client.call_async(GetParameters.Request(names=['use_sim_time']))
+    ros.until(future.done, 'the response')
+    assert requests == [['use_sim_time']]
+    assert future.result().values[0].bool_value is False
+
+
+# --- Time
+
+
+def test_time_reader_returns_the_time_of_the_clock(lockstep):
+    read = internals.time_reader(lockstep.node.get_clock())
+    for _ in range(3):
+        assert read() == lockstep.now == lockstep.node.get_clock().now().nanoseconds
+        lockstep.run_for(0.1)
+    lockstep.jump(-0.2)
+    assert read() == lockstep.now
+
+
+def test_sleep_is_wrapped_once(ros):
+    clock, slept = Clock(), []
+    for _ in range(2):
+        internals.wrap_sleep(clock, lambda _: slept.append)
+    clock.sleep_until(1)
+    assert slept == [1]
+
+
+def test_sleep_for_calls_sleep_until(ros):
+    from rclpy.duration import Duration
+
+    clock = Clock()
+    internals.wrap_sleep(clock, lambda _: lambda until, *_, **__: until.nanoseconds > 0)
+    assert clock.sleep_for(Duration(seconds=1e6)) is True
+
+
+def test_restarted_timer_expires_one_new_period_later(lockstep):
+    expired = []
+    timer = lockstep.node.create_timer(1.0, lambda: expired.append(lockstep.now))
+    lockstep.run_for(0.5)
+    start = lockstep.now
+    internals.restart_timer(timer, SECOND // 5)
+    lockstep.run_for(0.45)
+    assert expired == [start + SECOND // 5, start + 2 * SECOND // 5]
+    timer.cancel()
+    start = lockstep.now
+    internals.restart_timer(timer, SECOND // 2)
+    lockstep.run_for(0.6)
+    assert expired[2:] == [start + SECOND // 2]
+
+
+@pytest.mark.parametrize(
+    ('elapsed', 'period', 'first'), [(0.5, 0.2, 0.2), (0.9, 0.2, 0.1), (0.5, 2.0, 0.5)]
+)
+def test_changed_period_keeps_an_earlier_expiry(lockstep, elapsed, period, first):
+    expired = []
+    timer = lockstep.node.create_timer(1.0, lambda: expired.append(lockstep.now))
+    lockstep.run_for(elapsed)
+    start = lockstep.now
+    internals.change_timer_period(timer, round(period * SECOND))
+    lockstep.run_for(3.0)
+    assert expired[0] == start + round(first * SECOND)
+    assert timer.timer_period_ns == round(period * SECOND)
+
+
+def test_timer_handle_knows_when_the_timer_expires(ros):
+    timer = ros.peer.create_timer(100.0, lambda: None, autostart=False)
+    handle = internals.timer_handle(timer)
+    assert handle.time_until_next_call() is None
+    timer.reset()
+    assert 0 < handle.time_until_next_call() <= 100 * SECOND
+    internals.restart_timer(timer, 1)
+    while handle.time_until_next_call() > 0:
+        pass
+    internals.restart_timer(timer, 100 * SECOND)
+    handle.call_timer()
+    assert handle.time_until_next_call() > 100 * SECOND
+    ros.peer.destroy_timer(timer)
+    with pytest.raises(internals.RCLError):
+        handle.time_until_next_call()
+
+
+# --- Messages
+
+
+def test_publish_is_wrapped_and_restored(ros):
+    ros.listen(String, 'words')
+    publisher = ros.talk(String, 'words')
+    published = []
+
+    def wrap(publish):
+        def count(self, message):
+            published.append((self.topic_name, message.data))
+            publish(self, message)
+
+        return count
+
+    restore = internals.wrap_publish(wrap)
+    try:
+        publisher.publish(String(data='one'))
+    finally:
+        restore()
+    publisher.publish(String(data='two'))
+    assert published == [('/words', 'one')]
+
+
+def test_waiting_messages_are_taken_serialized_with_their_info(ros):
+    subscription = ros.peer.create_subscription(
+        String, 'words', lambda _: None, QoSProfile(depth=10), raw=True
+    )
+    publisher = ros.talk(String, 'words')
+    for word in ('one', 'two', 'three'):
+        publisher.publish(String(data=word))
+    taken = list(internals.waiting_messages(subscription))
+    assert [deserialize_message(data, String).data for data, _ in taken] == ['one', 'two', 'three']
+    assert taken[0][0] == serialize_message(String(data='one'))
+    numbers = [info['publication_sequence_number'] for _, info in taken]
+    assert numbers == [1, 2, 3]
+    assert all(info['received_timestamp'] > 0 and info['source_timestamp'] > 0 for _, info in taken)
+    assert list(internals.waiting_messages(subscription)) == []
+
+
+# --- Executors
+
+
+def test_events_executor_runs_a_task_after_the_queued_events(ros):
+    executor = internals.events_executor(ros.context)
+    node = Node('queued', context=ros.context)
+    order = []
+    node.create_subscription(String, 'words', lambda message: order.append(message.data), 10)
+    publisher = node.create_publisher(String, 'words', 10)
+    executor.add_node(node)
+    registered = executor.create_task(lambda: None)
+    while not registered.done():
+        executor.spin_once(timeout_sec=1.0)
+    # Delivered within publish: the message is queued before the task.
+    publisher.publish(String(data='message'))
+    task = executor.create_task(order.append, 'task')
+    while not task.done():
+        executor.spin_once(timeout_sec=1.0)
+    assert order == ['message', 'task']
+    executor.shutdown()
+    node.destroy_node()
+
+
+def test_rclpy_without_the_events_executor_is_detected(ros, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'rclpy.experimental.events_executor', None)
+    assert internals.events_executor(ros.context) is None
+
+
+def test_new_task_runs_a_function_when_it_is_called(ros):
+    task = internals.new_task(divmod, (7, 2), {}, ros.executor)
+    assert not task.done()
+    task()
+    assert task.done()
+    assert task.result() == (3, 1)
+
+
+def test_new_task_continues_a_coroutine_with_each_call(ros):
+    from rclpy.task import Future
+
+    future = Future()
+
+    async def wait():
+        return await future
+
+    task = internals.new_task(wait(), (), {}, ros.executor)
+    task()
+    assert not task.done()
+    future.set_result('done')
+    task()
+    assert task.result() == 'done'
+
+
+# --- Other modules
+
+
+def _uses_rclpy(tree):
+    return any(
+        (isinstance(node, ast.ImportFrom) and (node.module or '').split('.')[0] == 'rclpy')
+        or (isinstance(node, ast.Import) and any(n.name.split('.')[0] == 'rclpy' for n in node.names))
+        for node in ast.walk(tree)
+    )
+
+
+def _internals_in(path):
+    """Return the accesses to internals of rclpy in a file."""
+    tree = ast.parse(path.read_text(encoding='utf-8'))
+    if not _uses_rclpy(tree):
+        return set()
+    own = {
+        *(node.name for node in ast.walk(tree) if isinstance(node, (ast.ClassDef, ast.FunctionDef))),
+        *(
+            target.attr
+            for node in ast.walk(tree)
+            if isinstance(node, (ast.Assign, ast.AnnAssign))
+            for target in (node.targets if isinstance(node, ast.Assign) else [node.target])
+            if isinstance(target, ast.Attribute)
+            and isinstance(target.value, ast.Name)
+            and target.value.id == 'self'
+        ),
+        *(
+            node.target.id
+            for node in ast.walk(tree)
+            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
+        ),
+    }
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or '').startswith(
+            ('rclpy.impl', 'rclpy.experimental')
+        ):
+            found.add(node.module)
+        elif isinstance(node, ast.Attribute) and node.attr.startswith('_'):
+            private = not node.attr.startswith('__')
+            of_self = isinstance(node.value, ast.Name) and node.value.id in ('self', 'cls')
+            if private and not of_self and node.attr not in own:
+                found.add(node.attr)
+        elif isinstance(node, ast.Attribute) and (
+            node.attr == 'take_message'
+            or (node.attr == 'timer_period_ns' and isinstance(node.ctx, ast.Store))
+        ):
+            found.add(node.attr)
+    return found
+
+
+def test_the_search_for_internals_finds_those_of_the_adapter():
+    found = _internals_in(PACKAGE / 'ros' / 'rclpy_internals.py')
+    assert {'rclpy.impl.implementation_singleton', '_parameters', '_time_source', '_clock_sub'} <= found
+    assert {'rclpy.experimental.events_executor', 'timer_period_ns', 'take_message'} <= found
+
+
+def test_no_other_module_uses_internals_of_rclpy():
+    found = {
+        str(path.relative_to(PACKAGE)): internals_found
+        for path in PACKAGE.rglob('*.py')
+        if path.name != 'rclpy_internals.py' and (internals_found := _internals_in(path))
+    }
+    assert found == {}
