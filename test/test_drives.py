@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from diffdrive_jacobian.drives import DriveError, Outcome, drive, drive_in, waypoints_through
-from diffdrive_jacobian.drives.driving import in_lockstep
+from diffdrive_jacobian.drives.runners import in_lockstep
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.reading import read_run

@@ -12,10 +12,10 @@ goal -> control law -> body twist -> J_w^-1 -> wheel speeds -> J_w -> body twist
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from action_msgs.msg import GoalStatus
@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
-from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.drives.runners import NAME, in_lockstep, in_real_time
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
@@ -34,15 +34,9 @@ from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.recording.selection import Selection
 from diffdrive_jacobian.ros.goal_client import GoalClient
 from diffdrive_jacobian.ros.node_runner import NodeRunner
-from diffdrive_jacobian.ros.runner import Runner, discovery_off, ros_context, running
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.time_units import nanoseconds
 
-if TYPE_CHECKING:
-    from diffdrive_jacobian.lockstep.runner import LockstepRunner
-
-NAME = 'drive_to'
-"""Name of the node that sends the goals."""
 TIMEOUT = 300.0
 """Default of the longest duration of a drive (s)."""
 SETTLING = 0.1
@@ -51,10 +45,6 @@ DISCOVERY_PERIOD = 0.5
 """Time between two searches for new topics to record (s)."""
 STOP_PATIENCE = 2.0
 """Longest time in which the robot may come to rest at the end, and report that (s)."""
-
-
-class DriveError(Exception):
-    """A drive in simulated time was aborted. The message says why."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -296,48 +286,3 @@ def _recorder(runner: NodeRunner, recording: Recording | None) -> Callable[[], N
 
     discover()
     return discover
-
-
-@contextmanager
-def in_real_time(ros_arguments: Sequence[str] = (), *, isolated: bool = True) -> Iterator[Runner]:
-    """Create a runner of nodes in real time, and close it at the end.
-
-    Args:
-        ros_arguments: ROS arguments of all nodes.
-        isolated: Whether no other process can communicate with the nodes.
-
-    Raises:
-        UserError: The ROS arguments are invalid.
-    """
-    with (
-        discovery_off() if isolated else nullcontext(),
-        ros_context([NAME, *ros_arguments]) as context,
-        running(context, isolated=isolated) as runner,
-    ):
-        yield runner
-
-
-@contextmanager
-def in_lockstep(ros_arguments: Sequence[str] = ()) -> Iterator[LockstepRunner]:
-    """Create a runner of nodes in simulated time, and close it at the end.
-
-    Args:
-        ros_arguments: ROS arguments of all nodes.
-
-    Raises:
-        UserError: The ROS arguments are invalid.
-        DriveError: A callback blocks, or simulated time cannot advance for another reason.
-    """
-    # Slow to import.
-    from diffdrive_jacobian.lockstep import LockstepError
-    from diffdrive_jacobian.lockstep.runner import running_in_lockstep
-
-    with ExitStack() as stack:
-        try:
-            runner = stack.enter_context(running_in_lockstep(ros_arguments))
-        except LockstepError as error:
-            raise UserError(str(error)) from error
-        try:
-            yield runner
-        except LockstepError as error:
-            raise DriveError(str(error)) from error
