@@ -229,6 +229,7 @@ def test_goals_that_are_cut_off_are_no_goals(length):
         serialize_message(goals(goal(1, 0), goal(2, 0)))[:-50],
         serialize_message(goals())[:-4] + b'\x05\0\0\0',
     ],
+    ids=['empty', 'encapsulation', 'ones', 'cut off', 'poses missing'],
 )
 def test_bytes_that_are_no_goals_are_dropped(lockstep, controller, data):
     publisher = lockstep.node.create_publisher(Goals, 'goals', 10)

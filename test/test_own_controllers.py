@@ -282,7 +282,7 @@ def test_two_nodes_can_have_different_controllers_of_one_name(lockstep):
         assert node.parameters.chosen_controller() is controller
 
 
-@pytest.mark.parametrize('bad', ['pose', law, None, 3], ids=str)
+@pytest.mark.parametrize('bad', ['pose', law, None, 3], ids=['name', 'function', 'None', 'number'])
 def test_only_controllers_can_be_given(bad):
     with pytest.raises(ValueError, match='controller must be of class Controller'):
         GoToGoalParameters.with_controller(bad)
