@@ -117,7 +117,7 @@ def test_reading_and_drawing_load_nothing_of_ros(layer):
         [sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=60
     )
     loaded = set(run.stdout.split())
-    assert {PACKAGE, 'numpy'} <= loaded
+    assert PACKAGE in loaded
     assert not loaded & {*ROS_MODULES, 'rpyutils', 'matplotlib', 'rich'}
 
 
