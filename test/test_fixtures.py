@@ -230,18 +230,27 @@ def test_a_recording_on_a_full_disk_is_reported_and_the_session_goes_on(run):
 
 def test_no_hook_raises(run):
     result = run("""
+    import pytest
+
     def broken():
         raise KeyError('of a bug')
+
+    def timed_out():
+        pytest.fail('Timeout')
 
     def test_fails(lockstep, recorded_run, monkeypatch):
         monkeypatch.setattr(lockstep, 'report', broken)
         monkeypatch.setattr(recorded_run, 'keep', broken)
         assert False
 
+    def test_fails_while_a_plugin_stops_it(lockstep, recorded_run, monkeypatch):
+        monkeypatch.setattr(recorded_run, 'keep', timed_out)
+        assert False
+
     def test_of_the_same_session(lockstep):
         pass
     """)
-    result.assert_outcomes(failed=1, passed=1)
+    result.assert_outcomes(failed=2, passed=1)
     text = result.stdout.str()
     assert text.count("not available: KeyError('of a bug')") == 2
     assert 'INTERNALERROR' not in text

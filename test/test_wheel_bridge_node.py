@@ -125,13 +125,34 @@ def test_standing_wheels_are_not_stopped(lockstep, add, out):
     assert len(out) == 2
 
 
-@pytest.mark.parametrize('timeout', [0.1, 2.0])
-def test_new_timeout_counts_from_its_change_on(lockstep, add, out, timeout):
+@pytest.mark.parametrize('timeout', [0.1, 0.4, 2.0])
+def test_a_new_timeout_counts_from_the_last_command_on(lockstep, add, out, timeout):
     node = add(WheelBridge)
     lockstep.publish('cmd_vel', twist(0.2, 0.0))
     lockstep.run_for(0.3)
     assert change(node, cmd_vel_timeout=timeout).successful
-    assert list(comes_after(lockstep, out, timeout).velocity) == [0.0, 0.0]
+    rest = max(timeout - 0.3, 1e-9)
+    assert list(comes_after(lockstep, out, rest).velocity) == [0.0, 0.0]
+
+
+def test_changes_of_the_timeout_do_not_keep_the_wheels_turning(lockstep, add, out):
+    """Requests of another process must not replace commands."""
+    node = add(WheelBridge)
+    lockstep.publish('cmd_vel', twist(0.2, 0.0))
+    for timeout in (0.6, 0.5) * 3:
+        lockstep.run_for(0.3)
+        assert change(node, cmd_vel_timeout=timeout).successful
+    assert [list(one.velocity) for one in out] == [[0.2 / R] * 2, [0.0, 0.0]]
+
+
+@pytest.mark.lockstep(start=100.0)
+def test_a_clock_that_keeps_going_back_does_not_keep_the_wheels_turning(lockstep, add, out):
+    add(WheelBridge)
+    lockstep.publish('cmd_vel', twist(0.2, 0.0))
+    for _ in range(4):
+        lockstep.run_for(0.3)
+        lockstep.jump(-0.1)
+    assert [list(one.velocity) for one in out] == [[0.2 / R] * 2, [0.0, 0.0]]
 
 
 def test_without_a_timeout_the_wheels_turn_for_ever(lockstep, add, out):
@@ -200,7 +221,7 @@ def test_jump_puts_the_stop_off_by_a_timeout_at_most(lockstep, add, out, seconds
     add(WheelBridge)
     lockstep.publish('cmd_vel', twist(0.2, 0.0))
     lockstep.jump(seconds)
-    # After a jump back the timeout is restarted.
+    # After a jump back the rest of the timeout remains.
     left = 0.5 - max(seconds, 0.0)
     assert list(comes_after(lockstep, out, left).velocity) == [0.0, 0.0]
 

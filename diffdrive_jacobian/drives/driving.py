@@ -214,7 +214,8 @@ def drive_in(
         if client.robot is not None and not client.ended:
             index = controller.waypoint
             if index is not None:
-                client.index = index
+                # A goal of another process may have more poses.
+                client.index = min(index, len(goals) - 1)
             seconds = runner.seconds() - started
             progress.driving(seconds, client.index, client.distance, wheels.speeds)
         return bool(client.ended or signals.count or runner.seconds() - started > timeout)

@@ -259,7 +259,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             # The driven point or the law is another one.
             goal.waypoints = goal.waypoints.resumed()
         if self.parameters.odom_timeout != previous.odom_timeout:
-            self._watchdog.start(nanoseconds(self.parameters.odom_timeout))
+            self._watchdog.change_timeout(nanoseconds(self.parameters.odom_timeout))
 
     def _configure(self) -> None:
         """Compute from the parameters what every step needs, and warn of values that do not suit."""

@@ -104,6 +104,6 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
             self.flush(self._joint_command)
 
     def parameters_changed(self, previous: WheelBridgeParameters) -> None:
-        """Start a new timeout. Other parameters apply from the next command on."""
+        """Change the timeout. Other parameters apply from the next command on."""
         if self.parameters.cmd_vel_timeout != previous.cmd_vel_timeout:
-            self._watchdog.start(nanoseconds(self.parameters.cmd_vel_timeout))
+            self._watchdog.change_timeout(nanoseconds(self.parameters.cmd_vel_timeout))

@@ -40,6 +40,16 @@ class Watchdog:
         self._timeout = timeout
         self.feed(self._clock.now().nanoseconds)
 
+    def change_timeout(self, timeout: int) -> None:
+        """Change the timeout (ns); 0: it never expires. The time since it was fed counts."""
+        expired = bool(self._timeout) and not self._running
+        self._timeout = timeout
+        if not timeout:
+            self._running = False
+            self._timer.cancel()
+        elif not expired:
+            self._wait_for_rest()
+
     def feed(self, now: int) -> None:
         """Restart the timeout at a time (ns)."""
         self._fed_at = now
@@ -56,11 +66,16 @@ class Watchdog:
         self._running = True
         restart_timer(self._timer, duration)
 
-    def _on_jump_back(self, _: TimeJump) -> None:
+    def _wait_for_rest(self) -> None:
+        elapsed = max(0, self._clock.now().nanoseconds - self._fed_at)
+        self._wait(max(1, self._timeout - elapsed))
+
+    def _on_jump_back(self, jump: TimeJump) -> None:
+        # The elapsed time stays the same: a clock that keeps going back must not prevent the timeout.
         # The timer of rcl may still wait for a time before the jump.
+        self._fed_at += jump.delta.nanoseconds
         if self._running:
-            self._fed_at = self._clock.now().nanoseconds
-            self._wait(self._timeout)
+            self._wait_for_rest()
 
     def _on_timer(self) -> None:
         elapsed = self._clock.now().nanoseconds - self._fed_at

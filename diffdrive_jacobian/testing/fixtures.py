@@ -52,7 +52,10 @@ def _or_error(describe: Callable[[], str]) -> str:
     """Return a text, or the error instead: an exception in a hook would end the whole session."""
     try:
         return describe()
-    except Exception as error:
+    except (KeyboardInterrupt, pytest.exit.Exception):
+        raise
+    except BaseException as error:
+        # Also of pytest.fail and pytest.skip, which a timeout of a plugin may raise here.
         return str(error) if isinstance(error, RecordingError) else f'not available: {error!r}'
 
 
