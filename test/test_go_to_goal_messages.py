@@ -182,13 +182,23 @@ def test_without_a_timeout_the_last_command_stands(lockstep):
     assert twists(controller.commands) == [(0.5, 0.0)]
 
 
-@pytest.mark.parametrize('timeout', [0.1, 2.0])
-def test_new_timeout_counts_from_its_change_on(lockstep, controller, timeout):
+@pytest.mark.parametrize('timeout', [0.4, 2.0])
+def test_a_new_timeout_counts_from_the_last_odometry_on(lockstep, controller, timeout):
     controller.send(goal(1, 0))
     controller.at(0, 0)
     lockstep.run_for(0.3)
     assert change(controller.node, odom_timeout=timeout).successful
-    assert comes_after(lockstep, controller.commands, timeout) == Twist()
+    assert comes_after(lockstep, controller.commands, timeout - 0.3) == Twist()
+
+
+def test_changes_of_the_timeout_do_not_keep_the_robot_driving(lockstep, controller):
+    """Requests of another process must not replace odometry."""
+    controller.send(goal(1, 0))
+    controller.at(0, 0)
+    for timeout in (0.6, 0.5) * 3:
+        lockstep.run_for(0.3)
+        assert change(controller.node, odom_timeout=timeout).successful
+    assert controller.commands[-1] == Twist()
 
 
 @pytest.mark.parametrize('pause', [0.05, 0.1, 0.19])

@@ -365,7 +365,7 @@ BAD = [
     (iv.joint_limit_cost, {'upper': Q - 1.0}, r'^upper must be above lower'),
     (iv.joint_limit_gradient, {'upper': Q - 2.0}, r'^upper must be above lower'),
     (iv.joint_limit_gradient, {'q': [0.0]}, r'^(q|lower|upper)\b.* must .*got'),
-    (iv.manipulability_gradient, {'jacobian': lambda q: np.eye(2)}, r'^jacobian must give'),
+    (iv.manipulability_gradient, {'jacobian': lambda q: np.eye(2)}, r'^jacobian must return'),
     (iv.manipulability_gradient, {'q': 0.0}, r'^q must have shape'),
     (iv.prioritized, {'tasks': []}, r'^tasks must contain at least one'),
     (iv.prioritized, {'tasks': [TWO, THREE]}, r'^tasks must all be about the same joints.*2, 3'),
