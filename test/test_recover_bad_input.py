@@ -40,7 +40,7 @@ def test_what_is_no_bag(tmp_path, capsys):
         'empty': ('is an empty folder',),
         'other': ('holds neither .mcap nor .db3 files',),
         'other/notes.txt': ('is neither MCAP nor SQLite nor a journal',),
-        'fake.journal': ('is no journal',),
+        'fake.journal': ('is not a journal',),
     }.items():
         assert_refused(capsys, tmp_path, [tmp_path / name], 2, *words)
 

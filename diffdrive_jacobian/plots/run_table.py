@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from diffdrive_jacobian.plots.output_files import create
 from diffdrive_jacobian.reading.run import Run, Series
 from diffdrive_jacobian.reading.trace import Trace, seconds, trace
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 COLUMNS = (
     *('time_s', 'x_m', 'y_m', 'theta_rad', 'v_mps', 'omega_radps'),
@@ -75,7 +76,7 @@ def _clocks(one: Trace, series: Series) -> tuple[NDArray[np.float64], NDArray[np
 
 def decimal_seconds(nanoseconds: int) -> str:
     """Return a time as an exact decimal number (s)."""
-    sign, (whole, rest) = '-' * (nanoseconds < 0), divmod(abs(nanoseconds), 1_000_000_000)
+    sign, (whole, rest) = '-' * (nanoseconds < 0), divmod(abs(nanoseconds), NANOSECONDS)
     return f'{sign}{whole}.{rest:09d}'.rstrip('0').rstrip('.')
 
 
