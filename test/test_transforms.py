@@ -84,6 +84,6 @@ def test_without_tf2_ros_that_is_logged_once_and_the_rest_works(lockstep, add, c
     add(VirtualRobot)
     lockstep.run_for(0.3)
     assert topics.odom
-    words = 'tf2_ros is not installed: the pose is not sent as a transform'
+    words = 'tf2_ros is not installed: no transform is published'
     assert capfd.readouterr().err.count(words) == 1
     assert '/tf' not in dict(lockstep.node.get_topic_names_and_types())
