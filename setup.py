@@ -64,7 +64,14 @@ setup(
         ],
         'doc': ['pdoc>=15'],
         'plot': ['matplotlib>=3.5'],
-        'test': ['mcap>=1.2', 'hypothesis>=6', 'matplotlib>=3.5', 'pytest>=7', 'pyyaml>=5'],
+        'test': [
+            'mcap>=1.2',
+            'hypothesis>=6',
+            'matplotlib>=3.5',
+            'pytest>=7',
+            'pytest-xdist>=3',
+            'pyyaml>=5',
+        ],
     },
     zip_safe=False,
     entry_points={

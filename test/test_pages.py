@@ -80,7 +80,7 @@ def test_two_commands_of_one_line_each():
     commands = re.findall(r'^python3 -m venv .*$', TEXTS['README.md'], re.MULTILINE)
     assert len(commands) == 2
     assert commands[0].endswith('drive_to 1 1')
-    assert commands[1].endswith('pytest')
+    assert commands[1].endswith('pytest -n auto')
 
 
 def test_workflow_is_valid_yaml():
