@@ -54,6 +54,8 @@ class Guard:
         """
         self._patience = patience
         self._nodes = nodes
+        self.raised: Stuck | None = None
+        """What was raised at the current time."""
         self._since: float | None = None
         self._seen: dict[str, None] | None = None
         self._profiler: Any = None
@@ -65,6 +67,7 @@ class Guard:
 
     def arm(self) -> None:
         """Start the measurement."""
+        self.raised = None
         self._since = time.monotonic()
 
     def disarm(self) -> None:
@@ -103,7 +106,8 @@ class Guard:
             self._profiler = sys.getprofile()
             sys.setprofile(self._on_call)
             return
-        raise Stuck(self._diagnose(self._stop_observing(), frame))
+        self.raised = Stuck(self._diagnose(self._stop_observing(), frame))
+        raise self.raised
 
     def _stop_observing(self) -> list[str]:
         sys.setprofile(self._profiler)

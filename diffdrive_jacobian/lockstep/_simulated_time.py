@@ -151,7 +151,11 @@ class SimulatedTime:
             yield
         except ExternalShutdownException:
             raise LockstepError('rclpy was shut down: only lockstep may do that') from None
-        except Stuck as stuck:
+        except (Stuck, RuntimeError) as error:
+            # pybind11 replaces an exception that is raised while it converts an argument.
+            stuck = error if isinstance(error, Stuck) else self._guard.raised
+            if stuck is None:
+                raise
             raise LockstepError(f'at {self._now / NANOSECONDS:g} s: {stuck}\n{self.report()}') from stuck
         finally:
             self._guard.disarm()
