@@ -12,6 +12,7 @@ from nav_msgs.msg import Goals, Odometry
 from ros_messages import odometry
 
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.ros.goal_client import DRIVEN_POINT_PARAMETERS, GoalClient, driven_offset
 from diffdrive_jacobian.ros.liveness import Liveness
 
@@ -113,3 +114,22 @@ def test_a_node_without_these_parameters_answers_without_values(ros):
 )
 def test_driven_offset_of_any_values(values, expected):
     assert driven_offset(values) == expected
+
+
+def test_a_topic_with_another_type_in_the_process_is_named(ros):
+    with pytest.raises(ParameterError) as caught:
+        add_client(ros, [[0.0, 0.0, 0.0]], cli_args=['--ros-args', '-r', 'odom:=goal_status'])
+    assert str(caught.value) == (
+        'two topics of this node have the name /goal_status, one with type nav_msgs/msg/Odometry, the '
+        'other with action_msgs/msg/GoalStatus: remap them to different names'
+    )
+
+
+def test_a_topic_with_another_type_in_another_node_is_named(ros):
+    ros.peer.create_publisher(PoseStamped, 'odom', 1)
+    with pytest.raises(ParameterError) as caught:
+        add_client(ros, [[0.0, 0.0, 0.0]])
+    assert str(caught.value) == (
+        '/odom must have one type within a process: this node uses nav_msgs/msg/Odometry, another one '
+        'geometry_msgs/msg/PoseStamped'
+    )

@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from ros_messages import odometry
 from rosgraph_msgs.msg import Clock
+from type_description_interfaces.srv import GetTypeDescription
 
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
@@ -75,6 +76,54 @@ def test_atomic_request_with_a_value_of_an_unknown_type_is_refused_whole(lockste
     request.parameters.pop(1)
     assert lockstep.call(SetParametersAtomically, service, request).result.successful
     assert node.get_parameter(changed).value == 3.5
+
+
+MALFORMED_HASHES = {
+    'none': '',
+    'long': 'y' * 100_000,
+    'digit': f'RIHS01_{"0" * 63}g',
+    'version': f'RIHS02_{"0" * 64}',
+    'line': f'RIHS01_{"0" * 64}\n',
+}
+
+
+@pytest.mark.parametrize('name', [*NODES, 'client'])
+@pytest.mark.parametrize('case', MALFORMED_HASHES)
+def test_malformed_type_hash_is_refused_and_not_logged(ros, capfd, name, case):
+    if name == 'client':
+        with running(ros.context, isolated=False) as runner:
+            node = runner.add(lambda: GoalClient(name, np.zeros((1, 3)), ros.context))
+            check_type_hash(ros, capfd, node, MALFORMED_HASHES[case])
+    else:
+        check_type_hash(ros, capfd, ros.add(NODES[name]), MALFORMED_HASHES[case])
+
+
+def check_type_hash(ros, capfd, node, type_hash):
+    (service,) = [one for one in node.services if one.srv_type is GetTypeDescription]
+    capfd.readouterr()
+    request = GetTypeDescription.Request(type_name='x', type_hash=type_hash)
+    response = service.callback(request, GetTypeDescription.Response())
+    assert not response.successful
+    assert response.failure_reason == (
+        f'type_hash must be RIHS01_ and 64 hexadecimal digits, got {len(type_hash)} other characters'
+    )
+    log = capfd.readouterr().err
+    assert 'type description request refused' in log
+    assert len(log) < 300
+
+
+def test_type_description_is_still_provided(ros):
+    node = ros.add(VirtualRobot)
+    (info,) = node.get_publishers_info_by_topic('/odom')
+    request = GetTypeDescription.Request(
+        type_name='nav_msgs/msg/Odometry', type_hash=str(info.topic_type_hash)
+    )
+    client = ros.peer.create_client(GetTypeDescription, '/virtual_robot/get_type_description')
+    ros.until(client.service_is_ready, 'the service')
+    future = client.call_async(request)
+    ros.until(future.done, 'the answer')
+    assert future.result().successful
+    assert future.result().type_description.type_description.type_name == 'nav_msgs/msg/Odometry'
 
 
 def test_parameter_without_a_name_is_not_set(lockstep, add):

@@ -7,8 +7,8 @@ import pytest
 
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.ros import liveness
-from diffdrive_jacobian.ros.goal_client import SILENCE, GoalClient, loss
-from diffdrive_jacobian.ros.liveness import LONGEST_STEP, Liveness
+from diffdrive_jacobian.ros.goal_client import SILENCE, GoalClient, duplicates, loss
+from diffdrive_jacobian.ros.liveness import LONGEST_STEP, PERIOD, Liveness
 
 
 class Clock:
@@ -96,33 +96,94 @@ def test_requests_without_an_answer_do_not_pile_up(ros, clock):
 # --- Loss of a controller
 
 A, B, OTHER = b'a', b'b', b'o'
+STEP = 0.05
+"""Time by which a test advances the clock (s)."""
+RESTARTED = 'the controller /go_to_goal was restarted'
 
 
 @pytest.mark.parametrize(
-    ('sent_to', 'present', 'silence', 'expected'),
+    ('sent_to', 'present', 'silence', 'partial', 'expected'),
     [
-        ({A: '/go_to_goal'}, {A: '/go_to_goal'}, 2.9, None),
-        ({A: '/go_to_goal'}, {}, 0.0, 'the controller is gone'),
-        ({A: '/go_to_goal'}, {OTHER: '/other'}, 0.0, 'the controller is gone'),
-        ({A: '/go_to_goal'}, {A: '/go_to_goal', OTHER: '/other'}, 0.0, None),
-        ({A: '/go_to_goal'}, {A: '/go_to_goal', OTHER: ''}, 0.0, None),
-        ({A: ''}, {A: '', OTHER: ''}, 0.0, None),
+        ({A: '/go_to_goal'}, {A: '/go_to_goal'}, 2.9, 2.9, None),
+        ({A: '/go_to_goal'}, {}, 0.0, 0.0, 'the controller is gone'),
+        ({A: '/go_to_goal'}, {OTHER: '/other'}, 0.0, 0.0, 'the controller is gone'),
+        ({A: '/go_to_goal'}, {A: '/go_to_goal', OTHER: '/other'}, 0.0, 9.0, None),
+        ({A: '/go_to_goal'}, {A: '/go_to_goal', OTHER: ''}, 0.0, 9.0, None),
+        ({A: ''}, {A: '', OTHER: ''}, 0.0, 0.0, None),
+        ({A: '/go_to_goal'}, {A: '/go_to_goal', B: '/go_to_goal'}, 0.0, 2.9, None),
+        ({A: '/go_to_goal', B: '/go_to_goal'}, {A: '/go_to_goal', B: '/go_to_goal'}, 0.0, 9.0, None),
+        ({A: '/go_to_goal'}, {A: '/go_to_goal', B: '/go_to_goal'}, 0.0, 3.0, RESTARTED),
+        ({A: '/go_to_goal'}, {B: '/go_to_goal'}, 0.0, 0.0, RESTARTED),
         (
             {A: '/go_to_goal'},
-            {A: '/go_to_goal', B: '/go_to_goal'},
-            0.0,
-            'the controller /go_to_goal was restarted',
-        ),
-        (
             {A: '/go_to_goal'},
-            {A: '/go_to_goal'},
+            3.0,
             3.0,
             'the controller /go_to_goal has not answered for 3 s: it was killed or hangs',
         ),
     ],
 )
-def test_loss(sent_to, present, silence, expected):
-    assert loss(sent_to, present, silence) == expected
+def test_loss(sent_to, present, silence, partial, expected):
+    assert loss(sent_to, present, silence, {'/go_to_goal': partial}) == expected
+
+
+@pytest.mark.parametrize(
+    ('present', 'expected'),
+    [
+        ({A: '/go_to_goal'}, []),
+        ({A: '/go_to_goal', OTHER: '/other'}, []),
+        ({A: '/go_to_goal', B: '/go_to_goal'}, ['/go_to_goal']),
+        ({B: '/go_to_goal'}, []),
+    ],
+)
+def test_duplicates_of_a_controller_that_is_present(present, expected):
+    assert duplicates({A: '/go_to_goal'}, present) == expected
+
+
+def partial_silence(ros, watch, clock, seconds):
+    """Spin while some node answers, for a time of the clock; return the partial silence."""
+    end = clock.now + seconds
+
+    def over():
+        clock.now += STEP
+        watch.silence()
+        return clock.now >= end
+
+    ros.until(over, 'the end')
+    return watch.partial_silence()['/go_to_goal']
+
+
+def test_a_duplicate_that_answers_too_is_no_restart(ros, clock):
+    ros.add(GoToGoal)
+    watch = Liveness(ros.peer, ['/go_to_goal'])
+    answered(ros, watch, clock)
+    twin = ros.add(GoToGoal)
+    service = '/go_to_goal/get_parameters'
+    ros.until(lambda: ros.peer.count_services(service) == 2, 'both are discovered')
+    ros.until(lambda: partial_silence(ros, watch, clock, PERIOD) == 0.0, 'both have answered')
+    # Which of them falls silent now is unknown.
+    ros.executor.remove_node(twin)
+    assert partial_silence(ros, watch, clock, 2 * SILENCE) == 0.0
+
+
+def test_a_namesake_without_parameter_services_is_no_restart(ros, clock):
+    ros.add(GoToGoal)
+    watch = Liveness(ros.peer, ['/go_to_goal'])
+    ros.add(GoToGoal, start_parameter_services=False)
+    answered(ros, watch, clock)
+    assert partial_silence(ros, watch, clock, 2 * SILENCE) < 1.0
+
+
+def test_a_successor_that_answers_alone_is_a_restart(ros, clock):
+    old = ros.add(GoToGoal)
+    watch = Liveness(ros.peer, ['/go_to_goal'])
+    answered(ros, watch, clock)
+    ros.executor.remove_node(old)
+    ros.add(GoToGoal)
+    service = '/go_to_goal/get_parameters'
+    ros.until(lambda: ros.peer.count_services(service) == 2, 'both are discovered')
+    assert partial_silence(ros, watch, clock, 2 * SILENCE) >= SILENCE
+    assert watch.silence() < SILENCE
 
 
 def test_a_restarted_controller_is_distinguished_from_the_one_that_has_the_goal(ros):
@@ -138,15 +199,18 @@ def test_a_restarted_controller_is_distinguished_from_the_one_that_has_the_goal(
     ros.until(lambda: sender.obstacle() is None, 'the sender is ready')
     controllers = sender.controllers()
     assert list(controllers.values()) == ['/go_to_goal']
-    assert loss(controllers, sender.controllers(), 0.0) is None
+    assert loss(controllers, sender.controllers(), 0.0, {}) is None
     ros.add(GoToGoal)
     ros.until(lambda: len(sender.controllers()) == 2, 'the new one is found')
-    restarted = 'the controller /go_to_goal was restarted'
     ros.until(
-        lambda: loss(controllers, sender.controllers(), 0.0) == restarted, 'the restart is detected'
+        lambda: duplicates(controllers, sender.controllers()) == ['/go_to_goal'], 'it has a namesake'
     )
+    # Both are there: it is not lost, unless only the new one answers.
+    assert loss(controllers, sender.controllers(), 0.0, {'/go_to_goal': 0.0}) is None
+    assert loss(controllers, sender.controllers(), 0.0, {'/go_to_goal': SILENCE}) == RESTARTED
     ros.executor.remove_node(old)
     old.destroy_node()
     ros.nodes.remove(old)
     ros.until(lambda: len(sender.controllers()) == 1, 'the old one is gone')
-    assert loss(controllers, sender.controllers(), 0.0) == 'the controller is gone'
+    # Within a process the name of the new one is lost with the old one.
+    assert loss(controllers, sender.controllers(), 0.0, {}) == 'the controller is gone'

@@ -124,6 +124,24 @@ def test_service_callback_is_wrapped(ros, executor_kind):
     assert future.result().values[0].bool_value is False
 
 
+def test_every_response_to_a_request_is_counted(ros):
+    for name in ('one', 'two'):
+        ros.add(Node, node_name=name).create_service(
+            GetParameters, 'shared', lambda request, response: response
+        )
+    client = ros.peer.create_client(GetParameters, 'shared')
+    ros.until(lambda: ros.peer.count_services('shared') == 2, 'both servers are discovered')
+    responses = []
+    internals.on_response(client, responses.append)
+
+    def both_answered():
+        if not client._pending_requests:
+            client.call_async(GetParameters.Request())
+        return len(responses) > len(set(responses))
+
+    ros.until(both_answered, 'two responses to one request')
+
+
 # --- Time
 
 

@@ -22,6 +22,7 @@ from diffdrive_jacobian.control import Arrival
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.ros.node import THROTTLE
+from diffdrive_jacobian.ros.topic_errors import explaining_failure
 
 SILENCE = 3.0
 """A controller that has not answered for this long was killed or hangs (s)."""
@@ -70,6 +71,7 @@ class GoalClient(Node):  # type: ignore[misc]
             kwargs: Passed on to `rclpy.node.Node`.
 
         Raises:
+            ParameterError: A topic has another type in this process.
             ValueError: `goals` has another shape than the topic takes.
         """
         if goals.ndim != 2 or goals.shape[1] != 3 or not len(goals):
@@ -92,10 +94,13 @@ class GoalClient(Node):  # type: ignore[misc]
         self._topic = topic
         self._send_on_odometry = False
         self._message: PoseStamped | Goals | None = None
-        self._publisher = self.create_publisher(MESSAGES[topic], topic, 10)
+        with explaining_failure(self, MESSAGES[topic], topic):
+            self._publisher = self.create_publisher(MESSAGES[topic], topic, 10)
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.create_subscription(GoalStatus, 'goal_status', self._on_status, latched)
-        self.create_subscription(Odometry, 'odom', self._on_odometry, 10)
+        with explaining_failure(self, GoalStatus, 'goal_status'):
+            self.create_subscription(GoalStatus, 'goal_status', self._on_status, latched)
+        with explaining_failure(self, Odometry, 'odom'):
+            self.create_subscription(Odometry, 'odom', self._on_odometry, 10)
         # rclpy reports a name that is too long only here.
         self.resolve_service_name('cancel_goal')
         self._cancel = self.create_client(Trigger, 'cancel_goal')
@@ -244,21 +249,47 @@ def _full_name(node: tuple[str, str]) -> str:
     return f'{namespace.rstrip("/")}/{name}'
 
 
-def loss(sent_to: Mapping[bytes, str], present: Mapping[bytes, str], silence: float) -> str | None:
+def loss(
+    sent_to: Mapping[bytes, str],
+    present: Mapping[bytes, str],
+    silence: float,
+    partial_silence: Mapping[str, float],
+) -> str | None:
     """Describe why the controller of a goal is lost. None: it is not.
 
     Args:
         sent_to: The controllers to which the goal was sent, as from `GoalClient.controllers`.
         present: The controllers that are present now.
         silence: Time since any of them answered (s).
+        partial_silence: For how long fewer nodes of each name have answered than the graph lists (s).
     """
+    namesakes = _namesakes(sent_to, present)
     if not sent_to.keys() & present.keys():
+        if namesakes:
+            return f'the controller {namesakes[0]} was restarted'
         return 'the controller is gone'
-    # DDS may list one that was killed for 20 s more, beside its successor.
-    successors = {present[gid] for gid in present.keys() - sent_to.keys()}
-    if restarted := sorted(successors & set(sent_to.values()) - {''}):
-        return f'the controller {restarted[0]} was restarted'
     if silence >= SILENCE:
         names = ', '.join(sorted(set(sent_to.values()) - {''}))
         return f'the controller {names} has not answered for {SILENCE:g} s: it was killed or hangs'
+    # DDS may list one that was killed for 20 s more, beside its successor, which answers alone.
+    for name in namesakes:
+        if partial_silence.get(name, 0.0) >= SILENCE:
+            return f'the controller {name} was restarted'
     return None
+
+
+def duplicates(sent_to: Mapping[bytes, str], present: Mapping[bytes, str]) -> list[str]:
+    """Return the names of controllers of a goal that other nodes have as well, sorted.
+
+    Args:
+        sent_to: The controllers to which the goal was sent, as from `GoalClient.controllers`.
+        present: The controllers that are present now.
+    """
+    remaining = {gid: name for gid, name in sent_to.items() if gid in present}
+    return [name for name in _namesakes(sent_to, present) if name in remaining.values()]
+
+
+def _namesakes(sent_to: Mapping[bytes, str], present: Mapping[bytes, str]) -> list[str]:
+    """Return the names that later controllers share with those of the goal, sorted."""
+    later = {present[gid] for gid in present.keys() - sent_to.keys()}
+    return sorted(later & set(sent_to.values()) - {''})

@@ -1,12 +1,14 @@
-"""Guards for the two inputs that rclpy parses itself: parameter requests and /clock.
+"""Guards for inputs that rclpy and rcl parse themselves: parameter requests, type hashes and /clock.
 
 A parameter value of an unknown type or a clock message with a negative time raises an exception in
-rclpy, which ends the node. Both are refused before rclpy receives them, with a throttled warning. Other
-inputs are passed on unchanged, and exceptions of other callbacks are not caught.
+rclpy, which ends the node. A malformed type hash, which can be of any length, is written in full into
+the log by rcl. They are refused before rclpy receives them, with a throttled warning. Other inputs are
+passed on unchanged, and exceptions of other callbacks are not caught.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -17,6 +19,7 @@ from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
+from type_description_interfaces.srv import GetTypeDescription
 
 from diffdrive_jacobian.messages.conversion import MessageError, from_time
 from diffdrive_jacobian.ros.rclpy_internals import wrap_clock_callback, wrap_service_callback
@@ -24,11 +27,12 @@ from diffdrive_jacobian.text import printable
 
 THROTTLE = 2.0
 """Shortest time between two log lines about one kind of input (s)."""
+_TYPE_HASH = re.compile(r'RIHS01_[0-9a-fA-F]{64}')
 _TYPES = frozenset(member.value for member in Parameter.Type)
 
 
 def guard_inputs(node: Node) -> None:
-    """Refuse parameter requests and clock messages that rclpy cannot parse.
+    """Refuse parameter requests, type hashes and clock messages that rclpy or rcl cannot parse.
 
     /clock is also guarded when `use_sim_time` becomes true later.
     """
@@ -37,6 +41,7 @@ def guard_inputs(node: Node) -> None:
     wrap_service_callback(
         node, SetParametersAtomically, partial(_guarded_set_parameters_atomically, node)
     )
+    wrap_service_callback(node, GetTypeDescription, partial(_guarded_get_type_description, node))
 
 
 def _guarded_clock(node: Node, accept: Callable[[Clock], None]) -> Callable[[Clock], None]:
@@ -98,6 +103,31 @@ def _guarded_set_parameters_atomically(
                 response.result = refusal
                 return response
         return accept(request, response)
+
+    return on_request
+
+
+def _guarded_get_type_description(
+    node: Node, accept: Callable[[Any, Any], Any]
+) -> Callable[[GetTypeDescription.Request, GetTypeDescription.Response], GetTypeDescription.Response]:
+    log = node.get_logger()
+
+    def on_request(
+        request: GetTypeDescription.Request, response: GetTypeDescription.Response
+    ) -> GetTypeDescription.Response:
+        if _TYPE_HASH.fullmatch(request.type_hash):
+            return accept(request, response)
+        # The hash may have any length, so it is not repeated.
+        response.failure_reason = (
+            'type_hash must be RIHS01_ and 64 hexadecimal digits, got '
+            f'{len(request.type_hash)} other characters'
+        )
+        log.warning(
+            f'type description request refused: {response.failure_reason}',
+            throttle_duration_sec=THROTTLE,
+        )
+        response.successful = False
+        return response
 
     return on_request
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any
@@ -17,6 +17,8 @@ from typing import Any
 from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
+
+from diffdrive_jacobian.ros.rclpy_internals import on_response
 
 PERIOD = 0.5
 """Time between two requests (s)."""
@@ -43,6 +45,13 @@ class Liveness:
         self._clients = {
             name: node.create_client(GetParameters, f'{name}/get_parameters') for name in names
         }
+        self._node = node
+        self._answers: dict[str, Counter[int]] = {name: Counter() for name in self._clients}
+        self._partial_silence = dict.fromkeys(self._clients, 0.0)
+        self._servers = dict.fromkeys(self._clients, 0)
+        self._together: set[str] = set()
+        for name, client in self._clients.items():
+            on_response(client, partial(self._on_response, name))
         self._parameters = tuple(parameters)
         self._pending: deque[tuple[Any, Any]] = deque()
         self._silence = 0.0
@@ -65,15 +74,45 @@ class Liveness:
         """
         now = time.monotonic()
         if self._answered:
-            self._silence += min(now - self._updated, LONGEST_STEP)
+            step = min(now - self._updated, LONGEST_STEP)
+            self._silence += step
+            for name in self._partial_silence:
+                self._partial_silence[name] += step
         self._updated = now
         if now - self._requested >= PERIOD:
             self._requested = now
             self._request()
         return self._silence
 
+    def partial_silence(self) -> dict[str, float]:
+        """Return for how long fewer nodes of each name have answered than the graph lists (s).
+
+        DDS lists a node that was killed beside its successor of the same name, but only one of them
+        answers. It is 0 once several nodes of the name have answered the same request: they are
+        different nodes, and which of them falls silent later is unknown.
+        """
+        return {
+            name: 0.0 if name in self._together else silence
+            for name, silence in self._partial_silence.items()
+        }
+
+    def _on_response(self, name: str, request: int) -> None:
+        answers = self._answers[name]
+        answers[request] += 1
+        if answers[request] > 1:
+            self._together.add(name)
+        if answers[request] >= self._servers[name]:
+            self._partial_silence[name] = 0.0
+        while len(answers) > PENDING:
+            del answers[min(answers)]
+
     def _request(self) -> None:
         for name, client in self._clients.items():
+            servers = self._node.count_services(client.srv_name)
+            if servers > self._servers[name]:
+                # A new one has as long to answer as the others.
+                self._partial_silence[name] = 0.0
+            self._servers[name] = servers
             if client.service_is_ready():
                 future = client.call_async(GetParameters.Request(names=self._parameters))
                 future.add_done_callback(partial(self._on_answer, name))

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from typing import Any, Generic, TypeVar
 from weakref import WeakKeyDictionary
 
@@ -31,7 +30,8 @@ from diffdrive_jacobian.ros import parameters as ros_parameters
 from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.rate_limit import RateLimit
-from diffdrive_jacobian.ros.rclpy_internals import parameter_overrides, reason, time_reader
+from diffdrive_jacobian.ros.rclpy_internals import time_reader
+from diffdrive_jacobian.ros.topic_errors import explaining_failure, type_name
 from diffdrive_jacobian.text import printable
 
 P = TypeVar('P', bound=NodeParameters)
@@ -102,11 +102,11 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         Raises:
             ParameterError: The topic has another type in this process, or `qos_overrides` are invalid.
         """
-        self._topics.append((topic, _type_name(message), False))
+        self._topics.append((topic, type_name(message), False))
         profile = QoSProfile(depth=10)
         if latched:
             profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
-        with self._explaining_failure(message, topic):
+        with explaining_failure(self, message, topic):
             return self.create_publisher(
                 message,
                 topic,
@@ -128,8 +128,8 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         Raises:
             ParameterError: As for `advertise`.
         """
-        self._topics.append((topic, _type_name(message), True))
-        with self._explaining_failure(message, topic):
+        self._topics.append((topic, type_name(message), True))
+        with explaining_failure(self, message, topic):
             return self.create_subscription(
                 message,
                 topic,
@@ -168,33 +168,6 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
     def _may_log(self, event: str) -> bool:
         limit = self._event_limits.setdefault(event, RateLimit(EVENT_BURST, EVENT_PERIOD))
         return limit.permits(time.monotonic())
-
-    @contextmanager
-    def _explaining_failure(self, message: type, topic: str) -> Iterator[None]:
-        """Raise an error that explains why a publisher or subscription cannot be created.
-
-        Within a process Fast DDS refuses a topic of two types, which rclpy reports as "invalid
-        allocator". `qos_overrides` may be a combination that does not exist.
-        """
-        try:
-            yield
-        except RuntimeError as error:
-            name, wanted = self.resolve_topic_name(topic), _type_name(message)
-            types = dict(self.get_topic_names_and_types()).get(name, [])
-            others = ', '.join(other for other in types if other != wanted)
-            overridden = any(
-                key.startswith(f'qos_overrides.{name}.') for key in parameter_overrides(self)
-            )
-            if overridden and not others:
-                raise ParameterError(
-                    f'the qos_overrides of {name} are invalid: {reason(error)}'
-                ) from error
-            if not others:
-                raise
-            raise ParameterError(
-                f'{name} must have one type within a process: this node uses {wanted}, another one '
-                f'{others} (is enable_stamped_cmd_vel the same for both?)'
-            ) from error
 
     def parameters_changed(self, previous: P) -> None:
         """React to new values in `parameters`, which may equal the previous ones."""
@@ -298,9 +271,3 @@ def _topic_types(node: Node) -> dict[str, list[str]]:
 
 
 _topic_types_of: WeakKeyDictionary[Context, tuple[float, dict[str, list[str]]]] = WeakKeyDictionary()
-
-
-def _type_name(message: type) -> str:
-    """Return the name of a message type as it is in the graph: package/msg/Name."""
-    package = message.__module__.split('.')[0]
-    return f'{package}/msg/{message.__name__}'

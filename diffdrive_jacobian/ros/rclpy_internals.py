@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import redirect_stderr
 from typing import Any, Protocol
 
+from rclpy.client import Client
 from rclpy.clock import Clock
 from rclpy.context import Context
 from rclpy.executors import Executor
@@ -99,6 +100,24 @@ def wrap_service_callback(
     for service in node.services:
         if service.srv_type is service_type:
             service.callback = wrap(service.callback)
+
+
+def on_response(client: Client, listen: Callable[[int], None]) -> None:
+    """Call a function for each response to a client, also when several servers answer one request.
+
+    Relies on executors calling `Client.get_pending_request` of the instance for each response.
+
+    Args:
+        client: The client.
+        listen: Receives the sequence number of the request.
+    """
+    get_pending_request = client.get_pending_request
+
+    def listening(sequence_number: int) -> Any:
+        listen(sequence_number)
+        return get_pending_request(sequence_number)
+
+    client.get_pending_request = listening
 
 
 # --- Time

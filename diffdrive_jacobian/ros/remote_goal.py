@@ -13,11 +13,18 @@ import numpy as np
 from action_msgs.msg import GoalStatus
 from numpy.typing import ArrayLike
 
-from diffdrive_jacobian.ros.goal_client import DRIVEN_POINT_PARAMETERS, GoalClient, loss
+from diffdrive_jacobian.ros.goal_client import (
+    DRIVEN_POINT_PARAMETERS,
+    SILENCE,
+    GoalClient,
+    duplicates,
+    loss,
+)
 from diffdrive_jacobian.ros.liveness import Liveness
 from diffdrive_jacobian.ros.node_runner import NodeRunner
 from diffdrive_jacobian.ros.runner import ros_context, running
 from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.text import printable
 
 NAME = 'send_goal'
 """Name of the node."""
@@ -170,6 +177,8 @@ class _Session:
         self._signals = signals
         self._progress = progress
         self._lost: str | None = None
+        self._duplicates: dict[str, float] = {}
+        self._warned: set[str] = set()
 
     def run(self, patience: float, timeout: float, *, follow: bool) -> GoalResult:
         client, signals = self._client, self._signals
@@ -247,10 +256,28 @@ class _Session:
                 return True
             if now - queried >= DISCOVERY_PERIOD:
                 queried, present = now, client.controllers()
-            self._lost = loss(controllers, present, silence)
+            partial_silence = liveness.partial_silence()
+            self._lost = loss(controllers, present, silence, partial_silence)
+            if self._lost is None:
+                self._warn_of_duplicates(duplicates(controllers, present), partial_silence, now)
             return self._lost is not None
 
         self._spin(timeout, over)
+
+    def _warn_of_duplicates(
+        self, names: Sequence[str], partial_silence: Mapping[str, float], now: float
+    ) -> None:
+        """Log once for each name that another node has it, when it is no restarted controller."""
+        self._duplicates = {name: self._duplicates.get(name, now) for name in names}
+        for name, since in self._duplicates.items():
+            restarted = partial_silence.get(name, 0.0) > DISCOVERY_PERIOD
+            if now - since >= SILENCE and not restarted and name not in self._warned:
+                self._warned.add(name)
+                self._client.get_logger().warning(
+                    f'another node named {printable(name)} publishes '
+                    f'{self._client.resolve_topic_name("goal_status")}: two controllers may drive the '
+                    'robot; give them different names'
+                )
 
     def _cancel(self, result: Result) -> GoalResult:
         """Cancel the goal, and wait until that is confirmed, or for another signal."""
