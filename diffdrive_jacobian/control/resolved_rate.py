@@ -28,6 +28,7 @@ from diffdrive_jacobian.kinematics._checks import (
     positive,
     read_only,
 )
+from diffdrive_jacobian.kinematics._task_checks import finite_result
 from diffdrive_jacobian.kinematics.inverse_velocity import (
     damped_least_squares,
     limit_velocity,
@@ -67,7 +68,10 @@ def resolved_rate(
             are slowed down alike (see `inverse_velocity.limit_velocity`); None: no limits.
 
     Returns:
-        Joint velocities, shape (..., n).
+        Joint velocities, shape (..., n). Without `max_velocity` infinite where they overflow.
+
+    Raises:
+        ValueError: The velocity of the tip overflows, or with `max_velocity` the joint velocities do.
     """
     J = array('J', J, 'm', 'n')
     m = J.shape[-2]
@@ -85,15 +89,39 @@ def resolved_rate(
         gain=K.shape,
         max_correction=longest.shape,
     )
-    correction = K[..., np.newaxis] * (x_desired - x)
-    length = np.linalg.norm(correction, axis=-1)
-    correction = correction / np.maximum(length / longest, 1.0)[..., np.newaxis]
-    x_dot = x_dot_desired + correction
+    with np.errstate(all='ignore'):
+        correction = K[..., np.newaxis] * (x_desired - x)
+        excess = np.linalg.norm(correction, axis=-1) / longest
+        correction = correction / np.maximum(excess, 1.0)[..., np.newaxis]
+        overflows = ~(excess < np.inf)
+        if overflows.any():
+            scaled = _scaled_correction(x, x_desired, K, longest)
+            correction = np.where(overflows[..., np.newaxis], scaled, correction)
+        x_dot = x_dot_desired + correction
+    finite_result('x, x_desired, x_dot_desired and gain', 'velocity', x_dot)
     if q_dot_0 is None:
         q_dot = damped_least_squares(J, x_dot, damping, weights=weights)
     else:
         q_dot = redundant(J, x_dot, q_dot_0, damping, weights=weights)
-    return q_dot if max_velocity is None else limit_velocity(q_dot, max_velocity)
+    if max_velocity is None:
+        return q_dot
+    finite_result('J, the velocity of the tip, damping and weights', 'joint velocity', q_dot)
+    return limit_velocity(q_dot, max_velocity)
+
+
+def _scaled_correction(
+    x: NDArray[np.float64],
+    x_desired: NDArray[np.float64],
+    gain: NDArray[np.float64],
+    longest: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Compute `K (x_d - x)`, not longer than the limit, where its norm or its excess overflows."""
+    error = x_desired / 2.0 - x / 2.0
+    exponent = np.frexp(np.abs(error).max(axis=-1))[1]
+    error = np.ldexp(error, -exponent[..., np.newaxis])
+    length = np.linalg.norm(error, axis=-1)
+    limit = longest / np.where(length > 0.0, length, 1.0)
+    return np.asarray(error * np.minimum(np.ldexp(gain, exponent + 1), limit)[..., np.newaxis])
 
 
 @dataclass(frozen=True, eq=False)

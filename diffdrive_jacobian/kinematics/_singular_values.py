@@ -27,6 +27,8 @@ FILTER = 0.1
 """Width of the projector's filter, relative to the damping."""
 TINY = float(np.finfo(np.float64).tiny)
 """Smaller numbers have no inverse."""
+LARGE = 400
+"""Entries below `2**LARGE` have squares, and sums of their squares, that do not overflow."""
 
 Array = NDArray[np.float64]
 
@@ -65,6 +67,9 @@ def negligible(norm: Any, relative: float) -> Any:
 
 def pseudoinverse(J: Array) -> Array:
     """Compute J^+, shape (..., n, m)."""
+    if is_large(J):
+        units = large_exponent(J, 2)[..., np.newaxis, np.newaxis]
+        return np.asarray(np.ldexp(pseudoinverse(np.ldexp(J, -units)), -units))
     left, values, right = np.linalg.svd(J, full_matrices=False)
     kept = values > np.asarray(_least(values, J.shape))[..., np.newaxis]
     inverses = kept / np.where(kept, values, 1.0)
@@ -76,6 +81,9 @@ def pseudoinverse(J: Array) -> Array:
 
 def null_space_projector(J: Array, damping: Array) -> Array:
     """Compute N with damping of shape (...), shape (..., n, n)."""
+    if is_large(J):
+        units = large_exponent(J, 2)
+        J, damping = np.ldexp(J, -units[..., np.newaxis, np.newaxis]), np.ldexp(damping, -units)
     _, values, right = np.linalg.svd(J, full_matrices=False)
     return projector(right, removals(values, damping, _least(values, J.shape)))
 
@@ -118,16 +126,31 @@ def joint_velocities(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | No
 def manipulability(J: Array) -> Array:
     """Compute the product of the singular values of Jacobians with m <= n, shape (...)."""
     with np.errstate(all='ignore'):
-        if J.shape[-2] != 2:
-            return np.asarray(np.linalg.svd(J, compute_uv=False).prod(axis=-1))
-        w = _minors(J)
-        squares = np.einsum('...ij,...ij->...', J, J)
-        extreme = ~((squares > 1e-60) & (squares < 1e60))
+        if J.shape[-2] == 2:
+            w = _minors(J)
+            squares = np.einsum('...ij,...ij->...', J, J)
+            extreme = ~((squares > 1e-60) & (squares < 1e60))
+        else:
+            values = np.linalg.svd(J, compute_uv=False)
+            w, largest = np.asarray(values.prod(axis=-1)), values[..., 0]
+            extreme = ~((largest > 1e-30) & (largest < 1e30))
         if extreme.any():
-            exponents = _exponent(J[extreme], 2)
-            scaled = np.ldexp(J[extreme], -exponents[:, np.newaxis, np.newaxis])
-            w[extreme] = np.ldexp(_minors(scaled), 2 * exponents)
+            # The product is proportional to every row, so each row has its own scale.
+            exponents = _exponent(J[extreme], 1)
+            scaled = np.ldexp(J[extreme], -exponents[..., np.newaxis])
+            w[extreme] = _scaled_manipulability(scaled, exponents.sum(axis=-1, dtype=np.int32))
     return w
+
+
+def is_large(J: Array) -> bool:
+    """Return whether singular values of finite Jacobians, or products with them, may overflow."""
+    return not np.vdot(J, J) < 4.0**LARGE
+
+
+def large_exponent(values: Array, axes: int) -> NDArray[np.int32]:
+    """Return the binary exponent of the largest entry along the last axes, 0 if it is up to LARGE."""
+    exponents = _exponent(values, axes)
+    return np.asarray(np.where(exponents > LARGE, exponents, 0), dtype=np.int32)
 
 
 def _least(values: Array, shape: tuple[int, ...]) -> Any:
@@ -157,6 +180,16 @@ def _minors(J: Array) -> Array:
     return np.array(np.sqrt(squares))
 
 
+def _scaled_manipulability(J: Array, exponents: NDArray[np.int32]) -> Array:
+    """Compute the manipulability of Jacobians whose rows are about 1, times two to the exponents."""
+    if J.shape[-2] == 2:
+        return np.asarray(np.ldexp(_minors(J), exponents))
+    # Singular values can be so small that their product underflows before it is scaled.
+    mantissas, powers = np.frexp(np.linalg.svd(J, compute_uv=False))
+    exponents = exponents + powers.sum(axis=-1, dtype=np.int32)
+    return np.asarray(np.ldexp(mantissas.prod(axis=-1), exponents))
+
+
 def _exponent(values: Array, axes: int) -> NDArray[np.int32]:
     """Return the binary exponent of the largest entry along the last axes."""
     largest = np.abs(values).max(axis=tuple(range(-axes, 0)))
@@ -174,7 +207,11 @@ def _scaled(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None) -> Ar
     if q_dot_0 is not None:
         own = _exponent(q_dot_0, 1)[:, np.newaxis]
         free, _ = _by_svd(J, np.zeros_like(x_dot), damping, np.ldexp(q_dot_0, -own), tiny)
-        q_dot = q_dot + np.ldexp(free, own)
+        total = q_dot + np.ldexp(free, own)
+        # Infinite terms of opposite signs: add them at the larger scale.
+        top = np.maximum(speeds - units, own)
+        scaled = np.ldexp(task, speeds - units - top) + np.ldexp(free, own - top)
+        q_dot = np.where(np.isnan(total), np.ldexp(scaled, top), total)
     return q_dot
 
 

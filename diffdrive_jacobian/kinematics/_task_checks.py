@@ -35,14 +35,28 @@ def checked_damping(damping: ArrayLike) -> Array:
     return factor
 
 
-def weighted(J: Array, weights: ArrayLike) -> tuple[Array, Array]:
+def weighted(J: Array, weights: ArrayLike, name_J: str = 'J') -> tuple[Array, Array]:
     """Return `J W^-1/2` and the roots of the weights, shape (..., n).
 
     Raises:
-        ValueError: A weight is not positive and finite, or the shape is wrong.
+        ValueError: A weight is not positive and finite, the shape is wrong, or the product overflows.
     """
     values = array('weights', weights, J.shape[-1])
     positive('weights', values)
     leading(J=J.shape[:-2], weights=values.shape[:-1])
     roots = np.sqrt(values)
-    return J / roots[..., np.newaxis, :], roots
+    with np.errstate(over='ignore'):
+        product = np.asarray(J / roots[..., np.newaxis, :])
+    # LAPACK may not terminate with infinite entries.
+    finite_result(f'{name_J} and weights', 'product', product)
+    return product, roots
+
+
+def finite_result(names: str, result: str, values: Array) -> None:
+    """Require a result of finite arguments to be finite.
+
+    Raises:
+        ValueError: An entry has overflowed. The message names the arguments and the result.
+    """
+    if not np.isfinite(values).all():
+        raise ValueError(f'{names} must give a finite {result}, but it overflows')

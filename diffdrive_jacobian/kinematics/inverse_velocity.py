@@ -40,7 +40,12 @@ from diffdrive_jacobian.kinematics import _singular_values
 from diffdrive_jacobian.kinematics._adjugate import adjugate, refuse_singular
 from diffdrive_jacobian.kinematics._checks import array, floats, leading, not_negative, positive
 from diffdrive_jacobian.kinematics._singular_values import CUTOFF, FILTER, joint_velocities
-from diffdrive_jacobian.kinematics._task_checks import checked_damping, checked_task, weighted
+from diffdrive_jacobian.kinematics._task_checks import (
+    checked_damping,
+    checked_task,
+    finite_result,
+    weighted,
+)
 from diffdrive_jacobian.kinematics.secondary_tasks import (
     joint_limit_cost,
     joint_limit_gradient,
@@ -114,13 +119,18 @@ def pseudoinverse(J: ArrayLike, *, weights: ArrayLike | None = None) -> Array:
         weights: Weights of the joints, positive, shape (..., n). None: all 1.
 
     Returns:
-        The pseudo-inverses, shape (..., n, m).
+        The pseudo-inverses, shape (..., n, m). With weights infinite where they overflow.
+
+    Raises:
+        ValueError: `J W^-1/2` overflows.
     """
     J = array('J', J, 'm', 'n')
     if weights is None:
         return _singular_values.pseudoinverse(J)
     scaled, roots = weighted(J, weights)
-    return _singular_values.pseudoinverse(scaled) / roots[..., np.newaxis]
+    with np.errstate(over='ignore'):
+        inverse: Array = _singular_values.pseudoinverse(scaled) / roots[..., np.newaxis]
+    return inverse
 
 
 def damping(manipulability: ArrayLike, threshold: ArrayLike, maximum: ArrayLike) -> Array:
@@ -160,6 +170,9 @@ def damped_least_squares(
 
     Returns:
         Joint velocities, shape (..., n). Infinite where they overflow.
+
+    Raises:
+        ValueError: `J W^-1/2` overflows.
     """
     J, x_dot = checked_task(J, x_dot)
     factor = checked_damping(damping)
@@ -168,7 +181,9 @@ def damped_least_squares(
         return joint_velocities(J, x_dot, factor)
     scaled, roots = weighted(J, weights)
     leading(J=scaled.shape[:-2], x_dot=x_dot.shape[:-1], damping=factor.shape)
-    return joint_velocities(scaled, x_dot, factor) / roots
+    q_dot = joint_velocities(scaled, x_dot, factor)
+    with np.errstate(over='ignore'):
+        return np.asarray(q_dot / roots)
 
 
 def null_space_projector(
@@ -186,6 +201,9 @@ def null_space_projector(
 
     Returns:
         N, shape (..., n, n), symmetric. With weights `W N` is symmetric.
+
+    Raises:
+        ValueError: With weights, `J W^-1/2` or N overflows.
     """
     J, factor = array('J', J, 'm', 'n'), checked_damping(damping)
     if weights is None:
@@ -194,7 +212,9 @@ def null_space_projector(
     scaled, roots = weighted(J, weights)
     leading(J=scaled.shape[:-2], damping=factor.shape)
     projector = _singular_values.null_space_projector(scaled, factor)
-    oblique: Array = projector * roots[..., np.newaxis, :] / roots[..., np.newaxis]
+    with np.errstate(over='ignore'):
+        oblique: Array = projector * roots[..., np.newaxis, :] / roots[..., np.newaxis]
+    finite_result('J and weights', 'projector', oblique)
     return oblique
 
 
@@ -221,7 +241,11 @@ def redundant(
             gradient of a function with them, divide the gradient by the weights.
 
     Returns:
-        Joint velocities, shape (..., n): with `q_dot_0 = 0` the least ones.
+        Joint velocities, shape (..., n): with `q_dot_0 = 0` the least ones. Infinite where they
+        overflow.
+
+    Raises:
+        ValueError: `J W^-1/2` or `W^1/2 q_dot_0` overflows.
     """
     J, x_dot = checked_task(J, x_dot)
     secondary, factor = array('q_dot_0', q_dot_0, J.shape[-1]), checked_damping(damping)
@@ -231,4 +255,7 @@ def redundant(
     )
     if roots is None:
         return joint_velocities(J, x_dot, factor, secondary)
-    return joint_velocities(scaled, x_dot, factor, secondary * roots) / roots
+    with np.errstate(over='ignore'):
+        secondary = secondary * roots
+        finite_result('q_dot_0 and weights', 'product', secondary)
+        return np.asarray(joint_velocities(scaled, x_dot, factor, secondary) / roots)

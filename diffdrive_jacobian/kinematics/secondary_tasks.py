@@ -19,9 +19,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics import _singular_values
 from diffdrive_jacobian.kinematics._checks import array, leading
+from diffdrive_jacobian.kinematics._task_checks import finite_result
 
 _STEP = float(np.finfo(np.float64).eps) ** (1.0 / 3.0)
 """Step of central differences, at which rounding and truncation errors are of the same size."""
+_LARGE, _UNIT = 2.0**960, 2.0**-60
+"""Angles from which on ranges might overflow, and the factor by which these angles are scaled."""
 
 Array = NDArray[np.float64]
 
@@ -34,7 +37,8 @@ def manipulability(J: ArrayLike) -> Array:
 
     Returns:
         w, shape (...): the product of the singular values, 0 where J is singular. Also 0 where it has
-        more rows than columns, because some velocities cannot be produced then.
+        more rows than columns, because some velocities cannot be produced then. Infinite where it
+        overflows.
     """
     J = array('J', J, 'm', 'n')
     rows, columns = J.shape[-2:]
@@ -82,8 +86,10 @@ def joint_limit_cost(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> Array:
     Returns:
         The cost, shape (...): 0 in the middle, 1/8 with every joint at a limit.
     """
-    deviation, _ = _deviation(q, lower, upper)
-    cost: Array = (deviation * deviation).mean(axis=-1) / 2.0
+    deviation, _, _ = _deviation(q, lower, upper)
+    with np.errstate(all='ignore'):
+        cost: Array = (deviation * deviation).mean(axis=-1) / 2.0
+    finite_result('q, lower and upper', 'cost', cost)
     return cost
 
 
@@ -100,20 +106,28 @@ def joint_limit_gradient(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> Ar
     Returns:
         The gradients, shape (..., n) (1/rad).
     """
-    deviation, span = _deviation(q, lower, upper)
-    gradient: Array = deviation / (span * deviation.shape[-1])
+    deviation, span, unit = _deviation(q, lower, upper)
+    with np.errstate(all='ignore'):
+        gradient: Array = deviation / (span * deviation.shape[-1]) * unit
+    finite_result('q, lower and upper', 'gradient', gradient)
     return gradient
 
 
-def _deviation(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array]:
-    """Return each joint's distance from the middle of its range in units of the range, and the range."""
+def _deviation(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array, Array]:
+    """Return each joint's distance from the middle of its range in units of the range, the range, and
+    the unit of the latter: 1, or smaller where the range of angles might overflow.
+    """
     q = array('q', q, 'n')
     lower, upper = (array(name, value) for name, value in (('lower', lower), ('upper', upper)))
     for name, value in (('lower', lower), ('upper', upper)):
         if value.shape[-1:] not in ((), q.shape[-1:]):
             raise ValueError(f'{name} must have shape () or (..., {q.shape[-1]}), got {value.shape}')
     leading(q=q.shape, lower=lower.shape, upper=upper.shape)
-    span = upper - lower
-    if not (span > 0.0).all():
+    if not (upper > lower).all():
         raise ValueError(f'upper must be above lower for every joint, got {upper} and {lower}')
-    return (q - (lower + upper) / 2.0) / span, span
+    largest = np.maximum(np.abs(q), np.maximum(np.abs(lower), np.abs(upper)))
+    unit = np.where(largest < _LARGE, 1.0, _UNIT)
+    q, lower, upper = q * unit, lower * unit, upper * unit
+    span = upper - lower
+    with np.errstate(all='ignore'):
+        return (q - (lower + upper) / 2.0) / span, span, unit

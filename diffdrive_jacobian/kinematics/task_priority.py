@@ -17,8 +17,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._checks import array, floats, leading, number, positive
-from diffdrive_jacobian.kinematics._singular_values import gains, negligible, projector, removals
-from diffdrive_jacobian.kinematics._task_checks import checked_damping, checked_task, weighted
+from diffdrive_jacobian.kinematics._singular_values import (
+    gains,
+    is_large,
+    large_exponent,
+    negligible,
+    projector,
+    removals,
+)
+from diffdrive_jacobian.kinematics._task_checks import (
+    checked_damping,
+    checked_task,
+    finite_result,
+    weighted,
+)
 
 Array = NDArray[np.float64]
 
@@ -61,17 +73,17 @@ def prioritized(
         Joint velocities, shape (..., n).
 
     Raises:
-        ValueError: There is no task, a task is not a pair, or the numbers of joints differ.
+        ValueError: There is no task, a task is not a pair, the numbers of joints differ, or the joint
+            velocities overflow.
     """
     cutoff = number('cutoff', cutoff, positive)
     if cutoff >= 1.0:
         raise ValueError(f'cutoff must be below 1, got {cutoff}')
     factor = checked_damping(damping)
     pairs = _checked(tasks)
-    n = pairs[0][0].shape[-1]
     roots = None
     if weights is not None:
-        scaled = [weighted(J, weights) for J, _ in pairs]
+        scaled = [weighted(J, weights, f'J of task {k}') for k, (J, _) in enumerate(pairs)]
         pairs = [(J, x_dot) for (J, _), (_, x_dot) in zip(scaled, pairs, strict=True)]
         roots = scaled[0][1]
     batch = leading(
@@ -80,19 +92,16 @@ def prioritized(
         damping=factor.shape,
         weights=() if roots is None else roots.shape[:-1],
     )
-    q_dot, free = np.zeros((*batch, n)), np.eye(n)
-    for k, (J, x_dot) in enumerate(pairs):
-        left, values, right = np.linalg.svd(J @ free if k else J, full_matrices=False)
-        norm = np.linalg.norm(J, ord=2, axis=(-2, -1)) if k else values[..., 0]
-        least = negligible(norm, cutoff)
-        missing = x_dot - (J @ q_dot[..., np.newaxis])[..., 0] if k else x_dot
-        along = gains(values, factor, least) * (missing[..., np.newaxis, :] @ left)[..., 0, :]
-        step = np.swapaxes(right, -1, -2) @ along[..., np.newaxis]
-        q_dot = q_dot + (free @ step if k else step)[..., 0]
-        if k < len(pairs) - 1:
-            free = free @ projector(right, removals(values, factor, least))
-    if roots is not None:
-        q_dot = q_dot / roots
+    with np.errstate(all='ignore'):
+        q_dot = None
+        if not any(is_large(J) for J, _ in pairs):
+            q_dot = _in_order([(J, x_dot, factor) for J, x_dot in pairs], batch, cutoff)
+        if q_dot is None or not np.isfinite(q_dot).all():
+            q_dot = _scaled_in_order(pairs, factor, batch, cutoff)
+            finite_result('tasks and damping', 'result', q_dot)
+        if roots is not None:
+            q_dot = q_dot / roots
+            finite_result('tasks, damping and weights', 'result', q_dot)
     return q_dot if max_velocity is None else limit_velocity(q_dot, max_velocity)
 
 
@@ -118,8 +127,61 @@ def limit_velocity(q_dot: ArrayLike, max_velocity: ArrayLike) -> Array:
     if not (most > 0.0).all():
         raise ValueError(f'max_velocity must be positive, got {most}')
     leading(q_dot=q_dot.shape, max_velocity=most.shape)
-    excess = (np.abs(q_dot) / most).max(axis=-1, keepdims=True)
-    return np.asarray(np.clip(q_dot / np.maximum(excess, 1.0), -most, most))
+    with np.errstate(over='ignore'):
+        excess = (np.abs(q_dot) / most).max(axis=-1, keepdims=True)
+    limited = q_dot / np.maximum(excess, 1.0)
+    if not (excess < np.inf).all():
+        limited = np.where(excess < np.inf, limited, _scaled_limit(q_dot, most))
+    return np.asarray(np.clip(limited, -most, most))
+
+
+def _in_order(tasks: list[tuple[Array, Array, Array]], batch: tuple[int, ...], cutoff: float) -> Array:
+    """Compute joint velocities, shape (*batch, n), from J_k, x_k_dot and the damping of each task."""
+    n = tasks[0][0].shape[-1]
+    q_dot, free = np.zeros((*batch, n)), np.eye(n)
+    for k, (J, x_dot, factor) in enumerate(tasks):
+        left, values, right = np.linalg.svd(J @ free if k else J, full_matrices=False)
+        norm = np.linalg.norm(J, ord=2, axis=(-2, -1)) if k else values[..., 0]
+        least = negligible(norm, cutoff)
+        missing = x_dot - (J @ q_dot[..., np.newaxis])[..., 0] if k else x_dot
+        along = gains(values, factor, least) * (missing[..., np.newaxis, :] @ left)[..., 0, :]
+        step = np.swapaxes(right, -1, -2) @ along[..., np.newaxis]
+        q_dot = q_dot + (free @ step if k else step)[..., 0]
+        if k < len(tasks) - 1:
+            free = free @ projector(right, removals(values, factor, least))
+    return q_dot
+
+
+def _scaled_in_order(
+    pairs: list[tuple[Array, Array]], damping: Array, batch: tuple[int, ...], cutoff: float
+) -> Array:
+    """Compute the same without overflow in between.
+
+    A task is the same one if its Jacobian, velocity and damping are divided by the same number, and
+    joint velocities are proportional to the velocities of all tasks together.
+    """
+    speeds = np.zeros(batch, dtype=np.int32)
+    for _, x_dot in pairs:
+        speeds = np.maximum(speeds, large_exponent(x_dot, 1))
+    tasks = []
+    for J, x_dot in pairs:
+        units = large_exponent(J, 2)
+        scaled = np.ldexp(x_dot, -(units + speeds)[..., np.newaxis])
+        tasks.append(
+            (np.ldexp(J, -units[..., np.newaxis, np.newaxis]), scaled, np.ldexp(damping, -units))
+        )
+    return np.asarray(np.ldexp(_in_order(tasks, batch, cutoff), speeds[..., np.newaxis]))
+
+
+def _scaled_limit(q_dot: Array, most: Array) -> Array:
+    """Divide joint velocities by their largest excess, computed apart from its binary exponent."""
+    (speeds, speed_powers), (limits, limit_powers) = np.frexp(q_dot), np.frexp(most)
+    ratios, powers = np.abs(speeds) / limits, speed_powers - limit_powers
+    # Of joints at rest and of those without a limit, the exponent has no meaning.
+    top = np.where(ratios > 0.0, powers, -5000).max(axis=-1, keepdims=True)
+    with np.errstate(all='ignore'):
+        excess = np.ldexp(ratios, np.minimum(powers - top, 0)).max(axis=-1, keepdims=True)
+        return np.asarray(np.ldexp(speeds / np.where(excess > 0.0, excess, 1.0), speed_powers - top))
 
 
 def _checked(tasks: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[tuple[Array, Array]]:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.control.resolved_rate import StraightLine, resolved_rate
 from diffdrive_jacobian.kinematics._checks import array, leading, not_negative, number, positive
+from diffdrive_jacobian.kinematics._task_checks import weighted
 from diffdrive_jacobian.kinematics.inverse_velocity import damping as damping_factor
 from diffdrive_jacobian.kinematics.inverse_velocity import manipulability
 
@@ -105,6 +106,8 @@ def track_line(
     On a mobile base a tip that is far from the axle needs a higher rate, because the wheels swing it.
     """
     _check_callables(robot, secondary)
+    if not isinstance(line, StraightLine):
+        raise ValueError(f'line must be a control.StraightLine, got {line!r:.60}')
     rate = number('rate', rate, positive)
     settling = number('settling', settling, not_negative)
     gain = number('gain', gain, not_negative)
@@ -117,8 +120,6 @@ def track_line(
     if threshold is not None:
         threshold = number('threshold', threshold, positive)
     q = array('q0', q0, 'n')
-    if not isinstance(line, StraightLine):
-        raise ValueError(f'line must be a control.StraightLine, got {line!r:.60}')
     if line.start.shape[-1] != 2:
         raise ValueError(f'line must have 2 coordinates, got {line.start.shape[-1]}')
     leading(q0=q.shape[:-1], line=line.duration.shape)
@@ -142,7 +143,7 @@ def track_line(
         J = robot.jacobian(q)
         factor: ArrayLike = 0.0
         if threshold is not None:
-            measured = J if roots is None else J / roots[..., np.newaxis, :]
+            measured = J if weights is None else weighted(J, weights)[0]
             factor = damping_factor(manipulability(measured), threshold, most)
         q_dot_0 = None if secondary is None else _inputs(robot, secondary, q, inputs, roots)
         # The velocity that moves the target to its next sample, also when the line ends before it.
