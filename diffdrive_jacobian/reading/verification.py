@@ -9,7 +9,7 @@ it the commands take effect when they were recorded, with the limits and the tim
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -30,6 +30,8 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 ROBOT = 'virtual_robot'
 EXACT, BY_RECORDING_TIME = 1e-9, 0.02
 """Default tolerances, with `cmd_vel_out` and with commands by their time of recording (m, rad)."""
+_MAX_CANDIDATES = 32
+"""Largest number of commands among which the last one that preceded an odometry message is sought."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -130,19 +132,20 @@ def _nearest(anchors: list[_Anchor], odometry: Series, index: int) -> Robot | No
 
     A command that took effect before that stamp, but was recorded no sooner than the message, may have
     reached the robot after it sent the message, or only the recorder late. Which was published first is
-    unknown then, and the robot that is nearer to the odometry counts.
+    unknown then, and the robot that is nearer to the odometry counts. Of many such commands only the
+    latest ones are considered, so that the time of a verification is linear in the number of messages.
     """
     stamp, received = int(odometry.stamps[index]), int(odometry.received[index])
     last = bisect_right(anchors, stamp, key=lambda anchor: anchor.robot.stamp) - 1
     if last < 0:
         return None
     robot = anchors[last].robot.at(stamp)
-    known = last
-    while known > 0 and anchors[known].received >= received:
-        known -= 1
+    # The first one is the start of the robot, the others are in the order of their recording.
+    known = bisect_left(anchors, received, 1, last + 1, key=lambda anchor: anchor.received) - 1
     if known == last:
         return robot
-    candidates = [robot, *(anchors[one].robot.at(stamp) for one in range(known, last))]
+    earlier = range(max(known, last + 1 - _MAX_CANDIDATES), last)
+    candidates = [robot, *(anchors[one].robot.at(stamp) for one in earlier)]
 
     def apart(candidate: Robot) -> float:
         dx, dy, turn = (odometry.values[index, :3] - candidate.pose).tolist()
