@@ -284,3 +284,39 @@ def test_the_time_is_linear_where_all_commands_were_recorded_late(monkeypatch):
         )
         calls.append(len(computed))
     assert calls[1] < 2.1 * calls[0]
+
+
+@pytest.mark.parametrize('ahead', [10**18, -(10**18)], ids=['recorder', 'robot'])
+def test_recording_times_of_another_clock_than_the_odometry_are_refused(ahead):
+    stamps = 2 * 10**18 + 10**8 * np.arange(100)
+    run = run_of(
+        odometry=series('odometry', stamps + ahead, stamps, np.zeros((100, 5))),
+        cmd_vel=series('cmd_vel', stamps + ahead, stamps + ahead, np.full((100, 2), 0.5)),
+    )
+    with pytest.raises(BagError, match='another clock than the stamps of the odometry'):
+        verify(run)
+
+
+@pytest.mark.parametrize('topic', ['cmd_vel', 'cmd_vel_out'])
+def test_odometry_must_follow_a_command(topic):
+    stamps = 10**9 + 10**8 * np.arange(100)
+    late = stamps[-1:] + 1
+    run = run_of(
+        odometry=series('odometry', stamps, stamps, np.zeros((100, 5))),
+        **{topic: series(topic, late, late, [[0.5, 0.3]])},
+    )
+    with pytest.raises(BagError, match=f'no odometry after the first command on {topic}'):
+        verify(run)
+
+
+def test_odometry_that_was_not_compared_is_counted():
+    stamps = 10**9 + 10**8 * np.arange(100)
+    run = run_of(
+        odometry=series('odometry', stamps, stamps, np.zeros((100, 5))),
+        cmd_vel=series('cmd_vel', stamps[40:], stamps[40:], np.zeros((60, 2))),
+    )
+    verification = verify(run)
+    assert len(verification.seconds) == 61
+    assert verification.notes == (
+        '39 of 100 odometry messages precede the start of the simulated robot and were not compared',
+    )

@@ -32,6 +32,9 @@ EXACT, BY_RECORDING_TIME = 1e-9, 0.02
 """Default tolerances, with `cmd_vel_out` and with commands by their time of recording (m, rad)."""
 _MAX_CANDIDATES = 32
 """Largest number of commands among which the last one that preceded an odometry message is sought."""
+_MAX_DELAY = 1.0
+"""Beyond this delay of the odometry (median) its stamps and the recorder are of different clocks (s)."""
+_NEVER = int(np.iinfo(np.int64).max)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -49,7 +52,8 @@ class Verification:
     headings: NDArray[np.float64]
     """Differences of the heading, not negative, shape (n,) (rad)."""
     notes: tuple[str, ...] = ()
-    """Faults of the bag that did not prevent reading it, such as messages that were skipped."""
+    """Faults of the bag that did not prevent reading it, such as messages that were skipped, and how
+    many odometry messages were not compared."""
 
     @property
     def allowed(self) -> float:
@@ -67,6 +71,7 @@ class _Anchor:
 
     robot: Robot
     received: int
+    is_command: bool = False
 
 
 def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verification:
@@ -78,7 +83,8 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
             They are used only if `cmd_vel_out` was not recorded.
 
     Raises:
-        BagError: There is no odometry, or there are no commands.
+        BagError: There is no odometry, there are no commands, no odometry is later than a command, or
+            the times of the commands and of the odometry are of different clocks.
         ParameterError: The parameters are not valid parameters of the robot.
     """
     if not len(run.odometry):
@@ -95,6 +101,7 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
     stamps, values = run.odometry.stamps, run.odometry.values
     seconds, poses = [], []
     measured = []
+    followed = False
     epochs = _epochs(run.odometry)
     if epochs[-1] >= len(anchors):
         raise BagError(
@@ -102,14 +109,27 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
             f'robot was restarted {len(anchors) - 1} times. Where /clock goes back, '
             'record without use_sim_time'
         )
+    first_commands = [
+        next((anchor.robot.stamp for anchor in epoch if anchor.is_command), _NEVER) for epoch in anchors
+    ]
     for index, epoch in enumerate(epochs):
         robot = _nearest(anchors[epoch], run.odometry, index)
         if robot is not None:
+            followed |= int(stamps[index]) > first_commands[epoch]
             seconds.append((stamps[index] - stamps[0]) / NANOSECONDS)
             poses.append(robot.pose)
             measured.append(values[index, :3])
-    if not poses:
-        raise BagError(f'{run.path} has no odometry after the first command')
+    if not followed:
+        raise BagError(
+            f'{run.path} has no odometry after the first command on {source}: no motion can be verified'
+        )
+    notes = run.notes
+    if len(poses) < len(stamps):
+        omitted = len(stamps) - len(poses)
+        notes += (
+            f'{omitted} of {len(stamps)} odometry messages precede the start of the simulated robot and '
+            'were not compared',
+        )
     difference = np.array(measured) - np.array(poses)
     return Verification(
         source=source,
@@ -117,7 +137,7 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
         seconds=np.array(seconds),
         distances=np.hypot(difference[:, 0], difference[:, 1]),
         headings=np.abs(wrapped(difference[:, 2])),
-        notes=run.notes,
+        notes=notes,
     )
 
 
@@ -180,7 +200,7 @@ def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
             robot = latest.placed(row, latest.covariance, stamp)
         else:
             robot = latest.commanded((float(row[0]), float(row[1])), stamp)
-        epochs[-1].append(_Anchor(robot, received))
+        epochs[-1].append(_Anchor(robot, received, is_command=not is_start))
     return ('start_pose' if whole else 'odometry'), epochs
 
 
@@ -206,6 +226,13 @@ def _commanded(run: Run, given: Mapping[str, Any] | None) -> tuple[str, str, lis
         source, series = 'joint_command', run.wheel_commands
     if not len(series):
         raise BagError(f'{run.path} has no commands: record cmd_vel_out, or {source}')
+    delay = float(np.median(run.odometry.received - run.odometry.stamps)) / NANOSECONDS
+    if abs(delay) > _MAX_DELAY:
+        raise BagError(
+            f'{run.path} cannot be verified by the recording times of {source}: they are of another '
+            f'clock than the stamps of the odometry (median difference {delay:.6g} s, allowed '
+            f'{_MAX_DELAY:g} s). Record cmd_vel_out, or record with the use_sim_time of the robot'
+        )
     events: list[tuple[int, Any]] = list(zip(series.received.tolist(), series.values, strict=True))
     events += [
         (received, changes)
@@ -237,7 +264,7 @@ def _commanded(run: Run, given: Mapping[str, Any] | None) -> tuple[str, str, lis
                 # The node drops it as well.
                 continue
             robot = robot.commanded(twist, received)
-        anchors.append(_Anchor(robot, received))
+        anchors.append(_Anchor(robot, received, is_command=not isinstance(event, dict)))
     return source, 'odometry', [anchors]
 
 
