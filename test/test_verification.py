@@ -297,6 +297,17 @@ def test_recording_times_of_another_clock_than_the_odometry_are_refused(ahead):
         verify(run)
 
 
+def test_applied_commands_of_another_clock_than_the_odometry_are_refused():
+    stamps = 2 * 10**18 + 10**8 * np.arange(100)
+    for ahead in (10**18, -(10**18)):
+        run = run_of(
+            odometry=series('odometry', stamps, stamps, np.zeros((100, 5))),
+            cmd_vel_out=series('cmd_vel_out', stamps[50:], stamps[50:] + ahead, np.full((50, 2), 0.5)),
+        )
+        with pytest.raises(BagError, match='no odometry after the first command on cmd_vel_out'):
+            verify(run)
+
+
 @pytest.mark.parametrize('topic', ['cmd_vel', 'cmd_vel_out'])
 def test_odometry_must_follow_a_command(topic):
     stamps = 10**9 + 10**8 * np.arange(100)

@@ -72,6 +72,7 @@ class _Anchor:
     robot: Robot
     received: int
     is_command: bool = False
+    """Whether its twist is that of a recorded command."""
 
 
 def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verification:
@@ -121,7 +122,8 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
             measured.append(values[index, :3])
     if not followed:
         raise BagError(
-            f'{run.path} has no odometry after the first command on {source}: no motion can be verified'
+            f'{run.path} has no odometry after the first command on {source}, so that no motion can be '
+            'verified (are their stamps of different clocks?)'
         )
     notes = run.notes
     if len(poses) < len(stamps):
@@ -186,7 +188,14 @@ def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
         rows = zip(series.received.tolist(), series.stamps.tolist(), series.values, strict=True)
         events += [(received, stamp, is_start, row) for received, stamp, row in list(rows)[begin:]]
     events.sort(key=lambda event: event[0])
-    epochs: list[list[_Anchor]] = [[] if whole else [_Anchor(first, int(run.odometry.received[0]))]]
+    begun = int(run.odometry.received[0])
+    # The command that was recorded before the odometry is in effect in its first message.
+    driven = (run.cmd_vel_out.stamps <= first.stamp) & (
+        run.cmd_vel_out.received <= begun + _MAX_DELAY * NANOSECONDS
+    )
+    epochs: list[list[_Anchor]] = [
+        [] if whole else [_Anchor(first, begun, is_command=bool(driven.any()))]
+    ]
     for received, stamp, is_start, row in events:
         latest = epochs[-1][-1].robot if epochs[-1] else None
         if is_start and (latest is None or stamp < latest.stamp):
