@@ -17,8 +17,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.messages import conversion as messages
-from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.nodes.goal import MAX_WAYPOINTS
+from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.parameters.declaration import ParameterError

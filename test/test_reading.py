@@ -24,7 +24,9 @@ from std_msgs.msg import String
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Text
 from diffdrive_jacobian.bags.message_definitions import definition
+from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
 from diffdrive_jacobian.reading import run as run_module
+from diffdrive_jacobian.reading import trace as trace_module
 from diffdrive_jacobian.reading.reader import BagError, Run, read_run
 
 SECOND = 1_000_000_000
@@ -377,3 +379,51 @@ def test_a_bag_of_another_robot_is_read(tmp_path):
     assert {tuple(row) for row in run.cmd_vel.values.tolist()} <= {
         *((0.15, 0.0), (0.15, 0.8), (-0.1, -0.6), (0.0, 1.2), (0.0, 0.0))
     }
+
+
+# --- Many waypoints
+
+
+def test_goals_with_more_poses_than_the_node_accepts_are_skipped_and_counted(tmp_path):
+    most = goals(*[goal(1.0, 0.0)] * MAX_WAYPOINTS)
+    beyond = goals(*[goal(1.0, 0.0)] * (MAX_WAYPOINTS + 1))
+    run = read_run(write_bag(tmp_path / 'bag', [(1.0, '/goals', beyond), (2.0, '/goals', most)]))
+    assert len(run.goals) == MAX_WAYPOINTS
+    assert run.skipped == {'/goals': 1}
+
+
+def test_a_route_is_followed_in_one_pass_over_the_odometry(monkeypatch):
+    searched = []
+    distances = trace_module._distances
+
+    def counted(run, places, target):
+        searched.append(len(places))
+        return distances(run, places, target)
+
+    monkeypatch.setattr(trace_module, '_distances', counted)
+    totals = []
+    for n in (1000, 2000):
+        times = SECOND + np.arange(n) * SECOND // 10
+        values = np.zeros((n, 5))
+        values[:, 0], values[:, 3] = 0.1 * np.arange(n), 1.0
+        targets = values[1::2, :3]
+        first = np.full(len(targets), times[0])
+        empty = {name: series_of(name, [], []) for name in run_module.COLUMNS}
+        given = {
+            'odometry': series_of('odometry', times, values),
+            'goals': series_of('goals', first, targets),
+        }
+        run = Run(path=Path('run'), **(empty | given))
+        searched.clear()
+        # The goal changes at the message at which it is reached.
+        expected = np.minimum(np.arange(n) // 2 + np.arange(n) % 2, len(targets) - 1)
+        np.testing.assert_array_equal(trace_module.trace(run).goal, expected)
+        totals.append(sum(searched))
+    assert totals[1] < 2.5 * totals[0]
+
+
+def series_of(name, times, values):
+    columns = run_module.COLUMNS[name]
+    times = np.asarray(times, dtype=np.int64)
+    values = np.asarray(values, dtype=np.float64).reshape(len(times), len(columns))
+    return run_module.Series(received=times, stamps=times, values=values, columns=columns)

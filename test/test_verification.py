@@ -18,7 +18,9 @@ from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.reading import BagError, read_run
+from diffdrive_jacobian.reading.run import COLUMNS, Run, Series
 from diffdrive_jacobian.reading.verification import verify
+from diffdrive_jacobian.simulation.robot import Robot
 
 EXACT = 1e-9
 FOREIGN = Path(__file__).parent / 'bags' / 'turtlebot3_fake_sqlite'
@@ -250,3 +252,82 @@ def test_types_of_the_commands_are_both_read(lockstep, robot_at, tmp_path):
             lockstep.run_for(0.3)
         assert made.run.cmd_vel.values.tolist() == [[0.2, 0.3]]
         held(made.run)
+
+
+def series(name, received, stamps, values):
+    return Series(
+        received=np.asarray(received, dtype=np.int64),
+        stamps=np.asarray(stamps, dtype=np.int64),
+        values=np.asarray(values, dtype=np.float64).reshape(len(stamps), len(COLUMNS[name])),
+        columns=COLUMNS[name],
+    )
+
+
+def run_of(**given):
+    empty = {name: series(name, [], [], []) for name in COLUMNS}
+    return Run(path=Path('run'), **(empty | given))
+
+
+def test_the_time_is_linear_where_all_commands_were_recorded_late(monkeypatch):
+    computed = []
+    at = Robot.at
+    monkeypatch.setattr(Robot, 'at', lambda self, stamp: computed.append(stamp) or at(self, stamp))
+    calls = []
+    for n in (200, 400):
+        stamps = 10**9 + 1000 * np.arange(n)
+        computed.clear()
+        verify(
+            run_of(
+                odometry=series('odometry', stamps, stamps, np.zeros((n, 5))),
+                cmd_vel_out=series('cmd_vel_out', stamps + 10**9, stamps, np.full((n, 2), 0.1)),
+            )
+        )
+        calls.append(len(computed))
+    assert calls[1] < 2.1 * calls[0]
+
+
+@pytest.mark.parametrize('ahead', [10**18, -(10**18)], ids=['recorder', 'robot'])
+def test_recording_times_of_another_clock_than_the_odometry_are_refused(ahead):
+    stamps = 2 * 10**18 + 10**8 * np.arange(100)
+    run = run_of(
+        odometry=series('odometry', stamps + ahead, stamps, np.zeros((100, 5))),
+        cmd_vel=series('cmd_vel', stamps + ahead, stamps + ahead, np.full((100, 2), 0.5)),
+    )
+    with pytest.raises(BagError, match='another clock than the stamps of the odometry'):
+        verify(run)
+
+
+def test_applied_commands_of_another_clock_than_the_odometry_are_refused():
+    stamps = 2 * 10**18 + 10**8 * np.arange(100)
+    for ahead in (10**18, -(10**18)):
+        run = run_of(
+            odometry=series('odometry', stamps, stamps, np.zeros((100, 5))),
+            cmd_vel_out=series('cmd_vel_out', stamps[50:], stamps[50:] + ahead, np.full((50, 2), 0.5)),
+        )
+        with pytest.raises(BagError, match='no odometry after the first command on cmd_vel_out'):
+            verify(run)
+
+
+@pytest.mark.parametrize('topic', ['cmd_vel', 'cmd_vel_out'])
+def test_odometry_must_follow_a_command(topic):
+    stamps = 10**9 + 10**8 * np.arange(100)
+    late = stamps[-1:] + 1
+    run = run_of(
+        odometry=series('odometry', stamps, stamps, np.zeros((100, 5))),
+        **{topic: series(topic, late, late, [[0.5, 0.3]])},
+    )
+    with pytest.raises(BagError, match=f'no odometry after the first command on {topic}'):
+        verify(run)
+
+
+def test_odometry_that_was_not_compared_is_counted():
+    stamps = 10**9 + 10**8 * np.arange(100)
+    run = run_of(
+        odometry=series('odometry', stamps, stamps, np.zeros((100, 5))),
+        cmd_vel=series('cmd_vel', stamps[40:], stamps[40:], np.zeros((60, 2))),
+    )
+    verification = verify(run)
+    assert len(verification.seconds) == 61
+    assert verification.notes == (
+        '39 of 100 odometry messages precede the start of the simulated robot and were not compared',
+    )

@@ -33,6 +33,9 @@ from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS
 
+MAX_WAYPOINTS = 2_000
+"""Largest number of poses in a `goals` message: rclpy takes about 20 us to convert each of them."""
+
 # Indices of (x, y, yaw) and of (v, omega) in the row-major 6x6 covariances of ROS.
 _PLANAR = np.array([6 * row + column for row in (0, 1, 5) for column in (0, 1, 5)])
 _FORWARD_AND_YAW = np.array([0, 5, 30, 35])

@@ -11,8 +11,8 @@ from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.control import Arrival, Controller, LawError, saturate
 from diffdrive_jacobian.messages import conversion as messages
-from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.nodes.goal import MAX_WAYPOINTS, Goal, goal_info, read_goal
+from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
+from diffdrive_jacobian.nodes.goal import Goal, goal_info, read_goal
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 from diffdrive_jacobian.ros import serialization
 from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode

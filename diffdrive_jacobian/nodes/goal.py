@@ -16,9 +16,6 @@ from diffdrive_jacobian.control import Waypoints
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MessageError
 
-MAX_WAYPOINTS = 2_000
-"""Largest number of poses in a `goals` message: rclpy takes about 20 us to convert each of them."""
-
 
 @dataclass(slots=True)
 class Goal:

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from diffdrive_jacobian.messages.conversion import (
+    MAX_WAYPOINTS,
+    MessageError,
     from_joint_state,
     from_pose,
     from_time,
@@ -38,6 +40,8 @@ def _pose_with_covariance(message: Any, _: tuple[str, str]) -> Rows:
 
 
 def _goals(message: Any, _: tuple[str, str]) -> Rows:
+    if len(message.goals) > MAX_WAYPOINTS:
+        raise MessageError(f'goals must contain at most {MAX_WAYPOINTS} poses, got {len(message.goals)}')
     stamp = from_time(message.header.stamp)
     for goal in message.goals:
         yield stamp, from_pose(goal.pose).tolist()

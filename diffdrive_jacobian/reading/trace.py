@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.kinematics._elementary import wrapped
+from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 from diffdrive_jacobian.reading.reader import BagError
@@ -132,14 +133,13 @@ def _progress(run: Run, breaks: Indices) -> tuple[Indices, NDArray[np.bool_]]:
             stop = min(stop, int(np.searchsorted(seen, times[-1], side='right')))
         succeeded = times[states == GoalState.SUCCEEDED]
         for target in route[:-1]:
-            goal[here:stop] = target
-            within = _within(run, places[here:stop], target)
-            if within.any():
-                here += int(np.argmax(within))
-            elif len(within) and (len(succeeded) or not known):
-                here += int(np.argmin(_distances(run, places[here:stop], target)))
-            else:
+            next_here = _first_within(run, places, target, here, stop)
+            if next_here is None and here < stop and (len(succeeded) or not known):
+                next_here = here + int(np.argmin(_distances(run, places[here:stop], target)))
+            goal[here : stop if next_here is None else next_here] = target
+            if next_here is None:
                 break
+            here = next_here
         else:
             last, begin = route[-1], here
             goal[begin:stop] = last
@@ -170,6 +170,21 @@ def _within(run: Run, places: Array, target: int) -> Mask:
     return np.asarray(_distances(run, places, target) <= tolerance(run) + 1e-12)
 
 
+def _first_within(run: Run, places: Array, target: int, begin: int, end: int) -> int | None:
+    """Return the first place from `begin` until before `end` that counts as arrived; None: no place.
+
+    The places are searched in blocks of growing size, so that the time is that of the places searched:
+    a route whose waypoints are reached one after another takes one pass over the odometry.
+    """
+    size = 64
+    while begin < end:
+        within = _within(run, places[begin : min(begin + size, end)], target)
+        if within.any():
+            return begin + int(np.argmax(within))
+        begin, size = begin + size, 2 * size
+    return None
+
+
 def _arrival(within: Mask, success: int) -> int:
     """Return since which place the robot was at the goal when the node reported success there."""
     outside = np.flatnonzero(~within[: success + 1])
@@ -184,6 +199,9 @@ def _routes(run: Run) -> list[range]:
     routes = [range(*pair) for pair in pairwise(edges) if len(range(*pair))]
     accepted = []
     for index, route in enumerate(routes):
+        if len(route) > MAX_WAYPOINTS:
+            # These came in several messages at the same time, of which the last one counts.
+            route = route[-MAX_WAYPOINTS:]
         until = goals.received[route.stop] if index + 1 < len(routes) else _NEVER
         states, _ = _statuses(run, goals.received[route.start], until)
         if not len(states) or states[0] != GoalState.ABORTED:

@@ -9,7 +9,7 @@ it the commands take effect when they were recorded, with the limits and the tim
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -30,6 +30,11 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 ROBOT = 'virtual_robot'
 EXACT, BY_RECORDING_TIME = 1e-9, 0.02
 """Default tolerances, with `cmd_vel_out` and with commands by their time of recording (m, rad)."""
+_MAX_CANDIDATES = 32
+"""Largest number of commands among which the last one that preceded an odometry message is sought."""
+_MAX_DELAY = 1.0
+"""Beyond this delay of the odometry (median) its stamps and the recorder are of different clocks (s)."""
+_NEVER = int(np.iinfo(np.int64).max)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -47,7 +52,8 @@ class Verification:
     headings: NDArray[np.float64]
     """Differences of the heading, not negative, shape (n,) (rad)."""
     notes: tuple[str, ...] = ()
-    """Faults of the bag that did not prevent reading it, such as messages that were skipped."""
+    """Faults of the bag that did not prevent reading it, such as messages that were skipped, and how
+    many odometry messages were not compared."""
 
     @property
     def allowed(self) -> float:
@@ -65,6 +71,8 @@ class _Anchor:
 
     robot: Robot
     received: int
+    is_command: bool = False
+    """Whether its twist is that of a recorded command."""
 
 
 def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verification:
@@ -76,7 +84,8 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
             They are used only if `cmd_vel_out` was not recorded.
 
     Raises:
-        BagError: There is no odometry, or there are no commands.
+        BagError: There is no odometry, there are no commands, no odometry is later than a command, or
+            the times of the commands and of the odometry are of different clocks.
         ParameterError: The parameters are not valid parameters of the robot.
     """
     if not len(run.odometry):
@@ -93,6 +102,7 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
     stamps, values = run.odometry.stamps, run.odometry.values
     seconds, poses = [], []
     measured = []
+    followed = False
     epochs = _epochs(run.odometry)
     if epochs[-1] >= len(anchors):
         raise BagError(
@@ -100,14 +110,28 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
             f'robot was restarted {len(anchors) - 1} times. Where /clock goes back, '
             'record without use_sim_time'
         )
+    first_commands = [
+        next((anchor.robot.stamp for anchor in epoch if anchor.is_command), _NEVER) for epoch in anchors
+    ]
     for index, epoch in enumerate(epochs):
         robot = _nearest(anchors[epoch], run.odometry, index)
         if robot is not None:
+            followed |= int(stamps[index]) > first_commands[epoch]
             seconds.append((stamps[index] - stamps[0]) / NANOSECONDS)
             poses.append(robot.pose)
             measured.append(values[index, :3])
-    if not poses:
-        raise BagError(f'{run.path} has no odometry after the first command')
+    if not followed:
+        raise BagError(
+            f'{run.path} has no odometry after the first command on {source}, so that no motion can be '
+            'verified (are their stamps of different clocks?)'
+        )
+    notes = run.notes
+    if len(poses) < len(stamps):
+        omitted = len(stamps) - len(poses)
+        notes += (
+            f'{omitted} of {len(stamps)} odometry messages precede the start of the simulated robot and '
+            'were not compared',
+        )
     difference = np.array(measured) - np.array(poses)
     return Verification(
         source=source,
@@ -115,7 +139,7 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
         seconds=np.array(seconds),
         distances=np.hypot(difference[:, 0], difference[:, 1]),
         headings=np.abs(wrapped(difference[:, 2])),
-        notes=run.notes,
+        notes=notes,
     )
 
 
@@ -130,19 +154,20 @@ def _nearest(anchors: list[_Anchor], odometry: Series, index: int) -> Robot | No
 
     A command that took effect before that stamp, but was recorded no sooner than the message, may have
     reached the robot after it sent the message, or only the recorder late. Which was published first is
-    unknown then, and the robot that is nearer to the odometry counts.
+    unknown then, and the robot that is nearer to the odometry counts. Of many such commands only the
+    latest ones are considered, so that the time of a verification is linear in the number of messages.
     """
     stamp, received = int(odometry.stamps[index]), int(odometry.received[index])
     last = bisect_right(anchors, stamp, key=lambda anchor: anchor.robot.stamp) - 1
     if last < 0:
         return None
     robot = anchors[last].robot.at(stamp)
-    known = last
-    while known > 0 and anchors[known].received >= received:
-        known -= 1
+    # The first one is the start of the robot, the others are in the order of their recording.
+    known = bisect_left(anchors, received, 1, last + 1, key=lambda anchor: anchor.received) - 1
     if known == last:
         return robot
-    candidates = [robot, *(anchors[one].robot.at(stamp) for one in range(known, last))]
+    earlier = range(max(known, last + 1 - _MAX_CANDIDATES), last)
+    candidates = [robot, *(anchors[one].robot.at(stamp) for one in earlier)]
 
     def apart(candidate: Robot) -> float:
         dx, dy, turn = (odometry.values[index, :3] - candidate.pose).tolist()
@@ -163,7 +188,14 @@ def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
         rows = zip(series.received.tolist(), series.stamps.tolist(), series.values, strict=True)
         events += [(received, stamp, is_start, row) for received, stamp, row in list(rows)[begin:]]
     events.sort(key=lambda event: event[0])
-    epochs: list[list[_Anchor]] = [[] if whole else [_Anchor(first, int(run.odometry.received[0]))]]
+    begun = int(run.odometry.received[0])
+    # The command that was recorded before the odometry is in effect in its first message.
+    driven = (run.cmd_vel_out.stamps <= first.stamp) & (
+        run.cmd_vel_out.received <= begun + _MAX_DELAY * NANOSECONDS
+    )
+    epochs: list[list[_Anchor]] = [
+        [] if whole else [_Anchor(first, begun, is_command=bool(driven.any()))]
+    ]
     for received, stamp, is_start, row in events:
         latest = epochs[-1][-1].robot if epochs[-1] else None
         if is_start and (latest is None or stamp < latest.stamp):
@@ -177,7 +209,7 @@ def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
             robot = latest.placed(row, latest.covariance, stamp)
         else:
             robot = latest.commanded((float(row[0]), float(row[1])), stamp)
-        epochs[-1].append(_Anchor(robot, received))
+        epochs[-1].append(_Anchor(robot, received, is_command=not is_start))
     return ('start_pose' if whole else 'odometry'), epochs
 
 
@@ -203,6 +235,13 @@ def _commanded(run: Run, given: Mapping[str, Any] | None) -> tuple[str, str, lis
         source, series = 'joint_command', run.wheel_commands
     if not len(series):
         raise BagError(f'{run.path} has no commands: record cmd_vel_out, or {source}')
+    delay = float(np.median(run.odometry.received - run.odometry.stamps)) / NANOSECONDS
+    if abs(delay) > _MAX_DELAY:
+        raise BagError(
+            f'{run.path} cannot be verified by the recording times of {source}: they are of another '
+            f'clock than the stamps of the odometry (median difference {delay:.6g} s, allowed '
+            f'{_MAX_DELAY:g} s). Record cmd_vel_out, or record with the use_sim_time of the robot'
+        )
     events: list[tuple[int, Any]] = list(zip(series.received.tolist(), series.values, strict=True))
     events += [
         (received, changes)
@@ -234,7 +273,7 @@ def _commanded(run: Run, given: Mapping[str, Any] | None) -> tuple[str, str, lis
                 # The node drops it as well.
                 continue
             robot = robot.commanded(twist, received)
-        anchors.append(_Anchor(robot, received))
+        anchors.append(_Anchor(robot, received, is_command=not isinstance(event, dict)))
     return source, 'odometry', [anchors]
 
 
