@@ -99,7 +99,7 @@ WRONG = {
     # Wrong types.
     'version': [None, 'nine', 0, 10, 9.0, True, math.nan],
     'storage_identifier': [None, 3, 'rosbag', ['mcap']],
-    'relative_file_paths': [None, 'x', 3, [None], [3], [''], {'a': 'b'}],
+    'relative_file_paths': [None, 'x', 3, [None], [3], [''], {'a': 'b'}, ['a', 'a'], ['a', 'b/a']],
     'duration': [
         None,
         3,

@@ -128,6 +128,21 @@ def test_a_compressed_file_of_zeros(tmp_path, capsys, monkeypatch, name, declare
     assert 'unpacks to' in err
 
 
+def test_compressed_files_have_one_budget_for_all(tmp_path, monkeypatch):
+    monkeypatch.setattr(limits, 'FREE', 40 * MIB)
+    names = [f'{index}.mcap.zstd' for index in range(3)]
+    path = write_folder(tmp_path / 'run', ', '.join(names), mode='FILE')
+    for name in names:
+        (path / name).write_bytes(zstd_zeros(16 * MIB))
+    refused(path, r'2\.mcap\.zstd: it unpacks to more than 41\.9 MB')
+
+
+def test_a_file_that_is_listed_twice_is_not_unpacked(tmp_path):
+    path = write_folder(tmp_path / 'run', 'x.mcap.zstd, x.mcap.zstd', mode='FILE')
+    (path / 'x.mcap.zstd').write_bytes(zstd_zeros(MIB))
+    refused(path, r"relative_file_paths\[1\] must be a file that is not listed before, got 'x.mcap")
+
+
 @pytest.mark.parametrize('declared', [True, False])
 def test_a_message_that_unpacks_to_gigabytes(tmp_path, capsys, declared):
     bomb = message(zstd_zeros(6 * GIB, declared=declared))

@@ -184,8 +184,10 @@ class _DirectoryReader(DirectoryReader):
     def open(self) -> None:
         folder = Path(str(self.path))
         metadata = load_yaml(folder / 'metadata.yaml')
-        for file in _compressed_files(folder, metadata):
-            unpack_file(file, None)
+        files = _compressed_files(folder, metadata)
+        budget = Budget(sum(file.stat().st_size for file in files))
+        for file in files:
+            unpack_file(file, None, budget)
         super().open()
         # rosbags itself would unpack messages to any size.
         self._packed = self.metadata.compression_mode == 'message'

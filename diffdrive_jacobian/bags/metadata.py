@@ -60,10 +60,15 @@ def check_metadata(source: Path | str) -> None:
     _integer(_required(root, 'version', ''), 'version', 1, LATEST_VERSION)
     _choice(_required(root, 'storage_identifier', ''), 'storage_identifier', sorted(STORAGES))
     paths = _sequence(_required(root, 'relative_file_paths', ''), 'relative_file_paths')
+    names: set[str] = set()
     for index, path in enumerate(paths):
         where = f'relative_file_paths[{index}]'
         if not _string(path, where) or '\0' in path:
             raise _wrong(where, 'the name of a file', path)
+        # rosbags reads, and unpacks, a file as often as it is listed.
+        if Path(path).name in names:
+            raise _wrong(where, 'a file that is not listed before', path)
+        names.add(Path(path).name)
         if isinstance(source, Path):
             _check_data_file(source.parent / Path(path).name)
     count = _integer(_required(root, 'message_count', ''), 'message_count', 0, _INT64 - 1)
