@@ -7,6 +7,7 @@ report the same damage and name the same key.
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -171,8 +172,12 @@ def check_connections(described: Iterable[Connection], stored: Iterable[Connecti
                 raise DamagedError(f'the {what} of a topic must be text, got {printable(repr(value))}')
         if not isinstance(connection.ext, ConnectionExtRosbag2):
             raise DamagedError(f'{printable(connection.topic)} is not a topic of ROS 2')
+    by_name = defaultdict(list)
+    for connection in described:
+        by_name[connection.topic, connection.msgtype].append(connection)
     for connection in stored:
-        if connection.msgcount and not any(_alike(connection, one) for one in described):
+        candidates = by_name[connection.topic, connection.msgtype]
+        if connection.msgcount and not any(_alike(connection, one) for one in candidates):
             raise DamagedError(
                 f'metadata.yaml does not describe the topic {printable(connection.topic)} of '
                 f'{printable(connection.msgtype)} as the data file does '
