@@ -30,6 +30,7 @@ from rosbags.rosbag2 import CompressionMode
 from test_recover import make_messages, read_bag, recover, write_bag
 
 from diffdrive_jacobian.bags import limits
+from diffdrive_jacobian.bags.bag_reader import find_damage
 from diffdrive_jacobian.bags.bounded_reader import BoundedReader, _SqliteReader
 from diffdrive_jacobian.bags.limits import MAX_RECORD
 from diffdrive_jacobian.bounded_yaml import MAX_DEPTH, MAX_SIZE, TooLargeError, load_yaml
@@ -126,6 +127,19 @@ def test_a_compressed_file_of_zeros(tmp_path, capsys, monkeypatch, name, declare
     assert (code, out) == (2, '')
     assert f'{name}' in err
     assert 'unpacks to' in err
+
+
+@pytest.mark.parametrize('statistics', [3, None])
+def test_chunks_without_an_index_of_their_messages_are_read(tmp_path, statistics):
+    found = message(b'\0\1\0\0' + bytes(100)) * 3
+    one = chunk('', found, len(found))
+    entry = (len(topic_records()), len(one), '', len(found), len(found))
+    path = tmp_path / 'x.mcap'
+    path.write_bytes(mcap(topic_records() + one, (entry,), message_index=False, statistics=statistics))
+    with open_bag(path) as reader:
+        assert reader.message_count == 3
+        assert len(list(reader.messages(reader.connections))) == 3
+    assert find_damage(path) == ''
 
 
 def test_compressed_files_have_one_budget_for_all(tmp_path, monkeypatch):
