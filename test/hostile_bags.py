@@ -84,13 +84,21 @@ def message(data: bytes, stamp: int = 1, channel: int = 1) -> bytes:
     return record(5, struct.pack('<HIQQ', channel, 0, stamp, stamp) + data)
 
 
-def mcap(body: bytes, chunks: tuple[tuple[int, int, str, int, int], ...] = ()) -> bytes:
+def mcap(
+    body: bytes,
+    chunks: tuple[tuple[int, int, str, int, int], ...] = (),
+    *,
+    message_index: bool = True,
+    statistics: int | None = None,
+) -> bytes:
     """Return an MCAP file.
 
     Args:
         body: Its records.
         chunks: For the index: offset in `body`, length, compression, packed size, claimed size. Without
             them the file has no summary, and readers scan it.
+        message_index: Whether the index promises an index of messages behind each chunk.
+        statistics: Number of messages in the statistics; None: the summary has none.
     """
     head = MCAP_MAGIC + record(1, text('ros2') + text('test'))
     data = head + body + record(15, bytes(4))
@@ -104,11 +112,14 @@ def mcap(body: bytes, chunks: tuple[tuple[int, int, str, int, int], ...] = ()) -
             data += record(
                 8,
                 struct.pack('<QQQQ', 1, 1, at, length)
-                + text(struct.pack('<HQ', 1, at + length))
-                + struct.pack('<Q', 31)
+                + text(struct.pack('<HQ', 1, at + length) if message_index else b'')
+                + struct.pack('<Q', 31 if message_index else 0)
                 + text(compression)
                 + struct.pack('<QQ', packed, size),
             )
+        if statistics is not None:
+            head = struct.pack('<QHIIIIQQ', statistics, 1, 1, 0, 0, len(chunks), 1, 1)
+            data += record(11, head + text(struct.pack('<HQ', 1, statistics)))
     return data + record(2, struct.pack('<QQI', start, 0, 0)) + MCAP_MAGIC
 
 

@@ -11,13 +11,20 @@ import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
 from ros_messages import goal, joint_command, twist_stamped
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag2,
+    MessageDefinition,
+    MessageDefinitionFormat,
+)
 from ruamel.yaml import YAML
 from test_reading import SECOND, odom, start, write_bag
 
+from diffdrive_jacobian.bags import metadata
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, JournalWriter, Message, Text, journal_of
 from diffdrive_jacobian.bags.message_definitions import definition
-from diffdrive_jacobian.bags.metadata import DamagedError, check_metadata
+from diffdrive_jacobian.bags.metadata import DamagedError, check_connections, check_metadata
 from diffdrive_jacobian.plots.run_figure import LABELS, draw
 from diffdrive_jacobian.reading.reader import read_run
 from diffdrive_jacobian.reading.time_series import commanded, limits, measured
@@ -99,7 +106,7 @@ WRONG = {
     # Wrong types.
     'version': [None, 'nine', 0, 10, 9.0, True, math.nan],
     'storage_identifier': [None, 3, 'rosbag', ['mcap']],
-    'relative_file_paths': [None, 'x', 3, [None], [3], [''], {'a': 'b'}],
+    'relative_file_paths': [None, 'x', 3, [None], [3], [''], {'a': 'b'}, ['a', 'a'], ['a', 'b/a']],
     'duration': [
         None,
         3,
@@ -280,6 +287,27 @@ def test_qos_that_differs_between_metadata_and_file_hides_no_messages(bags, tmp_
         assert 'recover_run' in err
     assert run(capsys, 'recover_run', bag)[0] == 0
     assert len(read_run(tmp_path / 'bag_recovered').odometry) == COUNT
+
+
+def test_many_topics_are_checked_in_linear_time(monkeypatch):
+    compared = 0
+
+    def count(*connections, alike=metadata._alike):
+        nonlocal compared
+        compared += 1
+        return alike(*connections)
+
+    monkeypatch.setattr(metadata, '_alike', count)
+    ext = ConnectionExtRosbag2('cdr', [])
+    definition = MessageDefinition(MessageDefinitionFormat.NONE, '')
+    topics = [
+        Connection(index, f'/t{index}', 'std_msgs/msg/String', definition, '', 1, ext, None)
+        for index in range(500)
+    ]
+    check_connections(topics, topics)
+    assert compared == len(topics)
+    with pytest.raises(DamagedError, match='does not describe the topic /t0 '):
+        check_connections(topics[1:], topics)
 
 
 def rename_all(content, key, value):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from test_reading import SECOND, odom, write_bag
 
+from diffdrive_jacobian.bags import decoding
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.decoding import (
     UndecodableError,
@@ -260,3 +262,40 @@ def test_the_length_of_a_text_is_found_with_its_own_byte_order():
     head = struct.pack('>iII', 3, 4, len(text) + 1) + text + b'\0' + b'\0\0\0'
     found = decode(b'\0\0\0\0' + head, 'std_msgs/msg/Header')
     assert (found.stamp.sec, found.stamp.nanosec, found.frame_id) == (3, 4, 'caf?')
+
+
+def serialized(type_name, **fields):
+    return serialize_message(message_class(type_name)(**fields))
+
+
+def test_a_message_of_very_many_nested_messages_is_refused(monkeypatch):
+    """Poses and parameters take up to thirty times more memory as Python objects than as CDR."""
+    pose = message_class('geometry_msgs/msg/PoseStamped')()
+    name = 'nav_msgs/msg/Goals'
+    # Goals and its Header and Time, and six for each pose.
+    monkeypatch.setattr(decoding, '_SMALL', 1000)
+    monkeypatch.setattr(decoding, 'MAX_OBJECTS', 3 + 6 * 50)
+    assert len(decode(serialized(name, goals=[pose] * 50), name).goals) == 50
+    with pytest.raises(UndecodableError):
+        decode(serialized(name, goals=[pose] * 51), name)
+    # It counts for each message anew.
+    assert len(decode(serialized(name, goals=[pose] * 50), name).goals) == 50
+
+
+def test_a_large_message_with_very_many_strings_is_refused(monkeypatch):
+    monkeypatch.setattr(decoding, 'MAX_TEXTS', 1000)
+    for name, field in (
+        ('sensor_msgs/msg/JointState', 'name'),
+        ('rcl_interfaces/msg/ParameterValue', 'string_array_value'),
+    ):
+        assert len(getattr(decode(serialized(name, **{field: ['abc'] * 100}), name), field)) == 100
+        with pytest.raises(UndecodableError):
+            decode(serialized(name, **{field: ['abc'] * 150}), name)
+
+
+@pytest.mark.parametrize('name', ['sensor_msgs/msg/Image', 'sensor_msgs/msg/PointCloud2'])
+def test_large_arrays_of_numbers_are_decoded(name):
+    size = decoding.MAX_TEXTS + 1
+    store = get_typestore(Stores.ROS2_JAZZY)
+    message = replace(decode(serialized(name), name), data=np.zeros(size, np.uint8))
+    assert len(decode(bytes(store.serialize_cdr(message, name)), name).data) == size

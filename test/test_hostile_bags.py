@@ -30,6 +30,7 @@ from rosbags.rosbag2 import CompressionMode
 from test_recover import make_messages, read_bag, recover, write_bag
 
 from diffdrive_jacobian.bags import limits
+from diffdrive_jacobian.bags.bag_reader import find_damage
 from diffdrive_jacobian.bags.bounded_reader import BoundedReader, _SqliteReader
 from diffdrive_jacobian.bags.limits import MAX_RECORD
 from diffdrive_jacobian.bounded_yaml import MAX_DEPTH, MAX_SIZE, TooLargeError, load_yaml
@@ -126,6 +127,34 @@ def test_a_compressed_file_of_zeros(tmp_path, capsys, monkeypatch, name, declare
     assert (code, out) == (2, '')
     assert f'{name}' in err
     assert 'unpacks to' in err
+
+
+@pytest.mark.parametrize('statistics', [3, None])
+def test_chunks_without_an_index_of_their_messages_are_read(tmp_path, statistics):
+    found = message(b'\0\1\0\0' + bytes(100)) * 3
+    one = chunk('', found, len(found))
+    entry = (len(topic_records()), len(one), '', len(found), len(found))
+    path = tmp_path / 'x.mcap'
+    path.write_bytes(mcap(topic_records() + one, (entry,), message_index=False, statistics=statistics))
+    with open_bag(path) as reader:
+        assert reader.message_count == 3
+        assert len(list(reader.messages(reader.connections))) == 3
+    assert find_damage(path) == ''
+
+
+def test_compressed_files_have_one_budget_for_all(tmp_path, monkeypatch):
+    monkeypatch.setattr(limits, 'FREE', 40 * MIB)
+    names = [f'{index}.mcap.zstd' for index in range(3)]
+    path = write_folder(tmp_path / 'run', ', '.join(names), mode='FILE')
+    for name in names:
+        (path / name).write_bytes(zstd_zeros(16 * MIB))
+    refused(path, r'2\.mcap\.zstd: it unpacks to more than 41\.9 MB')
+
+
+def test_a_file_that_is_listed_twice_is_not_unpacked(tmp_path):
+    path = write_folder(tmp_path / 'run', 'x.mcap.zstd, x.mcap.zstd', mode='FILE')
+    (path / 'x.mcap.zstd').write_bytes(zstd_zeros(MIB))
+    refused(path, r"relative_file_paths\[1\] must be a file that is not listed before, got 'x.mcap")
 
 
 @pytest.mark.parametrize('declared', [True, False])

@@ -6,12 +6,14 @@ import csv
 import math
 import os
 import shutil
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import PROGRAM
 from ros_messages import goal, goals, joint_command, twist, twist_stamped
 from test_reading import REAL, SECOND, changed, odom, start, status, write_bag
 
@@ -613,6 +615,34 @@ def test_a_file_that_cannot_be_finished_is_taken_away(bag, tmp_path, capsys, mon
     assert plot(bag, '-o', tmp_path / 'a.png') == 1
     refuses(capsys, 1, 'a.png cannot be written: No space left on device')
     assert not (tmp_path / 'a.png').exists()
+
+
+@pytest.mark.parametrize('unbuffered', ['', '1'])
+def test_output_that_cannot_be_written_is_not_blamed_on_the_picture(bag, tmp_path, unbuffered):
+    picture = tmp_path / 'a.png'
+    with open('/dev/full', 'w') as full:
+        done = subprocess.run(
+            [sys.executable, '-c', PROGRAM.format('plot_run'), bag, '-o', picture],
+            env={**os.environ, 'PYTHONUNBUFFERED': unbuffered},
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    error = 'plot_run: error: the standard output cannot be written: No space left on device\n'
+    assert (done.returncode, done.stderr) == (1, error)
+    assert picture.exists()
+
+
+def test_paths_are_printed_without_control_characters(bag, tmp_path, capsys):
+    place = tmp_path / os.fsdecode(b'\x1b]0;x\x07 \xff')
+    place.mkdir()
+    assert plot(bag, '-o', place / 'a.png', '--csv', place / 'a.csv') == 0
+    escaped = rf'{tmp_path}/\x1b]0;x\x07 \udcff'
+    assert capsys.readouterr().out == f'{escaped}/a.png\n{escaped}/a.csv\n'
+    assert plot(bag, '-o', place / 'a.png') == 2
+    refuses(capsys, 2, rf'{escaped}/a.png exists already')
+    assert plot(bag, '-o', place / 'none' / 'a.png') == 1
+    refuses(capsys, 1, rf'{escaped}/none/a.png cannot be written: No such file or directory')
 
 
 def test_without_matplotlib_it_says_how_to_get_it(bag, tmp_path, capsys, monkeypatch):

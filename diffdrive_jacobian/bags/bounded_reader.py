@@ -91,9 +91,16 @@ class _McapReader(McapReader):
         self.bio = _BoundedFile(self.bio.detach())  # type: ignore[attr-defined]
         self._budget = Budget(size)
         super()._open()
+        for chunk in self.chunks:
+            if not chunk.message_index_offsets:
+                # The index of a chunk's messages is optional. rosbags skips chunks without.
+                chunk.channel_count.update(dict.fromkeys(self.channels, 1))
 
     def read_index(self) -> None:
         super().read_index()
+        if self.statistics is None and not all(one.message_index_offsets for one in self.chunks):
+            # rosbags counts messages by these indexes, or scans a file without chunks.
+            self.chunks.clear()
         for chunk in self.chunks:
             check_record(chunk.uncompressed_size, 'a chunk')
             check_record(chunk.compressed_size, 'a chunk')
@@ -184,8 +191,10 @@ class _DirectoryReader(DirectoryReader):
     def open(self) -> None:
         folder = Path(str(self.path))
         metadata = load_yaml(folder / 'metadata.yaml')
-        for file in _compressed_files(folder, metadata):
-            unpack_file(file, None)
+        files = _compressed_files(folder, metadata)
+        budget = Budget(sum(file.stat().st_size for file in files))
+        for file in files:
+            unpack_file(file, None, budget)
         super().open()
         # rosbags itself would unpack messages to any size.
         self._packed = self.metadata.compression_mode == 'message'

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
-from rosbags.interfaces import Connection
+from rosbags.interfaces import Connection, Msgdef, Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -33,10 +34,60 @@ _ERRORS = (
 )
 """What generated code raises on data that is not a message of its type."""
 _MAX_REPAIRS = 50
+MAX_OBJECTS = 500_000
+"""Largest number of nested messages that are decoded of one message.
+
+The smallest ones take thirty times more memory as Python objects than as CDR.
+"""
+MAX_TEXTS = 1 << 24
+"""Size of the largest message that is decoded of a type with sequences of strings (bytes)."""
+_SMALL = 1 << 20
+"""Size up to which messages are decoded without counting (bytes)."""
 
 
 class UndecodableError(ValueError):
     """A recorded message is not a valid message of its type."""
+
+
+class _CountingTypes:
+    """The part of a typestore that generated code uses, for one message of unknown origin."""
+
+    def __init__(self, store: Typestore) -> None:
+        self.max_sequence_length = store.max_sequence_length
+        self._store = store
+        self._counting: dict[str, Msgdef[object]] = {}
+        self._objects = 0
+
+    def get_msgdef(self, name: str) -> Msgdef[object]:
+        """Return a type, whose constructor raises SerdeError beyond `MAX_OBJECTS`."""
+        if name not in self._counting:
+            found = self._store.get_msgdef(name)
+            self._counting[name] = replace(found, cls=self._count(found.cls))
+        return self._counting[name]
+
+    def _count(self, constructor: Callable[..., object]) -> Any:
+        def construct(*values: object) -> object:
+            self._objects += 1
+            if self._objects > MAX_OBJECTS:
+                raise SerdeError(f'more than {MAX_OBJECTS} nested messages')
+            return constructor(*values)
+
+        return construct
+
+
+@cache
+def _has_texts(type_name: str) -> bool:
+    """Return whether a type, or one of its fields, has a sequence of strings."""
+
+    def has(description: Any) -> bool:
+        kind, content = description
+        if kind == Nodetype.NAME:
+            return _has_texts(content)
+        if kind == Nodetype.SEQUENCE and content[0][0] == Nodetype.BASE:
+            return bool(content[0][1][0] == 'string')
+        return kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and has(content[0])
+
+    return any(has(description) for _, description in _typestore().fielddefs[type_name][1])
 
 
 @cache
@@ -79,7 +130,8 @@ def decode(data: bytes, type_name: str) -> Any:
         type_name: Its type, `package/msg/Name`.
 
     Raises:
-        UndecodableError: It is not a message of that type, or the type is not known.
+        UndecodableError: It is not a message of that type, the type is not known, or the message would
+            take far more memory than its size (`MAX_OBJECTS`, `MAX_TEXTS`).
     """
     if not is_known(type_name):
         raise UndecodableError(f'{printable(type_name)} is not a type of ROS 2 Jazzy')
@@ -104,7 +156,11 @@ def _deserialized(data: bytes, type_name: str) -> Any:
     """
     if data[:2] not in (b'\x00\x00', b'\x00\x01') or len(data) < 4:
         raise SerdeError(f'the encapsulation must be CDR, got {data[:2].hex()}')
-    store = _typestore()
+    if len(data) > MAX_TEXTS and _has_texts(type_name):
+        raise SerdeError(f'more than {MAX_TEXTS} bytes with sequences of strings')
+    store: Any = _typestore()
+    if len(data) > _SMALL:
+        store = _CountingTypes(store)
     message_definition = store.get_msgdef(type_name)
     little = message_definition.deserialize_cdr_le
     deserialize = little if data[1] else message_definition.deserialize_cdr_be

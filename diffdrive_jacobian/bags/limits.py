@@ -47,13 +47,13 @@ def check_record(size: int, what: str) -> None:
 
 
 class Budget:
-    """Total size that one file may unpack to, in proportion to its size."""
+    """Total size that one file, or the files of one bag, may unpack to, in proportion to their size."""
 
     def __init__(self, packed: int, ratio: int = MAX_RATIO) -> None:
-        """Allow a multiple of the size of the file, and at least `FREE`.
+        """Allow a multiple of the size of the file or files, and at least `FREE`.
 
         Args:
-            packed: Size of the file (bytes).
+            packed: Their size (bytes).
             ratio: The multiple.
         """
         self.limit = max(FREE, ratio * packed)
@@ -130,19 +130,20 @@ def _unpack_zstd(data: bytes, limit: int, *, whole: bool = False) -> bytes:
     return b''.join(parts)
 
 
-def unpack_file(path: Path, out: BinaryIO | None) -> None:
+def unpack_file(path: Path, out: BinaryIO | None, budget: Budget | None = None) -> None:
     """Decompress a file, or as much of it as there is.
 
     Args:
         path: A Zstandard file.
         out: Where to write the content; None: only its size is checked.
+        budget: What the files of its bag may unpack to; None: that of the file alone.
 
     Raises:
         TooLargeError: It unpacks to more than a file of its size may.
         OSError: It cannot be read, or `out` not be written.
         EOFError, zstd.ZstdError: It is damaged. What precedes the damage has been written.
     """
-    budget = Budget(path.stat().st_size)
+    budget = Budget(path.stat().st_size) if budget is None else budget
     with open(path, 'rb') as file:
         try:
             declared = zstd.get_frame_info(file.read(18)).decompressed_size

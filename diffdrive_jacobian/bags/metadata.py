@@ -7,6 +7,7 @@ report the same damage and name the same key.
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -60,10 +61,15 @@ def check_metadata(source: Path | str) -> None:
     _integer(_required(root, 'version', ''), 'version', 1, LATEST_VERSION)
     _choice(_required(root, 'storage_identifier', ''), 'storage_identifier', sorted(STORAGES))
     paths = _sequence(_required(root, 'relative_file_paths', ''), 'relative_file_paths')
+    names: set[str] = set()
     for index, path in enumerate(paths):
         where = f'relative_file_paths[{index}]'
         if not _string(path, where) or '\0' in path:
             raise _wrong(where, 'the name of a file', path)
+        # rosbags reads, and unpacks, a file as often as it is listed.
+        if Path(path).name in names:
+            raise _wrong(where, 'a file that is not listed before', path)
+        names.add(Path(path).name)
         if isinstance(source, Path):
             _check_data_file(source.parent / Path(path).name)
     count = _integer(_required(root, 'message_count', ''), 'message_count', 0, _INT64 - 1)
@@ -166,8 +172,12 @@ def check_connections(described: Iterable[Connection], stored: Iterable[Connecti
                 raise DamagedError(f'the {what} of a topic must be text, got {printable(repr(value))}')
         if not isinstance(connection.ext, ConnectionExtRosbag2):
             raise DamagedError(f'{printable(connection.topic)} is not a topic of ROS 2')
+    by_name = defaultdict(list)
+    for connection in described:
+        by_name[connection.topic, connection.msgtype].append(connection)
     for connection in stored:
-        if connection.msgcount and not any(_alike(connection, one) for one in described):
+        candidates = by_name[connection.topic, connection.msgtype]
+        if connection.msgcount and not any(_alike(connection, one) for one in candidates):
             raise DamagedError(
                 f'metadata.yaml does not describe the topic {printable(connection.topic)} of '
                 f'{printable(connection.msgtype)} as the data file does '

@@ -16,6 +16,7 @@ from functools import partial
 from diffdrive_jacobian.signals import Signals
 
 INTERRUPTED = 130
+OUTPUT_ERROR = 'the standard output cannot be written'
 NODES = ('virtual_robot', 'go_to_goal', 'wheel_bridge')
 """Programs that run a node."""
 ROS_MODULES = (
@@ -75,10 +76,9 @@ def _run(module: str, function: str, *arguments: str, watched: bool = False) -> 
         if watched:
             signals.exit_on_second(partial(_exit, module))
         code: int = run(*arguments, sys.argv[1:], signals)
-        sys.stdout.flush()
     except BrokenPipeError:
         # The reader of the output is gone, as `head` when it has enough.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_output()
         code = 1
     except ModuleNotFoundError as error:
         if error.name not in ROS_MODULES:
@@ -95,7 +95,19 @@ def _run(module: str, function: str, *arguments: str, watched: bool = False) -> 
         code = 1
     finally:
         signals.ignore()
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        if not isinstance(error, BrokenPipeError):
+            print(f'{program}: error: {OUTPUT_ERROR}: {error.strerror}', file=sys.stderr)
+        _discard_output()
+        code = 1
     return code
+
+
+def _discard_output() -> None:
+    """Discard what could not be written, which the interpreter would try again when it exits."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _exit(program: str) -> None:

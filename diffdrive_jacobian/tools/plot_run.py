@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from diffdrive_jacobian.bags.bag_reader import BagError
@@ -17,6 +18,7 @@ from diffdrive_jacobian.reading.trace import trace
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools.entry_points import OUTPUT_ERROR
 
 PROGRAM = 'plot_run'
 TOPICS = (
@@ -58,7 +60,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                 return _interrupted()
         return _write(runs, picture, tables, signals)
     except (BagError, UsageError) as error:
-        return _cli.complain(PROGRAM, error)
+        return _cli.complain(PROGRAM, printable(error, PATH_LIMIT))
     except ModuleNotFoundError as error:
         if (error.name or '').split('.')[0] != 'matplotlib':
             raise
@@ -69,20 +71,29 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
 
 def _write(runs: Sequence[Run], picture: Path, tables: Sequence[Path], signals: Signals) -> int:
     """Write the picture, then the tables, and return the exit code."""
-    path = picture
-    try:
-        draw(runs, picture)
-        print(picture)
-        for run, path in zip(runs, tables, strict=bool(tables)):
-            if signals.count:
-                return _interrupted()
-            path.parent.mkdir(exist_ok=True)
-            write_csv(run, path)
-            print(path)
-    except OSError as error:
-        print(f'{PROGRAM}: error: {path} cannot be written: {error.strerror or error}', file=sys.stderr)
-        return _cli.FAILED
+    writers = [partial(draw, runs, picture)]
+    writers += [partial(_write_table, *pair) for pair in zip(runs, tables, strict=bool(tables))]
+    for path, write in zip([picture, *tables], writers, strict=True):
+        if signals.count:
+            return _interrupted()
+        try:
+            write()
+        except OSError as error:
+            message = f'{path} cannot be written: {error.strerror or error}'
+            return _cli.complain(PROGRAM, printable(message, PATH_LIMIT), _cli.FAILED)
+        try:
+            print(printable(path, PATH_LIMIT))
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            # It is not buffered.
+            return _cli.complain(PROGRAM, f'{OUTPUT_ERROR}: {error.strerror}', _cli.FAILED)
     return _cli.DONE
+
+
+def _write_table(run: Run, path: Path) -> None:
+    path.parent.mkdir(exist_ok=True)
+    write_csv(run, path)
 
 
 def _interrupted() -> int:
