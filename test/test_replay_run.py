@@ -189,6 +189,22 @@ def test_another_publisher_is_reported(world, bag):
     assert '/peer also publishes on /cmd_vel' in child.stderr
 
 
+# --- Other names
+
+
+def test_relative_names_are_remapped(world, bag):
+    """Playing under the recorded name instead would move the real robot."""
+    path, run = bag
+    recorded, commands = (
+        world.harness.listen(Twist, 'cmd_vel'),
+        world.harness.listen(Twist, 'sim/cmd_vel'),
+    )
+    child = world.start('replay_run', str(path), '-r', '4', '-w', '1', '-m', 'cmd_vel:=sim/cmd_vel')
+    world.harness.until(lambda: len(commands) == len(run.cmd_vel), 'all have come')
+    assert child.exit() == 0
+    assert recorded == []
+
+
 # --- Nothing to play
 
 
@@ -309,6 +325,10 @@ def test_bag_of_others_is_verified_with_parameters_from_a_file(capsys, request, 
         (['BAG', '--start-offset', '-1'], 'must not be negative'),
         (['BAG', '--topics', '/nothing'], 'has no topic /nothing; it has /cmd_vel'),
         (['BAG', '-m', 'nonsense'], 'must be OLD:=NEW'),
+        (['BAG', '-m', 'cmd_vell:=/sim/cmd_vel'], 'that is played, /cmd_vel, got /cmd_vell'),
+        (['BAG', '--goals', '-m', 'cmd_vel:=/sim/cmd_vel'], 'that is played, /goals, got /cmd_vel'),
+        (['BAG', '-m', 'cmd_vel:=/a', '/cmd_vel:=/b'], '/cmd_vel must be remapped once, got /a and /b'),
+        (['BAG', '-m', '~/x{y}:=/cmd_vel'], 'remapping ~/x{y}:=/cmd_vel: '),
         (['BAG', '-w', '0'], 'must be a whole number of at least 1'),
         (['BAG', '--timeout', '1'], '--timeout needs -w'),
         (
