@@ -15,6 +15,12 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 
 NODE = 'replay_run'
 """Name of the node."""
+MAX_DURATION = 2**62
+"""Longest playback (ns): 146 years, half of the longest period of a timer of rcl."""
+MAX_STAMP = 2**31 * NANOSECONDS
+"""Limit of the times in messages (ns)."""
+CLOCK_RATES = (1e-9, 1e9)
+"""Lowest and highest rate of /clock (Hz). The period of a timer is a number of ns, of at least 1."""
 COMMANDS = ('cmd_vel',)
 """Topics of the commands to a robot."""
 GOALS = ('goal_pose', 'goals')
@@ -102,16 +108,37 @@ class Playback:
         """Return the time in the bag at which playing starts (ns).
 
         Raises:
-            BagError: The bag is not that long.
+            BagError: The bag is not that long, or takes too long at this rate; or its times cannot be
+                published on /clock, or not at this rate.
         """
-        start = reader.start_time + round(self.start_offset * NANOSECONDS)
+        length = (reader.end_time - reader.start_time) / NANOSECONDS
+        # An offset beyond the end can be too large for an integer of nanoseconds.
+        start = reader.start_time + round(min(self.start_offset, length + 1.0) * NANOSECONDS)
         if start >= reader.end_time:
-            length = (reader.end_time - reader.start_time) / NANOSECONDS
             raise BagError(
                 f'--start-offset must be less than the length of the bag, {length:.3f} s, '
                 f'got {self.start_offset:g}'
             )
+        slowest = (reader.end_time - start) / MAX_DURATION
+        if self.rate < slowest:
+            raise BagError(
+                f'--rate must be at least {slowest:.3g} for a bag of {length:.3f} s, got {self.rate:g}'
+            )
+        self._check_clock(reader)
         return start
+
+    def _check_clock(self, reader: Reader) -> None:
+        """Raise BagError if the times of a bag cannot be published on /clock, or not at this rate."""
+        if self.clock is None:
+            return
+        lowest, highest = CLOCK_RATES
+        if not lowest <= self.clock <= highest:
+            raise BagError(f'--clock must be in [{lowest:g}, {highest:g}] Hz, got {self.clock:g}')
+        if not -MAX_STAMP <= reader.start_time <= reader.end_time < MAX_STAMP:
+            raise BagError(
+                f'{reader.path} cannot be played with --clock: a message on /clock must have less than '
+                f'{MAX_STAMP // NANOSECONDS} s, the bag ends at {reader.end_time / NANOSECONDS:.3f} s'
+            )
 
     def _wants(self, topic: str) -> bool:
         if self.topics:

@@ -43,8 +43,9 @@ class Replayer(Node):  # type: ignore[misc]
 
         Raises:
             NothingToPlayError: The bag has no message of the selected topics, or none after the offset.
-            BagError: The bag cannot be played: it is too short for the offset, lacks a topic, or has
-                messages of a type that is not installed; or a remapping is invalid.
+            BagError: The bag cannot be played: it is too short for the offset, too long for the rate,
+                lacks a topic, or has messages of a type that is not installed; or a remapping or the
+                rate of /clock is invalid.
         """
         connections, start = playback.choose(reader), playback.start(reader)
         names = playback.names_by_topic(connections)
@@ -177,7 +178,8 @@ class Replayer(Node):  # type: ignore[misc]
         return self._wall + round((stamp - self.start) / self._playback.rate)
 
     def _bag_time(self, wall: int) -> int:
-        return self.start + round((wall - self._wall) * self._playback.rate)
+        # Not beyond the end: at a high rate that soon is no valid time.
+        return self.start + round(min((wall - self._wall) * self._playback.rate, self.end - self.start))
 
     def _on_timer(self) -> None:
         self._timer.cancel()
