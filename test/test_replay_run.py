@@ -189,6 +189,22 @@ def test_another_publisher_is_reported(world, bag):
     assert '/peer also publishes on /cmd_vel' in child.stderr
 
 
+# --- Other names
+
+
+def test_relative_names_are_remapped(world, bag):
+    """Playing under the recorded name instead would move the real robot."""
+    path, run = bag
+    recorded, commands = (
+        world.harness.listen(Twist, 'cmd_vel'),
+        world.harness.listen(Twist, 'sim/cmd_vel'),
+    )
+    child = world.start('replay_run', str(path), '-r', '4', '-w', '1', '-m', 'cmd_vel:=sim/cmd_vel')
+    world.harness.until(lambda: len(commands) == len(run.cmd_vel), 'all have come')
+    assert child.exit() == 0
+    assert recorded == []
+
+
 # --- Nothing to play
 
 
@@ -218,8 +234,8 @@ def test_nothing_to_play_is_an_error(world, bag, tmp_path, monkeypatch, capsys, 
     assert err.count('\n') == 1
 
 
-def build(path, topics):
-    """Write a bag with the messages of each topic at 1 s, 2 s, ..."""
+def build(path, topics, step=1):
+    """Write a bag with the messages of each topic at 1 s, and each a step (s) after the one before."""
     types = {'/cmd_vel': 'geometry_msgs/msg/Twist', '/goals': 'nav_msgs/msg/Goals'}
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         for topic, sent in topics.items():
@@ -227,8 +243,36 @@ def build(path, topics):
             connection = writer.add_connection(
                 topic, known.name, msgdef=known.text, rihs01=known.type_hash
             )
-            for second, message in enumerate(sent, 1):
-                writer.write(connection, second * 1_000_000_000, serialize_message(message))
+            for index, message in enumerate(sent):
+                writer.write(connection, (1 + index * step) * 1_000_000_000, serialize_message(message))
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (('-r', '0.1'), '--rate must be at least 2'),
+        (('--clock', '-r', '1e9'), 'must have less than 2147483648 s, the bag ends at 9223372036'),
+    ],
+    ids=['rate', 'clock'],
+)
+def test_times_that_are_far_apart_are_reported(tmp_path, capsys, arguments, words):
+    build(tmp_path / 'FAR', {'/cmd_vel': [Twist(), Twist()]}, step=9_223_372_035)
+    assert play(tmp_path / 'FAR', *arguments) == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count('\n')) == ('', 1)
+    assert words in err
+
+
+def test_the_clock_does_not_pass_the_end_at_any_rate(world, bag, monkeypatch):
+    signals, publish_time = Signals(), Replayer._publish_time
+
+    def publish_time_and_interrupt(player):
+        publish_time(player)
+        signals.count = int(player._wall > 0)
+
+    monkeypatch.setattr(replay_run, 'MATCH_PATIENCE', 0.1)
+    monkeypatch.setattr(Replayer, '_publish_time', publish_time_and_interrupt)
+    assert play(bag[0], '-r', '1e300', '-l', '--clock', '100', signals=signals) == 130
 
 
 def test_every_round_takes_as_long_as_the_recording(world, bag):
@@ -306,9 +350,20 @@ def test_bag_of_others_is_verified_with_parameters_from_a_file(capsys, request, 
         (['file.txt', '--verify'], 'file.txt is not a bag'),
         (['BAG', '-r', '-1'], 'must be positive'),
         (['BAG', '--start-offset', '99'], '--start-offset must be less than the length of the bag'),
+        (['BAG', '-r', '1e-12'], '--rate must be at least 4.'),
+        (['BAG', '-r', '1e-320'], '--rate must be at least 4.'),
+        (['BAG', '--clock', '1e-12'], '--clock must be in [1e-09, 1e+09] Hz, got 1e-12'),
+        (['BAG', '--clock', '1e12'], '--clock must be in [1e-09, 1e+09] Hz, got 1e+12'),
+        (['BAG', '-m', '/cmd_vel:=~/x{y}'], "cannot be played as '~/x{y}': failed to resolve name"),
+        (['BAG', '-m', '/cmd_vel:=a b'], "cannot be played as 'a b': failed to resolve name"),
+        (['BAG', '--start-offset', '1e300'], 'must be less than the length of the bag'),
         (['BAG', '--start-offset', '-1'], 'must not be negative'),
         (['BAG', '--topics', '/nothing'], 'has no topic /nothing; it has /cmd_vel'),
         (['BAG', '-m', 'nonsense'], 'must be OLD:=NEW'),
+        (['BAG', '-m', 'cmd_vell:=/sim/cmd_vel'], 'that is played, /cmd_vel, got /cmd_vell'),
+        (['BAG', '--goals', '-m', 'cmd_vel:=/sim/cmd_vel'], 'that is played, /goals, got /cmd_vel'),
+        (['BAG', '-m', 'cmd_vel:=/a', '/cmd_vel:=/b'], '/cmd_vel must be remapped once, got /a and /b'),
+        (['BAG', '-m', '~/x{y}:=/cmd_vel'], 'remapping ~/x{y}:=/cmd_vel: '),
         (['BAG', '-w', '0'], 'must be a whole number of at least 1'),
         (['BAG', '--timeout', '1'], '--timeout needs -w'),
         (

@@ -55,8 +55,8 @@ sys.exit(getattr(entry_points, {tool!r})())
 )
 
 
-def run(tool, *arguments, modules=ROS_MODULES, **kwargs):
-    program = RUN.format(modules=(*modules, 'rpyutils'), tool=tool)
+def run(tool, *arguments, modules=(*ROS_MODULES, 'rpyutils'), **kwargs):
+    program = RUN.format(modules=modules, tool=tool)
     return subprocess.run(
         [sys.executable, '-c', program, *map(str, arguments)],
         capture_output=True,
@@ -188,6 +188,27 @@ def test_a_journal_is_recovered_without_ros(tmp_path):
     assert 'the 1 messages on /x were not checked' in ended.stdout
     assert '1 of 2 messages on /odom cannot be decoded' in ended.stdout
     assert len(read_run(tmp_path / 'run').odometry) == 1
+
+
+@pytest.mark.parametrize(
+    ('tool', 'arguments'),
+    [
+        ('drive_to', ('1', '1')),
+        ('plot_run', (BAG,)),
+        ('record_run', ('-o', 'run')),
+        ('recover_run', (BAG,)),
+        ('replay_run', (BAG,)),
+        ('verify_run', (BAG,)),
+    ],
+)
+def test_without_rosbags_one_line_reports_the_remedy(tmp_path, tool, arguments):
+    """A ROS installation has no rosbags. This package needs it in addition."""
+    ended = run(tool, *arguments, modules=('rosbags',), cwd=tmp_path)
+    assert (ended.returncode, ended.stdout) == (1, '')
+    assert ended.stderr == (
+        f'{tool}: error: there is no Python module rosbags: call pip install rosbags\n'
+    )
+    assert not list(tmp_path.iterdir())
 
 
 def test_another_module_that_is_missing_is_a_defect_and_surfaces():

@@ -1,18 +1,13 @@
 """Replay of recorded messages."""
 
+from diffdrive_jacobian.replay.playback import COMMANDS, GOALS, NothingToPlayError, Playback
 from diffdrive_jacobian.replay.playing import (
     ReplayProgress,
     ReplayResult,
     describe_too_few,
     replay,
 )
-from diffdrive_jacobian.replay.replayer import (
-    COMMANDS,
-    GOALS,
-    NothingToPlayError,
-    Playback,
-    Replayer,
-)
+from diffdrive_jacobian.replay.replayer import Replayer
 
 __all__ = [
     'COMMANDS',

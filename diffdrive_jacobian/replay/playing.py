@@ -19,15 +19,14 @@ from pathlib import Path
 from typing import Protocol
 
 from diffdrive_jacobian.reading.reader import open_bag
-from diffdrive_jacobian.replay.replayer import Playback, Replayer
+from diffdrive_jacobian.replay.playback import NODE, Playback
+from diffdrive_jacobian.replay.replayer import Replayer
 from diffdrive_jacobian.ros.heartbeats import fast_heartbeats
 from diffdrive_jacobian.ros.node_runner import NodeRunner
 from diffdrive_jacobian.ros.runner import ros_context, running
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.time_units import seconds
 
-NAME = 'replay_run'
-"""Name of the node."""
 DISCOVERY_PATIENCE = 5.0
 """Default of the longest wait for subscriptions where no number is required (s): an older participant
 is announced every 3 s."""
@@ -120,14 +119,14 @@ def replay(
 
     Raises:
         UserError: The ROS arguments are invalid.
-        BagError: The bag cannot be played.
+        BagError: The bag cannot be played, or not with these remappings.
         NothingToPlayError: It has no message to play.
     """
     playback, signals, progress = playback or Playback(), signals or Signals(), progress or _Silent()
     with (
         open_bag(bag) as reader,
         nullcontext() if acknowledgement_timeout is None else fast_heartbeats(),
-        ros_context([NAME, *ros_arguments]) as context,
+        ros_context([NODE, *ros_arguments]) as context,
         running(context, isolated=False) as runner,
     ):
         player = runner.add(lambda: Replayer(reader, playback, context=context))

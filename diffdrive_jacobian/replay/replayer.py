@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from rclpy.clock import Clock
@@ -16,90 +15,15 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2
 from rosbags.rosbag2 import Reader
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from diffdrive_jacobian.bags.bag_reader import BagError, base_name, messages
+from diffdrive_jacobian.bags.bag_reader import BagError, messages
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, message_class
 from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.replay.lateness import Lateness
+from diffdrive_jacobian.replay.playback import NODE, NothingToPlayError, Playback
 from diffdrive_jacobian.ros.qos import publisher_profile
-from diffdrive_jacobian.ros.rclpy_internals import restart_timer
-from diffdrive_jacobian.time_units import NANOSECONDS
+from diffdrive_jacobian.ros.rclpy_internals import RCLError, reason, restart_timer
 
 DEPTH = 1000
-COMMANDS = ('cmd_vel',)
-"""Topics of the commands to a robot."""
-GOALS = ('goal_pose', 'goals')
-"""Topics of the goals of its controller."""
-
-
-class NothingToPlayError(BagError):
-    """The bag is readable, but has no message of the selected topics."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Playback:
-    """Which messages of a bag are played, and how."""
-
-    names: tuple[str, ...] | None = COMMANDS
-    """Base names of the topics; None: all."""
-    topics: tuple[str, ...] = ()
-    """Fully qualified names of the topics, instead of `names`."""
-    remap: Mapping[str, str] = field(default_factory=dict)
-    """Topics to the other names under which they are published."""
-    rate: float = 1.0
-    """Factor on the speed."""
-    start_offset: float = 0.0
-    """Time after the beginning of the bag at which playback starts (s)."""
-    loop: bool = False
-    """Whether to start again at the end of the bag."""
-    clock: float | None = None
-    """Rate at which the time of the bag is published on /clock (Hz). None: it is not."""
-    paused: bool = False
-    """Whether to start in the paused state."""
-
-    def choose(self, reader: Reader) -> list[Connection]:
-        """Return the connections of a bag that are played.
-
-        Raises:
-            BagError: The bag lacks one of `topics`.
-            NothingToPlayError: It has no message of them.
-        """
-        there = sorted({connection.topic for connection in reader.connections})
-        missing = [topic for topic in self.topics if topic not in there]
-        if missing:
-            raise BagError(
-                f'{reader.path} has no topic {missing[0]}; it has {", ".join(there) or "none"}'
-            )
-        chosen = [one for one in reader.connections if self._wants(one.topic)]
-        if not any(connection.msgcount for connection in chosen):
-            if not reader.message_count:
-                raise NothingToPlayError(f'nothing to play: {reader.path} has no messages')
-            wanted = ' or '.join(self.topics or self.names or ())
-            full = sorted({one.topic for one in reader.connections if one.msgcount})
-            raise NothingToPlayError(
-                f'nothing to play: {reader.path} has no messages of {wanted}, only of '
-                f'{", ".join(full)} (--all-topics plays them)'
-            )
-        return chosen
-
-    def start(self, reader: Reader) -> int:
-        """Return the time in the bag at which playing starts (ns).
-
-        Raises:
-            BagError: The bag is not that long.
-        """
-        start = reader.start_time + round(self.start_offset * NANOSECONDS)
-        if start >= reader.end_time:
-            length = (reader.end_time - reader.start_time) / NANOSECONDS
-            raise BagError(
-                f'--start-offset must be less than the length of the bag, {length:.3f} s, '
-                f'got {self.start_offset:g}'
-            )
-        return start
-
-    def _wants(self, topic: str) -> bool:
-        if self.topics:
-            return topic in self.topics
-        return self.names is None or base_name(topic) in self.names
 
 
 class Replayer(Node):  # type: ignore[misc]
@@ -119,20 +43,23 @@ class Replayer(Node):  # type: ignore[misc]
 
         Raises:
             NothingToPlayError: The bag has no message of the selected topics, or none after the offset.
-            BagError: The bag cannot be played: it is too short for the offset, lacks a topic, or has
-                messages of a type that is not installed.
+            BagError: The bag cannot be played: it is too short for the offset, too long for the rate,
+                lacks a topic, or has messages of a type that is not installed; or a remapping or the
+                rate of /clock is invalid.
         """
         connections, start = playback.choose(reader), playback.start(reader)
+        names = playback.names_by_topic(connections)
         if next(_messages_from(reader, connections, start), None) is None:
             topics = ', '.join(sorted({one.topic for one in connections}))
             raise NothingToPlayError(
                 f'nothing to play: {reader.path} has no messages of {topics} after '
                 f'--start-offset {playback.start_offset:g}'
             )
-        super().__init__('replay_run', start_parameter_services=False, **kwargs)
+        super().__init__(NODE, start_parameter_services=False, **kwargs)
         self._reader = reader
         self._playback = playback
         self._connections = connections
+        self._names = names
         self.start = start
         """Time in the bag at which playing starts (ns)."""
         self.end = reader.end_time
@@ -159,7 +86,14 @@ class Replayer(Node):  # type: ignore[misc]
             self._ticks = self.create_timer(1.0 / playback.clock, self._publish_time, clock=steady)
 
     def _advertise(self, connection: Connection) -> Publisher:
-        topic = self._playback.remap.get(connection.topic, connection.topic)
+        topic = self._names.get(connection.topic, connection.topic)
+        try:
+            # Here all invalid names give the same error. In create_publisher they do not.
+            self.resolve_topic_name(topic)
+        except RCLError as error:
+            raise BagError(
+                f'{connection.topic} cannot be played as {topic!r}: {reason(error)}'
+            ) from error
         assert isinstance(connection.ext, ConnectionExtRosbag2)
         profile = publisher_profile(connection.ext.offered_qos_profiles, DEPTH)
         try:
@@ -244,7 +178,8 @@ class Replayer(Node):  # type: ignore[misc]
         return self._wall + round((stamp - self.start) / self._playback.rate)
 
     def _bag_time(self, wall: int) -> int:
-        return self.start + round((wall - self._wall) * self._playback.rate)
+        # Not beyond the end: at a high rate that soon is no valid time.
+        return self.start + round(min((wall - self._wall) * self._playback.rate, self.end - self.start))
 
     def _on_timer(self) -> None:
         self._timer.cancel()

@@ -24,6 +24,8 @@ ROS_MODULES = (
     *('rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs', 'unique_identifier_msgs'),
 )
 """Modules of a ROS installation, or of the extra `jazzy`."""
+ROSBAGS_MODULES = ('rosbags', 'apsw', 'backports', 'backports.zstd', 'lz4', 'ruamel', 'ruamel.yaml')
+"""Modules that come with rosbags, which a ROS installation does not bring."""
 _NO_TOOLS = ('__init__', 'entry_points', 'run_node')
 
 
@@ -81,14 +83,10 @@ def _run(module: str, function: str, *arguments: str, watched: bool = False) -> 
         _discard_output()
         code = 1
     except ModuleNotFoundError as error:
-        if error.name not in ROS_MODULES:
+        remedy = _remedy(error.name)
+        if remedy is None:
             raise
-        print(
-            f'{program}: error: ROS 2 is not available, there is no Python module {error.name}: source '
-            'the setup file of a ROS 2 Jazzy installation (. /opt/ros/jazzy/setup.bash), or call '
-            "pip install '.[jazzy]' in a clone of diffdrive_jacobian",
-            file=sys.stderr,
-        )
+        print(f'{program}: error: {remedy}', file=sys.stderr)
         code = 1
     except OSError as error:
         print(f'{program}: error: {error}', file=sys.stderr)
@@ -108,6 +106,19 @@ def _run(module: str, function: str, *arguments: str, watched: bool = False) -> 
 def _discard_output() -> None:
     """Discard what could not be written, which the interpreter would try again when it exits."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _remedy(module: str | None) -> str | None:
+    """Return what to do about a Python module that is missing. None: it can only be a defect."""
+    if module in ROS_MODULES:
+        return (
+            f'ROS 2 is not available, there is no Python module {module}: source the setup file of a '
+            'ROS 2 Jazzy installation (. /opt/ros/jazzy/setup.bash), or call '
+            "pip install '.[jazzy]' in a clone of diffdrive_jacobian"
+        )
+    if module in ROSBAGS_MODULES:
+        return f'there is no Python module {module}: call pip install rosbags'
+    return None
 
 
 def _exit(program: str) -> None:

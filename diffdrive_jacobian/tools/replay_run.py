@@ -182,7 +182,7 @@ def _parser() -> argparse.ArgumentParser:
         default=[],
         type=_remapping,
         metavar='OLD:=NEW',
-        help='publish a topic under another name',
+        help='publish a topic that is played under another name; a relative OLD is in the namespace /',
     )
     parser.add_argument(
         '--clock',

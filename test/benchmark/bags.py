@@ -70,7 +70,7 @@ def replay(bag):
     from rclpy.node import Node
 
     from diffdrive_jacobian.reading.reader import open_bag
-    from diffdrive_jacobian.replay.replayer import Playback, Replayer
+    from diffdrive_jacobian.replay import Playback, Replayer
     from diffdrive_jacobian.ros.runner import ros_context, running
 
     playback = Playback(names=None)
