@@ -138,3 +138,27 @@ def test_what_a_latched_topic_overwrote_before_is_not_missed(ros, executor_kind)
     made.end()
     ros.until(made.drained, 'all is collected')
     assert sink.missed == {}
+
+
+@pytest.mark.parametrize('name', ['/foo bar', '/foo//bar', '/1', '/\x1b[2J', '/' + 'a' * 300])
+def test_an_invalid_topic_name_of_a_dds_application_is_reported_once(ros, name, monkeypatch, capfd):
+    # No ROS node can publish such a topic.
+    publisher = ros.peer.create_publisher(Twist, 'cmd_vel', 10)
+    recorder = ros.add(Recorder, selection=Selection(everything=True), sink=(sink := Sink()))
+    find = recorder.get_topic_names_and_types
+    monkeypatch.setattr(
+        recorder,
+        'get_topic_names_and_types',
+        lambda: [(name, ['geometry_msgs/msg/Twist']), *find()],
+    )
+
+    def recorded():
+        recorder.discover()
+        publisher.publish(Twist())
+        return sink.data
+
+    ros.until(recorded, 'the other topic is recorded')
+    recorder.discover()
+    reports = capfd.readouterr().err
+    assert reports.count('is not recorded') == 1
+    assert '\x1b[2J' not in reports

@@ -25,6 +25,7 @@ from diffdrive_jacobian.recording.parameter_query import ParameterQuery
 from diffdrive_jacobian.recording.selection import Selection as Selection
 from diffdrive_jacobian.ros.qos import subscription_profile, to_fields
 from diffdrive_jacobian.ros.rclpy_internals import reason, waiting_messages
+from diffdrive_jacobian.text import printable
 
 DEPTH = 4000
 """Depth of the queue of each subscription."""
@@ -34,6 +35,8 @@ DRAIN_PATIENCE = 3.0
 """Longest time at the end in which messages that were sent before are received (s)."""
 IN_TRANSIT = 0.1
 """After this time without such a message no more is expected (s)."""
+MAX_REPORT = 500
+"""Largest length of the report on a topic (characters)."""
 
 
 class Sink(Protocol):
@@ -100,7 +103,12 @@ class Recorder(Node):  # type: ignore[misc]
         for topic, types in self.get_topic_names_and_types():
             if not self._wants(topic) or topic in self._refused:
                 continue
-            publishers = self.get_publishers_info_by_topic(topic)
+            try:
+                publishers = self.get_publishers_info_by_topic(topic)
+            except (ValueError, NameValidationException) as error:
+                # A DDS application without ROS can use any name.
+                self._refuse(topic, reason(error))
+                continue
             if not publishers:
                 continue
             if topic not in self._channels:
@@ -200,7 +208,8 @@ class Recorder(Node):  # type: ignore[misc]
 
     def _refuse(self, topic: str, why: str) -> None:
         self._refused.add(topic)
-        self.get_logger().error(f'{topic} is not recorded: {why}')
+        # Other processes choose the names.
+        self.get_logger().error(printable(f'{topic} is not recorded: {why}', MAX_REPORT))
 
     def _note_profiles(self, channel: Channel, publishers: list[Any]) -> None:
         profiles = _profiles(publishers)
