@@ -85,17 +85,77 @@ def test_a_module_that_hides_a_message_package_is_not_imported(tmp_path, monkeyp
     assert 'shape_msgs' not in sys.modules
 
 
-def test_a_package_of_an_overlay_is_found(tmp_path, monkeypatch):
-    library = tmp_path / 'lib' / 'python3.12' / 'site-packages'
-    (library / 'my_msgs' / 'msg').mkdir(parents=True)
-    (library / 'my_msgs' / '__init__.py').write_text('')
-    (library / 'my_msgs' / 'msg' / '__init__.py').write_text('class Mine: pass')
-    (tmp_path / 'share' / 'my_msgs' / 'msg').mkdir(parents=True)
-    (tmp_path / 'share' / 'my_msgs' / 'msg' / 'Mine.msg').write_text('int32 x\n')
-    monkeypatch.syspath_prepend(str(library))
-    assert message_class('my_msgs/msg/Mine').__name__ == 'Mine'
+GENERATED = """\
+class Metaclass(type):
+    _TYPE_SUPPORT = None
+
+    @classmethod
+    def __import_type_support__(cls):
+        {statement}
+
+
+class Mine(metaclass=Metaclass):
+    pass
+"""
+"""Python code of a message type, reduced from what rosidl_generator_py generates."""
+
+
+@pytest.fixture
+def overlay(tmp_path, monkeypatch):
+    """A function that installs `my_msgs/msg/Mine`, from its Python code and its description in JSON."""
+
+    def install(code, described='{}'):
+        library = tmp_path / 'lib' / 'python3.12' / 'site-packages'
+        (library / 'my_msgs' / 'msg').mkdir(parents=True)
+        (library / 'my_msgs' / '__init__.py').write_text('')
+        (library / 'my_msgs' / 'msg' / '__init__.py').write_text(code)
+        share = tmp_path / 'share' / 'my_msgs' / 'msg'
+        share.mkdir(parents=True)
+        (share / 'Mine.msg').write_text('int32 x\n')
+        (share / 'Mine.json').write_text(described)
+        monkeypatch.syspath_prepend(str(library))
+
+    yield install
     for name in ('my_msgs', 'my_msgs.msg'):
-        monkeypatch.delitem(sys.modules, name)
+        sys.modules.pop(name, None)
+    for find in (definition, message_class):
+        find.cache_clear()
+
+
+def test_a_package_of_an_overlay_is_found(overlay):
+    overlay(GENERATED.format(statement='cls._TYPE_SUPPORT = object()'))
+    assert message_class('my_msgs/msg/Mine').__name__ == 'Mine'
+
+
+@pytest.mark.parametrize(
+    ('code', 'reason'),
+    [
+        (
+            GENERATED.format(
+                statement='from rosidl_generator_py import import_type_support\n'
+                "        import_type_support('my_msgs')"
+            ),
+            'type support of my_msgs/msg/Mine cannot be loaded: UnsupportedTypeSupport',
+        ),
+        (GENERATED.format(statement='pass'), 'type support of my_msgs/msg/Mine is not installed'),
+        ('class Mine: pass', 'type support of my_msgs/msg/Mine cannot be loaded: AttributeError'),
+        ('invalid code', 'Python code of my_msgs/msg/Mine cannot be imported: SyntaxError'),
+        ('', 'Python code of my_msgs/msg/Mine is not installed'),
+    ],
+)
+def test_a_type_without_usable_python_code_is_unknown(overlay, code, reason):
+    overlay(code)
+    with pytest.raises(UnknownTypeError, match=reason):
+        message_class('my_msgs/msg/Mine')
+
+
+@pytest.mark.parametrize(
+    'described', ['', '{', '[]', '{}', '{"type_hashes": []}', '{"type_hashes": [1]}', '[' * 100_000]
+)
+def test_a_type_with_an_invalid_description_is_unknown(overlay, described):
+    overlay('', described)
+    with pytest.raises(UnknownTypeError, match='definition of my_msgs/msg/Mine is invalid'):
+        definition('my_msgs/msg/Mine')
 
 
 def test_an_installed_message():

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 from conftest import PATIENCE
-from geometry_msgs.msg import Twist
+from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 
 from diffdrive_jacobian.bags.journal import Message
 from diffdrive_jacobian.recording import recorder
 from diffdrive_jacobian.recording.recorder import Recorder, Selection
+from diffdrive_jacobian.ros.runner import ros_context
 
 DEPTH = 200
 """Messages that may wait: fewer than the recorder allows."""
@@ -22,6 +26,7 @@ class Sink:
     def __init__(self):
         self.data = []
         self.missed = {}
+        self.left_out = {}
 
     def add(self, record):
         if isinstance(record, Message):
@@ -29,6 +34,9 @@ class Sink:
 
     def set_missed(self, topic, messages):
         self.missed[topic] = messages
+
+    def set_left_out(self, topic, why):
+        self.left_out[topic] = why
 
 
 class Setting:
@@ -138,3 +146,98 @@ def test_what_a_latched_topic_overwrote_before_is_not_missed(ros, executor_kind)
     made.end()
     ros.until(made.drained, 'all is collected')
     assert sink.missed == {}
+
+
+@pytest.mark.parametrize('name', ['/foo bar', '/foo//bar', '/1', '/\x1b[2J', '/' + 'a' * 300])
+def test_an_invalid_topic_name_of_a_dds_application_is_reported_once(ros, name, monkeypatch, capfd):
+    # No ROS node can publish such a topic.
+    publisher = ros.peer.create_publisher(Twist, 'cmd_vel', 10)
+    recorder = ros.add(Recorder, selection=Selection(everything=True), sink=(sink := Sink()))
+    find = recorder.get_topic_names_and_types
+    monkeypatch.setattr(
+        recorder,
+        'get_topic_names_and_types',
+        lambda: [(name, ['geometry_msgs/msg/Twist']), *find()],
+    )
+
+    def recorded():
+        recorder.discover()
+        publisher.publish(Twist())
+        return sink.data
+
+    ros.until(recorded, 'the other topic is recorded')
+    recorder.discover()
+    reports = capfd.readouterr().err
+    assert reports.count('is not recorded') == 1
+    assert '\x1b[2J' not in reports
+
+
+@pytest.mark.parametrize('with_info', [True, False])
+@pytest.mark.parametrize(
+    ('first', 'second'),
+    [
+        ({'durability': DurabilityPolicy.VOLATILE}, {'reliability': ReliabilityPolicy.BEST_EFFORT}),
+        ({'durability': DurabilityPolicy.TRANSIENT_LOCAL}, {'durability': DurabilityPolicy.VOLATILE}),
+        (
+            {'durability': DurabilityPolicy.TRANSIENT_LOCAL},
+            {'reliability': ReliabilityPolicy.BEST_EFFORT},
+        ),
+    ],
+    ids=['best effort', 'volatile', 'best effort and volatile'],
+)
+def test_a_later_publisher_with_weaker_qos_is_recorded(ros, executor_kind, first, second, with_info):
+    strict = ros.peer.create_publisher(Twist, 'cmd_vel', QoSProfile(depth=10, **first))
+    sink = Sink()
+    recorder = ros.add(
+        Recorder, selection=Selection(topics=('cmd_vel',)), sink=sink, with_info=with_info
+    )
+
+    def matched(publisher):
+        recorder.discover()
+        return publisher.get_subscription_count()
+
+    ros.until(lambda: matched(strict), 'the first is matched')
+    strict.publish(Twist())
+    ros.until(lambda: len(sink.data) == 1, 'its message is recorded')
+    weak = ros.peer.create_publisher(Twist, 'cmd_vel', QoSProfile(depth=10, **second))
+    # This message waits in the old subscription.
+    strict.publish(Twist())
+    ros.until(lambda: matched(weak) and matched(strict), 'both are matched')
+    weak.publish(Twist())
+    strict.publish(Twist())
+    ros.until(lambda: len(sink.data) == 4, 'all four are recorded')
+    recorder.discover()
+    assert sink.missed == {}
+
+
+@pytest.fixture
+def local_discovery(monkeypatch):
+    """Contexts that are created after this discover each other, as processes do."""
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(os.getpid() % 100 + 1))
+
+
+def test_publishers_of_another_type_are_reported(local_discovery, ros, executor_kind):
+    sink = Sink()
+    recorder = ros.add(Recorder, selection=Selection(topics=('cmd_vel', 'x')), sink=sink)
+
+    def until(condition, what):
+        ros.until(lambda: (recorder.discover(), condition())[1], what, PATIENCE)
+
+    # In one context a topic can have one type only.
+    with ros_context(['one']) as one, ros_context(['other']) as other:
+        twists, stamped = Node('one', context=one), Node('other', context=other)
+        first = twists.create_publisher(Twist, 'cmd_vel', 10)
+        until(first.get_subscription_count, 'the first is matched')
+        twists.destroy_publisher(first)
+        stamped.create_publisher(TwistStamped, 'cmd_vel', 10)
+        until(lambda: sink.left_out, 'the other type is reported')
+        twists.create_publisher(Twist, 'x', 10)
+        stamped.create_publisher(TwistStamped, 'x', 10)
+        until(lambda: len(sink.left_out) == 2, 'the topic with two types is reported')
+        for node in (twists, stamped):
+            node.destroy_node()
+    assert sink.left_out['/cmd_vel of geometry_msgs/msg/TwistStamped'] == (
+        '/cmd_vel is recorded as geometry_msgs/msg/Twist'
+    )
+    assert any(topic.startswith('/x') for topic in sink.left_out)

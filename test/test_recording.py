@@ -16,7 +16,7 @@ from ruamel.yaml import YAML
 
 from diffdrive_jacobian.bags import bag_writer as building
 from diffdrive_jacobian.bags import journal
-from diffdrive_jacobian.bags.journal import Channel, Message, journal_of, read_journal
+from diffdrive_jacobian.bags.journal import LEFT_OUT, Channel, Message, Text, journal_of, read_journal
 from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.bags.storage import BagReader
 from diffdrive_jacobian.recording.journal_thread import JournalThread
@@ -380,3 +380,31 @@ def test_the_thread_syncs(tmp_path, monkeypatch):
     until(lambda: synced, 'it is synced')
     thread.close()
     writer.close()
+
+
+def test_a_topic_that_is_left_out_is_reported_and_noted(tmp_path):
+    bag = tmp_path / 'run'
+    recording = Recording(bag, 'mcap')
+    add_all(recording, channel(), *messages(3))
+    recording.set_left_out('/odom', 'it has several types')
+    with pytest.raises(RecordingError, match='/odom was not recorded: it has several types') as caught:
+        recording.finish()
+    assert caught.value.summary.messages == 3
+    assert json.loads(custom_data(bag)[LEFT_OUT]) == {'/odom': 'it has several types'}
+    assert not journal_of(bag).exists()
+
+
+def test_a_topic_that_is_left_out_is_reported_after_a_crash(tmp_path, capsys):
+    bag = tmp_path / 'run'
+    recording = Recording(bag, 'mcap')
+    add_all(recording, channel(), *messages(3))
+    recording.set_left_out('/odom', 'it has several types')
+    noted = journal_of(bag)
+    until(
+        lambda: any(isinstance(one, Text) and one.key == LEFT_OUT for one in read_journal(noted)),
+        'noted',
+    )
+    shutil.copy(noted, tmp_path / 'crashed.journal')
+    recording.discard()
+    recover_run([str(tmp_path / 'crashed.journal')], Signals())
+    assert 'lost: /odom was not recorded: it has several types' in capsys.readouterr().out

@@ -31,6 +31,8 @@ PARAMETERS = 'parameters of '
 """Followed by a node's name, the key of the custom data that holds its parameters as JSON."""
 LOST = 'messages lost'
 """Key of the custom data with the number of messages that are known to be missing, by topic, as JSON."""
+LEFT_OUT = 'topics left out'
+"""Key of the custom data with the reasons why topics were not recorded, by topic, as JSON."""
 MAGIC = b'\x89ddjournal1\r\n\x1a\n'
 _HEAD = struct.Struct('<cII')
 _MESSAGE = struct.Struct('<Hq')

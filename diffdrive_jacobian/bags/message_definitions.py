@@ -52,12 +52,18 @@ def definition(name: str) -> Definition:
         name: `package/msg/Name`.
 
     Raises:
-        UnknownTypeError: No installed package defines it.
+        UnknownTypeError: No installed package defines it, or its files are invalid.
     """
     package, message = _split(name)
-    described = json.loads(_file(package, message, '.json').read_text(encoding='utf-8'))
-    hashes = {one['type_name']: one['hash_string'] for one in described['type_hashes']}
-    return Definition(name=name, text=_full_text(package, message, set()), type_hash=hashes[name])
+    try:
+        described = json.loads(_file(package, message, '.json').read_text(encoding='utf-8'))
+        hashes = {one['type_name']: one['hash_string'] for one in described['type_hashes']}
+        text = _full_text(package, message, set())
+        return Definition(name=name, text=text, type_hash=hashes[name])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise UnknownTypeError(
+            f'the installed definition of {name} is invalid: {printable(repr(error))}'
+        ) from error
 
 
 @cache
@@ -68,14 +74,42 @@ def message_class(name: str) -> Any:
         name: `package/msg/Name`.
 
     Raises:
-        UnknownTypeError: No installed package defines it, or its Python code is not installed.
+        UnknownTypeError: No installed package defines it, or its Python code or its type support is not
+            installed or cannot be loaded.
     """
     package, message = _split(name)
     _file(package, message, '.msg')
     try:
-        return getattr(importlib.import_module(f'{package}.msg'), message)
+        found = getattr(importlib.import_module(f'{package}.msg'), message)
     except (ImportError, AttributeError) as error:
         raise UnknownTypeError(f'the Python code of {name} is not installed') from error
+    # Code of other packages can raise any exception.
+    except Exception as error:
+        raise UnknownTypeError(
+            f'the Python code of {name} cannot be imported: {printable(repr(error))}'
+        ) from error
+    _load_type_support(name, found)
+    return found
+
+
+def _load_type_support(name: str, found: Any) -> None:
+    """Load the type support of a message class, as rclpy does when it creates a subscription.
+
+    Raises:
+        UnknownTypeError: It is not installed or cannot be loaded.
+    """
+    kind = type(found)
+    try:
+        if kind._TYPE_SUPPORT is None:
+            kind.__import_type_support__()
+        missing = kind._TYPE_SUPPORT is None
+    # UnsupportedTypeSupport of rosidl_generator_py is a plain Exception.
+    except Exception as error:
+        raise UnknownTypeError(
+            f'the type support of {name} cannot be loaded: {printable(repr(error))}'
+        ) from error
+    if missing:
+        raise UnknownTypeError(f'the type support of {name} is not installed')
 
 
 def _split(name: str) -> tuple[str, str]:

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.subscription import Subscription
 
 from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Record, Text
@@ -25,6 +25,7 @@ from diffdrive_jacobian.recording.parameter_query import ParameterQuery
 from diffdrive_jacobian.recording.selection import Selection as Selection
 from diffdrive_jacobian.ros.qos import subscription_profile, to_fields
 from diffdrive_jacobian.ros.rclpy_internals import reason, waiting_messages
+from diffdrive_jacobian.text import printable
 
 DEPTH = 4000
 """Depth of the queue of each subscription."""
@@ -34,6 +35,8 @@ DRAIN_PATIENCE = 3.0
 """Longest time at the end in which messages that were sent before are received (s)."""
 IN_TRANSIT = 0.1
 """After this time without such a message no more is expected (s)."""
+MAX_REPORT = 500
+"""Largest length of the report on a topic (characters)."""
 
 
 class Sink(Protocol):
@@ -44,6 +47,9 @@ class Sink(Protocol):
 
     def set_missed(self, topic: str, messages: int) -> None:
         """Set the number of messages of a topic that are known to be missed so far."""
+
+    def set_left_out(self, topic: str, why: str) -> None:
+        """Note that a topic, or its publishers of one type, are not recorded."""
 
 
 class Recorder(Node):  # type: ignore[misc]
@@ -85,6 +91,7 @@ class Recorder(Node):  # type: ignore[misc]
         self._stamped = with_info and not self.get_parameter('use_sim_time').value
         self._missed: dict[str, MissedMessages] = {}
         self._reported: Counter[str] = Counter()
+        self._lost_before: Counter[str] = Counter()
         self._end: int | None = None
         self._drain_deadline = self._last_added = 0.0
         self.messages = 0
@@ -97,17 +104,23 @@ class Recorder(Node):  # type: ignore[misc]
 
     def discover(self) -> None:
         """Subscribe to new topics, and query parameters of new nodes; to be called often."""
-        for topic, types in self.get_topic_names_and_types():
+        for topic, _ in self.get_topic_names_and_types():
             if not self._wants(topic) or topic in self._refused:
                 continue
-            publishers = self.get_publishers_info_by_topic(topic)
+            try:
+                publishers = self.get_publishers_info_by_topic(topic)
+            except (ValueError, NameValidationException) as error:
+                # A DDS application without ROS can use any name.
+                self._refuse(topic, reason(error))
+                continue
             if not publishers:
                 continue
             if topic not in self._channels:
-                self._subscribe(topic, types, publishers)
+                self._subscribe(topic, publishers)
             else:
                 self._note_profiles(self._channels[topic], publishers)
                 self._note_types(self._channels[topic], publishers)
+                self._match(self._channels[topic], publishers)
             for publisher in publishers:
                 self._ask_for_parameters(publisher.node_namespace, publisher.node_name)
         for query in self._queries.values():
@@ -151,9 +164,12 @@ class Recorder(Node):  # type: ignore[misc]
             return True
         return self._pattern is not None and self._pattern.search(topic) is not None
 
-    def _subscribe(self, topic: str, types: list[str], publishers: list[Any]) -> None:
+    def _subscribe(self, topic: str, publishers: list[Any]) -> None:
+        types = sorted({one.topic_type for one in publishers})
         if len(types) > 1:
-            self._refuse(topic, f'it has several types: {", ".join(types)}')
+            why = f'it has several types: {", ".join(types)}'
+            self._refuse(topic, why)
+            self._sink.set_left_out(topic, why)
             return
         try:
             described = definition(types[0])
@@ -173,18 +189,49 @@ class Recorder(Node):  # type: ignore[misc]
         self._channels[topic] = channel
         self._missed[topic] = MissedMessages(partial(self.count_publishers, topic))
         self._sink.add(channel)
-        try:
-            self._create_subscription(channel, message, profile)
-        except (RuntimeError, NameValidationException) as error:
-            self._refuse(topic, reason(error))
+        self._create_subscription(channel, message, profile)
+
+    def _match(self, channel: Channel, publishers: list[Any]) -> None:
+        """Replace a subscription that is too strict for one of the publishers.
+
+        Messages that are sent until the new subscription is matched are missed, and counted with
+        `with_info`.
+        """
+        before = self._subscriptions_by_topic[channel.topic]
+        offered = [one.qos_profile for one in publishers if one.topic_type == channel.type_name]
+        if all(
+            qos_check_compatible(one, before.qos_profile)[0] != QoSCompatibility.ERROR for one in offered
+        ):
+            return
+        profile = subscription_profile([*offered, before.qos_profile], DEPTH)
+        # Latched messages are already recorded.
+        profile.durability = DurabilityPolicy.VOLATILE
+        for data, info in waiting_messages(before):
+            self._take(channel, data, info)
+        self.destroy_subscription(before)
+        self._lost_before[channel.topic] = self._reported[channel.topic]
+        self._create_subscription(channel, before.msg_type, profile)
+
+    def _take(self, channel: Channel, data: bytes, info: dict[str, int]) -> None:
+        if self._with_info:
+            self._takers[channel.topic](data, info)
+        else:
+            self._on_message(channel.id, data)
 
     def _create_subscription(self, channel: Channel, message: Any, profile: QoSProfile) -> None:
+        try:
+            subscription = self._new_subscription(channel, message, profile)
+        except (RuntimeError, NameValidationException) as error:
+            self._refuse(channel.topic, reason(error))
+            return
+        self._subscriptions_by_topic[channel.topic] = subscription
+
+    def _new_subscription(self, channel: Channel, message: Any, profile: QoSProfile) -> Subscription:
         topic = channel.topic
         if not self._with_info:
-            self.create_subscription(
+            return self.create_subscription(
                 message, topic, partial(self._on_message, channel.id), profile, raw=True
             )
-            return
         self._takers[topic] = partial(self._record, channel.id, self._missed[topic])
         callback = partial(self._on_informed, topic)
         # rclpy passes message info to a callable with two arguments.
@@ -193,14 +240,14 @@ class Recorder(Node):  # type: ignore[misc]
         latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         on_lost = None if latched else partial(self._on_lost, topic)
         try:
-            subscription = create(event_callbacks=SubscriptionEventCallbacks(message_lost=on_lost))
+            return create(event_callbacks=SubscriptionEventCallbacks(message_lost=on_lost))
         except UnsupportedEventTypeError:
-            subscription = create()
-        self._subscriptions_by_topic[topic] = subscription
+            return create()
 
     def _refuse(self, topic: str, why: str) -> None:
         self._refused.add(topic)
-        self.get_logger().error(f'{topic} is not recorded: {why}')
+        # Other processes choose the names.
+        self.get_logger().error(printable(f'{topic} is not recorded: {why}', MAX_REPORT))
 
     def _note_profiles(self, channel: Channel, publishers: list[Any]) -> None:
         profiles = _profiles(publishers)
@@ -213,7 +260,9 @@ class Recorder(Node):  # type: ignore[misc]
     def _note_types(self, channel: Channel, publishers: list[Any]) -> None:
         for other in {one.topic_type for one in publishers} - {channel.type_name}:
             if (mismatch := f'{channel.topic} of {other}') not in self._refused:
-                self._refuse(mismatch, f'{channel.topic} is recorded as {channel.type_name}')
+                why = f'{channel.topic} is recorded as {channel.type_name}'
+                self._refuse(mismatch, why)
+                self._sink.set_left_out(mismatch, why)
 
     # --- Messages
 
@@ -242,7 +291,7 @@ class Recorder(Node):  # type: ignore[misc]
         self._add(channel, info['received_timestamp'] if self._stamped else self._now(), data)
 
     def _on_lost(self, topic: str, event: Any) -> None:
-        self._reported[topic] = event.total_count
+        self._reported[topic] = self._lost_before[topic] + event.total_count
 
     def _now(self) -> int:
         # A bag cannot contain a negative time.

@@ -9,10 +9,12 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from diffdrive_jacobian import __version__
 from diffdrive_jacobian.bags.bag_writer import Summary, build_bag, check_target
 from diffdrive_jacobian.bags.journal import (
+    LEFT_OUT,
     LOST,
     Channel,
     JournalWriter,
@@ -24,6 +26,10 @@ from diffdrive_jacobian.bags.journal import (
 )
 from diffdrive_jacobian.plots.output_files import names_by_time
 from diffdrive_jacobian.recording.journal_thread import CAPACITY, JournalThread
+from diffdrive_jacobian.text import printable
+
+MAX_REASON = 500
+"""Largest length of the report on a topic that was left out (characters)."""
 
 
 class RecordingError(Exception):
@@ -76,7 +82,8 @@ class Recording:
         self._added: Counter[int] = Counter()
         self._dropped: Counter[int] = Counter()
         self._missed: dict[str, int] = {}
-        self._noted: dict[str, int] = {}
+        self._left_out: dict[str, str] = {}
+        self._noted: list[Text] = []
         self._open = True
         self.journal.add(Text('recorder', f'diffdrive_jacobian {__version__}'))
         self.journal.add(Text('storage', storage))
@@ -130,6 +137,10 @@ class Recording:
         """Set the number of messages of a topic that are known to be missed so far."""
         self._missed[topic] = messages
 
+    def set_left_out(self, topic: str, why: str) -> None:
+        """Note that a topic, or its publishers of one type, are not recorded. `finish` raises it."""
+        self._left_out[topic] = why
+
     def finish(self) -> Summary:
         """Write the bag, read it back, and remove the journal.
 
@@ -169,7 +180,7 @@ class Recording:
                 summary,
             )
         journal.unlink()
-        if summary.lost:
+        if summary.lost or self._left_out:
             raise RecordingError(self._describe_losses(), summary)
         return summary
 
@@ -184,14 +195,20 @@ class Recording:
 
     def _records(self) -> Iterator[Record]:
         yield from read_journal(self.journal.path)
-        if lost := self.lost:
-            yield Text(LOST, json.dumps(lost))
+        yield from self._notes()
+
+    def _notes(self) -> list[Text]:
+        """Return the losses so far as entries of the custom data."""
+        notes: dict[str, dict[str, Any]] = {LOST: self.lost, LEFT_OUT: dict(self._left_out)}
+        return [Text(key, json.dumps(note)) for key, note in notes.items() if note]
 
     def _note_losses(self) -> None:
         """Write the losses so far into the journal, for recover_run."""
-        if (lost := self.lost) != self._noted:
-            self._noted = lost
-            self.journal.add(Text(LOST, json.dumps(lost)))
+        notes = self._notes()
+        for note in notes:
+            if note not in self._noted:
+                self.journal.add(note)
+        self._noted = notes
 
     def _count_unwritten(self) -> None:
         """Count messages that were queued, but could not be written, as dropped."""
@@ -208,7 +225,12 @@ class Recording:
         if missed := sum(self._missed.values()):
             causes.append(f'{missed} were not received by the recorder')
         topics = ', '.join(f'{topic} {number}' for topic, number in self.lost.items())
-        return f'messages are lost: {"; ".join(causes)} ({topics})'
+        parts = [f'messages are lost: {"; ".join(causes)} ({topics})'] if causes else []
+        parts += [
+            printable(f'{topic} was not recorded: {why}', MAX_REASON)
+            for topic, why in sorted(self._left_out.items())
+        ]
+        return '; '.join(parts)
 
     def _raise_gone(self) -> None:
         journal = self.journal.path

@@ -15,6 +15,7 @@ from diffdrive_jacobian.bags.bag_writer import Summary, build_bag
 from diffdrive_jacobian.bags.files import NotABagError as NotABagError
 from diffdrive_jacobian.bags.journal import (
     JOURNAL,
+    LEFT_OUT,
     LOST,
     Channel,
     Message,
@@ -117,7 +118,7 @@ def recover(
             summary=summary,
             damaged=damaged,
             lost=lost,
-            lost_before=_lost_before(survey.lost),
+            lost_before=_lost_before(survey.notes),
             topics_left_out=left_out,
             undecodable=undecodable,
         )
@@ -129,8 +130,8 @@ class _Survey:
     def __init__(self, records: Iterable[Record]) -> None:
         self.kinds: Counter[type[Record]] = Counter()
         self.decoding = DecodingCheck()
-        self.lost = ''
-        """The custom data of the key `LOST`."""
+        self.notes: dict[str, str] = {}
+        """The custom data of the keys `LOST` and `LEFT_OUT`."""
         channels: dict[int, Channel] = {}
         for record in records:
             self.kinds[type(record)] += 1
@@ -138,25 +139,32 @@ class _Survey:
                 channels[record.id] = record
             elif isinstance(record, Message):
                 self.decoding.add(channels[record.channel], record.data)
-            elif isinstance(record, Text) and record.key == LOST:
-                self.lost = record.value
+            elif isinstance(record, Text) and record.key in (LOST, LEFT_OUT):
+                self.notes[record.key] = record.value
 
 
-def _lost_before(text: str) -> tuple[str, ...]:
+def _lost_before(notes: dict[str, str]) -> tuple[str, ...]:
     """Return descriptions of the losses that a recorder has noted in the custom data."""
-    if not text:
-        return ()
-    try:
-        counts = json.loads(text)
-    except (ValueError, RecursionError):
-        counts = None
-    if not isinstance(counts, dict):
-        return (f'the recorder noted losses: {printable(text)}',)
-    return tuple(
-        f'{printable(count)} messages on {printable(topic)} while it was recorded'
-        for topic, count in sorted(counts.items())
-        if count
-    )
+    described: list[str] = []
+    for key, text in sorted(notes.items()):
+        try:
+            losses = json.loads(text)
+        except (ValueError, RecursionError):
+            losses = None
+        if not isinstance(losses, dict):
+            described.append(f'the recorder noted losses: {printable(text)}')
+        elif key == LEFT_OUT:
+            described += [
+                f'{printable(topic)} was not recorded: {printable(why)}'
+                for topic, why in sorted(losses.items())
+            ]
+        else:
+            described += [
+                f'{printable(count)} messages on {printable(topic)} while it was recorded'
+                for topic, count in sorted(losses.items())
+                if count
+            ]
+    return tuple(described)
 
 
 def _default_target(what: Path, kind: str) -> Path:
