@@ -84,13 +84,14 @@ def message(data: bytes, stamp: int = 1, channel: int = 1) -> bytes:
     return record(5, struct.pack('<HIQQ', channel, 0, stamp, stamp) + data)
 
 
-def mcap(body: bytes, chunks: tuple[tuple[int, int, str, int, int], ...] = ()) -> bytes:
+def mcap(body: bytes, chunks: tuple[tuple[int, int, str, int, int], ...] = (), *, end: int = 1) -> bytes:
     """Return an MCAP file.
 
     Args:
         body: Its records.
         chunks: For the index: offset in `body`, length, compression, packed size, claimed size. Without
             them the file has no summary, and readers scan it.
+        end: Time of the last message of each chunk, for the index (ns); that of the first is 1.
     """
     head = MCAP_MAGIC + record(1, text('ros2') + text('test'))
     data = head + body + record(15, bytes(4))
@@ -103,7 +104,7 @@ def mcap(body: bytes, chunks: tuple[tuple[int, int, str, int, int], ...] = ()) -
             # One message of channel 1 is promised by an index of 16 bytes behind the chunk.
             data += record(
                 8,
-                struct.pack('<QQQQ', 1, 1, at, length)
+                struct.pack('<QQQQ', 1, end, at, length)
                 + text(struct.pack('<HQ', 1, at + length))
                 + struct.pack('<Q', 31)
                 + text(compression)
@@ -112,7 +113,9 @@ def mcap(body: bytes, chunks: tuple[tuple[int, int, str, int, int], ...] = ()) -
     return data + record(2, struct.pack('<QQI', start, 0, 0)) + MCAP_MAGIC
 
 
-def chunk_bomb(compression: str, packed: bytes, size: int, *, indexed: bool, times: int = 1) -> bytes:
+def chunk_bomb(
+    compression: str, packed: bytes, size: int, *, indexed: bool, times: int = 1, end: int = 1
+) -> bytes:
     """Return an MCAP file whose chunks unpack to zeros."""
     one = chunk(compression, packed, size)
     first = topic_records()
@@ -120,7 +123,7 @@ def chunk_bomb(compression: str, packed: bytes, size: int, *, indexed: bool, tim
         (len(first) + number * len(one), len(one), compression, len(packed), size)
         for number in range(times)
     ]
-    return mcap(first + one * times, tuple(entry) if indexed else ())
+    return mcap(first + one * times, tuple(entry) if indexed else (), end=end)
 
 
 def write_folder(

@@ -22,6 +22,7 @@ from diffdrive_jacobian.bags.journal import (
     journal_of,
     read_journal,
 )
+from diffdrive_jacobian.bags.limits import MAX_MESSAGE
 from diffdrive_jacobian.plots.output_files import names_by_time
 from diffdrive_jacobian.recording.journal_thread import CAPACITY, JournalThread
 
@@ -75,6 +76,7 @@ class Recording:
         self._channels: dict[int, str] = {}
         self._added: Counter[int] = Counter()
         self._dropped: Counter[int] = Counter()
+        self._too_large: Counter[int] = Counter()
         self._missed: dict[str, int] = {}
         self._noted: dict[str, int] = {}
         self._open = True
@@ -112,8 +114,9 @@ class Recording:
     def lost(self) -> dict[str, int]:
         """Number of messages known to be lost so far, by topic."""
         lost = Counter(dict(self._missed))
-        for channel, dropped in list(self._dropped.items()):
-            lost[self._channels[channel]] += dropped
+        for counts in (self._dropped, self._too_large):
+            for channel, number in list(counts.items()):
+                lost[self._channels[channel]] += number
         return {topic: number for topic, number in sorted(lost.items()) if number}
 
     def add(self, record: Record) -> None:
@@ -124,7 +127,9 @@ class Recording:
             self._channels[record.id] = record.topic
         added = self._thread.add(record)
         if isinstance(record, Message):
-            (self._added if added else self._dropped)[record.channel] += 1
+            # Messages that are too large for a bag stay in the journal.
+            kept = self._too_large if len(record.data) > MAX_MESSAGE else self._added
+            (kept if added else self._dropped)[record.channel] += 1
 
     def set_missed(self, topic: str, messages: int) -> None:
         """Set the number of messages of a topic that are known to be missed so far."""
@@ -168,6 +173,12 @@ class Recording:
                 f'{summary.messages}. The journal {journal} is kept',
                 summary,
             )
+        if summary.left_out:
+            raise RecordingError(
+                f'{self.bag} does not contain all that was recorded: {"; ".join(summary.left_out)}. '
+                f'The journal {journal} is kept',
+                summary,
+            )
         journal.unlink()
         if summary.lost:
             raise RecordingError(self._describe_losses(), summary)
@@ -199,7 +210,8 @@ class Recording:
             return
         records = read_journal(self.journal.path)
         written = Counter(record.channel for record in records if isinstance(record, Message))
-        self._dropped += self._added - written
+        self._dropped += self._added + self._too_large - written
+        self._too_large &= written
 
     def _describe_losses(self) -> str:
         causes = []
