@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import sqlite3
+import stat
 import threading
 import time
 from dataclasses import replace
@@ -449,3 +450,34 @@ def test_more_than_the_readers_unpack_at_once_can_be_recorded_at_one_time(
     with open_bag(tmp_path / 'run') as reader:
         found = [data for _, _, data in bag_reader.messages(reader, reader.connections)]
     assert found == [one.data for one in records]
+
+
+# --- File systems that lack something
+
+
+def test_a_directory_that_cannot_be_synchronized_does_not_matter(tmp_path, monkeypatch):
+    fsync = os.fsync
+
+    def refuse_directories(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, 'fsync', refuse_directories)
+    recording = Recording(tmp_path / 'run', 'mcap')
+    add_all(recording, channel(), *messages(3))
+    assert recording.finish().messages == 3
+    assert os.listdir(tmp_path) == ['run']
+
+
+@pytest.mark.parametrize('code', [errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP])
+def test_a_file_system_without_locks_is_recorded_to(tmp_path, monkeypatch, code):
+    def refuse(descriptor, operation):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(journal.fcntl, 'flock', refuse)
+    recording = Recording(tmp_path / 'run', 'mcap')
+    add_all(recording, channel(), *messages(3))
+    assert not journal.is_being_written(journal_of(tmp_path / 'run'))
+    assert recording.finish().messages == 3
+    assert os.listdir(tmp_path) == ['run']

@@ -222,9 +222,13 @@ def _contents(path: Path) -> Content:
 
 
 def _sync(path: Path) -> None:
-    """Wait until a file or a directory is on the disk."""
+    """Wait until a file or a directory is on the disk, as far as its file system can."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        # Some network and FUSE file systems cannot do that with directories.
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP) or not path.is_dir():
+            raise
     finally:
         os.close(descriptor)
