@@ -481,3 +481,26 @@ def test_a_file_system_without_locks_is_recorded_to(tmp_path, monkeypatch, code)
     assert not journal.is_being_written(journal_of(tmp_path / 'run'))
     assert recording.finish().messages == 3
     assert os.listdir(tmp_path) == ['run']
+
+
+def nested(folder, length):
+    """Create a directory whose path has this length (bytes)."""
+    while (missing := length - len(os.fsencode(folder)) - 1) > 0:
+        # Not a name that leaves just the separator of the next one.
+        folder = folder / ('d' * (missing if missing <= 100 else 98))
+    folder.mkdir(parents=True)
+    return folder
+
+
+def test_a_path_too_long_for_sqlite_is_refused_before_recording(tmp_path):
+    # Below it: .run.building-xxxxxxxx/run/run.db3
+    longest = 504 - len('/.run.building-xxxxxxxx/run/run.db3')
+    fits = nested(tmp_path / 'fits', longest)
+    recording = Recording(fits / 'run', 'sqlite3')
+    add_all(recording, channel(), *messages(3))
+    assert recording.finish().messages == 3
+    too_long = nested(tmp_path / 'long', longest + 1)
+    with pytest.raises(OSError, match='too long for SQLite: at most 504 bytes, got 505'):
+        Recording(too_long / 'run', 'sqlite3')
+    assert os.listdir(too_long) == []
+    Recording(too_long / 'run', 'mcap').discard()

@@ -29,6 +29,8 @@ from diffdrive_jacobian.bags.storage import BagWriter
 from diffdrive_jacobian.bounded_yaml import MAX_SIZE
 from diffdrive_jacobian.text import format_size, printable
 
+MAX_SQLITE_PATH = 504
+"""Length of the longest resolved path that SQLite opens (bytes)."""
 REMAINDER = 10_000
 """Length of metadata.yaml without its topics and custom data, at most (characters)."""
 _SUM = (1 << 64) - 1
@@ -51,12 +53,16 @@ class Summary:
     """Descriptions of records that are not in the bag because readers would refuse it with them."""
 
 
-def check_target(target: Path) -> None:
+def check_target(target: Path, storage: str) -> None:
     """Check that a bag can have this path, before anything is recorded for it.
+
+    Args:
+        target: The bag's directory.
+        storage: `mcap` or `sqlite3`.
 
     Raises:
         FileExistsError: It exists, possibly as a broken symbolic link.
-        OSError: Its name is not UTF-8, as metadata.yaml must be.
+        OSError: Its name is not UTF-8, as metadata.yaml must be, or its path is too long for SQLite.
     """
     if os.path.lexists(target):
         raise FileExistsError(f'{target} exists already')
@@ -64,6 +70,20 @@ def check_target(target: Path) -> None:
         target.name.encode()
     except UnicodeEncodeError:
         raise OSError(errno.EILSEQ, f'the name of a bag must be UTF-8, got {target.name!a}') from None
+    if storage == 'sqlite3':
+        scratch = target.parent.resolve() / (_scratch_prefix(target) + 8 * 'x')
+        length = len(os.fsencode(scratch / target.name / f'{target.name}.db3'))
+        if length > MAX_SQLITE_PATH:
+            raise OSError(
+                errno.ENAMETOOLONG,
+                f'the path is too long for SQLite: at most {MAX_SQLITE_PATH} bytes, got {length} with '
+                'the directory in which the bag is written',
+            )
+
+
+def _scratch_prefix(target: Path) -> str:
+    """Return the beginning of the name of the directory in which a bag is written."""
+    return f'.{target.name[:40]}.building-'
 
 
 def build_bag(records: Callable[[], Iterable[Record]], target: Path, storage: str) -> Summary:
@@ -80,9 +100,9 @@ def build_bag(records: Callable[[], Iterable[Record]], target: Path, storage: st
         FileExistsError: `target` exists.
         OSError: It cannot be written, or is not read back as it was written. It is removed then.
     """
-    check_target(target)
+    check_target(target, storage)
     channels = {record.id: record for record in records() if isinstance(record, Channel)}
-    scratch = Path(tempfile.mkdtemp(prefix=f'.{target.name[:40]}.building-', dir=target.parent))
+    scratch = Path(tempfile.mkdtemp(prefix=_scratch_prefix(target), dir=target.parent))
     try:
         # The directory has the final name, after which rosbags names the files.
         bag = scratch / target.name
@@ -93,7 +113,7 @@ def build_bag(records: Callable[[], Iterable[Record]], target: Path, storage: st
             _sync(path)
         _sync(bag)
         # Renaming would replace an empty directory that was created meanwhile.
-        check_target(target)
+        check_target(target, storage)
         os.rename(bag, target)
         _sync(target.parent)
     finally:

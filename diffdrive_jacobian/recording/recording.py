@@ -63,7 +63,7 @@ class Recording:
             FileExistsError: The bag or its journal exists.
             OSError: They cannot be written there.
         """
-        check_target(bag)
+        check_target(bag, storage)
         journal = journal_of(bag)
         if journal.exists():
             raise FileExistsError(
