@@ -90,6 +90,7 @@ def mcap(
     *,
     message_index: bool = True,
     statistics: int | None = None,
+    end: int = 1,
 ) -> bytes:
     """Return an MCAP file.
 
@@ -99,6 +100,7 @@ def mcap(
             them the file has no summary, and readers scan it.
         message_index: Whether the index promises an index of messages behind each chunk.
         statistics: Number of messages in the statistics; None: the summary has none.
+        end: Time of the last message of each chunk, for the index (ns); that of the first is 1.
     """
     head = MCAP_MAGIC + record(1, text('ros2') + text('test'))
     data = head + body + record(15, bytes(4))
@@ -111,7 +113,7 @@ def mcap(
             # One message of channel 1 is promised by an index of 16 bytes behind the chunk.
             data += record(
                 8,
-                struct.pack('<QQQQ', 1, 1, at, length)
+                struct.pack('<QQQQ', 1, end, at, length)
                 + text(struct.pack('<HQ', 1, at + length) if message_index else b'')
                 + struct.pack('<Q', 31 if message_index else 0)
                 + text(compression)
@@ -123,7 +125,9 @@ def mcap(
     return data + record(2, struct.pack('<QQI', start, 0, 0)) + MCAP_MAGIC
 
 
-def chunk_bomb(compression: str, packed: bytes, size: int, *, indexed: bool, times: int = 1) -> bytes:
+def chunk_bomb(
+    compression: str, packed: bytes, size: int, *, indexed: bool, times: int = 1, end: int = 1
+) -> bytes:
     """Return an MCAP file whose chunks unpack to zeros."""
     one = chunk(compression, packed, size)
     first = topic_records()
@@ -131,7 +135,7 @@ def chunk_bomb(compression: str, packed: bytes, size: int, *, indexed: bool, tim
         (len(first) + number * len(one), len(one), compression, len(packed), size)
         for number in range(times)
     ]
-    return mcap(first + one * times, tuple(entry) if indexed else ())
+    return mcap(first + one * times, tuple(entry) if indexed else (), end=end)
 
 
 def write_folder(

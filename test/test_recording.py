@@ -7,18 +7,31 @@ import json
 import os
 import shutil
 import sqlite3
+import stat
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from ruamel.yaml import YAML
 
+from diffdrive_jacobian import bounded_yaml
+from diffdrive_jacobian.bags import bag_reader, bounded_reader, journal, limits
 from diffdrive_jacobian.bags import bag_writer as building
-from diffdrive_jacobian.bags import journal
-from diffdrive_jacobian.bags.journal import LEFT_OUT, Channel, Message, Text, journal_of, read_journal
+from diffdrive_jacobian.bags.bag_reader import open_bag
+from diffdrive_jacobian.bags.journal import (
+    LEFT_OUT,
+    PARAMETERS,
+    Channel,
+    Message,
+    Text,
+    journal_of,
+    read_journal,
+)
 from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.bags.storage import BagReader
+from diffdrive_jacobian.recording import recording as recordings
 from diffdrive_jacobian.recording.journal_thread import JournalThread
 from diffdrive_jacobian.recording.recording import LOST, Recording, RecordingError
 from diffdrive_jacobian.signals import Signals
@@ -408,3 +421,122 @@ def test_a_topic_that_is_left_out_is_reported_after_a_crash(tmp_path, capsys):
     recording.discard()
     recover_run([str(tmp_path / 'crashed.journal')], Signals())
     assert 'lost: /odom was not recorded: it has several types' in capsys.readouterr().out
+
+
+# --- What readers would refuse
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_custom_data_that_readers_would_refuse_stays_in_the_journal(
+    tmp_path, monkeypatch, storage, capsys
+):
+    for module in (bounded_yaml, building):
+        monkeypatch.setattr(module, 'MAX_SIZE', 60_000, raising=False)
+    recording = Recording(tmp_path / 'run', storage)
+    large = {
+        f'{PARAMETERS}/robot_{index}': json.dumps({'text': "it's " * 2_000 * (index + 1)})
+        for index in range(4)
+    }
+    add_all(recording, channel(), *messages(3), *(Text(*one) for one in large.items()))
+    with pytest.raises(RecordingError, match=r'robot_3.*too large.*run\.journal is kept') as caught:
+        recording.finish()
+    assert caught.value.summary.messages == 3
+    with open_bag(tmp_path / 'run') as reader:
+        kept = bag_reader.custom_data(reader)
+        assert len(list(bag_reader.messages(reader, reader.connections))) == 3
+    assert kept['storage'] == storage
+    assert f'{PARAMETERS}/robot_0' in kept
+    assert len(large) > sum(key in kept for key in large)
+    arguments = [str(journal_of(tmp_path / 'run')), '-o', str(tmp_path / 'again')]
+    assert recover_run(arguments, Signals()) == 1
+    assert 'robot_3: metadata.yaml would be too large' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_a_message_that_readers_would_refuse_stays_in_the_journal(
+    tmp_path, monkeypatch, storage, capsys
+):
+    for module in (bounded_reader, limits):
+        monkeypatch.setattr(module, 'MAX_RECORD', 5_000_000)
+    for module in (building, recordings):
+        monkeypatch.setattr(module, 'MAX_MESSAGE', 3_000_000, raising=False)
+    recording = Recording(tmp_path / 'run', storage)
+    add_all(recording, channel(), *messages(1), *messages(2, size=6_000_000), *messages(1))
+    with pytest.raises(RecordingError, match=r'/cmd_vel: 2 messages larger than 3\.0 MB') as caught:
+        recording.finish()
+    summary = caught.value.summary
+    assert (summary.messages, summary.lost) == (2, {'/cmd_vel': 2})
+    assert json.loads(custom_data(tmp_path / 'run')[LOST]) == {'/cmd_vel': 2}
+    with open_bag(tmp_path / 'run') as reader:
+        assert len(list(bag_reader.messages(reader, reader.connections))) == 2
+    arguments = [str(journal_of(tmp_path / 'run')), '-o', str(tmp_path / 'again')]
+    assert recover_run(arguments, Signals()) == 1
+    assert '/cmd_vel: 2 messages larger than 3.0 MB' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_more_than_the_readers_unpack_at_once_can_be_recorded_at_one_time(
+    tmp_path, monkeypatch, storage
+):
+    monkeypatch.setattr(bounded_reader, 'MAX_OVERLAP', 4_000_000)
+    recording = Recording(tmp_path / 'run', storage)
+    records = [replace(one, stamp=7) for one in messages(12, size=1_000_000)]
+    add_all(recording, channel(), *records)
+    assert recording.finish().messages == 12
+    with open_bag(tmp_path / 'run') as reader:
+        found = [data for _, _, data in bag_reader.messages(reader, reader.connections)]
+    assert found == [one.data for one in records]
+
+
+# --- File systems that lack something
+
+
+def test_a_directory_that_cannot_be_synchronized_does_not_matter(tmp_path, monkeypatch):
+    fsync = os.fsync
+
+    def refuse_directories(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, 'fsync', refuse_directories)
+    recording = Recording(tmp_path / 'run', 'mcap')
+    add_all(recording, channel(), *messages(3))
+    assert recording.finish().messages == 3
+    assert os.listdir(tmp_path) == ['run']
+
+
+@pytest.mark.parametrize('code', [errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP])
+def test_a_file_system_without_locks_is_recorded_to(tmp_path, monkeypatch, code):
+    def refuse(descriptor, operation):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(journal.fcntl, 'flock', refuse)
+    recording = Recording(tmp_path / 'run', 'mcap')
+    add_all(recording, channel(), *messages(3))
+    assert not journal.is_being_written(journal_of(tmp_path / 'run'))
+    assert recording.finish().messages == 3
+    assert os.listdir(tmp_path) == ['run']
+
+
+def nested(folder, length):
+    """Create a directory whose path has this length (bytes)."""
+    while (missing := length - len(os.fsencode(folder)) - 1) > 0:
+        # Not a name that leaves just the separator of the next one.
+        folder = folder / ('d' * (missing if missing <= 100 else 98))
+    folder.mkdir(parents=True)
+    return folder
+
+
+def test_a_path_too_long_for_sqlite_is_refused_before_recording(tmp_path):
+    # Below it: .run.building-xxxxxxxx/run/run.db3
+    longest = 504 - len('/.run.building-xxxxxxxx/run/run.db3')
+    fits = nested(tmp_path / 'fits', longest)
+    recording = Recording(fits / 'run', 'sqlite3')
+    add_all(recording, channel(), *messages(3))
+    assert recording.finish().messages == 3
+    too_long = nested(tmp_path / 'long', longest + 1)
+    with pytest.raises(OSError, match='too long for SQLite: at most 504 bytes, got 505'):
+        Recording(too_long / 'run', 'sqlite3')
+    assert os.listdir(too_long) == []
+    Recording(too_long / 'run', 'mcap').discard()

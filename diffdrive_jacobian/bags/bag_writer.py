@@ -12,15 +12,27 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from io import StringIO
 from pathlib import Path
 
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.interfaces import Connection, ConnectionExtRosbag2
+from rosbags.rosbag2.metadata import dump_qos_v9
+from ruamel.yaml import YAML
 
+from diffdrive_jacobian.bags.bag_reader import BagError, DamagedBagError, messages, open_bag
 from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
+from diffdrive_jacobian.bags.limits import MAX_MESSAGE
+from diffdrive_jacobian.bags.metadata import ROOT
 from diffdrive_jacobian.bags.qos import to_rosbags
-from diffdrive_jacobian.bags.storage import BagReader, BagWriter
+from diffdrive_jacobian.bags.storage import STORAGES as STORAGES
+from diffdrive_jacobian.bags.storage import BagWriter
+from diffdrive_jacobian.bounded_yaml import MAX_SIZE
+from diffdrive_jacobian.text import format_size, printable
 
-STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
+MAX_SQLITE_PATH = 504
+"""Length of the longest resolved path that SQLite opens (bytes)."""
+REMAINDER = 10_000
+"""Length of metadata.yaml without its topics and custom data, at most (characters)."""
 _SUM = (1 << 64) - 1
 
 
@@ -37,14 +49,20 @@ class Summary:
     """Time of the last message (ns)."""
     lost: dict[str, int] = field(default_factory=dict)
     """Messages that are known to be missing, by topic."""
+    left_out: tuple[str, ...] = ()
+    """Descriptions of records that are not in the bag because readers would refuse it with them."""
 
 
-def check_target(target: Path) -> None:
+def check_target(target: Path, storage: str) -> None:
     """Check that a bag can have this path, before anything is recorded for it.
+
+    Args:
+        target: The bag's directory.
+        storage: `mcap` or `sqlite3`.
 
     Raises:
         FileExistsError: It exists, possibly as a broken symbolic link.
-        OSError: Its name is not UTF-8, as metadata.yaml must be.
+        OSError: Its name is not UTF-8, as metadata.yaml must be, or its path is too long for SQLite.
     """
     if os.path.lexists(target):
         raise FileExistsError(f'{target} exists already')
@@ -52,10 +70,26 @@ def check_target(target: Path) -> None:
         target.name.encode()
     except UnicodeEncodeError:
         raise OSError(errno.EILSEQ, f'the name of a bag must be UTF-8, got {target.name!a}') from None
+    if storage == 'sqlite3':
+        scratch = target.parent.resolve() / (_scratch_prefix(target) + 8 * 'x')
+        length = len(os.fsencode(scratch / target.name / f'{target.name}.db3'))
+        if length > MAX_SQLITE_PATH:
+            raise OSError(
+                errno.ENAMETOOLONG,
+                f'the path is too long for SQLite: at most {MAX_SQLITE_PATH} bytes, got {length} with '
+                'the directory in which the bag is written',
+            )
+
+
+def _scratch_prefix(target: Path) -> str:
+    """Return the beginning of the name of the directory in which a bag is written."""
+    return f'.{target.name[:40]}.building-'
 
 
 def build_bag(records: Callable[[], Iterable[Record]], target: Path, storage: str) -> Summary:
-    """Write records to a new bag, and give it its name after it was read back.
+    """Write records to a new bag, and give it its name after it was read back as readers do.
+
+    Messages and custom data that exceed the limits of the readers are left out.
 
     Args:
         records: Returns all records, with each call from the beginning.
@@ -66,9 +100,9 @@ def build_bag(records: Callable[[], Iterable[Record]], target: Path, storage: st
         FileExistsError: `target` exists.
         OSError: It cannot be written, or is not read back as it was written. It is removed then.
     """
-    check_target(target)
+    check_target(target, storage)
     channels = {record.id: record for record in records() if isinstance(record, Channel)}
-    scratch = Path(tempfile.mkdtemp(prefix=f'.{target.name[:40]}.building-', dir=target.parent))
+    scratch = Path(tempfile.mkdtemp(prefix=_scratch_prefix(target), dir=target.parent))
     try:
         # The directory has the final name, after which rosbags names the files.
         bag = scratch / target.name
@@ -79,7 +113,7 @@ def build_bag(records: Callable[[], Iterable[Record]], target: Path, storage: st
             _sync(path)
         _sync(bag)
         # Renaming would replace an empty directory that was created meanwhile.
-        check_target(target)
+        check_target(target, storage)
         os.rename(bag, target)
         _sync(target.parent)
     finally:
@@ -118,14 +152,21 @@ def _write(
             for channel in channels.values()
         }
         start = end = None
+        texts: dict[str, str] = {}
+        too_large: Counter[str] = Counter()
         for record in records:
             if isinstance(record, Text):
-                writer.set_custom_data(record.key, record.value)
+                texts[record.key] = record.value
+            elif isinstance(record, Message) and len(record.data) > MAX_MESSAGE:
+                too_large[channels[record.channel].topic] += 1
             elif isinstance(record, Message):
                 writer.write(connections[record.channel], record.stamp, record.data)
                 content.add(channels[record.channel].topic, record.stamp, record.data)
                 start = record.stamp if start is None else min(start, record.stamp)
                 end = record.stamp if end is None else max(end, record.stamp)
+        unwritten = _too_large(texts, writer.connections)
+        for key in texts.keys() - unwritten:
+            writer.set_custom_data(key, texts[key])
         writer.close()
     except BaseException as error:
         with suppress(Exception):
@@ -135,33 +176,79 @@ def _write(
             raise OSError(errno.EIO, str(error)) from error
         raise
     topics = {channel.topic: content.counts[channel.topic] for channel in channels.values()}
-    return Summary(messages=sum(topics.values()), topics=topics, start=start, end=end), content
+    left_out = [
+        f'{printable(topic)}: {number} messages larger than {format_size(MAX_MESSAGE)}'
+        for topic, number in sorted(too_large.items())
+    ]
+    left_out += [f'{printable(key)}: metadata.yaml would be too large' for key in unwritten]
+    summary = Summary(
+        messages=sum(topics.values()), topics=topics, start=start, end=end, left_out=tuple(left_out)
+    )
+    return summary, content
+
+
+def _too_large(texts: dict[str, str], connections: Iterable[Connection]) -> list[str]:
+    """Return the keys of the largest custom data, without which readers accept metadata.yaml."""
+    topics = [
+        {
+            'topic_metadata': {
+                'name': one.topic,
+                'type': one.msgtype,
+                'serialization_format': one.ext.serialization_format,
+                'offered_qos_profiles': dump_qos_v9(one.ext.offered_qos_profiles),
+                'type_description_hash': one.digest,
+            },
+            'message_count': 2**63 - 1,
+        }
+        for one in connections
+        if isinstance(one.ext, ConnectionExtRosbag2)
+    ]
+    sizes = {key: _yaml_size({key: value}) for key, value in texts.items()}
+    excess = REMAINDER + _yaml_size(topics) + sum(sizes.values()) - MAX_SIZE
+    largest = []
+    for key in sorted(sizes, key=sizes.__getitem__, reverse=True):
+        if excess <= 0:
+            break
+        largest.append(key)
+        excess -= sizes[key]
+    return largest
+
+
+def _yaml_size(content: object) -> int:
+    """Return the length of a value at its place in metadata.yaml (characters)."""
+    stream = StringIO()
+    yaml = YAML(typ='safe')
+    yaml.default_flow_style = False
+    yaml.dump({ROOT: {'custom_data': content}}, stream)
+    return len(stream.getvalue())
 
 
 def _contents(path: Path) -> Content:
-    """Read a whole bag.
+    """Read a whole bag with the limits of all readers.
 
     Raises:
         OSError: It cannot be read.
     """
     content = Content()
-    reader = BagReader(path)
     try:
-        reader.open()
-        try:
-            for connection, stamp, data in reader.messages(reader.connections):
+        with open_bag(path) as reader:
+            for connection, stamp, data in messages(reader, reader.connections):
                 content.add(connection.topic, stamp, data)
-        finally:
-            reader.close()
-    except Exception as error:  # whatever the parsers of a wrong file raise
-        raise OSError(errno.EIO, f'it cannot be read back: {error!r}') from error
+    except BagError as error:
+        # The whole message would name a directory that is removed.
+        why = error.why if isinstance(error, DamagedBagError) else str(error.__cause__ or error)
+        raise OSError(errno.EIO, f'it cannot be read back: {why}') from error
     return content
 
 
 def _sync(path: Path) -> None:
-    """Wait until a file or a directory is on the disk."""
+    """Wait until a file or a directory is on the disk, as far as its file system can."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        # Some network and FUSE file systems cannot do that with directories.
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP) or not path.is_dir():
+            raise
     finally:
         os.close(descriptor)

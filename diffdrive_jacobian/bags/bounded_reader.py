@@ -6,9 +6,11 @@ The classes here check before it does so.
 
 from __future__ import annotations
 
+import heapq
 import io
-from collections.abc import Collection, Generator, Mapping
+from collections.abc import Collection, Generator, Iterator, Mapping
 from contextlib import suppress
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -105,17 +107,63 @@ class _McapReader(McapReader):
             check_record(chunk.uncompressed_size, 'a chunk')
             check_record(chunk.compressed_size, 'a chunk')
             self._budget.spend(chunk.uncompressed_size)
-        # rosbags unpacks all chunks whose times overlap before it yields their messages.
-        ends = ((one.message_end_time, 1, -one.uncompressed_size) for one in self.chunks)
-        starts = ((one.message_start_time, 0, one.uncompressed_size) for one in self.chunks)
+        # `messages` holds all chunks unpacked whose times overlap, but one after the other of those that
+        # only have the same time.
+        changes = []
+        for chunk in self.chunks:
+            place, size = chunk.chunk_start_offset, chunk.uncompressed_size
+            changes.append((chunk.message_start_time, place, 0, size))
+            changes.append((chunk.message_end_time, place, 1, -size))
         unpacked = 0
-        for _, _, change in sorted([*starts, *ends]):
+        for *_, change in sorted(changes):
             unpacked += change
             if unpacked > MAX_OVERLAP:
                 raise TooLargeError(
                     'its chunks overlap in time and unpack to more than '
                     f'{format_size(MAX_OVERLAP)} at once'
                 )
+
+    def messages(
+        self,
+        connections: Collection[Connection],
+        start: int | None = None,
+        stop: int | None = None,
+    ) -> Messages:
+        if not self.chunks:
+            yield from super().messages(connections, start, stop)
+            return
+        channels = {connection.id: connection for connection in connections}
+        sources = [
+            self._chunk_messages(chunk, channels, start, stop)
+            for chunk in self.chunks
+            if (start is None or start <= chunk.message_end_time)
+            and (stop is None or chunk.message_start_time < stop)
+            and any(chunk.channel_count.get(channel, 0) for channel in channels)
+        ]
+        for stamp, _, connection, data in heapq.merge(*sources, key=itemgetter(0, 1)):
+            if connection is not None:
+                yield connection, stamp, data
+
+    def _chunk_messages(
+        self, chunk: Any, channels: dict[int, Connection], start: int | None, stop: int | None
+    ) -> Iterator[tuple[int, int, Connection | None, Any]]:
+        """Yield a marker, then the messages of a chunk: time, place of the chunk, topic, data.
+
+        The markers of rosbags precede all messages of the same time, so that it unpacks all chunks with
+        that time at once.
+        """
+        assert self.bio is not None
+        first, last = chunk.message_start_time, chunk.message_end_time
+        source = storage_mcap.msgsrc(
+            chunk,
+            channels,
+            first if start is None else start,
+            last + 1 if stop is None else stop,
+            self.bio,
+        )
+        next(source)
+        yield first, chunk.chunk_start_offset, None, None
+        yield from source
 
     def meta_scan(self) -> None:
         if not self.chunks:

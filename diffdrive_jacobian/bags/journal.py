@@ -107,8 +107,9 @@ class JournalWriter:
         self.path = path
         # Unbuffered: the buffer of `open` would raise again when it is closed after a failed write.
         self._file = open(path, 'x+b', buffering=0)  # noqa: SIM115
-        # The lock ends with the process, also if that is killed.
-        fcntl.flock(self._file, fcntl.LOCK_EX)
+        # The lock ends with the process, also if that is killed. Some file systems have no locks.
+        with suppress(OSError):
+            fcntl.flock(self._file, fcntl.LOCK_EX)
         self._lock = threading.Lock()
         self._pending = [MAGIC]
         self.waiting = len(MAGIC)
@@ -225,12 +226,15 @@ def _blocks(pieces: list[bytes]) -> Iterator[bytes]:
 
 
 def is_being_written(path: Path) -> bool:
-    """Return whether the process that writes a journal is still running."""
+    """Return whether the process that writes a journal is still running, as far as it has a lock."""
     with open(path, 'rb') as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
             return True
+        except OSError:
+            # The file system has no locks.
+            return False
     return False
 
 

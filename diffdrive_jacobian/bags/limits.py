@@ -22,6 +22,8 @@ else:
 
 MAX_RECORD = 1 << 27
 """Size of the largest message, chunk or other record that is read (bytes, unpacked)."""
+MAX_MESSAGE = MAX_RECORD - (1 << 24)
+"""Size of the largest message that is written (bytes). What is before it in its chunk has the rest."""
 MAX_OVERLAP = 1 << 29
 """Unpacked size of all chunks that are open at the same time (bytes)."""
 FREE = 1 << 28

@@ -16,9 +16,9 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2
 from rosbags.rosbag2 import ReaderError
 from ruamel.yaml.error import YAMLError
 
-from diffdrive_jacobian.bags.bag_writer import STORAGES
 from diffdrive_jacobian.bags.bounded_reader import parse_bounded_qos
 from diffdrive_jacobian.bags.files import NotARegularFileError, check_regular
+from diffdrive_jacobian.bags.storage import STORAGES
 from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, TooLargeError, load_yaml
 from diffdrive_jacobian.text import printable
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from rosbags.rosbag2.reader import ReaderProtocol
     from rosbags.rosbag2.writer import StorageWriter
 
+STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
+
 
 class PathSqlite3Writer(Sqlite3Writer):
     """rosbags' writer, which opens its file by the path and not by a URI."""

@@ -24,6 +24,7 @@ from diffdrive_jacobian.bags.journal import (
     journal_of,
     read_journal,
 )
+from diffdrive_jacobian.bags.limits import MAX_MESSAGE
 from diffdrive_jacobian.plots.output_files import names_by_time
 from diffdrive_jacobian.recording.journal_thread import CAPACITY, JournalThread
 from diffdrive_jacobian.text import printable
@@ -68,7 +69,7 @@ class Recording:
             FileExistsError: The bag or its journal exists.
             OSError: They cannot be written there.
         """
-        check_target(bag)
+        check_target(bag, storage)
         journal = journal_of(bag)
         if journal.exists():
             raise FileExistsError(
@@ -81,6 +82,7 @@ class Recording:
         self._channels: dict[int, str] = {}
         self._added: Counter[int] = Counter()
         self._dropped: Counter[int] = Counter()
+        self._too_large: Counter[int] = Counter()
         self._missed: dict[str, int] = {}
         self._left_out: dict[str, str] = {}
         self._noted: list[Text] = []
@@ -119,8 +121,9 @@ class Recording:
     def lost(self) -> dict[str, int]:
         """Number of messages known to be lost so far, by topic."""
         lost = Counter(dict(self._missed))
-        for channel, dropped in list(self._dropped.items()):
-            lost[self._channels[channel]] += dropped
+        for counts in (self._dropped, self._too_large):
+            for channel, number in list(counts.items()):
+                lost[self._channels[channel]] += number
         return {topic: number for topic, number in sorted(lost.items()) if number}
 
     def add(self, record: Record) -> None:
@@ -131,7 +134,9 @@ class Recording:
             self._channels[record.id] = record.topic
         added = self._thread.add(record)
         if isinstance(record, Message):
-            (self._added if added else self._dropped)[record.channel] += 1
+            # Messages that are too large for a bag stay in the journal.
+            kept = self._too_large if len(record.data) > MAX_MESSAGE else self._added
+            (kept if added else self._dropped)[record.channel] += 1
 
     def set_missed(self, topic: str, messages: int) -> None:
         """Set the number of messages of a topic that are known to be missed so far."""
@@ -179,6 +184,12 @@ class Recording:
                 f'{summary.messages}. The journal {journal} is kept',
                 summary,
             )
+        if summary.left_out:
+            raise RecordingError(
+                f'{self.bag} does not contain all that was recorded: {"; ".join(summary.left_out)}. '
+                f'The journal {journal} is kept',
+                summary,
+            )
         journal.unlink()
         if summary.lost or self._left_out:
             raise RecordingError(self._describe_losses(), summary)
@@ -216,7 +227,8 @@ class Recording:
             return
         records = read_journal(self.journal.path)
         written = Counter(record.channel for record in records if isinstance(record, Message))
-        self._dropped += self._added - written
+        self._dropped += self._added + self._too_large - written
+        self._too_large &= written
 
     def _describe_losses(self) -> str:
         causes = []

@@ -57,7 +57,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             else _cli.FAILED
         )
     print(report(recovery))
-    return _cli.FAILED if recovery.topics_left_out else _cli.DONE
+    return _cli.FAILED if recovery.topics_left_out or recovery.records_left_out else _cli.DONE
 
 
 def report(recovery: Recovery) -> str:
@@ -87,7 +87,8 @@ def _parser() -> argparse.ArgumentParser:
         'full disk has left incomplete, and report what was saved and what was lost. The original is '
         'not changed. Exit code 0: all that could be read is in the new bag; 1: nothing to recover (the '
         'bag is complete, or no message can be read), or the disk is full, or topics were left out '
-        'because their type is unknown; 2: wrong arguments; 130: interrupted.',
+        'because their type is unknown, or records because they are too large; 2: wrong arguments; '
+        '130: interrupted.',
     )
     parser.add_argument(
         'what',
