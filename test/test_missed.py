@@ -45,15 +45,20 @@ def test_a_silent_publisher_hides_one_gap_at_most():
     st.lists(st.tuples(st.integers(0, 3), st.booleans()), max_size=60),
 )
 def test_what_several_publishers_lost_adds_up(starts, events):
-    """Each event is a message of one of them that arrives or not; in the end each is heard again."""
+    """Each event is a message of one of them that arrives or not.
+
+    In the end one message of each arrives, the largest number first: a message that continues the numbers
+    of another publisher would hide a gap, as a silent publisher does.
+    """
     last = [start + 1 for start in starts]
     # The first messages must not continue each other's numbers.
     numbers, lost = sorted(last, reverse=True), 0
-    for publisher, arrives in [*events, *((index, True) for index in range(len(starts)))]:
-        publisher %= len(starts)
+    for event, arrives in events:
+        publisher = event % len(starts)
         last[publisher] += 1
         if arrives:
             numbers.append(last[publisher])
         else:
             lost += 1
+    numbers += sorted((one + 1 for one in last), reverse=True)
     assert missed(numbers, len(starts)) == lost
