@@ -23,7 +23,7 @@ def close(actual, expected, tolerance=1e-14):
     np.testing.assert_allclose(actual, expected, rtol=0.0, atol=tolerance)
 
 
-# --- A: course module 3.2. Its text lost every formula; they follow its prose, its script and MATH.md
+# --- A: course module 3.2. Its text lost every formula; they follow its prose and script
 
 
 def test_a_script_prints_these_numbers():

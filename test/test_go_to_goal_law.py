@@ -100,7 +100,7 @@ def test_the_error_is_wrapped_across_the_cut():
 
 @pytest.mark.parametrize('ratio', [0.3, 0.7, 0.99])
 def test_with_kp_below_kv_the_heading_error_has_a_fixed_point_off_zero(ratio):
-    """`e_dot = Kv sin(e) cos(e) - Kp e` vanishes where sin(2e) / (2e) = Kp / Kv (MATH.md)."""
+    """`e_dot = Kv sin(e) cos(e) - Kp e` vanishes where sin(2e) / (2e) = Kp / Kv (doc/mathematics.md)."""
     low, high = 1e-3, math.pi / 2.0
     for _ in range(100):
         error = (low + high) / 2.0

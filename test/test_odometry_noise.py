@@ -1,4 +1,4 @@
-"""The covariance of odometry: MATH.md's integral along the arc, by quadrature and by noisy wheels."""
+"""The covariance of odometry: the integral along the arc (doc/mathematics.md), by quadrature and by noisy wheels."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ ARCS = [
 
 
 def spectral_density(v, omega, separation=L, k=K):
-    """W of MATH.md: `B diag(k |v_R|, k |v_L|) B^T`, from the rim speeds."""
+    """W: `B diag(k |v_R|, k |v_L|) B^T`, from the rim speeds."""
     B = np.array([[0.5, 0.5], [1.0 / separation, -1.0 / separation]])
     rim_speeds = np.array([v + omega * separation / 2.0, v - omega * separation / 2.0])
     return B @ np.diag(k * np.abs(rim_speeds)) @ B.T
 
 
 def transition(displacement):
-    """Phi of MATH.md for a displacement in the world."""
+    """Phi for a displacement in the world."""
     Phi = np.eye(3)
     Phi[:2, 2] = -displacement[1], displacement[0]
     return Phi
 
 
 def by_quadrature(covariance, pose, twist, duration):
-    """MATH.md's integral, panel by panel: Gauss-Legendre, exact to rounding on arcs of half a radian."""
+    """The integral, panel by panel: Gauss-Legendre, exact to rounding on arcs of half a radian."""
     W = spectral_density(*twist)
     panels = 1 + int(2.0 * abs(twist[1]) * duration)
     edges = np.linspace(0.0, duration, panels + 1)
