@@ -47,8 +47,8 @@ def test_a_silent_publisher_hides_one_gap_at_most():
 def test_what_several_publishers_lost_adds_up(starts, events):
     """Each event is a message of one of them that arrives or not.
 
-    In the end one message of each arrives, the largest number first: a message that continues the numbers
-    of another publisher would hide a gap, as a silent publisher does.
+    In the end one message of each arrives, the largest number first. One that continues the numbers of
+    another publisher would hide a gap, as a silent publisher does.
     """
     last = [start + 1 for start in starts]
     # The first messages must not continue each other's numbers.

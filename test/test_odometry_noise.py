@@ -1,4 +1,4 @@
-"""The covariance of odometry: the integral along the arc (doc/mathematics.md), by quadrature and by noisy wheels."""
+"""The covariance of odometry: the integral along the arc, by quadrature and by noisy wheels."""
 
 from __future__ import annotations
 
