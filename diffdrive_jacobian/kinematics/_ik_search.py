@@ -103,7 +103,7 @@ class Search:
         J = np.zeros((*e.shape, q.shape[-1]))
         still = _Open(which, q.copy(), e, error, J, np.full(len(q), self._first_factor()))
         still = still.keep(np.isfinite(error) & (error > self.tolerance))
-        ended = np.zeros(len(still.which), dtype=np.bool_)
+        ended: Flags = np.zeros(len(still.which), dtype=np.bool_)
         self._differentiate(still, ~ended)
         for count in range(max_iterations):
             J, gradient = self._free(still)

@@ -117,17 +117,18 @@ def _deviation(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[Array,
     """Return each joint's distance from the middle of its range in units of the range, the range, and
     the unit of the latter: 1, or smaller where the range of angles might overflow.
     """
-    q = array('q', q, 'n')
-    lower, upper = (array(name, value) for name, value in (('lower', lower), ('upper', upper)))
-    for name, value in (('lower', lower), ('upper', upper)):
-        if value.shape[-1:] not in ((), q.shape[-1:]):
-            raise ValueError(f'{name} must have shape () or (..., {q.shape[-1]}), got {value.shape}')
-    leading(q=q.shape, lower=lower.shape, upper=upper.shape)
-    if not (upper > lower).all():
-        raise ValueError(f'upper must be above lower for every joint, got {upper} and {lower}')
-    largest = np.maximum(np.abs(q), np.maximum(np.abs(lower), np.abs(upper)))
-    unit = np.where(largest < _LARGE, 1.0, _UNIT)
-    q, lower, upper = q * unit, lower * unit, upper * unit
-    span = upper - lower
+    angles = array('q', q, 'n')
+    low, high = array('lower', lower), array('upper', upper)
+    for name, value in (('lower', low), ('upper', high)):
+        if value.shape[-1:] not in ((), angles.shape[-1:]):
+            allowed = f'() or (..., {angles.shape[-1]})'
+            raise ValueError(f'{name} must have shape {allowed}, got {value.shape}')
+    leading(q=angles.shape, lower=low.shape, upper=high.shape)
+    if not (high > low).all():
+        raise ValueError(f'upper must be above lower for every joint, got {high} and {low}')
+    largest = np.maximum(np.abs(angles), np.maximum(np.abs(low), np.abs(high)))
+    unit: Array = np.where(largest < _LARGE, 1.0, _UNIT)
+    angles, low, high = angles * unit, low * unit, high * unit
+    span = high - low
     with np.errstate(all='ignore'):
-        return (q - (lower + upper) / 2.0) / span, span, unit
+        return (angles - (low + high) / 2.0) / span, span, unit

@@ -132,7 +132,7 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
             f'{omitted} of {len(stamps)} odometry messages precede the start of the simulated robot and '
             'were not compared',
         )
-    difference = np.array(measured) - np.array(poses)
+    difference: NDArray[np.float64] = np.array(measured) - np.array(poses)
     return Verification(
         source=source,
         start=start,
