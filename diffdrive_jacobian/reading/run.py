@@ -53,7 +53,7 @@ class Series:
         columns = ', '.join(self.columns) or f'{self.values.shape[1]} columns'
         text = f'{len(self)} message{"" if len(self) == 1 else "s"} of [{columns}]'
         if len(self):
-            text += f', recorded over {(self.received.max() - self.received.min()) / NANOSECONDS:.3f} s'
+            text += f', recorded over {float(np.ptp(self.received)) / NANOSECONDS:.3f} s'
         return f'Series({text})'
 
 

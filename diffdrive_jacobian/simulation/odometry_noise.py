@@ -157,7 +157,7 @@ def covariance_entries(name: str, covariance: ArrayLike) -> tuple[Any, ...]:
         valid: Any = min(_margins(max(map(abs, rows)), *rows)) >= -ROUNDING
     else:
         largest = np.abs(made).max(axis=(-2, -1), initial=0.0)
-        valid = np.minimum.reduce(_margins(largest, *rows)) >= -ROUNDING
+        valid = np.min(np.stack(_margins(largest, *rows)), axis=0) >= -ROUNDING
     if valid is not True and not np.all(valid):
         index = tuple(np.argwhere(~np.asarray(valid))[0])
         raise ValueError(
