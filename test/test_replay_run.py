@@ -78,7 +78,9 @@ def test_goals_drive_a_new_robot_to_the_same_place(world, bag):
     world.start('go_to_goal')
     told, commands = world.harness.listen(Goals, 'goals'), world.harness.listen(Twist, 'cmd_vel')
     world.until_published('odom', 'cmd_vel')
-    child = world.start('replay_run', str(path), '--goals', '-w', '2')
+    # A reader may find the publisher later than the publisher finds the reader.
+    acked = ('--wait-for-all-acked', '10000')
+    child = world.start('replay_run', str(path), '--goals', '-w', '2', *acked)
     world.harness.until(lambda: commands, 'the controller drives')
     assert told[0].goals[0].pose.position.x == 1.0
     assert child.exit() == 0
