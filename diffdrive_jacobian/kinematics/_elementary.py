@@ -44,7 +44,7 @@ def components(name: str, value: Any, size: int) -> list[Any]:
 
 
 def operand(name: str, value: Any, check: Callable[[str, Any], None] = finite) -> Any:
-    """Let numbers be floats, and everything else a float array.
+    """Convert numbers to floats, and everything else to float arrays.
 
     Raises:
         ValueError: A number does not pass the check, or something is no number.

@@ -110,7 +110,7 @@ class SimulatedTime:
             self._advance(end)
 
     def jump(self, seconds: float) -> None:
-        """Let time jump by a duration (s), forward or back, as when a simulator is reset.
+        """Jump by a duration of time (s), forward or back, as when a simulator is reset.
 
         Timers do not expire one by one in between. rcl determines how they react to the jump.
 

@@ -194,7 +194,7 @@ class Lockstep(SimulatedTime):
         self._on_new.append(callback)
 
     def _refuse_sleep(self, node: Node) -> None:
-        """Let `sleep_until` of a node's clock raise an error within callbacks.
+        """Make `sleep_until` of a node's clock raise an error within callbacks.
 
         The time could not come before the callback returns, and rclpy would wait where no signal handler
         runs.

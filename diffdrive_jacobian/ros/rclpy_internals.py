@@ -150,7 +150,7 @@ def wrap_sleep(clock: Clock, wrap: Callable[[Callable[..., Any]], Callable[..., 
 
 
 def restart_timer(timer: Timer, period: int) -> None:
-    """Let a timer expire one period (ns) from now, also if it was cancelled.
+    """Restart a timer, so that it expires one period (ns) from now, also if it was cancelled.
 
     Relies on `Timer.timer_period_ns` being settable, and on `Timer.reset`, without which the timer would
     still expire at the end of its old period.
