@@ -33,6 +33,8 @@ MAX_SQLITE_PATH = 504
 """Length of the longest resolved path that SQLite opens (bytes)."""
 REMAINDER = 10_000
 """Length of metadata.yaml without its topics and custom data, at most (characters)."""
+ESCAPED = 20
+"""Length in YAML of a character, with its share of indentation, at most."""
 _SUM = (1 << 64) - 1
 
 
@@ -203,6 +205,8 @@ def _too_large(texts: dict[str, str], connections: Iterable[Connection]) -> list
         for one in connections
         if isinstance(one.ext, ConnectionExtRosbag2)
     ]
+    if ESCAPED * (len(str(topics)) + sum(map(len, texts.values()))) + REMAINDER <= MAX_SIZE:
+        return []
     sizes = {key: _yaml_size({key: value}) for key, value in texts.items()}
     excess = REMAINDER + _yaml_size(topics) + sum(sizes.values()) - MAX_SIZE
     largest = []

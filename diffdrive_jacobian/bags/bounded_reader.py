@@ -10,6 +10,7 @@ import heapq
 import io
 from collections.abc import Collection, Generator, Iterator, Mapping
 from contextlib import suppress
+from functools import lru_cache
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,9 @@ from diffdrive_jacobian.text import format_size
 
 Messages = Generator[tuple[Connection, int, bytes], None, None]
 
+MAX_KNOWN = 10_000
+"""Length of texts with profiles whose values are stored (characters)."""
+
 # --- Replacements of functions of rosbags' modules
 
 
@@ -47,11 +51,21 @@ def parse_bounded_qos(profiles: Any) -> list[Qos]:
     Raises:
         TooLargeError: The text, or what its aliases stand for, is too large.
     """
-    if isinstance(profiles, str):
-        with suppress(YAMLError):
-            # rosbags reports invalid YAML itself.
-            check_yaml(profiles)
-    return parse_qos(profiles)
+    if not isinstance(profiles, str):
+        return parse_qos(profiles)
+    parse = _parse_known_text if len(profiles) < MAX_KNOWN else _parse_text
+    return list(parse(profiles))
+
+
+def _parse_text(profiles: str) -> tuple[Qos, ...]:
+    with suppress(YAMLError):
+        # rosbags reports invalid YAML itself.
+        check_yaml(profiles)
+    return tuple(parse_qos(profiles))
+
+
+# Most topics of a bag have the same profiles, and rosbags parses each several times.
+_parse_known_text = lru_cache(maxsize=64)(_parse_text)
 
 
 def _unpack_lz4(data: bytes, size: int) -> bytes:
