@@ -17,7 +17,7 @@ from unittest import mock
 
 from conftest import PATIENCE, Harness
 
-LIMIT = 30.0
+LIMIT = 90.0
 """How long a child may live (s): then it is killed, whatever became of its test."""
 PROGRAM = 'import sys; from diffdrive_jacobian.tools.entry_points import {0}; sys.exit({0}())'
 
