@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from sensor_msgs.msg import JointState
     from std_msgs.msg import Float64MultiArray
 
+from diffdrive_jacobian.messages.errors import MessageError as MessageError
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION as MAX_POSITION
 from diffdrive_jacobian.messages.plausibility import MAX_SPEED as MAX_SPEED
 from diffdrive_jacobian.messages.plausibility import MAX_WHEEL_SPEED as MAX_WHEEL_SPEED
@@ -39,10 +40,6 @@ MAX_WAYPOINTS = 2_000
 # Indices of (x, y, yaw) and of (v, omega) in the row-major 6x6 covariances of ROS.
 _PLANAR = np.array([6 * row + column for row in (0, 1, 5) for column in (0, 1, 5)])
 _FORWARD_AND_YAW = np.array([0, 5, 30, 35])
-
-
-class MessageError(ValueError):
-    """A message with invalid content."""
 
 
 def quoted(texts: Iterable[str], most: int = 4) -> str:
