@@ -80,7 +80,7 @@ def go_to_pose(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any, h: Any = Non
     if (
         type(x) is type(x_goal) is type(Kp) is type(Kv) is float
         and Kp > 0.0 < Kv
-        and (h is None or type(h) is float and h > 0.0)
+        and (h is None or (type(h) is float and h > 0.0))
         and isfinite(Kp + Kv + (h or 0.0))
     ):
         v, omega = _law(x, y, theta, x_goal, y_goal, heading, Kp, Kv, h)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._checks import positive
-from diffdrive_jacobian.kinematics._elementary import agree, cos, matrix, operand, sin, stack
+from diffdrive_jacobian.kinematics._elementary import agree, cos, matrix, operand, sin, vector
 
 AT_GROUND = np.pi
 """The angle phi of the point that touches the ground (rad)."""
@@ -44,7 +44,7 @@ def wheel_contact_position(x: ArrayLike, phi: ArrayLike, r: ArrayLike) -> NDArra
     if not single:
         x, phi, r = operand('x', x), operand('phi', phi), operand('r', r, positive)
         agree(x=x, phi=phi, r=r)
-    return stack(x + r * sin(phi), r + r * cos(phi), 0.0)
+    return vector(x + r * sin(phi), r + r * cos(phi), 0.0)
 
 
 def wheel_contact_jacobian(phi: ArrayLike, r: ArrayLike) -> NDArray[np.float64]:
@@ -79,4 +79,4 @@ def rolling_direction(r: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ValueError: r is not positive and finite.
     """
-    return stack(operand('r', r, positive), 1.0)
+    return vector(operand('r', r, positive), 1.0)

@@ -18,6 +18,7 @@ from __future__ import annotations
 from math import isfinite
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._checks import offset, positive
