@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._adjugate import EPS, refuse_singular
-from diffdrive_jacobian.kinematics._checks import array, leading, positive
+from diffdrive_jacobian.kinematics._checks import array, floats, leading, positive
 from diffdrive_jacobian.kinematics._elementary import (
     agree,
     components,
@@ -86,6 +86,10 @@ class PlanarArm:
         Returns:
             `[x, y, heading]`, shape (..., 3) (m, m, rad), the heading wrapped to (-pi, pi].
         """
+        q = floats('q', q)
+        if q.ndim == 2 and len(q) == 1:
+            # In floats: several times as fast as a batch of one.
+            return self.forward_kinematics(q[0])[np.newaxis]
         return vector(*self._tip(self._directions(q)))
 
     def jacobian(self, q: ArrayLike, heading: bool = False) -> NDArray[np.float64]:
@@ -101,6 +105,9 @@ class PlanarArm:
         Returns:
             The Jacobian, shape (..., 2, n), or (..., 3, n) with a last row of ones for the heading.
         """
+        q = floats('q', q)
+        if q.ndim == 2 and len(q) == 1:
+            return self.jacobian(q[0], heading)[np.newaxis]
         levers = self._levers(self._directions(q))
         entries = [-y for _, y in levers] + [x for x, _ in levers]
         if heading:
