@@ -100,13 +100,18 @@ def executor_kind(request):
 @pytest.fixture
 def ros(request):
     """A harness in a context of its own."""
+    from rclpy.executors import SingleThreadedExecutor
+
     from diffdrive_jacobian.ros.runner import make_executor, ros_context
 
     single = (
         'executor_kind' in request.fixturenames and request.getfixturevalue('executor_kind') == 'single'
     )
     with ros_context(['test']) as context:
-        harness = Harness(context, make_executor(context, isolated=not single))
+        executor = (
+            SingleThreadedExecutor(context=context) if single else make_executor(context, isolated=True)
+        )
+        harness = Harness(context, executor)
         yield harness
         harness.close()
 

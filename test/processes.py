@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from contextlib import ExitStack, contextmanager
@@ -17,20 +16,15 @@ from unittest import mock
 
 from conftest import PATIENCE, Harness
 
+from diffdrive_jacobian.ros.fastdds_profiles import announce_frequently
+
 LIMIT = 90.0
 """How long a child may live (s): then it is killed, whatever became of its test."""
 PROGRAM = 'import sys; from diffdrive_jacobian.tools.entry_points import {0}; sys.exit({0}())'
 
-# Fast DDS announces a participant every 3 s, and who comes later is often found at that pace only.
-# It reads this file once in a process: with the first participant, long after this module is loaded.
-_PROFILE = tempfile.NamedTemporaryFile(mode='w', suffix='.xml')  # noqa: SIM115
-_PROFILE.write("""<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
-  <participant profile_name="quick" is_default_profile="true"><rtps><builtin><discovery_config>
-    <leaseAnnouncement><sec>0</sec><nanosec>100000000</nanosec></leaseAnnouncement>
-  </discovery_config></builtin></rtps></participant>
-</profiles>""")
-_PROFILE.flush()
-os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = _PROFILE.name
+# The harness is found as fast as the children. Fast DDS reads this with the first participant of a
+# process, long after this module is loaded.
+announce_frequently()
 
 _numbers = itertools.count()
 

@@ -6,15 +6,17 @@ If a test fails with a new release of rclpy, the function that it names must cha
 from __future__ import annotations
 
 import ast
+import math
 import sys
 from pathlib import Path
 
 import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.clock import Clock
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile
+from rclpy.qos import HistoryPolicy, QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import String
@@ -277,6 +279,93 @@ def test_events_executor_runs_a_task_after_the_queued_events(ros):
     assert order == ['message', 'task']
     executor.shutdown()
     node.destroy_node()
+
+
+def test_events_executor_releases_nodes_at_shutdown_and_can_be_used_again(ros):
+    executor = internals.events_executor(ros.context)
+    node = Node('released', context=ros.context)
+    received = []
+    node.create_subscription(String, 'words', lambda message: received.append(message.data), 10)
+    publisher = node.create_publisher(String, 'words', 10)
+    single = SingleThreadedExecutor(context=ros.context)
+    for number, current in enumerate((executor, single, executor)):
+        executor.shutdown()
+        publisher.publish(String(data=str(number)))
+        current.add_node(node)
+        while len(received) <= number:
+            current.spin_once(timeout_sec=1.0)
+    assert received == ['0', '1', '2']
+    executor.shutdown()
+    single.shutdown()
+    node.destroy_node()
+
+
+def test_ready_callbacks_are_executed_in_rounds(ros):
+    node = Node('rounds', context=ros.context, start_parameter_services=False)
+    received = []
+    for topic in ('first', 'second'):
+        node.create_subscription(String, topic, lambda message: received.append(message.data), 10)
+    publishers = [node.create_publisher(String, topic, 10) for topic in ('first', 'second')]
+    single = SingleThreadedExecutor(context=ros.context)
+    single.add_node(node)
+    while internals.execute_ready(single):
+        pass
+    for publisher, count in zip(publishers, (2, 1), strict=True):
+        for number in range(count):
+            publisher.publish(String(data=f'{publisher.topic_name}{number}'))
+    rounds = []
+    while not rounds or rounds[-1]:
+        rounds.append(len(received))
+        while internals.execute_ready(single):
+            pass
+        rounds[-1] = len(received) - rounds[-1]
+    assert rounds == [2, 1, 0]
+    assert received[-1] == '/first1'
+    single.shutdown()
+    node.destroy_node()
+
+
+def test_entities_of_a_node_are_counted(ros):
+    node = Node('counted', context=ros.context, start_parameter_services=False)
+    before = internals.entity_count(node)
+    node.create_timer(1.0, lambda: None)
+    node.create_client(GetParameters, 'get')
+    assert internals.entity_count(node) == before + 2
+    node.create_subscription(String, 'words', print, 2000)
+    # With its QoS events.
+    assert internals.entity_count(node) > before + 2
+    assert internals.queue_depth(node) == 2000
+    node.create_subscription(String, 'all', print, QoSProfile(history=HistoryPolicy.KEEP_ALL))
+    assert internals.queue_depth(node) == math.inf
+    node.destroy_node()
+
+
+def test_nodes_that_require_a_wait_set_are_detected(ros):
+    async def wait(message):
+        pass
+
+    def on_message(message):
+        pass
+
+    def with_info(message, info):
+        pass
+
+    for callback, required in ((on_message, False), (with_info, True), (wait, True)):
+        node = Node('detected', context=ros.context)
+        node.create_subscription(String, 'words', callback, 10)
+        assert internals.requires_wait_set(node) == required
+        node.destroy_node()
+
+
+def test_tasks_that_are_not_done_are_detected(ros):
+    single = SingleThreadedExecutor(context=ros.context)
+    assert not internals.has_tasks(single)
+    task = single.create_task(lambda: None)
+    assert internals.has_tasks(single)
+    while not task.done():
+        single.spin_once(timeout_sec=1.0)
+    assert not internals.has_tasks(single)
+    single.shutdown()
 
 
 def test_rclpy_without_the_events_executor_is_detected(ros, monkeypatch):

@@ -119,9 +119,7 @@ def test_offset_leaves_the_beginning_out(world, bag):
     assert twists(commands) == run.cmd_vel.values[-count:].tolist()
 
 
-def test_fast_playback_is_acknowledged_within_a_second(world, bag, monkeypatch):
-    # Not with the heartbeats of a user's profile.
-    monkeypatch.delenv('FASTRTPS_DEFAULT_PROFILES_FILE')
+def test_fast_playback_is_acknowledged_within_a_second(world, bag):
     path, run = bag
     commands = world.harness.listen(Twist, 'cmd_vel')
     child = world.start('replay_run', str(path), '-w', '1', '-r', '20', '--wait-for-all-acked', '1000')

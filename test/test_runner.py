@@ -11,21 +11,29 @@ from rclpy.node import Node
 
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.ros.guarded_executor import GuardedExecutor
 from diffdrive_jacobian.ros.runner import UserError, make_executor, ros_context, running
 
 
-def test_isolated_nodes_have_the_events_executor_and_others_the_single_threaded_one(ros):
+def test_isolated_nodes_have_the_events_executor_and_others_the_guarded_one(ros):
     open_to_all = make_executor(ros.context, isolated=False)
-    assert isinstance(open_to_all, SingleThreadedExecutor)
+    assert isinstance(open_to_all, GuardedExecutor)
     open_to_all.shutdown()
     closed = make_executor(ros.context, isolated=True)
     assert type(closed).__name__ == 'EventsExecutor'
     closed.shutdown()
 
 
-def test_without_the_events_executor_all_have_the_single_threaded_one(ros, monkeypatch):
+def test_callbacks_with_message_info_have_the_single_threaded_executor(ros):
+    executor = make_executor(ros.context, isolated=False, with_info=True)
+    assert isinstance(executor, SingleThreadedExecutor)
+    executor.shutdown()
+
+
+@pytest.mark.parametrize('isolated', [False, True])
+def test_without_the_events_executor_all_have_the_single_threaded_one(ros, monkeypatch, isolated):
     monkeypatch.setitem(sys.modules, 'rclpy.experimental.events_executor', None)
-    executor = make_executor(ros.context, isolated=True)
+    executor = make_executor(ros.context, isolated=isolated)
     assert isinstance(executor, SingleThreadedExecutor)
     executor.shutdown()
 

@@ -131,7 +131,7 @@ def _receive(
 ) -> None:
     with (
         ros_context([NAME, *ros_arguments]) as context,
-        running(context, isolated=False) as runner,
+        running(context, isolated=False, with_info=True) as runner,
     ):
         recorder = runner.add(lambda: Recorder(selection, recording, with_info=True, context=context))
         discovered = -DISCOVERY_PERIOD

@@ -21,7 +21,7 @@ from typing import Protocol
 from diffdrive_jacobian.reading.reader import open_bag
 from diffdrive_jacobian.replay.playback import NODE, Playback
 from diffdrive_jacobian.replay.replayer import Replayer
-from diffdrive_jacobian.ros.heartbeats import fast_heartbeats
+from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
 from diffdrive_jacobian.ros.node_runner import NodeRunner
 from diffdrive_jacobian.ros.runner import ros_context, running
 from diffdrive_jacobian.signals import Signals

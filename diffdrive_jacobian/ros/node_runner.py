@@ -15,6 +15,7 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError
 
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import ParameterError
+from diffdrive_jacobian.ros.fastdds_profiles import withdraw
 from diffdrive_jacobian.ros.node import ParameterizedNode
 from diffdrive_jacobian.ros.parameters import report_unknown
 from diffdrive_jacobian.ros.rclpy_internals import RCLError, reason
@@ -53,6 +54,7 @@ class NodeRunner(ABC):
             UserError: The user gave an invalid name, parameter or quality of service.
         """
         node = created(create)
+        withdraw()
         self._nodes.append(node)
         self._add(node)
         return node

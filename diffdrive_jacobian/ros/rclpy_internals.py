@@ -9,6 +9,8 @@ each, so that a release of rclpy that differs fails there first. Tried with rclp
 
 from __future__ import annotations
 
+import inspect
+import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import redirect_stderr
@@ -17,11 +19,12 @@ from typing import Any, Protocol
 from rclpy.client import Client
 from rclpy.clock import Clock
 from rclpy.context import Context
-from rclpy.executors import Executor
+from rclpy.executors import Executor, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
+from rclpy.qos import HistoryPolicy, qos_profile_default
 from rclpy.subscription import Subscription
 from rclpy.task import Task
 from rclpy.timer import Timer
@@ -230,7 +233,8 @@ def events_executor(context: Context) -> Executor | None:
     """Return a new EventsExecutor. None: this rclpy has none.
 
     Relies on `rclpy.experimental.events_executor.EventsExecutor`. Its `spin_once` handles one event. A
-    task that is created with `create_task` runs after all events that were queued before.
+    task that is created with `create_task` runs after all events that were queued before. `shutdown`
+    releases the nodes at once, and afterwards it can be used again.
     """
     try:
         from rclpy.experimental.events_executor import EventsExecutor
@@ -239,6 +243,71 @@ def events_executor(context: Context) -> Executor | None:
     # It enables the faulthandler, for which sys.stderr must be a file. In some tests it is not.
     with redirect_stderr(sys.__stderr__):
         return EventsExecutor(context=context)
+
+
+def entity_count(node: Node) -> int:
+    """Return the number of timers, subscriptions, services, clients and waitables of a node."""
+    lists = (node.timers, node.subscriptions, node.services, node.clients, node.waitables)
+    return sum(len(list(entities)) for entities in lists)
+
+
+def queue_depth(node: Node) -> float:
+    """Return the number of messages in the longest queue of a node (inf: it has no limit).
+
+    Queues inside waitables, such as those of actions, are taken to have the default depth of rclpy.
+    """
+    depths = [
+        math.inf if profile.history == HistoryPolicy.KEEP_ALL else profile.depth
+        for profile in (
+            entity.qos_profile for entity in (*node.subscriptions, *node.services, *node.clients)
+        )
+    ]
+    return float(max([*depths, qos_profile_default.depth]))
+
+
+def requires_wait_set(node: Node) -> bool:
+    """Return whether a node has callbacks that the EventsExecutor of Jazzy does not support.
+
+    It passes a message and its info as one argument, does not await coroutines of subscriptions and
+    services, and raises an exception for guard conditions.
+    Relies on `Subscription._callback_type`.
+    """
+    with_info = any(
+        subscription._callback_type is not Subscription.CallbackType.MessageOnly
+        for subscription in node.subscriptions
+    )
+    entities = (*node.subscriptions, *node.services)
+    coroutines = any(inspect.iscoroutinefunction(entity.callback) for entity in entities)
+    return with_info or coroutines or any(True for _ in node.guards)
+
+
+def execute_ready(executor: Executor) -> bool:
+    """Execute the next callback that is ready on a SingleThreadedExecutor, without waiting.
+
+    It goes in rounds. At the beginning of each it looks which entities are ready, and then executes one
+    callback of each of them.
+    Relies on `wait_for_ready_callbacks`, which is documented for executors of users.
+
+    Returns:
+        Whether a callback was executed. False: a round is over.
+    """
+    try:
+        task, *_ = executor.wait_for_ready_callbacks(timeout_sec=0)
+    except TimeoutException:
+        return False
+    task()
+    if (error := task.exception()) is not None:
+        raise error
+    return True
+
+
+def has_tasks(executor: Executor) -> bool:
+    """Return whether a SingleThreadedExecutor has tasks that are not done, such as coroutines that wait.
+
+    It continues those of a node only while it has the node.
+    Relies on `Executor._tasks`.
+    """
+    return any(not (task.done() or task.cancelled()) for task, *_ in list(executor._tasks))
 
 
 def new_task(function: Any, arguments: tuple[Any, ...], keywords: dict[str, Any], executor: Any) -> Task:

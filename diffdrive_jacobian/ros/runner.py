@@ -14,12 +14,13 @@ from itertools import pairwise
 
 import rclpy
 from rclpy.context import Context
-from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.logging import get_logger_level, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from diffdrive_jacobian.errors import UserError as UserError
+from diffdrive_jacobian.ros.guarded_executor import GuardedExecutor, NodeExecutor
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.node import ParameterizedNode
 from diffdrive_jacobian.ros.node_runner import MAX_NAME_LENGTH, NodeRunner
@@ -109,23 +110,33 @@ def _check_name_length(rule: str) -> None:
         )
 
 
-def make_executor(context: Context, *, isolated: bool) -> Executor:
-    """Return an executor.
+def make_executor(context: Context, *, isolated: bool, with_info: bool = False) -> NodeExecutor:
+    """Return an executor: the SingleThreadedExecutor if rclpy has no EventsExecutor, else as follows.
 
     Args:
         context: The context of its nodes.
-        isolated: Whether the nodes are isolated from other processes. Then it is an EventsExecutor,
-            if rclpy has it, which takes a third of the time per message. Its queue is unbounded and
-            first in, first out, so nodes that others can flood need the SingleThreadedExecutor.
+        isolated: Whether the nodes are isolated from other processes. Then it is an EventsExecutor.
+            Nodes that others can flood get a GuardedExecutor.
+        with_info: Whether callbacks receive message info, with the time of receipt. Then it is a
+            SingleThreadedExecutor.
     """
-    executor = events_executor(context) if isolated else None
-    return executor or SingleThreadedExecutor(context=context)
+    events: NodeExecutor | None = None if with_info else events_executor(context)
+    if events is None:
+        single: NodeExecutor = SingleThreadedExecutor(context=context)
+        return single
+    return events if isolated else GuardedExecutor(context, events)
 
 
 @contextmanager
-def running(context: Context, *, isolated: bool) -> Iterator[Runner]:
-    """Create a runner. At the end stop and destroy its nodes."""
-    runner = Runner(context, make_executor(context, isolated=isolated))
+def running(context: Context, *, isolated: bool, with_info: bool = False) -> Iterator[Runner]:
+    """Create a runner. At the end stop and destroy its nodes.
+
+    Args:
+        context: The context of the nodes.
+        isolated: As for `make_executor`.
+        with_info: As for `make_executor`.
+    """
+    runner = Runner(context, make_executor(context, isolated=isolated, with_info=with_info))
     try:
         yield runner
     finally:
@@ -135,7 +146,7 @@ def running(context: Context, *, isolated: bool) -> Iterator[Runner]:
 class Runner(NodeRunner):
     """Nodes in real time: an executor with its nodes."""
 
-    def __init__(self, context: Context, executor: Executor) -> None:
+    def __init__(self, context: Context, executor: NodeExecutor) -> None:
         """Start without nodes."""
         super().__init__(context)
         self._executor = executor

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable
 from functools import partial
 
+from diffdrive_jacobian.ros.fastdds_profiles import announce_frequently
 from diffdrive_jacobian.signals import Signals
 
 INTERRUPTED = 130
@@ -73,6 +74,7 @@ def _run(module: str, function: str, *arguments: str, watched: bool = False) -> 
         if getattr(sys, name) is None:
             # Started without it, as by cron. Imported modules write to it.
             setattr(sys, name, open(os.devnull, 'w'))  # noqa: SIM115
+    announce_frequently()
     try:
         run = getattr(importlib.import_module(f'diffdrive_jacobian.tools.{module}'), function)
         if watched:

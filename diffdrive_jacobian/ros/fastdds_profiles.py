@@ -1,0 +1,92 @@
+"""Profiles of Fast DDS for the process of an entry point: frequent announcements and heartbeats.
+
+Fast DDS announces a participant to others five times when it is created, and then every 3 s. One that
+is older than half a second also answers a new one only then. Nodes that announce themselves every 0.2 s
+are discovered by any new process in that time.
+
+A reliable writer of Fast DDS sends its readers a heartbeat every 3 s. A reader that has received all
+messages acknowledges them only in reply to a heartbeat. `Publisher.wait_for_all_acked` therefore takes
+up to 3 s after the messages were received, unless heartbeats are more frequent.
+
+Fast DDS reads the file that an environment variable names, when the first participant of a process is
+created. A choice of the user is left as it is: a file of profiles in the environment or in the working
+directory, a discovery server, or another middleware.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+"""Environment variable that names the file."""
+SWITCH = 'DIFFDRIVE_JACOBIAN_FAST_DISCOVERY'
+"""Environment variable that switches frequent announcements off if it is 0."""
+_FOLDER = os.path.join(os.path.dirname(os.path.abspath(__file__)), 'fastdds')
+# Other names of the variable, how Fast DDS is told to ignore files, and servers, which replace
+# announcements.
+_CHOICES = (
+    *(VARIABLE, 'FASTDDS_DEFAULT_PROFILES_FILE', 'SKIP_DEFAULT_XML', 'SKIP_DEFAULT_XML_FILE'),
+    *('ROS_DISCOVERY_SERVER', 'ROS_SUPER_CLIENT', 'ROS2_EASY_MODE'),
+)
+_FILES = ('DEFAULT_FASTRTPS_PROFILES.xml', 'DEFAULT_FASTDDS_PROFILES.xml')
+
+
+def announce_frequently() -> bool:
+    """Announce the participants of this process every 0.2 s.
+
+    Nothing happens if the user has chosen otherwise, see the module, or by the variable SWITCH.
+
+    Returns:
+        Whether Fast DDS will do so, if it is used.
+    """
+    return os.environ.get(SWITCH, '') != '0' and _use('announcements')
+
+
+@contextmanager
+def fast_heartbeats() -> Iterator[None]:
+    """Set the heartbeat period of publishers to 0.1 s.
+
+    This affects only a process that has not created a participant yet, and only Fast DDS. It does
+    nothing if the user has chosen otherwise, see the module.
+    """
+    _use('heartbeats')
+    try:
+        yield
+    finally:
+        withdraw()
+
+
+def withdraw() -> None:
+    """Remove the variable if it names a file of this package.
+
+    To be called when the first participant exists. Processes that are started then do not inherit it.
+    """
+    if _own() is not None:
+        del os.environ[VARIABLE]
+
+
+def _use(profile: str) -> bool:
+    """Add a profile to those that Fast DDS will read. Return whether it will."""
+    present = _own()
+    if present is None and _user_has_chosen():
+        return False
+    names = sorted({profile, *(present or [])})
+    os.environ[VARIABLE] = os.path.join(_FOLDER, f'{"_".join(names)}.xml')
+    return True
+
+
+def _own() -> list[str] | None:
+    """Return the profiles in the file that the variable names. None: it is no file of this package."""
+    folder, file = os.path.split(os.environ.get(VARIABLE, ''))
+    return os.path.splitext(file)[0].split('_') if folder == _FOLDER else None
+
+
+def _user_has_chosen() -> bool:
+    middleware = os.environ.get('RMW_IMPLEMENTATION', '')
+    return (
+        any(os.environ.get(name) for name in _CHOICES)
+        or not (not middleware or middleware.startswith('rmw_fastrtps'))
+        or any(os.path.exists(file) for file in _FILES)
+    )
