@@ -96,11 +96,11 @@ class Lockstep(SimulatedTime):
         except ValueError as error:
             raise LockstepError('Lockstep must be created and used in the main thread') from error
         self._closing.callback(self._guard.close)
-        self._traffic.start()
+        self._traffic.start(self._executor.deliveries)
         self._closing.callback(self._traffic.close)
         self.node = Node('lockstep', start_parameter_services=False, enable_rosout=False)
         """Node for the publishers, subscriptions and clients of a test."""
-        self._clock_publisher = self.node.create_publisher(Clock, '/clock', 1)
+        self._executor.clock = self.node.create_publisher(Clock, '/clock', 1)
         self._executor.add(self.node)
         Lockstep._open = self
         self._publish_clock()
