@@ -48,19 +48,15 @@ class Deliveries:
             without: Subscriptions that are not served.
 
         Returns:
-            The new ones.
+            Those that wait for `admit`.
         """
         known, self._readers = self._readers, {}
-        new = []
         for node in nodes:
             for subscription in node.subscriptions:
                 if subscription in without:
                     continue
                 reader = known.pop(subscription, None)
-                if reader is None:
-                    reader = Reader(subscription, self._create_task)
-                    new.append(reader)
-                self._readers[subscription] = reader
+                self._readers[subscription] = reader or Reader(subscription, self._create_task)
         gone = set(known.values())
         for reader in gone:
             reader.close()
@@ -69,7 +65,8 @@ class Deliveries:
             readers.clear()
         for reader in self._readers.values():
             self.readers_of(reader.topic).append(reader)
-        return new
+        admitted = set(self._polled)
+        return [reader for reader in self._readers.values() if reader not in admitted]
 
     def admit(self, reader: Reader) -> None:
         """Deliver the messages that a new subscription has received before, and let it be polled."""

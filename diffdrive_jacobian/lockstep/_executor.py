@@ -16,20 +16,20 @@ from typing import Any
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration
+from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.task import Task
-from rclpy.time import Time
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 
+from diffdrive_jacobian.lockstep._clocks import Clocks
 from diffdrive_jacobian.lockstep._deliveries import Deliveries, is_latched
 from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._facade import Facade
 from diffdrive_jacobian.lockstep._served import Served
 from diffdrive_jacobian.lockstep._tasks import Tasks
 from diffdrive_jacobian.ros.rclpy_internals import (
     RCLError,
-    SimulatedClock,
     TimerHandle,
     events_executor,
     timer_handle,
@@ -61,15 +61,13 @@ class QuiescentExecutor:
         self._events = events
         self._on_registered = on_registered
         self._served: dict[Node, Served] = {}
-        self._facade = _Facade(self)
+        self._facade = Facade(self._note_change, self.create_task)
         self._changed = False
         self._tasks = Tasks()
         self.deliveries = Deliveries(self.create_task)
         """The messages that wait."""
         self._restore_calls = wrap_calls(self._noting)
-        self.clock: Publisher | None = None
-        """Publisher of /clock."""
-        self._clocks: list[SimulatedClock] = []
+        self.clocks = Clocks()
         # With their handles, whose methods take a third of the time of those of the timers.
         self._sim_timers: list[tuple[TimerHandle, Timer]] = []
         self._wall_timers: list[tuple[TimerHandle, Timer]] = []
@@ -97,17 +95,19 @@ class QuiescentExecutor:
         self._served[node] = Served(node, self.create_task)
         node.executor = self._facade
         self._events.add_node(self._served[node])
-        self._find_clocks()
+        self.clocks.find(self._served)
         self._changed = True
 
     def remove(self, node: Node) -> None:
         """Remove a node."""
+        self._forget(node)
+        self._changed = True
+        self.settle()
+
+    def _forget(self, node: Node) -> None:
         served = self._served.pop(node)
         self._release(node)
         self._events.remove_node(served)
-        self._events.wake()
-        self._changed = True
-        self.settle()
 
     def close(self) -> None:
         """Remove all nodes and shut down."""
@@ -123,28 +123,9 @@ class QuiescentExecutor:
         self._facade.released = node
         node.executor = None
 
-    # --- Time
-
     def set_time(self, message: Clock) -> None:
-        """Set the clocks of the nodes, and publish the message if /clock has other subscriptions.
-
-        A message for each node would take as long as the rest of a step.
-        """
-        now = Time.from_msg(message.clock)
-        for clock in self._clocks:
-            clock.set(now)
-        if self.clock is not None and self.clock.get_subscription_count() > len(self._clocks):
-            self.clock.publish(message)
-
-    def _find_clocks(self) -> None:
-        """Find the clocks that follow /clock. A node may have renamed its topic."""
-        topic = self.clock and self.clock.topic_name
-        clocks = [SimulatedClock(node) for node in self._served]
-        self._clocks = [
-            clock
-            for clock in clocks
-            if clock.subscription is not None and clock.subscription.topic_name == topic
-        ]
+        """Set the clocks of the nodes."""
+        self.clocks.set(message)
 
     # --- Work
 
@@ -183,7 +164,12 @@ class QuiescentExecutor:
         while True:
             self._drain()
             if self._changed:
-                self._register()
+                self._changed = False
+                try:
+                    self._register()
+                except BaseException:
+                    self._changed = True
+                    raise
             elif not (self._tasks and self._tasks.run()):
                 return
 
@@ -240,7 +226,7 @@ class QuiescentExecutor:
 
     # --- Entities
 
-    def changed(self) -> None:
+    def _note_change(self) -> None:
         """Note that a node has created or destroyed an entity."""
         self._changed = True
 
@@ -250,7 +236,8 @@ class QuiescentExecutor:
         Another thread delivers latched messages to later subscriptions. This waits for them, and
         processes those of one topic before those of the next, which fixes their order.
         """
-        self._changed = False
+        for node in [node for node in self._served if _is_destroyed(node)]:
+            self._forget(node)
         for node, served in self._served.items():
             if list(node.guards):
                 raise LockstepError(
@@ -262,11 +249,10 @@ class QuiescentExecutor:
                     publisher.wait_for_all_acked(LATCHED_PATIENCE)
             served.update()
             self._on_registered(node)
-        self._find_clocks()
         self._events.wake()
         # The registration itself does not count as an event.
         self._handle_events()
-        new = self.deliveries.update(self._served, {clock.subscription for clock in self._clocks})
+        new = self.deliveries.update(self._served, without=self.clocks.find(self._served))
         # Messages that a subscription has received before.
         for reader in sorted(new, key=lambda reader: reader.latched):
             self.deliveries.admit(reader)
@@ -287,6 +273,14 @@ def _follows_sim_time(timer: Timer) -> bool:
     return clock.clock_type == ClockType.ROS_TIME and bool(clock.ros_time_is_active)
 
 
+def _is_destroyed(node: Node) -> bool:
+    try:
+        node.get_fully_qualified_name()
+    except InvalidHandle:
+        return True
+    return False
+
+
 def _is_due(handle: TimerHandle) -> bool:
     try:
         left = handle.time_until_next_call()
@@ -294,44 +288,3 @@ def _is_due(handle: TimerHandle) -> bool:
         # A callback has destroyed the timer.
         return False
     return left is not None and left <= 0
-
-
-class _Facade:
-    """The executor of the nodes, as they see it."""
-
-    def __init__(self, executor: QuiescentExecutor) -> None:
-        self._executor = executor
-        self.released: Node | None = None
-
-    def add_node(self, node: Node) -> bool:
-        """Accept a node. It was added before its `executor` is set."""
-        return True
-
-    def remove_node(self, node: Node) -> None:
-        """Accept the removal of a node by lockstep.
-
-        Raises:
-            LockstepError: Another executor is about to add the node.
-        """
-        if node is not self.released:
-            raise LockstepError(
-                f'node {node.get_fully_qualified_name()} is in lockstep and cannot be spun by another '
-                'executor'
-            )
-
-    def wake(self) -> None:
-        """Note that a node has created or destroyed an entity."""
-        self._executor.changed()
-
-    def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
-        """Schedule a function or a coroutine. Return its future."""
-        return self._executor.create_task(callback, *args, **kwargs)
-
-    def __getattr__(self, name: str) -> Any:
-        raise _NoAttributeError(
-            f'a node in lockstep cannot call executor.{name}: lockstep executes its callbacks'
-        )
-
-
-class _NoAttributeError(LockstepError, AttributeError):
-    """The executor has no such attribute. `hasattr` returns False."""

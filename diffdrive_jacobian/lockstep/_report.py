@@ -42,11 +42,7 @@ class _Record:
         wire. One that has been modified and cannot be serialized any more is returned itself.
         """
         try:
-            data = (
-                self.message
-                if isinstance(self.message, bytes)
-                else serialize_message(self.message)
-            )
+            data = self.message if isinstance(self.message, bytes) else serialize_message(self.message)
             return deserialize_message(data, self.message_type)
         except Exception:
             return self.message
@@ -170,7 +166,8 @@ def _scalar(value: Any) -> str:
     if hasattr(value, 'get_fields_and_field_types'):
         return brief(value)
     if isinstance(value, float):
-        return f'{value:.6g}' if math.isfinite(value) else str(value)
+        # Six digits, or all of them where that is shorter: 5e-324.
+        return min(f'{value:.6g}', repr(value), key=len) if math.isfinite(value) else str(value)
     return repr(value)
 
 
