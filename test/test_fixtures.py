@@ -61,7 +61,7 @@ def test_runs_whatever_pytest_captures(run, capture):
 
 
 def test_each_test_has_a_world_of_its_own(run):
-    run("""
+    result = run("""
     @pytest.mark.parametrize('turn', range(3))
     def test_begins_anew(lockstep, robot_at, turn):
         assert lockstep.elapsed == 0.0
@@ -75,7 +75,15 @@ def test_each_test_has_a_world_of_its_own(run):
 
     def test_marks_do_not_last(lockstep):
         assert lockstep.now == 1_000_000_000
-    """).assert_outcomes(passed=5)
+
+    @pytest.mark.lockstep(3)
+    def test_has_a_mark_without_a_name(lockstep):
+        pass
+    """)
+    result.assert_outcomes(passed=5, errors=1)
+    result.stdout.fnmatch_lines(
+        ['*TypeError: the marker lockstep takes args=, start= and patience= only, got (3,)']
+    )
 
 
 def test_a_failure_tells_the_last_messages_once(run):

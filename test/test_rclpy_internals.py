@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import HistoryPolicy, QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import String
 
@@ -218,7 +219,71 @@ def test_timer_handle_knows_when_the_timer_expires(ros):
         handle.time_until_next_call()
 
 
+def test_simulated_clock_is_set_as_by_a_message(ros):
+    node = ros.add(Node, node_name='clocked', parameters={'use_sim_time': True})
+    clock = internals.SimulatedClock(node)
+    assert clock.subscription.topic_name == '/clock'
+    assert clock.subscription in list(node.subscriptions)
+    message = ClockMessage()
+    message.clock.sec = 7
+    clock.set(Time.from_msg(message.clock))
+    assert node.get_clock().now().nanoseconds == 7 * SECOND
+    set_directly = dict(vars(node._time_source))
+    node._time_source.clock_callback(message)
+    assert vars(node._time_source) == set_directly
+    assert internals.SimulatedClock(ros.peer).subscription is None
+
+
 # --- Messages
+
+
+def test_messages_are_taken_until_the_use_ends(ros):
+    node = ros.add(Node, node_name='taking')
+    subscription = node.create_subscription(String, 'words', lambda _: None, 10)
+    take, close = internals.message_taker(subscription)
+    publisher = ros.talk(String, 'words')
+    publisher.publish(String(data='one'))
+    message, info = take(String, False)
+    assert message == String(data='one')
+    assert info['source_timestamp'] > 0
+    assert take(String, False) is None
+    node.destroy_subscription(subscription)
+    assert take(String, True) is None
+    assert publisher.get_subscription_count() == 1
+    close()
+    ros.until(lambda: publisher.get_subscription_count() == 0, 'the subscription is destroyed')
+
+
+def test_callbacks_with_message_info_are_known(ros):
+    subscription = ros.peer.create_subscription(String, 'words', lambda message: None, 10)
+    assert not internals.receives_info(subscription)
+    subscription.callback = lambda message, info: None
+    assert internals.receives_info(subscription)
+
+
+def test_requests_and_responses_are_wrapped_and_restored(ros):
+    node = ros.add(Node, node_name='served')
+    node.create_service(GetParameters, 'ask', lambda request, response: response)
+    client = ros.peer.create_client(GetParameters, 'ask')
+    ros.until(client.service_is_ready, 'the service')
+    sent = []
+
+    def wrap(send):
+        def count(self, *args):
+            sent.append(type(self).__name__)
+            return send(self, *args)
+
+        return count
+
+    restore = internals.wrap_calls(wrap)
+    try:
+        future = client.call_async(GetParameters.Request())
+        ros.until(future.done, 'the response')
+    finally:
+        restore()
+    future = client.call_async(GetParameters.Request())
+    ros.until(future.done, 'another response')
+    assert sent == ['Client', 'Service']
 
 
 def test_publish_is_wrapped_and_restored(ros):

@@ -1,9 +1,10 @@
 """An executor that detects when all work is done, and does it in a reproducible order.
 
-Messages, service calls and tasks run on the EventsExecutor of rclpy, in the order in which they were
-sent. Within a process Fast DDS delivers a message before `publish` returns. The EventsExecutor would
-call timers from a second thread, at times and in an order that vary. Timers are therefore hidden from it
-and called here one by one, the most overdue first, each after all messages are processed.
+Messages are taken from the subscriptions in the order in which they were published. Requests and
+responses of services, actions and events of QoS come through the EventsExecutor of rclpy, services in
+their place among the messages. Timers are called one by one, the most overdue first, each after all
+messages are processed: the EventsExecutor would call them from a second thread, at times and in an order
+that vary.
 """
 
 from __future__ import annotations
@@ -15,18 +16,24 @@ from typing import Any
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration
+from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.task import Task
 from rclpy.timer import Timer
+from rosgraph_msgs.msg import Clock
 
+from diffdrive_jacobian.lockstep._clocks import Clocks
+from diffdrive_jacobian.lockstep._deliveries import Deliveries, is_latched
 from diffdrive_jacobian.lockstep._errors import LockstepError
-from diffdrive_jacobian.lockstep._served import Served, is_latched
+from diffdrive_jacobian.lockstep._facade import Facade
+from diffdrive_jacobian.lockstep._served import Served
+from diffdrive_jacobian.lockstep._tasks import Tasks
 from diffdrive_jacobian.ros.rclpy_internals import (
     RCLError,
     TimerHandle,
     events_executor,
-    new_task,
     timer_handle,
+    wrap_calls,
 )
 
 LATCHED_PATIENCE = Duration(seconds=5.0)
@@ -54,12 +61,27 @@ class QuiescentExecutor:
         self._events = events
         self._on_registered = on_registered
         self._served: dict[Node, Served] = {}
-        self._facade = _Facade(self)
+        self._facade = Facade(self._note_change, self.create_task)
         self._changed = False
-        self._tasks: list[_Task] = []
+        self._tasks = Tasks()
+        self.deliveries = Deliveries(self.create_task)
+        """The messages that wait."""
+        self._restore_calls = wrap_calls(self._noting)
+        self.clocks = Clocks()
         # With their handles, whose methods take a third of the time of those of the timers.
         self._sim_timers: list[tuple[TimerHandle, Timer]] = []
         self._wall_timers: list[tuple[TimerHandle, Timer]] = []
+
+    def _noting(self, send: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a method that sends a request or a response, and takes its place among the messages."""
+        pending = self.deliveries.pending
+
+        def sent(*args: Any, **kwargs: Any) -> Any:
+            result = send(*args, **kwargs)
+            pending.append(None)
+            return result
+
+        return sent
 
     # --- Nodes
 
@@ -73,100 +95,109 @@ class QuiescentExecutor:
         self._served[node] = Served(node, self.create_task)
         node.executor = self._facade
         self._events.add_node(self._served[node])
+        self.clocks.find(self._served)
         self._changed = True
 
     def remove(self, node: Node) -> None:
         """Remove a node."""
-        served = self._served.pop(node)
-        self._release(node)
-        self._events.remove_node(served)
-        self._events.wake()
+        self._forget(node)
         self._changed = True
         self.settle()
 
+    def _forget(self, node: Node) -> None:
+        served = self._served.pop(node)
+        self._release(node)
+        self._events.remove_node(served)
+
     def close(self) -> None:
         """Remove all nodes and shut down."""
-        for task in self._tasks:
-            task.future.cancel()
+        self._restore_calls()
+        self._tasks.cancel()
         for node in self.nodes:
             self._release(node)
         self._served.clear()
+        self.deliveries.close()
         self._events.shutdown()
 
     def _release(self, node: Node) -> None:
         self._facade.released = node
         node.executor = None
 
+    def set_time(self, message: Clock) -> None:
+        """Set the clocks of the nodes."""
+        self.clocks.set(message)
+
     # --- Work
 
-    def settle(self) -> int | None:
+    def settle(self, *, after: bool = False) -> int | None:
         """Execute all callbacks that are due at the current time, and all that they cause.
+
+        Args:
+            after: Whether nothing but `set_time` was called since the last time.
 
         Returns:
             Time until the next timer in simulated time expires (ns); None: there is no such timer.
         """
-        self._handle_all()
+        settled = False
+        if not after or self._changed or self._tasks or self.deliveries.pending:
+            self._handle_all()
+            settled = True
         while True:
             due, until_next = self._due_timers()
-            if not due:
+            if due:
+                for handle, timer in due:
+                    if _is_due(handle):
+                        self._call(handle, timer)
+                        self._handle_all()
+            elif settled:
                 return until_next
-            for handle, timer in due:
-                if _is_due(handle):
-                    self._call(handle, timer)
-                    self._handle_all()
+            else:
+                self._handle_all()
+            settled = True
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
         """Schedule a function or a coroutine for the current time. Return its future."""
-        if _is_async(callback):
-            callback, args, kwargs = callback(*args, **kwargs), (), {}
-        task = _Task(callback, new_task(callback, args, kwargs, self._facade))
-        self._tasks.append(task)
-        return task.future
+        return self._tasks.create(callback, args, kwargs, self._facade)
 
     def _handle_all(self) -> None:
         """Process messages, service calls and tasks until none is left that can continue."""
         while True:
             self._drain()
             if self._changed:
-                self._register()
-            elif not (self._tasks and self._run_tasks()):
+                self._changed = False
+                try:
+                    self._register()
+                except BaseException:
+                    self._changed = True
+                    raise
+            elif not (self._tasks and self._tasks.run()):
                 return
 
-    def _run_tasks(self) -> bool:
-        """Continue each task once. Return whether any made progress.
-
-        It is not known what a coroutine waits for, so it is continued and may wait again.
-        """
-        progress = False
-        tasks, self._tasks = self._tasks, []
-        waiting = []
-        try:
-            while tasks:
-                task = tasks.pop(0)
-                progress |= task.proceed()
-                if (error := task.future.exception()) is not None:
-                    raise error
-                if not (task.future.done() or task.future.cancelled()):
-                    waiting.append(task)
-        finally:
-            self._tasks = [*waiting, *tasks, *self._tasks]
-        return progress
-
     def _drain(self) -> None:
-        """Process events until none is left.
+        """Process messages and events until none is left."""
+        pending, poll = self.deliveries.pending, self.deliveries.poll
+        take = pending.popleft
+        while True:
+            while pending:
+                if (reader := take()) is None:
+                    self._handle_events()
+                else:
+                    reader.deliver()
+            if not (self._handle_events() or pending or poll() or pending):
+                return
+
+    def _handle_events(self) -> bool:
+        """Process events that the EventsExecutor has queued. Return whether there were any.
 
         A task runs after all events that were queued before it. If it is the first event, the queue was
         empty.
         """
-        create_task, spin_once = self._events.create_task, self._events.spin_once
-        while True:
-            last = create_task(_nothing)
-            done, events = last.done, 0
-            while not done():
-                spin_once()
-                events += 1
-            if events == 1:
-                return
+        spin_once = self._events.spin_once
+        done, events = self._events.create_task(_nothing).done, 0
+        while not done():
+            spin_once()
+            events += 1
+        return events > 1
 
     def _due_timers(self) -> tuple[list[tuple[TimerHandle, Timer]], int | None]:
         """Return the due timers, the most overdue first, and the time until the next one (ns)."""
@@ -195,7 +226,7 @@ class QuiescentExecutor:
 
     # --- Entities
 
-    def changed(self) -> None:
+    def _note_change(self) -> None:
         """Note that a node has created or destroyed an entity."""
         self._changed = True
 
@@ -203,9 +234,10 @@ class QuiescentExecutor:
         """Register entities that the nodes have created since the last call, and forget destroyed ones.
 
         Another thread delivers latched messages to later subscriptions. This waits for them, and
-        registers the subscriptions of latched topics one by one, which fixes the order of the messages.
+        processes those of one topic before those of the next, which fixes their order.
         """
-        self._changed = False
+        for node in [node for node in self._served if _is_destroyed(node)]:
+            self._forget(node)
         for node, served in self._served.items():
             if list(node.guards):
                 raise LockstepError(
@@ -218,11 +250,13 @@ class QuiescentExecutor:
             served.update()
             self._on_registered(node)
         self._events.wake()
-        self._drain()
-        for served in self._served.values():
-            while served.admit_latched():
-                self._events.wake()
-                self._drain()
+        # The registration itself does not count as an event.
+        self._handle_events()
+        new = self.deliveries.update(self._served, without=self.clocks.find(self._served))
+        # Messages that a subscription has received before.
+        for reader in sorted(new, key=lambda reader: reader.latched):
+            self.deliveries.admit(reader)
+            self._drain()
         timers = [timer for node in self._served for timer in node.timers]
         self._sim_timers = [(timer_handle(timer), timer) for timer in timers if _follows_sim_time(timer)]
         self._wall_timers = [
@@ -239,6 +273,14 @@ def _follows_sim_time(timer: Timer) -> bool:
     return clock.clock_type == ClockType.ROS_TIME and bool(clock.ros_time_is_active)
 
 
+def _is_destroyed(node: Node) -> bool:
+    try:
+        node.get_fully_qualified_name()
+    except InvalidHandle:
+        return True
+    return False
+
+
 def _is_due(handle: TimerHandle) -> bool:
     try:
         left = handle.time_until_next_call()
@@ -246,76 +288,3 @@ def _is_due(handle: TimerHandle) -> bool:
         # A callback has destroyed the timer.
         return False
     return left is not None and left <= 0
-
-
-class _Task:
-    """A task and the point at which its coroutine waits."""
-
-    def __init__(self, handler: Any, future: Task) -> None:
-        self.future = future
-        self._handler = handler
-        # A reference is kept so that no later object has the same identity.
-        self._waits_for: Any = self
-
-    def proceed(self) -> bool:
-        """Continue the task. Return whether it made progress."""
-        before = self._waits_for
-        self.future()
-        self._waits_for = self._innermost()
-        return bool(self.future.done()) or self._waits_for is not before
-
-    def _innermost(self) -> Any:
-        """Return the innermost object that the coroutine awaits."""
-        point = self._handler
-        while (
-            inner := getattr(point, 'cr_await', None) or getattr(point, 'gi_yieldfrom', None)
-        ) is not None:
-            point = inner
-        return point
-
-
-def _is_async(callback: Any) -> bool:
-    return inspect.iscoroutinefunction(callback) or inspect.iscoroutinefunction(
-        getattr(callback, '__call__', None)  # noqa: B004
-    )
-
-
-class _Facade:
-    """The executor of the nodes, as they see it."""
-
-    def __init__(self, executor: QuiescentExecutor) -> None:
-        self._executor = executor
-        self.released: Node | None = None
-
-    def add_node(self, node: Node) -> bool:
-        """Accept a node. It was added before its `executor` is set."""
-        return True
-
-    def remove_node(self, node: Node) -> None:
-        """Accept the removal of a node by lockstep.
-
-        Raises:
-            LockstepError: Another executor is about to add the node.
-        """
-        if node is not self.released:
-            raise LockstepError(
-                f'node {node.get_fully_qualified_name()} is in lockstep and cannot be spun by another '
-                'executor'
-            )
-
-    def wake(self) -> None:
-        """Note that a node has created or destroyed an entity."""
-        self._executor.changed()
-
-    def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
-        """Schedule a function or a coroutine. Return its future."""
-        return self._executor.create_task(callback, *args, **kwargs)
-
-    def __getattr__(self, name: str) -> Any:
-        raise _NoAttributeError(
-            f'a node in lockstep cannot call executor.{name}: lockstep executes its callbacks'
-        )
-
-
-class _NoAttributeError(LockstepError, AttributeError):
-    """The executor has no such attribute. `hasattr` returns False."""

@@ -23,6 +23,7 @@ import rclpy
 from rclpy.node import Node
 
 from diffdrive_jacobian.lockstep import _executor
+from diffdrive_jacobian.ros import rclpy_internals
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 SIGNAL = signal.SIGUSR2
@@ -35,7 +36,11 @@ MAX_NAMED = 8
 """Largest number of callbacks that are named."""
 _STANDARD = sysconfig.get_path('stdlib') + os.sep
 _PACKAGES = sysconfig.get_path('platlib') + os.sep
-_INFRASTRUCTURE = (os.path.dirname(rclpy.__file__) + os.sep, os.path.dirname(__file__) + os.sep)
+_INFRASTRUCTURE = (
+    os.path.dirname(rclpy.__file__) + os.sep,
+    os.path.dirname(__file__) + os.sep,
+    rclpy_internals.__file__,
+)
 
 
 class Stuck(BaseException):

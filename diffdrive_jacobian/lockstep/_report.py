@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.serialization import deserialize_message, serialize_message
 
+from diffdrive_jacobian.lockstep._deliveries import Deliveries
 from diffdrive_jacobian.ros.rclpy_internals import wrap_publish
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -21,18 +23,33 @@ OMITTED = ('/clock', '/parameter_events', '/rosout')
 """Topics that are not reported."""
 
 
-@dataclass(slots=True)
 class _Record:
     """Messages of one publisher."""
 
-    topic: str
-    count: int = 0
-    at: int = 0
-    message: Any = None
+    __slots__ = ('at', 'count', 'message', 'message_type', 'order', 'readers', 'topic')
+
+    def __init__(self, publisher: Publisher, deliveries: Deliveries) -> None:
+        self.topic: str = publisher.topic_name
+        self.message_type: Any = publisher.msg_type
+        self.readers = deliveries.readers_of(self.topic)
+        self.count = self.at = self.order = 0
+        self.message: Any = None
+
+    def received(self) -> Any:
+        """Return the last message as a subscription received it.
+
+        The message of the publisher may differ: an int in a field for a float is another number on the
+        wire. One that has been modified and cannot be serialized any more is returned itself.
+        """
+        try:
+            data = self.message if isinstance(self.message, bytes) else serialize_message(self.message)
+            return deserialize_message(data, self.message_type)
+        except Exception:
+            return self.message
 
 
 class Traffic:
-    """Counts the messages of every publisher and stores the last one.
+    """Counts the messages of every publisher, stores the last one, and queues the deliveries.
 
     It wraps `Publisher.publish`. A subscription for each topic would cost as much as the run, and change
     the number of subscriptions, which nodes may query. Messages are not copied, so one that its node
@@ -45,23 +62,31 @@ class Traffic:
         self._records: dict[Publisher, _Record] = {}
         self._restore: Callable[[], None] | None = None
 
-    def start(self) -> None:
+    def start(self, deliveries: Deliveries) -> None:
         """Start counting."""
-        records, now = self._records, self._now
+        records, now, numbers = self._records, self._now, count(1)
+        extend = deliveries.pending.extend
 
         def counting(publish: Callable[..., None]) -> Callable[..., None]:
             def counted(self: Publisher, msg: Any) -> None:
                 record = records.get(self)
                 if record is None:
-                    record = records[self] = _Record(self.topic_name)
+                    record = records[self] = _Record(self, deliveries)
                 record.count += 1
+                record.order = next(numbers)
                 record.at = now()
                 record.message = msg
                 publish(self, msg)
+                extend(record.readers)
 
             return counted
 
         self._restore = wrap_publish(counting)
+
+    def last(self, topic: str) -> Any:
+        """Return the last message of a topic as it was received; None: there is none."""
+        records = [record for record in self._records.values() if record.topic == topic]
+        return max(records, key=lambda record: record.order).received() if records else None
 
     def close(self) -> None:
         """Stop counting."""
@@ -80,7 +105,7 @@ class Traffic:
         ]
         lines = [
             f'  {topic}: {record.count} from {node}, last at {record.at / NANOSECONDS:g} s: '
-            f'{brief(record.message)}'
+            f'{brief(record.received())}'
             for topic, node, record in sorted(published, key=lambda item: item[:2])
         ]
         active = {topic for topic, _, _ in published}
@@ -141,7 +166,8 @@ def _scalar(value: Any) -> str:
     if hasattr(value, 'get_fields_and_field_types'):
         return brief(value)
     if isinstance(value, float):
-        return f'{value:.6g}' if math.isfinite(value) else str(value)
+        # Six digits, or all of them where that is shorter: 5e-324.
+        return min(f'{value:.6g}', repr(value), key=len) if math.isfinite(value) else str(value)
     return repr(value)
 
 

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rclpy.executors import ExternalShutdownException
-from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
@@ -27,7 +26,6 @@ class SimulatedTime:
 
     _executor: QuiescentExecutor
     _guard: Guard
-    _clock_publisher: Publisher
 
     def __init__(self, start: int) -> None:
         """Start at a time (ns)."""
@@ -137,9 +135,9 @@ class SimulatedTime:
 
     def _publish_clock(self) -> None:
         set_time(self._clock.clock, self._now)
-        self._clock_publisher.publish(self._clock)
         with self._watched():
-            self._until_next = self._executor.settle()
+            self._executor.set_time(self._clock)
+            self._until_next = self._executor.settle(after=True)
 
     @contextmanager
     def _watched(self) -> Iterator[None]:

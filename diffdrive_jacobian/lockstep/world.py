@@ -15,24 +15,20 @@ from typing import Any, ClassVar, TypeVar
 import rclpy
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
-from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
 from diffdrive_jacobian.lockstep._guard import Guard
-from diffdrive_jacobian.lockstep._simulated_time import SimulatedTime, checked_nanoseconds
-from diffdrive_jacobian.ros.rclpy_internals import SERVICES_OF_RCLPY, wrap_sleep
+from diffdrive_jacobian.lockstep._messaging import Messaging
+from diffdrive_jacobian.lockstep._simulated_time import checked_nanoseconds
+from diffdrive_jacobian.ros.rclpy_internals import wrap_sleep
 from diffdrive_jacobian.ros.runner import UserError, discovery_off, ros_context
 
 N = TypeVar('N', bound=Node)
 
-LISTENING_DEPTH = 1000
-"""Queue size of `listen`: the number of messages of a topic at one simulated time."""
 
-
-class Lockstep(SimulatedTime):
+class Lockstep(Messaging):
     """Executes nodes in the default context of rclpy, in simulated time.
 
     Nodes are created as usual, after the `Lockstep`, and added to it. `use_sim_time` is true for all of
@@ -72,7 +68,6 @@ class Lockstep(SimulatedTime):
         if rclpy.ok():
             raise LockstepError('rclpy is already initialized: only lockstep may do that')
         self._thread = threading.get_ident()
-        self._publishers: dict[tuple[type, str], Publisher] = {}
         self._on_new: list[Callable[[], None]] = []
         self._closing = ExitStack()
         try:
@@ -96,11 +91,10 @@ class Lockstep(SimulatedTime):
         except ValueError as error:
             raise LockstepError('Lockstep must be created and used in the main thread') from error
         self._closing.callback(self._guard.close)
-        self._traffic.start()
+        self._traffic.start(self._executor.deliveries)
         self._closing.callback(self._traffic.close)
         self.node = Node('lockstep', start_parameter_services=False, enable_rosout=False)
-        """Node for the publishers, subscriptions and clients of a test."""
-        self._clock_publisher = self.node.create_publisher(Clock, '/clock', 1)
+        self._executor.clocks.publisher = self.node.create_publisher(Clock, '/clock', 1)
         self._executor.add(self.node)
         Lockstep._open = self
         self._publish_clock()
@@ -221,106 +215,3 @@ class Lockstep(SimulatedTime):
                 f'node {node.get_fully_qualified_name()} runs on wall time: '
                 'its parameter use_sim_time must be true'
             )
-
-    # --- Messages and services
-
-    def publish(self, topic: str, message: Any) -> None:
-        """Publish a message and execute all callbacks that it causes (within a callback: later).
-
-        Raises:
-            LockstepError: The topic has no subscription, or another type.
-        """
-        self._check_open()
-        key = type(message), topic
-        if key not in self._publishers:
-            create = self.node.create_publisher
-            self._publishers[key] = self._with_type(topic, create, *key, 10)
-        publisher = self._publishers[key]
-        self._settle_unless_busy()
-        if publisher.get_subscription_count() == 0:
-            raise LockstepError(
-                f'{publisher.topic_name} has no subscription of type {_type_name(type(message))}\n'
-                f'{self.report()}'
-            )
-        publisher.publish(message)
-        self._settle_unless_busy()
-
-    def listen(self, message_type: type, topic: str, *, latched: bool = False) -> list[Any]:
-        """Return a list to which the messages of a topic are appended.
-
-        Args:
-            message_type: Type of the topic.
-            topic: Name of the topic.
-            latched: Whether to include earlier messages of a latched topic.
-
-        Raises:
-            LockstepError: The topic has another type.
-        """
-        self._check_open()
-        received: list[Any] = []
-        profile = QoSProfile(depth=LISTENING_DEPTH)
-        if latched:
-            profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
-        else:
-            # Matches every publisher. Within a process no message is lost.
-            profile.reliability = ReliabilityPolicy.BEST_EFFORT
-        create = self.node.create_subscription
-        self._with_type(topic, create, message_type, topic, received.append, profile)
-        self._settle_unless_busy()
-        return received
-
-    def call(self, service_type: Any, name: str, request: Any = None, *, timeout: float = 10.0) -> Any:
-        """Call a service and return the response.
-
-        Args:
-            service_type: Type of the service.
-            name: Name of the service.
-            request: The request; None: an empty one.
-            timeout: Longest simulated time for the response (s).
-
-        Raises:
-            LockstepError: There is no such service, or it does not respond in time.
-        """
-        self._check_open()
-        name = self.node.resolve_service_name(name)
-        services = dict(self.node.get_service_names_and_types())
-        wanted = _type_name(service_type, 'srv')
-        if wanted not in services.get(name, []):
-            others = ', '.join(other for other, kinds in services.items() if not _is_of_rclpy(kinds))
-            raise LockstepError(
-                f'there is no service {name} of type {wanted}; services: {others or "none"}'
-                if name not in services
-                else f'{name} is of type {services[name][0]}, not {wanted}'
-            )
-        client = self.node.create_client(service_type, name)
-        try:
-            future = client.call_async(request or service_type.Request())
-            self.run_until(future.done, timeout, f'a response of {name}')
-            return future.result()
-        finally:
-            self.node.destroy_client(client)
-
-    def _settle_unless_busy(self) -> None:
-        """Settle, except within a callback, after which it happens anyway."""
-        if not self._busy:
-            self.settle()
-
-    def _with_type(self, topic: str, create: Callable[..., Any], *args: Any) -> Any:
-        try:
-            return create(*args)
-        except RuntimeError as error:
-            # Within one process Fast DDS refuses a topic of two types.
-            name = self.node.resolve_topic_name(topic)
-            types = dict(self.node.get_topic_names_and_types()).get(name, [])
-            raise LockstepError(
-                f'{name} is of type {", ".join(types) or "unknown"}, not {_type_name(args[0])}'
-            ) from error
-
-
-def _type_name(interface: Any, kind: str = 'msg') -> str:
-    return f'{interface.__module__.split(".")[0]}/{kind}/{interface.__name__}'
-
-
-def _is_of_rclpy(types: list[str]) -> bool:
-    """Return whether a service is one that rclpy provides for every node."""
-    return types[0].startswith(SERVICES_OF_RCLPY)

@@ -25,8 +25,10 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, qos_profile_default
+from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.task import Task
+from rclpy.time import Time
 from rclpy.timer import Timer
 
 RCLError: type[Exception] = rclpy_implementation.RCLError
@@ -192,7 +194,74 @@ def timer_handle(timer: Timer) -> TimerHandle:
     return handle
 
 
+class SimulatedClock:
+    """The clock of a node whose time is set directly, instead of by a message on /clock.
+
+    Does what `TimeSource.clock_callback` does. Relies on `Node._time_source`, `TimeSource._clock_sub`,
+    `TimeSource._last_time_set` and `TimeSource._associated_clocks`.
+    """
+
+    __slots__ = ('_source', 'subscription')
+
+    def __init__(self, node: Node) -> None:
+        """Take the clock of a node."""
+        self._source = node._time_source
+        self.subscription: Subscription | None = self._source._clock_sub
+        """Subscription that would receive the time. None: the clock shows wall time."""
+
+    def set(self, now: Time) -> None:
+        """Set the time. Callbacks for jumps are called."""
+        source = self._source
+        source._last_time_set = now
+        for clock in source._associated_clocks:
+            clock.set_ros_time_override(now)
+
+
 # --- Messages
+
+
+def message_taker(
+    subscription: Subscription,
+) -> tuple[Callable[[type, bool], tuple[Any, dict[str, Any]] | None], Callable[[], None]]:
+    """Return a function that takes a message, and one that ends its use.
+
+    Relies on `Subscription.handle.take_message`, which returns the message and its info. Until its use
+    ends, the subscription is not destroyed.
+
+    Args:
+        subscription: The subscription.
+    """
+    handle = subscription.handle
+    handle.__enter__()
+    return handle.take_message, lambda: handle.__exit__(None, None, None)
+
+
+def receives_info(subscription: Subscription) -> bool:
+    """Return whether the callback of a subscription receives a message and its info.
+
+    Relies on `Subscription._callback_type`.
+    """
+    return bool(subscription._callback_type is Subscription.CallbackType.WithMessageInfo)
+
+
+def wrap_calls(wrap: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Callable[[], None]:
+    """Replace the methods of all clients and services that send a request or a response.
+
+    Relies on `Client.call_async` and `Service.send_response` being looked up in the class for each one.
+
+    Args:
+        wrap: Receives a present method, returns its replacement.
+
+    Returns:
+        A function that restores the present ones.
+    """
+    call_async, send_response = Client.call_async, Service.send_response
+    Client.call_async, Service.send_response = wrap(call_async), wrap(send_response)
+
+    def restore() -> None:
+        Client.call_async, Service.send_response = call_async, send_response
+
+    return restore
 
 
 def wrap_publish(wrap: Callable[[Callable[..., None]], Callable[..., None]]) -> Callable[[], None]:

@@ -63,6 +63,10 @@ def _or_error(describe: Callable[[], str]) -> str:
 def lockstep(request: pytest.FixtureRequest) -> Iterator[Lockstep]:
     """Return a Lockstep without nodes."""
     marker = request.node.get_closest_marker('lockstep')
+    if marker and marker.args:
+        raise TypeError(
+            f'the marker lockstep takes args=, start= and patience= only, got {marker.args!r}'
+        )
     with Lockstep(**(marker.kwargs if marker else {})) as world:
         yield world
 

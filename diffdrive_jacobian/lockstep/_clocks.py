@@ -1,0 +1,49 @@
+"""The clocks of the nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
+
+from diffdrive_jacobian.ros.rclpy_internals import SimulatedClock
+
+
+class Clocks:
+    """Sets the clocks of the nodes directly. A message for each would double the time of a step.
+
+    Other subscriptions to /clock receive messages.
+    """
+
+    def __init__(self) -> None:
+        """Start without clocks."""
+        self.publisher: Publisher | None = None
+        """Publisher of /clock."""
+        self._clocks: list[SimulatedClock] = []
+
+    def find(self, nodes: Iterable[Node]) -> set[Subscription]:
+        """Find the clocks of nodes. Return the subscriptions to /clock that are replaced.
+
+        A clock whose topic was renamed follows that topic.
+        """
+        topic = self.publisher and self.publisher.topic_name
+        replaced = set()
+        self._clocks = []
+        for node in nodes:
+            clock = SimulatedClock(node)
+            if clock.subscription is not None and clock.subscription.topic_name == topic:
+                self._clocks.append(clock)
+                replaced.add(clock.subscription)
+        return replaced
+
+    def set(self, message: Clock) -> None:
+        """Set the time, and publish the message if somebody else receives it."""
+        now = Time.from_msg(message.clock)
+        for clock in self._clocks:
+            clock.set(now)
+        if self.publisher is not None and self.publisher.get_subscription_count() > len(self._clocks):
+            self.publisher.publish(message)

@@ -1,0 +1,87 @@
+"""Tasks and coroutines of the nodes."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+from rclpy.task import Task
+
+from diffdrive_jacobian.ros.rclpy_internals import new_task
+
+
+class Tasks:
+    """Tasks that are not done."""
+
+    def __init__(self) -> None:
+        """Start without tasks."""
+        self._tasks: list[_Task] = []
+
+    def __len__(self) -> int:
+        """Return the number of tasks that are not done."""
+        return len(self._tasks)
+
+    def create(self, callback: Any, args: Any, kwargs: Any, executor: Any) -> Task:
+        """Add a function or a coroutine. Return its future."""
+        if _is_async(callback):
+            callback, args, kwargs = callback(*args, **kwargs), (), {}
+        task = _Task(callback, new_task(callback, args, kwargs, executor))
+        self._tasks.append(task)
+        return task.future
+
+    def run(self) -> bool:
+        """Continue each task once. Return whether any made progress.
+
+        It is not known what a coroutine waits for, so it is continued and may wait again.
+        """
+        progress = False
+        tasks, self._tasks = self._tasks, []
+        waiting = []
+        try:
+            while tasks:
+                task = tasks.pop(0)
+                progress |= task.proceed()
+                if (error := task.future.exception()) is not None:
+                    raise error
+                if not (task.future.done() or task.future.cancelled()):
+                    waiting.append(task)
+        finally:
+            self._tasks = [*waiting, *tasks, *self._tasks]
+        return progress
+
+    def cancel(self) -> None:
+        """Cancel all."""
+        for task in self._tasks:
+            task.future.cancel()
+
+
+class _Task:
+    """A task and the point at which its coroutine waits."""
+
+    def __init__(self, handler: Any, future: Task) -> None:
+        self.future = future
+        self._handler = handler
+        # A reference is kept so that no later object has the same identity.
+        self._waits_for: Any = self
+
+    def proceed(self) -> bool:
+        """Continue the task. Return whether it made progress."""
+        before = self._waits_for
+        self.future()
+        self._waits_for = self._innermost()
+        return bool(self.future.done()) or self._waits_for is not before
+
+    def _innermost(self) -> Any:
+        """Return the innermost object that the coroutine awaits."""
+        point = self._handler
+        while (
+            inner := getattr(point, 'cr_await', None) or getattr(point, 'gi_yieldfrom', None)
+        ) is not None:
+            point = inner
+        return point
+
+
+def _is_async(callback: Any) -> bool:
+    return inspect.iscoroutinefunction(callback) or inspect.iscoroutinefunction(
+        getattr(callback, '__call__', None)  # noqa: B004
+    )
