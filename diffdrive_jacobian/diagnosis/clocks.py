@@ -19,9 +19,7 @@ def check_clocks(graph: Graph) -> Iterator[Finding]:
     publishers = [one.node for one in graph.publishers(CLOCK)]
     simulated = [node.name for node in graph.nodes if node.use_sim_time]
     real = [
-        node.name
-        for node in graph.nodes
-        if node.use_sim_time is False and node.name not in publishers
+        node.name for node in graph.nodes if node.use_sim_time is False and node.name not in publishers
     ]
     if len(publishers) > 1:
         yield Finding(

@@ -113,7 +113,7 @@ def base_name(topic: str) -> str:
 
 
 def listed(names: list[str]) -> str:
-    """Return names in one line, sorted: `/a`, `/a and /b`, `/a, /b and /c`; repeated ones are counted."""
+    """Return names in one line, sorted: `/a`, `/a and /b`, `/a, /b and /c`; repetitions as counts."""
     counts = {name: names.count(name) for name in sorted(names)}
     words = [name if count == 1 else f'{name} ({count} times)' for name, count in counts.items()]
     if len(words) < 2:

@@ -6,6 +6,7 @@ import importlib.util
 import os
 import platform
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -18,6 +19,8 @@ DISTRIBUTION = 'jazzy'
 """The ROS distribution that this package is made for."""
 WHEEL_VERSION = '7.1.'
 """Beginning of the version of its rclpy."""
+WHEEL_RMW = 'rmw_fastrtps_cpp'
+"""The only implementation of the middleware that the wheels have."""
 RANGES = ('OFF', 'LOCALHOST', 'SUBNET', 'SYSTEM_DEFAULT')
 SAFE_DOMAIN = 101
 """Largest domain whose ports do not collide with those that Linux gives to clients."""
@@ -45,6 +48,8 @@ class Environment:
     """Where the packages of ROS come from, WHEELS or INSTALLATION, by name."""
     variables: Mapping[str, str] = field(default_factory=dict)
     """The environment variables that are set."""
+    rmw_missing: bool = False
+    """Whether the implementation in RMW_IMPLEMENTATION is not installed."""
 
     @property
     def domain(self) -> str:
@@ -64,17 +69,30 @@ class Environment:
 def environment() -> Environment:
     """Return the environment of this process."""
     versions = {'diffdrive_jacobian': __version__}
-    for name in (*PYTHON_PACKAGES, 'ros-rclpy', 'rclpy'):
-        try:
+    # A ROS installation has a distribution rclpy, the wheels have both.
+    for name in (*PYTHON_PACKAGES, 'rclpy', 'ros-rclpy'):
+        with suppress(metadata.PackageNotFoundError):
             versions[name.removeprefix('ros-')] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
+    sources = {name: source for name in ROS_PACKAGES if (source := _source(name))}
     return Environment(
         python=platform.python_version(),
         versions=versions,
-        sources={name: source for name in ROS_PACKAGES if (source := _source(name))},
+        sources=sources,
         variables={name: os.environ[name] for name in VARIABLES if name in os.environ},
+        rmw_missing=_rmw_missing(wheels=sources.get('rclpy') == WHEELS),
     )
+
+
+def _rmw_missing(*, wheels: bool) -> bool:
+    """Return whether the middleware that the environment names is not installed.
+
+    rclpy must not be imported then: rcl ends the process.
+    """
+    name = os.environ.get('RMW_IMPLEMENTATION')
+    if not name or (wheels and name == WHEEL_RMW):
+        return False
+    folders = os.environ.get('LD_LIBRARY_PATH', '').split(os.pathsep)
+    return wheels or not any(Path(folder, f'lib{name}.so').exists() for folder in folders if folder)
 
 
 def _source(package: str) -> str:
@@ -117,8 +135,10 @@ def _check_versions(found: Environment) -> Iterator[Finding]:
             f'source the setup file of a ROS installation (. /opt/ros/{DISTRIBUTION}/setup.bash), or '
             f'call {install}',
         )
-    by_source = {source: sorted(n for n, s in found.sources.items() if s == source)
-                 for source in set(found.sources.values())}
+    by_source = {
+        source: sorted(n for n, s in found.sources.items() if s == source)
+        for source in set(found.sources.values())
+    }
     if len(by_source) > 1:
         yield Finding(
             f'two installations of ROS are mixed: {", ".join(by_source[WHEELS])} from {WHEELS}, '
@@ -130,6 +150,12 @@ def _check_versions(found: Environment) -> Iterator[Finding]:
     if found.sources.get('rclpy') == WHEELS and not version.startswith(WHEEL_VERSION):
         yield Finding(
             f'rclpy {version} is not that of ROS 2 Jazzy ({WHEEL_VERSION}x)', f'call {install}'
+        )
+    if found.rmw_missing:
+        yield Finding(
+            f'RMW_IMPLEMENTATION is {printable(found.variables["RMW_IMPLEMENTATION"])}, which is not '
+            'installed: no node can start',
+            f'unset RMW_IMPLEMENTATION, or install it (the wheels have {WHEEL_RMW} only)',
         )
     distribution = found.variables.get('ROS_DISTRO', DISTRIBUTION)
     if distribution != DISTRIBUTION:
@@ -159,8 +185,8 @@ def _check_discovery(found: Environment) -> Iterator[Finding]:
     given = found.variables.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '')
     if given and given not in RANGES:
         yield Finding(
-            f'ROS_AUTOMATIC_DISCOVERY_RANGE must be one of {", ".join(RANGES)}, got {printable(given)!r}:'
-            ' SUBNET is used',
+            f'ROS_AUTOMATIC_DISCOVERY_RANGE must be one of {", ".join(RANGES)}, '
+            f'got {printable(given)!r}: SUBNET is used',
             'export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST',
         )
     local = found.variables.get('ROS_LOCALHOST_ONLY', '')

@@ -7,16 +7,18 @@ import os
 import secrets
 import shutil
 import socket
+import struct
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from diffdrive_jacobian.diagnosis.description import Finding
-from diffdrive_jacobian.text import format_size
+from diffdrive_jacobian.text import format_size, printable
 
 SHARED_MEMORY = Path('/dev/shm')
-INTERFACES = Path('/sys/class/net')
+SIOCGIFFLAGS = 0x8913
+"""Request for the flags of an interface, as in linux/sockios.h."""
 IFF_UP, IFF_LOOPBACK, IFF_MULTICAST = 0x1, 0x8, 0x1000
 """Flags of network interfaces, as in linux/if.h."""
 MULTICAST_GROUP = '239.255.0.1'
@@ -80,22 +82,22 @@ def _stale_segments(path: Path) -> Iterator[int]:
                 yield lock.with_name(lock.name.removesuffix('_el')).stat().st_size
 
 
-def interfaces(path: Path = INTERFACES) -> tuple[Interface, ...]:
+def interfaces() -> tuple[Interface, ...]:
     """Return the network interfaces, sorted by name. Empty: they are unknown."""
     found = []
-    with suppress(OSError):
-        for entry in sorted(path.iterdir()):
-            with suppress(OSError, ValueError):
-                flags = int((entry / 'flags').read_text(), 16)
-                found.append(
-                    Interface(
-                        entry.name,
-                        up=bool(flags & IFF_UP),
-                        loopback=bool(flags & IFF_LOOPBACK),
-                        multicast=bool(flags & IFF_MULTICAST),
-                    )
+    with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as query:
+        for _, name in socket.if_nameindex():
+            request = struct.pack('16sh22x', name.encode(), 0)
+            _, flags = struct.unpack('16sH22x', fcntl.ioctl(query, SIOCGIFFLAGS, request))
+            found.append(
+                Interface(
+                    printable(name),
+                    up=bool(flags & IFF_UP),
+                    loopback=bool(flags & IFF_LOOPBACK),
+                    multicast=bool(flags & IFF_MULTICAST),
                 )
-    return tuple(found)
+            )
+    return tuple(sorted(found, key=lambda one: one.name))
 
 
 def multicast_error() -> str:
@@ -124,7 +126,7 @@ def check_shared_memory(memory: SharedMemory | None) -> Iterator[Finding]:
     """Yield what is wrong with the shared memory."""
     if memory is None or not memory.writable:
         yield Finding(
-            f'{SHARED_MEMORY} is missing or cannot be written: Fast DDS sends all messages by the network',
+            f'{SHARED_MEMORY} is missing or cannot be written: Fast DDS sends messages by the network',
             f'mount a tmpfs on {SHARED_MEMORY} (in a container: --ipc=host or --shm-size)',
             problem=False,
         )

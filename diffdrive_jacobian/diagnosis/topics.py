@@ -18,7 +18,7 @@ from diffdrive_jacobian.diagnosis.description import (
 
 START_READER = {
     'cmd_vel': 'start virtual_robot, wheel_bridge or the driver of your robot',
-    'joint_command': 'start virtual_robot with -p command_interface:=wheels, or the driver of your motors',
+    'joint_command': 'start virtual_robot with -p command_interface:=wheels, or your motor driver',
     'goal_pose': 'start go_to_goal',
     'goals': 'start go_to_goal',
 }
@@ -70,8 +70,8 @@ def _check_types(graph: Graph, topic: str) -> Iterator[Finding]:
         for ours, sinks in sorted(subscriptions.items()):
             if theirs != ours:
                 yield Finding(
-                    f'{listed(sources)} publishes {topic} as {theirs}, but {listed(sinks)} subscribes to '
-                    f'it as {ours}: no message arrives',
+                    f'{listed(sources)} publishes {topic} as {theirs}, but {listed(sinks)} subscribes '
+                    f'to it as {ours}: no message arrives',
                     type_remedy(theirs, ours),
                 )
 
@@ -181,9 +181,7 @@ def _namesake(graph: Graph, topic: str, *, publishes: bool) -> str:
     others: list[Endpoint] = [
         one
         for one in graph.endpoints
-        if one.publishes == publishes
-        and one.topic != topic
-        and base_name(one.topic) == base_name(topic)
+        if one.publishes == publishes and one.topic != topic and base_name(one.topic) == base_name(topic)
     ]
     if not others:
         return ''

@@ -7,13 +7,25 @@ import math
 import os
 import sys
 from collections.abc import Sequence
+from typing import Any
 
+from diffdrive_jacobian import __version__
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 
 DONE, FAILED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
 """Exit codes: done, not done, wrong arguments, interrupted by a signal."""
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser with the option that every tool has."""
+
+    def __init__(self, *, prog: str, **kwargs: Any) -> None:
+        """Add `--version`. Arguments as for `argparse.ArgumentParser`."""
+        super().__init__(prog=prog, **kwargs)
+        version = f'{prog} (diffdrive_jacobian) {__version__}'
+        self.add_argument('--version', action='version', version=version, help='print the version')
 
 
 def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:

@@ -188,7 +188,7 @@ def _reason(outcome: Outcome, timeout: float) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} X Y [X Y ...] [options] [--ros-args ...]',
         description='Drive the virtual robot to goals, in order: robot, controller and wheel bridge '

@@ -156,7 +156,7 @@ def _topic(text: str) -> tuple[str, str]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=PROGRAM,
         description='Draw runs that record_run or ros2 bag record has written: the path with its goals, '
         'and over time the distance to the goal, the heading error, the speeds and their limits. '

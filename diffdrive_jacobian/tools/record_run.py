@@ -112,7 +112,7 @@ def _pattern(text: str) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} [TOPIC ...] [options] [--ros-args ...]',
         description='Record topics as a rosbag2 bag until Ctrl-C. Messages are on the disk within a '

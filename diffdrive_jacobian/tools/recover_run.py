@@ -80,7 +80,7 @@ def _listed(losses: Sequence[str], prefix: str = '') -> list[str]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} BAG [options]',
         description='Write a complete bag with all messages that can be read of one that a crash or a '

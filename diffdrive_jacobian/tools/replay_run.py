@@ -148,7 +148,7 @@ def _not_negative(text: str) -> float:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} BAG [options] [--ros-args ...]',
         description='Replay a recorded run: the commands (cmd_vel), unless an option selects other '

@@ -101,7 +101,7 @@ def _parser(name: str, program: Program) -> argparse.ArgumentParser:
             f'  {ros_name}',
             *textwrap.wrap(text, 90, initial_indent='      ', subsequent_indent='      '),
         ]
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=name,
         usage=f'{name} [-h] [--params-file FILE] [--ros-args -p PARAMETER:=VALUE -r NAME:=NAME ...]',
         description=textwrap.fill(program.description, 90),

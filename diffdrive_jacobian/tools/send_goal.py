@@ -119,7 +119,7 @@ def _hint(result: GoalResult) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} X Y [options] [--ros-args ...]',
         description='Send a goal to a running go_to_goal and wait until it has ended. Ctrl-C cancels '

@@ -164,7 +164,7 @@ def _whole(text: str) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} [options]',
         description='Sweep the gains kp and kv of a control law over a grid: thousands of closed loops '

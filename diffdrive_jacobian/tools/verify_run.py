@@ -85,7 +85,7 @@ def _run(options: argparse.Namespace, program: str) -> int:
 
 
 def _parser(program: str = PROGRAM, option: str = '') -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=program,
         usage=' '.join([program, *option.split(), 'BAG [options]']),
         description='Simulate a recorded run again from its commands, and compare the path with the '
