@@ -101,6 +101,7 @@ OTHERS = {
     ROBOT.remodelled: {'model': MODEL, 'stamp': 5},
     ROBOT.restarted: {'stamp': 5},
     ROBOT.twist_covariance: {'interval': 0.02},
+    ROBOT.twist_covariance_tuple: {'interval': 0.02},
     closed_loops: {'law': control.go_to_goal, **LOOP, 'arrival': Arrival(), 'limits': LIMITS}
     | {'progress': None},
     trajectories: {'law': control.go_to_goal, **LOOP, 'arrival': Arrival(), 'limits': LIMITS},

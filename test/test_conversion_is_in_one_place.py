@@ -1,4 +1,4 @@
-"""Stamps are written, and the order of the wheels is converted, by `messages.conversion` only."""
+"""Stamps are written, and the order of the wheels is converted, by the package `messages` only."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import ast
 from pathlib import Path
 
 import pytest
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 import diffdrive_jacobian
-from diffdrive_jacobian.messages import conversion
+from diffdrive_jacobian.messages import conversion, wire
+from diffdrive_jacobian.ros.serialization import reader
 
 PACKAGE = Path(diffdrive_jacobian.__file__).parent
 FIELDS = {'sec', 'nanosec', 'velocity', 'position', 'data'}
@@ -33,7 +35,7 @@ def writers():
 
 def test_only_the_conversion_writes_stamps_and_wheels():
     found = set(writers())
-    assert {path for path, _ in found} == {'messages/conversion.py'}
+    assert {path for path, _ in found} == {'messages/conversion.py', 'messages/wire.py'}
     assert {field for _, field in found} == FIELDS
 
 
@@ -47,10 +49,18 @@ def test_no_module_assigns_a_stamp_of_its_own_making():
 
 @pytest.mark.parametrize('angles', [None, (0.5, -0.5)])
 def test_wheels_are_left_right_in_messages_and_right_left_in_the_library(angles):
-    state, array = JointState(name=['left', 'right']), Float64MultiArray()
-    conversion.set_joint_state(state, 1_500_000_000, (3.0, 2.0), angles)
-    conversion.set_wheel_array(array, (3.0, 2.0))
+    state, time, speeds = JointState(name=['left', 'right']), 1_500_000_000, (3.0, 2.0)
+    if angles is None:
+        data = wire.joint_command_writer(state)(time, speeds)
+    else:
+        data = wire.joint_state_writer(state)(time, speeds, angles)
+    state = deserialize_message(data, JointState)
+    data = wire.wheel_array_writer(Float64MultiArray())(time, speeds)
+    array = deserialize_message(data, Float64MultiArray)
     assert list(state.velocity) == list(array.data) == [2.0, 3.0]
     assert list(state.position) == ([] if angles is None else [-0.5, 0.5])
     assert (state.header.stamp.sec, state.header.stamp.nanosec) == (1, 500_000_000)
-    assert conversion.from_joint_state(state, ('left', 'right')) == (3.0, 2.0)
+    assert conversion.from_joint_state(state, ('left', 'right')) == speeds
+    assert reader(JointState, wire.JOINT_STATE)(
+        wire.joint_command_writer(JointState(name=['left', 'right']))(time, speeds)
+    ) == (1, 500_000_000, ('left', 'right'), (2.0, 3.0))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +13,7 @@ from diffdrive_jacobian.control import VelocityLimits
 from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
 from diffdrive_jacobian.kinematics.se2 import integrate, wrap_angle
 from diffdrive_jacobian.simulation import Robot, RobotModel
+from diffdrive_jacobian.simulation._uncertainty import MAX_PENDING
 from diffdrive_jacobian.simulation.odometry_noise import propagate_covariance, twist_covariance
 
 SECOND = 1_000_000_000
@@ -294,3 +297,64 @@ def test_restarted_stands_still_on_an_earlier_time_line():
     assert state(restarted.at(10 * SECOND)) == state(restarted)
     # It stays where it is, and keeps what it knows of it.
     assert state(restarted)[:3] == state(robot)[:3]
+
+
+# --- The covariance is computed when it is read
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_it_does_not_matter_when_the_covariance_is_read(seed):
+    rng = np.random.default_rng(30 + seed)
+    commands = random_commands(rng, 3 * MAX_PENDING + 5)
+    never, always, sometimes = start(), start(), start()
+    for instant, twist in commands:
+        never, always, sometimes = (
+            robot.commanded(twist, instant) for robot in (never, always, sometimes)
+        )
+        assert np.isfinite(always.covariance).all()
+        if rng.random() < 0.02:
+            assert np.isfinite(sometimes.at(instant + 1000).covariance).all()
+    assert state(never) == state(always) == state(sometimes)
+
+
+def test_a_robot_whose_covariance_is_never_read_keeps_a_bounded_number_of_arcs():
+    robot = start(HELD)
+    for step in range(5 * MAX_PENDING):
+        robot = robot.commanded((0.1, 0.01 * step), step * SECOND // 50)
+        kept, pending = 0, robot._uncertainty._pending
+        while pending is not None:
+            kept, pending = kept + 1, pending[0]._pending
+        assert kept <= MAX_PENDING
+
+
+def test_a_time_that_was_computed_is_not_computed_again():
+    robot = start().commanded((0.2, 1.0), 0)
+    first, again = robot.at(1000), robot.at(1000)
+    assert first is not again
+    assert first._uncertainty is again._uncertainty is robot.commanded((0.1, 0.0), 1000)._uncertainty
+    assert first.pose_tuple == tuple(first.pose.tolist())
+    assert first.covariance_tuple == tuple(first.covariance.ravel().tolist())
+
+
+def test_a_covariance_that_overflows_raises_an_error_whenever_it_is_read():
+    fast = Robot(model=RobotModel(), stamp=0, pose=np.zeros(3)).commanded((1e200, 0.0), 0).at(SECOND)
+    later = fast
+    for step in range(2 * MAX_PENDING):
+        later = later.commanded((0.0, float(step)), (2 + step) * SECOND)
+    for robot in (fast, later, fast):
+        assert robot.pose_tuple[0] >= 1e200
+        with pytest.raises(ValueError, match='overflows'):
+            _ = robot.covariance
+    assert not later.placed(START, np.zeros((3, 3)), later.stamp).covariance.any()
+
+
+@pytest.mark.parametrize(
+    'duplicate', [copy.copy, copy.deepcopy, lambda r: pickle.loads(pickle.dumps(r))]
+)
+def test_a_copy_is_the_same_robot(duplicate):
+    robot = start().commanded((0.2, 1.0), 0).at(1000).commanded((0.1, 1.0), 2000)
+    made = duplicate(robot)
+    assert state(made.at(SECOND // 5)) == state(robot.at(SECOND // 5))
+    assert drive(made) == drive(robot)
+    assert repr(made) == repr(robot)
+    assert not hasattr(robot, 'speed')

@@ -7,6 +7,7 @@ document B's law the distance is measured from the offset point (doc/mathematics
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite
 from typing import Any
 
 from diffdrive_jacobian.kinematics._checks import (
@@ -83,6 +84,12 @@ class Arrival:
         Raises:
             ValueError: An argument is not finite, shapes do not broadcast, or the distance overflows.
         """
+        if type(x) is type(y) is type(theta) is type(x_goal) is type(y_goal) is float and isfinite(
+            x + y + theta + x_goal + y_goal
+        ):
+            (distance,) = self._distance(x, y, theta, x_goal, y_goal)
+            if type(distance) is float and isfinite(distance):
+                return distance
         x, y, theta = operand('x', x), operand('y', y), operand('theta', theta)
         x_goal, y_goal = operand('x_goal', x_goal), operand('y_goal', y_goal)
         single = agree(x=x, y=y, theta=theta, x_goal=x_goal, y_goal=y_goal, offset=self.offset)
@@ -113,13 +120,13 @@ class Arrival:
         Raises:
             ValueError: An argument is not finite, shapes do not broadcast, or the difference overflows.
         """
-        theta, heading = operand('theta', theta), operand('heading', heading)
-        single = agree(theta=theta, heading=heading)
-        (error,) = evaluated(
-            single,
-            'theta and heading',
-            lambda theta, heading: (wrapped(heading - theta),),
-            theta,
-            heading,
-        )
+        single = type(theta) is type(heading) is float and isfinite(theta + heading)
+        if not single:
+            theta, heading = operand('theta', theta), operand('heading', heading)
+            single = agree(theta=theta, heading=heading)
+        (error,) = evaluated(single, 'theta and heading', _heading_error, theta, heading)
         return abs(error) <= self.yaw_tolerance
+
+
+def _heading_error(theta: Any, heading: Any) -> tuple[Any]:
+    return (wrapped(heading - theta),)

@@ -9,6 +9,7 @@ Source: document A, equations (9)-(11); doc/mathematics.md, "Control laws".
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import isfinite
 from typing import Any
 
 from numpy.typing import ArrayLike
@@ -50,6 +51,10 @@ def go_to_goal(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any) -> tuple[Any
     """
     x, y, theta = components('state', state, 3)
     x_goal, y_goal = components('goal', goal, 2)
+    if type(x) is type(x_goal) is type(Kp) is type(Kv) is float and isfinite(Kp + Kv):
+        v, omega = _law(x, y, theta, x_goal, y_goal, Kp, Kv)
+        if isfinite(v + omega):
+            return v, omega
     Kp, Kv = operand('Kp', Kp), operand('Kv', Kv)
     single = agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv)
     v, omega = evaluated(single, 'state, goal, Kp and Kv', _law, x, y, theta, x_goal, y_goal, Kp, Kv)
@@ -104,14 +109,15 @@ def turn_in_place(theta: Any, heading: Any, Kp: Any) -> tuple[Any, Any]:
     Raises:
         ValueError: Shapes do not broadcast, something is not finite, or the twist overflows.
     """
+    if type(theta) is type(heading) is type(Kp) is float and isfinite(theta + heading + Kp):
+        (omega,) = _turn(theta, heading, Kp)
+        if isfinite(omega):
+            return 0.0 * omega, omega
     theta, heading, Kp = operand('theta', theta), operand('heading', heading), operand('Kp', Kp)
     single = agree(theta=theta, heading=heading, Kp=Kp)
-    (omega,) = evaluated(
-        single,
-        'theta, heading and Kp',
-        lambda theta, heading, Kp: (Kp * wrapped(heading - theta),),
-        theta,
-        heading,
-        Kp,
-    )
+    (omega,) = evaluated(single, 'theta, heading and Kp', _turn, theta, heading, Kp)
     return 0.0 * omega, omega
+
+
+def _turn(theta: Any, heading: Any, Kp: Any) -> tuple[Any]:
+    return (Kp * wrapped(heading - theta),)

@@ -13,6 +13,7 @@ Source: document B, "Let's add a control point offset"; doc/mathematics.md, "Dif
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import isfinite
 from typing import Any
 
 from numpy.typing import ArrayLike
@@ -47,6 +48,10 @@ def offset_point(state: ArrayLike, goal: ArrayLike, k: Any, d: Any) -> tuple[Any
     """
     x, y, theta = components('state', state, 3)
     x_goal, y_goal = components('goal', goal, 2)
+    if type(x) is type(x_goal) is type(k) is type(d) is float and d != 0.0 and isfinite(k + d):
+        v, omega = _law(x, y, theta, x_goal, y_goal, k, d)
+        if isfinite(v + omega):
+            return v, omega
     k, d = operand('k', k), operand('d', d, offset)
     single = agree(state=x, goal=x_goal, k=k, d=d)
     v, omega = evaluated(single, 'state, goal, k and d', _law, x, y, theta, x_goal, y_goal, k, d)

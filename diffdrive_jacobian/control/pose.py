@@ -17,6 +17,7 @@ vehicles via Lyapunov techniques", IEEE Robotics & Automation Magazine 2(1), 199
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import isfinite
 from typing import Any
 
 from numpy.typing import ArrayLike
@@ -76,6 +77,15 @@ def go_to_pose(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any, h: Any = Non
     """
     x, y, theta = components('state', state, 3)
     x_goal, y_goal, heading = components('goal', goal, 3)
+    if (
+        type(x) is type(x_goal) is type(Kp) is type(Kv) is float
+        and Kp > 0.0 < Kv
+        and (h is None or (type(h) is float and h > 0.0))
+        and isfinite(Kp + Kv + (h or 0.0))
+    ):
+        v, omega = _law(x, y, theta, x_goal, y_goal, heading, Kp, Kv, h)
+        if isfinite(v + omega):
+            return v, omega
     Kp, Kv = operand('Kp', Kp, positive), operand('Kv', Kv, positive)
     names = 'state, goal, Kp and Kv'
     if h is None:

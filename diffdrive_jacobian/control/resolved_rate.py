@@ -28,6 +28,14 @@ from diffdrive_jacobian.kinematics._checks import (
     positive,
     read_only,
 )
+from diffdrive_jacobian.kinematics._elementary import (
+    agree,
+    components,
+    maximum,
+    operand,
+    sqrt,
+    vector,
+)
 from diffdrive_jacobian.kinematics._task_checks import finite_result
 from diffdrive_jacobian.kinematics.inverse_velocity import (
     damped_least_squares,
@@ -75,29 +83,23 @@ def resolved_rate(
     """
     J = array('J', J, 'm', 'n')
     m = J.shape[-2]
-    x, x_desired = array('x', x, m), array('x_desired', x_desired, m)
-    x_dot_desired, K = array('x_dot_desired', x_dot_desired, m), floats('gain', gain)
-    not_negative('gain', K)
-    longest = floats('max_correction', max_correction)
-    if not (longest > 0.0).all():
-        raise ValueError(f'max_correction must be positive, got {longest}')
-    leading(
-        J=J.shape[:-2],
-        x=x.shape[:-1],
-        x_desired=x_desired.shape[:-1],
-        x_dot_desired=x_dot_desired.shape[:-1],
-        gain=K.shape,
-        max_correction=longest.shape,
+    tip, wanted = components('x', x, m), components('x_desired', x_desired, m)
+    forward, K = components('x_dot_desired', x_dot_desired, m), operand('gain', gain, not_negative)
+    longest = operand('max_correction', max_correction, _positive_or_infinite)
+    single = agree(
+        x=tip[0], x_desired=wanted[0], x_dot_desired=forward[0], gain=K, max_correction=longest
     )
+    if not single or J.ndim > 2:
+        leading(
+            J=J.shape[:-2],
+            x=np.shape(tip[0]),
+            x_desired=np.shape(wanted[0]),
+            x_dot_desired=np.shape(forward[0]),
+            gain=np.shape(K),
+            max_correction=np.shape(longest),
+        )
     with np.errstate(all='ignore'):
-        correction = K[..., np.newaxis] * (x_desired - x)
-        excess = np.linalg.norm(correction, axis=-1) / longest
-        correction = correction / np.maximum(excess, 1.0)[..., np.newaxis]
-        overflows = ~(excess < np.inf)
-        if overflows.any():
-            scaled = _scaled_correction(x, x_desired, K, longest)
-            correction = np.where(overflows[..., np.newaxis], scaled, correction)
-        x_dot = x_dot_desired + correction
+        x_dot = _tip_velocity(tip, wanted, forward, K, longest)
     finite_result('x, x_desired, x_dot_desired and gain', 'velocity', x_dot)
     if q_dot_0 is None:
         q_dot = damped_least_squares(J, x_dot, damping, weights=weights)
@@ -107,6 +109,33 @@ def resolved_rate(
         return q_dot
     finite_result('J, the velocity of the tip, damping and weights', 'joint velocity', q_dot)
     return limit_velocity(q_dot, max_velocity)
+
+
+def _positive_or_infinite(name: str, value: Any) -> None:
+    if not np.all(value > 0.0):
+        raise ValueError(f'{name} must be positive, got {value}')
+
+
+def _tip_velocity(
+    x: list[Any], x_desired: list[Any], x_dot_desired: list[Any], gain: Any, longest: Any
+) -> NDArray[np.float64]:
+    """Compute `x_dot_d + K (x_d - x)` from the entries, with the limited correction, shape (..., m)."""
+    correction = [gain * (there - here) for here, there in zip(x, x_desired, strict=True)]
+    squares: Any = 0.0
+    for entry in correction:
+        squares = squares + entry * entry
+    excess = sqrt(squares) / longest
+    factor = maximum(excess, 1.0)
+    correction = [entry / factor for entry in correction]
+    if not np.all(excess < np.inf):
+        overflows = ~np.asarray(excess < np.inf)
+        entries = _scaled_correction(
+            vector(*x), vector(*x_desired), np.asarray(gain), np.asarray(longest)
+        )
+        correction = [
+            np.where(overflows, entries[..., index], entry) for index, entry in enumerate(correction)
+        ]
+    return vector(*(own + added for own, added in zip(x_dot_desired, correction, strict=True)))
 
 
 def _scaled_correction(

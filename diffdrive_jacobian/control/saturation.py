@@ -7,7 +7,10 @@ Source: doc/mathematics.md, "Control laws".
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -21,8 +24,10 @@ from diffdrive_jacobian.kinematics._checks import (
     positive,
     read_only,
 )
-from diffdrive_jacobian.kinematics._elementary import agree, alike, maximum, minimum, operand, where
+from diffdrive_jacobian.kinematics._elementary import agree, alike, operand, where
 
+Select = Callable[..., Any]
+"""`max` or `min` of floats, or of arrays element by element."""
 SMALLEST = 5e-324
 """Smallest positive float."""
 
@@ -53,6 +58,10 @@ class VelocityLimits:
     """Whether every limit is a number, equal for all robots."""
     _bounds: tuple[Any, ...] = field(init=False, repr=False, compare=False)
     """For v, then omega: bounds that clip, lower and upper, and bounds that scale, lower and upper."""
+    _clips: bool = field(init=False, repr=False, compare=False)
+    """Whether there are bounds that clip: a limit is zero."""
+    _wheels: bool = field(init=False, repr=False, compare=False)
+    """Whether the wheel speeds have a limit."""
 
     def __post_init__(self) -> None:
         """Check every limit."""
@@ -82,6 +91,10 @@ class VelocityLimits:
             for low, high in ((self.min_v, self.max_v), (self.min_omega, self.max_omega))
         )
         object.__setattr__(self, '_bounds', tuple(bounds))
+        clips = any(bool(np.any(limit == 0.0)) for limit in self.all())
+        object.__setattr__(self, '_clips', clips)
+        wheels = type(self.max_wheel_speed) is not float or self.max_wheel_speed < np.inf
+        object.__setattr__(self, '_wheels', wheels)
 
     def __eq__(self, other: object) -> bool:
         """Compare every limit, arrays by shape and entries."""
@@ -130,6 +143,18 @@ def saturate(
         ValueError: v or omega is not finite; limits are of another class; shapes do not broadcast; the
             wheels have a limit, and r or L is not positive and finite.
     """
+    if (
+        type(v) is type(omega) is float
+        and isfinite(v + omega)
+        and type(limits) is VelocityLimits
+        and limits.alike
+    ):
+        if limits.unlimited:
+            return v, omega
+        if not limits._wheels:
+            return _saturated(v, omega, limits, 1.0, 1.0, max, min)
+        if type(r) is type(L) is float and r > 0.0 < L and isfinite(r + L):
+            return _saturated(v, omega, limits, r, L, max, min)
     v, omega = operand('v', v), operand('omega', omega)
     instance('limits', limits, VelocityLimits)
     single = type(v) is type(omega) is float
@@ -139,8 +164,7 @@ def saturate(
         agree(v=v, omega=omega)
         v, omega = alike(v, omega)
         return np.array(v), np.array(omega)
-    wheels = type(limits.max_wheel_speed) is not float or limits.max_wheel_speed < np.inf
-    if wheels:
+    if limits._wheels:
         if r is None or L is None:
             raise ValueError('limits have a max_wheel_speed, so r and L must be given')
         r, L = operand('r', r, positive), operand('L', L, positive)
@@ -148,26 +172,30 @@ def saturate(
     else:
         r = L = 1.0
     if single and limits.alike:
-        return _saturated(v, omega, limits, r, L, wheels)
+        return _saturated(v, omega, limits, r, L, max, min)
     agree(v=v, omega=omega, r=r, L=L, **dict(zip(limits.names(), limits.all(), strict=True)))
     with np.errstate(all='ignore'):
-        limited_v, limited_omega = alike(*_saturated(v, omega, limits, r, L, wheels))
+        limited = _saturated(v, omega, limits, r, L, _maximum, np.minimum)
+        limited_v, limited_omega = alike(*limited)
     return limited_v, limited_omega
 
 
 def _saturated(
-    v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, wheels: bool
+    v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, maximum: Select, minimum: Select
 ) -> tuple[Any, Any]:
     (v_floor, v_ceiling, *_), (omega_floor, omega_ceiling, *_) = limits._bounds
-    v = minimum(maximum(v, v_floor), v_ceiling)
-    omega = minimum(maximum(omega, omega_floor), omega_ceiling)
-    divisor = _excess(v, omega, limits, r, L, 1.0)
+    if limits._clips:
+        v = minimum(maximum(v, v_floor), v_ceiling)
+        omega = minimum(maximum(omega, omega_floor), omega_ceiling)
+    divisor = _excess(v, omega, limits, r, L, 1.0, maximum)
+    if type(divisor) is float and divisor == 1.0:
+        return v, omega
     if _any(divisor == np.inf):
-        v, omega, divisor = _scaled_down(v, omega, limits, r, L, divisor)
+        v, omega, divisor = _scaled_down(v, omega, limits, r, L, divisor, maximum)
     # The quotient may round to one unit in the last place beyond the limit.
     v = minimum(maximum(v / divisor, limits.min_v), limits.max_v)
     omega = minimum(maximum(omega / divisor, limits.min_omega), limits.max_omega)
-    if wheels:
+    if limits._wheels:
         # So may the wheel speeds. Shrink by one unit in the last place, then by two, four, and so on.
         step = 2.0**-53
         while _any(above := _fastest(v, omega, r, L) > limits.max_wheel_speed):
@@ -176,34 +204,41 @@ def _saturated(
     return v, omega
 
 
-def _excess(v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, least: Any) -> Any:
+def _excess(
+    v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, least: Any, maximum: Select
+) -> Any:
     """Compute the factor by which a twist exceeds the limits; at least `least`."""
     (_, _, v_low, v_high), (_, _, omega_low, omega_high) = limits._bounds
-    most = maximum(maximum(v / v_low, v / v_high), maximum(omega / omega_low, omega / omega_high))
-    limit = limits.max_wheel_speed
-    if type(limit) is not float:
-        # Infinity divided by infinity would be NaN.
-        most = maximum(most, np.where(limit < np.inf, _fastest(v, omega, r, L) / limit, 0.0))
-    elif limit < np.inf:
-        most = maximum(most, _fastest(v, omega, r, L) / limit)
-    return maximum(most, least)
+    of_wheels: Any = 0.0
+    if limits._wheels:
+        limit = limits.max_wheel_speed
+        of_wheels = _fastest(v, omega, r, L) / limit
+        if type(limit) is not float:
+            # Infinity divided by infinity would be NaN.
+            of_wheels = np.where(limit < np.inf, of_wheels, 0.0)
+    return maximum(v / v_low, v / v_high, omega / omega_low, omega / omega_high, of_wheels, least)
 
 
 def _scaled_down(
-    v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, divisor: Any
+    v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, divisor: Any, maximum: Select
 ) -> tuple[Any, Any, Any]:
     """Scale twists whose excess is infinite until it can be computed."""
     least: Any = 1.0
     while _any(infinite := divisor == np.inf):
         factor = where(infinite, 2.0**-600, 1.0)
         v, omega, least = v * factor, omega * factor, maximum(least * factor, SMALLEST)
-        divisor = _excess(v, omega, limits, r, L, least)
+        divisor = _excess(v, omega, limits, r, L, least, maximum)
     return v, omega, divisor
 
 
 def _fastest(v: Any, omega: Any, r: Any, L: Any) -> Any:
     """Compute the speed of the faster wheel, bit-identical to `body_to_wheel`."""
     return (abs(v) + abs(omega * L / 2.0)) / r
+
+
+def _maximum(*values: Any) -> Any:
+    """Return the largest of arrays that broadcast, element by element."""
+    return functools.reduce(np.maximum, values)
 
 
 def _any(condition: Any) -> bool:

@@ -84,9 +84,10 @@ class Waypoints:
             # The heading no longer counts, and the position was reached.
             return here, None
         while not here.turning:
-            x_goal, y_goal, _ = here.poses[here.index].tolist()
+            goal = here.poses[here.index]
+            x_goal, y_goal, _ = goal.tolist()
             if not arrival.reached(x, y, theta, x_goal, y_goal):
-                return here, law(pose, here.poses[here.index])
+                return here, law(pose, goal)
             if here.index + 1 < len(here.poses):
                 here = here._progressed(here.index + 1, turning=False)
             elif arrival.use_heading:

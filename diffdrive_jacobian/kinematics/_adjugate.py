@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+EPS = float(np.finfo(np.float64).eps)
 
 
 def adjugate(J: Array) -> Array:
@@ -16,9 +19,10 @@ def adjugate(J: Array) -> Array:
     return adjugates
 
 
-def refuse_singular(determinant: Array, singular: NDArray[np.bool_]) -> None:
+def refuse_singular(determinant: Any, singular: Any) -> None:
     """Raise LinAlgError with the determinant of the first Jacobian that is singular, if there is one."""
-    if np.any(singular):
+    if singular is not False and np.any(singular):
+        determinant = np.asarray(determinant)
         where = tuple(int(index) for index in np.argwhere(singular)[0])
         at = f' (at index {where if len(where) > 1 else where[0]})' if where else ''
         raise np.linalg.LinAlgError(

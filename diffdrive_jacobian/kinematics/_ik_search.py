@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from diffdrive_jacobian.kinematics._ik_task import EPS, Flags, Floats, Integers, Task, norm
-from diffdrive_jacobian.kinematics.inverse_velocity import damped_least_squares
+from diffdrive_jacobian.kinematics._singular_values import joint_velocities
 
 STATIONARY = {'newton': 1e-6, 'transpose': 1e-6, 'levenberg_marquardt': 1e-7}
 """Cosine between the error and what a joint does, below which the joint cannot lower the error.
@@ -234,7 +234,12 @@ class Search:
             linear = norm(gradient) / norm(along)
             return np.asarray(gradient * (still.factor * linear**2)[:, np.newaxis])
         # With lambda zero it is the pseudo-inverse's.
-        step = damped_least_squares(J, still.e, np.sqrt(still.factor))
+        lambdas = np.sqrt(still.factor)
+        if len(J) == 1:
+            # In floats: ten times as fast as a batch of one.
+            step = joint_velocities(J[0], still.e[0], lambdas[0, ...])[np.newaxis]
+        else:
+            step = joint_velocities(J, still.e, lambdas)
         if self.method == 'levenberg_marquardt' and count >= SECOND_ORDER_AFTER:
             late = found.iterations[still.which] - found.began[still.which] >= SECOND_ORDER_AFTER
             if late.any():

@@ -106,7 +106,15 @@ def joint_velocities(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | No
     Returns:
         Joint velocities, shape (..., n). Infinite where they overflow.
     """
-    method = _two_rows if J.shape[-2] == 2 else _by_svd
+    axes = J.ndim == 2 and x_dot.ndim == 1 and damping.ndim == 0
+    if axes and len(J) == 2 and (q_dot_0 is None or q_dot_0.ndim == 1):
+        # Floats: several times as fast as arrays of one.
+        secondary = [] if q_dot_0 is None else q_dot_0.tolist()
+        columns = list(zip(*J.tolist(), strict=True))
+        single, exact = _two_rows(columns, *x_dot.tolist(), float(damping), secondary)
+        if exact:
+            return np.array(single)
+    method = _columns if J.shape[-2] == 2 else _by_svd
     with np.errstate(all='ignore'):
         q_dot, exact = method(J, x_dot, damping, q_dot_0)
         if np.all(exact):
@@ -125,9 +133,13 @@ def joint_velocities(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | No
 
 def manipulability(J: Array) -> Array:
     """Compute the product of the singular values of Jacobians with m <= n, shape (...)."""
+    if J.ndim == len(J) == 2:
+        columns = list(zip(*J.tolist(), strict=True))
+        if 1e-60 < sum(a * a + b * b for a, b in columns) < 1e60:
+            return np.array(_minors(columns))
     with np.errstate(all='ignore'):
         if J.shape[-2] == 2:
-            w = _minors(J)
+            w = np.asarray(_minors(_column_pairs(J)))
             squares = np.einsum('...ij,...ij->...', J, J)
             extreme = ~((squares > 1e-60) & (squares < 1e60))
         else:
@@ -168,22 +180,27 @@ def _each(function: Any, values: Array, damping: Array, least: Any) -> Array:
     return computed
 
 
-def _minors(J: Array) -> Array:
+def _minors(columns: list[tuple[Any, Any]]) -> Any:
     """Compute the manipulability of two rows: the root of the sum of all squared minors (Cauchy and
     Binet), which loses no digits.
     """
-    squares: Any = np.zeros(J.shape[:-2])
-    for i in range(J.shape[-1]):
-        for j in range(i):
-            minor = J[..., 0, i] * J[..., 1, j] - J[..., 0, j] * J[..., 1, i]
+    squares: Any = 0.0
+    for i, (a, b) in enumerate(columns):
+        for c, d in columns[:i]:
+            minor = a * d - c * b
             squares = squares + minor * minor
-    return np.array(np.sqrt(squares))
+    return sqrt(squares)
+
+
+def _column_pairs(J: Array) -> list[tuple[Any, Any]]:
+    """Return the columns of two rows: pairs of shape (...)."""
+    return [(J[..., 0, k], J[..., 1, k]) for k in range(J.shape[-1])]
 
 
 def _scaled_manipulability(J: Array, exponents: NDArray[np.int32]) -> Array:
     """Compute the manipulability of Jacobians whose rows are about 1, times two to the exponents."""
     if J.shape[-2] == 2:
-        return np.asarray(np.ldexp(_minors(J), exponents))
+        return np.asarray(np.ldexp(_minors(_column_pairs(J)), exponents))
     # Singular values can be so small that their product underflows before it is scaled.
     mantissas, powers = np.frexp(np.linalg.svd(J, compute_uv=False))
     exponents = exponents + powers.sum(axis=-1, dtype=np.int32)
@@ -234,26 +251,21 @@ def _by_svd(
     return q_dot, (largest > 1e-30) & (largest < 1e30) & np.isfinite(q_dot).all(axis=-1)
 
 
-def _two_rows(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None) -> tuple[Array, Any]:
+def _columns(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None) -> tuple[Array, Any]:
+    """Compute the same for arrays of two rows."""
+    # Column by column, because loops over the short last axis take longer.
+    secondary = [] if q_dot_0 is None else [q_dot_0[..., k] for k in range(J.shape[-1])]
+    q_dot, exact = _two_rows(_column_pairs(J), x_dot[..., 0], x_dot[..., 1], damping, secondary)
+    return np.stack(q_dot, axis=-1), exact
+
+
+def _two_rows(
+    columns: list[tuple[Any, Any]], one: Any, other: Any, factor: Any, secondary: list[Any]
+) -> tuple[list[Any], Any]:
     """Compute the same for two rows, in closed form: a rotation in the plane of the task makes the rows
     orthogonal (one-sided Jacobi), then they are `s_i v_i^T`. Many times as fast as LAPACK.
     """
-    # Column by column, because loops over the short last axis take longer; of a single Jacobian floats.
-    n = J.shape[-1]
-    columns: list[tuple[Any, Any]]
-    secondary: list[Any] = []
-    one: Any
-    other: Any
-    factor: Any = damping
-    if J.ndim == 2 and x_dot.ndim == 1 and damping.ndim == 0 and (q_dot_0 is None or q_dot_0.ndim == 1):
-        first_row, second_row = J.tolist()
-        columns = list(zip(first_row, second_row, strict=True))
-        (one, other), factor = x_dot.tolist(), float(damping)
-        secondary = [] if q_dot_0 is None else q_dot_0.tolist()
-    else:
-        columns = [(J[..., 0, k], J[..., 1, k]) for k in range(n)]
-        one, other = x_dot[..., 0], x_dot[..., 1]
-        secondary = [] if q_dot_0 is None else [q_dot_0[..., k] for k in range(n)]
+    n = len(columns)
     for _ in range(2):  # The second rotation removes the rounding of the first near a singularity.
         c, s = _rotation(*_products(columns))
         one, other = c * one + s * other, c * other - s * one
@@ -275,9 +287,10 @@ def _two_rows(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | None) -> 
         q_dot = [one * a + other * b for a, b in columns]
     exact = (first > 1e-60) & (first < 1e60) & (abs(_sum(map(abs, q_dot))) < np.inf)
     small = second < 1e-200
-    if np.any(small):  # Its square may have underflowed although that of the first has not.
+    if small is not False and np.any(small):
+        # Its square may have underflowed although that of the first has not.
         exact = exact & ~(np.asarray(small) & np.any([b != 0.0 for _, b in columns], axis=0))
-    return np.stack(q_dot, axis=-1), exact
+    return q_dot, exact
 
 
 def _rotation(first: Any, second: Any, both: Any) -> tuple[Any, Any]:
@@ -298,11 +311,11 @@ def _rotation(first: Any, second: Any, both: Any) -> tuple[Any, Any]:
 
 def _products(columns: list[tuple[Any, Any]]) -> tuple[Any, Any, Any]:
     """Return the squares of two rows, and their product."""
-    return (
-        _sum(a * a for a, _ in columns),
-        _sum(b * b for _, b in columns),
-        _sum(a * b for a, b in columns),
-    )
+    a, b = columns[0]
+    first, second, both = a * a, b * b, a * b
+    for a, b in columns[1:]:
+        first, second, both = first + a * a, second + b * b, both + a * b
+    return first, second, both
 
 
 def _sum(terms: Iterable[Any]) -> Any:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import array, floats, leading, not_negative, positive
+from diffdrive_jacobian.kinematics._checks import array, leading, not_negative, positive
+from diffdrive_jacobian.kinematics._elementary import operand
 
 Array = NDArray[np.float64]
 
@@ -20,6 +21,8 @@ def checked_task(
     """
     J = array(name_J, J, 'm', 'n')
     x_dot = array(name_x_dot, x_dot, J.shape[-2])
+    if J.ndim == 2 and x_dot.ndim == 1:
+        return J, x_dot
     leading(**{name_J: J.shape[:-2], name_x_dot: x_dot.shape[:-1]})
     return J, x_dot
 
@@ -30,9 +33,7 @@ def checked_damping(damping: ArrayLike) -> Array:
     Raises:
         ValueError: An entry is negative or not a finite number.
     """
-    factor = floats('damping', damping)
-    not_negative('damping', factor)
-    return factor
+    return np.asarray(operand('damping', damping, not_negative))
 
 
 def weighted(J: Array, weights: ArrayLike, name_J: str = 'J') -> tuple[Array, Array]:

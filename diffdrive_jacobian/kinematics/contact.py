@@ -14,12 +14,13 @@ Source: document C, "Kinematic structure of mobile robots"; doc/mathematics.md, 
 
 from __future__ import annotations
 
-from typing import Any
+from math import isfinite
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import array, floats, leading, positive
+from diffdrive_jacobian.kinematics._checks import positive
+from diffdrive_jacobian.kinematics._elementary import agree, cos, matrix, operand, sin, vector
 
 AT_GROUND = np.pi
 """The angle phi of the point that touches the ground (rad)."""
@@ -39,12 +40,11 @@ def wheel_contact_position(x: ArrayLike, phi: ArrayLike, r: ArrayLike) -> NDArra
     Raises:
         ValueError: r is not positive and finite, or x or phi is not finite.
     """
-    x, phi, r = _checked(x=x, phi=phi, r=r)
-    x, phi, r = np.broadcast_arrays(x, phi, r)
-    position: NDArray[np.float64] = np.stack(
-        [x + r * np.sin(phi), r + r * np.cos(phi), np.zeros_like(x)], axis=-1
-    )
-    return position
+    single = type(x) is type(phi) is type(r) is float and r > 0.0 and isfinite(x + phi + r)
+    if not single:
+        x, phi, r = operand('x', x), operand('phi', phi), operand('r', r, positive)
+        agree(x=x, phi=phi, r=r)
+    return vector(x + r * sin(phi), r + r * cos(phi), 0.0)
 
 
 def wheel_contact_jacobian(phi: ArrayLike, r: ArrayLike) -> NDArray[np.float64]:
@@ -60,12 +60,11 @@ def wheel_contact_jacobian(phi: ArrayLike, r: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ValueError: r is not positive and finite, or phi is not finite.
     """
-    phi, r = _checked(phi=phi, r=r)
-    jacobian = np.zeros((*np.broadcast(phi, r).shape, 3, 2))
-    jacobian[..., 0, 0] = 1.0
-    jacobian[..., 0, 1] = r * np.cos(phi)
-    jacobian[..., 1, 1] = -r * np.sin(phi)
-    return jacobian
+    single = type(phi) is type(r) is float and r > 0.0 and isfinite(phi + r)
+    if not single:
+        phi, r = operand('phi', phi), operand('r', r, positive)
+        agree(phi=phi, r=r)
+    return matrix(3, 2, 1.0, r * cos(phi), 0.0, -r * sin(phi), 0.0, 0.0)
 
 
 def rolling_direction(r: ArrayLike) -> NDArray[np.float64]:
@@ -80,14 +79,4 @@ def rolling_direction(r: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ValueError: r is not positive and finite.
     """
-    (r,) = _checked(r=r)
-    direction: NDArray[np.float64] = np.stack([r, np.ones_like(r)], axis=-1)
-    return direction
-
-
-def _checked(*, r: Any, **coordinates: Any) -> list[NDArray[np.float64]]:
-    checked = {name: array(name, value) for name, value in coordinates.items()}
-    checked['r'] = floats('r', r)
-    positive('r', checked['r'])
-    leading(**{name: value.shape for name, value in checked.items()})
-    return list(checked.values())
+    return vector(operand('r', r, positive), 1.0)

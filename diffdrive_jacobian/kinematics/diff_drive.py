@@ -15,17 +15,20 @@ Source: document A, equations (4)-(8); documents B and E; doc/mathematics.md, "D
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import array, floats, leading, offset, positive
+from diffdrive_jacobian.kinematics._checks import offset, positive
 from diffdrive_jacobian.kinematics._elementary import (
     agree,
+    alike,
     components,
     cos,
     evaluated,
+    matrix,
     operand,
     sin,
     stack,
@@ -41,12 +44,8 @@ def unicycle_jacobian(theta: ArrayLike) -> NDArray[np.float64]:
     Returns:
         S, shape (..., 3, 2). Its rank is 2 and its singular values are 1, 1 for every heading.
     """
-    theta = _angles(theta)
-    jacobian = np.zeros((*theta.shape, 3, 2))
-    jacobian[..., 0, 0] = np.cos(theta)
-    jacobian[..., 1, 0] = np.sin(theta)
-    jacobian[..., 2, 1] = 1.0
-    return jacobian
+    theta = operand('theta', theta)
+    return matrix(3, 2, cos(theta), 0.0, sin(theta), 0.0, 0.0, 1.0)
 
 
 def wheel_to_body_jacobian(r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
@@ -62,13 +61,9 @@ def wheel_to_body_jacobian(r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    r, L = _geometry(r, L)
-    jacobian = np.empty((*np.broadcast(r, L).shape, 2, 2))
-    jacobian[..., 0, 0] = jacobian[..., 0, 1] = r / 2.0
-    (ratio,) = evaluated(False, 'r and L', lambda: (r / L,))
-    jacobian[..., 1, 0] = ratio
-    jacobian[..., 1, 1] = -ratio
-    return jacobian
+    r, L, single = _geometry(r, L)
+    half, ratio = evaluated(single, 'r and L', lambda r, L: (r / 2.0, r / L), r, L)
+    return matrix(2, 2, half, half, ratio, -ratio)
 
 
 def body_to_wheel_jacobian(r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
@@ -84,13 +79,9 @@ def body_to_wheel_jacobian(r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    r, L = _geometry(r, L)
-    jacobian = np.empty((*np.broadcast(r, L).shape, 2, 2))
-    along, across = evaluated(False, 'r and L', lambda: (1.0 / r, L / (2.0 * r)))
-    jacobian[..., 0, 0] = jacobian[..., 1, 0] = along
-    jacobian[..., 0, 1] = across
-    jacobian[..., 1, 1] = -across
-    return jacobian
+    r, L, single = _geometry(r, L)
+    along, across = evaluated(single, 'r and L', lambda r, L: (1.0 / r, L / (2.0 * r)), r, L)
+    return matrix(2, 2, along, across, along, -across)
 
 
 def wheel_to_world_jacobian(theta: ArrayLike, r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
@@ -107,10 +98,14 @@ def wheel_to_world_jacobian(theta: ArrayLike, r: ArrayLike, L: ArrayLike) -> NDA
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    r, L = _geometry(r, L)
-    theta = _angles(theta, r=r, L=L)
-    chain: NDArray[np.float64] = unicycle_jacobian(theta) @ wheel_to_body_jacobian(r, L)
-    return chain
+    theta, r, L, single = _heading_and_geometry(theta, r, L)
+    x, y, turn = evaluated(single, 'r and L', _wheel_to_world, theta, r, L)
+    return matrix(3, 2, x, x, y, y, turn, -turn)
+
+
+def _wheel_to_world(theta: Any, r: Any, L: Any) -> tuple[Any, Any, Any]:
+    half = r / 2.0
+    return cos(theta) * half, sin(theta) * half, r / L
 
 
 def single_wheel_jacobian(theta: ArrayLike, r: ArrayLike) -> NDArray[np.float64]:
@@ -126,14 +121,11 @@ def single_wheel_jacobian(theta: ArrayLike, r: ArrayLike) -> NDArray[np.float64]
     Raises:
         ValueError: r is not positive and finite.
     """
-    r = floats('r', r)
-    positive('r', r)
-    theta = _angles(theta, r=r)
-    jacobian = np.zeros((*np.broadcast(theta, r).shape, 3, 2))
-    jacobian[..., 0, 0] = r * np.cos(theta)
-    jacobian[..., 1, 0] = r * np.sin(theta)
-    jacobian[..., 2, 1] = 1.0
-    return jacobian
+    single = type(theta) is type(r) is float and r > 0.0 and isfinite(theta + r)
+    if not single:
+        theta, r = operand('theta', theta), operand('r', r, positive)
+        agree(theta=theta, r=r)
+    return matrix(3, 2, r * cos(theta), 0.0, r * sin(theta), 0.0, 0.0, 1.0)
 
 
 def wheel_to_position_jacobian(theta: ArrayLike, r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
@@ -154,7 +146,9 @@ def wheel_to_position_jacobian(theta: ArrayLike, r: ArrayLike, L: ArrayLike) -> 
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    return wheel_to_world_jacobian(theta, r, L)[..., :2, :]
+    theta, r, L, single = _heading_and_geometry(theta, r, L)
+    x, y, _ = evaluated(single, 'r and L', _wheel_to_world, theta, r, L)
+    return matrix(2, 2, x, x, y, y)
 
 
 def offset_point(pose: ArrayLike, d: ArrayLike) -> NDArray[np.float64]:
@@ -171,13 +165,15 @@ def offset_point(pose: ArrayLike, d: ArrayLike) -> NDArray[np.float64]:
         ValueError: Something is not finite, or shapes do not broadcast.
     """
     x, y, theta = components('pose', pose, 3)
-    d = operand('d', d)
-    single = agree(pose=x, d=d)
+    single = type(x) is type(d) is float and isfinite(d)
+    if not single:
+        d = operand('d', d)
+        single = agree(pose=x, d=d)
+    return stack(*evaluated(single, 'pose and d', _point, x, y, theta, d))
 
-    def point(x: Any, y: Any, theta: Any, d: Any) -> tuple[Any, Any]:
-        return x + d * cos(theta), y + d * sin(theta)
 
-    return stack(*evaluated(single, 'pose and d', point, x, y, theta, d))
+def _point(x: Any, y: Any, theta: Any, d: Any) -> tuple[Any, Any]:
+    return x + d * cos(theta), y + d * sin(theta)
 
 
 def offset_point_jacobian(
@@ -200,23 +196,27 @@ def offset_point_jacobian(
     Raises:
         ValueError: r or L is not positive and finite, d is 0 or not finite.
     """
-    r, L = _geometry(r, L)
-    d = array('d', d)
-    offset('d', d)
-    theta = _angles(theta, r=r, L=L, d=d)
-    c, s = np.cos(theta), np.sin(theta)
+    single = (
+        type(theta) is type(r) is type(L) is type(d) is float
+        and (r > 0.0 < L and d != 0.0)
+        and isfinite(theta + r + L + d)
+    )
+    if not single:
+        theta, r, L = operand('theta', theta), operand('r', r, positive), operand('L', L, positive)
+        d = operand('d', d, offset)
+        single = agree(theta=theta, r=r, L=L, d=d)
+    return matrix(2, 2, *evaluated(single, 'r, L and d', _offset_jacobian, theta, r, L, d))
 
-    def entries() -> tuple[Any, ...]:
-        along, across = r / 2.0, d * r / L
-        return (
-            c * along - s * across,
-            c * along + s * across,
-            s * along + c * across,
-            s * along - c * across,
-        )
 
-    jacobian = stack(*evaluated(False, 'r, L and d', entries))
-    return jacobian.reshape(*jacobian.shape[:-1], 2, 2)
+def _offset_jacobian(theta: Any, r: Any, L: Any, d: Any) -> tuple[Any, Any, Any, Any]:
+    c, s = cos(theta), sin(theta)
+    along, across = r / 2.0, d * r / L
+    return (
+        c * along - s * across,
+        c * along + s * across,
+        s * along + c * across,
+        s * along - c * across,
+    )
 
 
 def body_to_wheel(v: Any, omega: Any, r: Any, L: Any) -> tuple[Any, Any]:
@@ -235,6 +235,14 @@ def body_to_wheel(v: Any, omega: Any, r: Any, L: Any) -> tuple[Any, Any]:
         ValueError: r or L is not positive and finite, v or omega is not finite, shapes do not
             broadcast, or a wheel speed overflows.
     """
+    if (
+        type(v) is type(omega) is type(r) is type(L) is float
+        and r > 0.0 < L
+        and isfinite(v + omega + r + L)
+    ):
+        omega_R, omega_L = _wheel_speeds(v, omega, r, L)
+        if isfinite(omega_R + omega_L):
+            return omega_R, omega_L
     v, omega = operand('v', v), operand('omega', omega)
     r, L = operand('r', r, positive), operand('L', L, positive)
     single = agree(v=v, omega=omega, r=r, L=L)
@@ -263,6 +271,14 @@ def wheel_to_body(omega_R: Any, omega_L: Any, r: Any, L: Any) -> tuple[Any, Any]
         ValueError: r or L is not positive and finite, a wheel speed is not finite, shapes do not
             broadcast, or v or omega overflows.
     """
+    if (
+        type(omega_R) is type(omega_L) is type(r) is type(L) is float
+        and r > 0.0 < L
+        and isfinite(omega_R + omega_L + r + L)
+    ):
+        v, omega = _body_twist(omega_R, omega_L, r, L)
+        if isfinite(v + omega):
+            return v, omega
     omega_R, omega_L = operand('omega_R', omega_R), operand('omega_L', omega_L)
     r, L = operand('r', r, positive), operand('L', L, positive)
     single = agree(omega_R=omega_R, omega_L=omega_L, r=r, L=L)
@@ -283,11 +299,8 @@ def no_lateral_slip_constraint(theta: ArrayLike) -> NDArray[np.float64]:
     Returns:
         The constraint, shape (..., 1, 3). Its null space is the range of S(theta).
     """
-    theta = _angles(theta)
-    constraint = np.zeros((*theta.shape, 1, 3))
-    constraint[..., 0, 0] = np.sin(theta)
-    constraint[..., 0, 1] = -np.cos(theta)
-    return constraint
+    theta = operand('theta', theta)
+    return matrix(1, 3, sin(theta), -cos(theta), 0.0)
 
 
 def rolling_constraints(
@@ -309,29 +322,28 @@ def rolling_constraints(
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    r, L = _geometry(r, L)
-    theta = _angles(theta, r=r, L=L)
-    shape = np.broadcast(theta, r, L).shape
-    over_pose, over_wheels = np.zeros((*shape, 3, 3)), np.zeros((*shape, 3, 2))
-    over_pose[..., :1, :] = no_lateral_slip_constraint(theta)
-    over_pose[..., 1:, 0] = np.cos(theta)[..., np.newaxis]
-    over_pose[..., 1:, 1] = np.sin(theta)[..., np.newaxis]
-    over_pose[..., 1, 2] = L / 2.0
-    over_pose[..., 2, 2] = -L / 2.0
-    over_wheels[..., 1, 0] = over_wheels[..., 2, 1] = r
+    theta, r, L, single = _heading_and_geometry(theta, r, L)
+    if not single:
+        theta, r, L = alike(theta, r, L)
+    c, s = cos(theta), sin(theta)
+    over_pose = matrix(3, 3, s, -c, 0.0, c, s, L / 2.0, c, s, -L / 2.0)
+    over_wheels = matrix(3, 2, 0.0, 0.0, r, 0.0, 0.0, r)
     return over_pose, over_wheels
 
 
-def _angles(theta: ArrayLike, **lengths: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Take headings that broadcast with the other arguments."""
-    angles = array('theta', theta)
-    leading(theta=angles.shape, **{name: length.shape for name, length in lengths.items()})
-    return angles
+def _geometry(r: Any, L: Any) -> tuple[Any, Any, bool]:
+    """Check radius and separation. Return whether both are floats, too."""
+    single = type(r) is type(L) is float and r > 0.0 < L and isfinite(r + L)
+    if not single:
+        r, L = operand('r', r, positive), operand('L', L, positive)
+        single = agree(r=r, L=L)
+    return r, L, single
 
 
-def _geometry(r: ArrayLike, L: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    r, L = floats('r', r), floats('L', L)
-    positive('r', r)
-    positive('L', L)
-    leading(r=r.shape, L=L.shape)
-    return r, L
+def _heading_and_geometry(theta: Any, r: Any, L: Any) -> tuple[Any, Any, Any, bool]:
+    """Check heading, radius and separation. Return whether all are floats, too."""
+    single = type(theta) is type(r) is type(L) is float and r > 0.0 < L and isfinite(theta + r + L)
+    if not single:
+        theta, r, L = operand('theta', theta), operand('r', r, positive), operand('L', L, positive)
+        single = agree(theta=theta, r=r, L=L)
+    return theta, r, L, single

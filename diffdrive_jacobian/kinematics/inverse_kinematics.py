@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._checks import array, floats, leading, not_negative, number, positive
-from diffdrive_jacobian.kinematics._elementary import wrapped
+from diffdrive_jacobian.kinematics._elementary import agree, components, vector, wrapped
 from diffdrive_jacobian.kinematics._ik_search import Search
 from diffdrive_jacobian.kinematics._ik_task import Difference, Floats, Function, Task
 
@@ -74,11 +74,10 @@ def pose_difference(target: ArrayLike, pose: ArrayLike) -> Floats:
     Raises:
         ValueError: A shape is wrong, or an entry is infinite or NaN.
     """
-    target, pose = array('target', target, 3), array('pose', pose, 3)
-    leading(target=target.shape[:-1], pose=pose.shape[:-1])
-    difference: Floats = target - pose
-    difference[..., 2] = wrapped(difference[..., 2])
-    return difference
+    x, y, heading = components('target', target, 3)
+    x_is, y_is, heading_is = components('pose', pose, 3)
+    agree(target=heading, pose=heading_is)
+    return vector(x - x_is, y - y_is, wrapped(heading - heading_is))
 
 
 def solve(

@@ -33,12 +33,16 @@ Control*, 2009, 3.5.1. Without damping a singular value counts as zero if it is 
 
 from __future__ import annotations
 
+from math import isfinite
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics import _singular_values
-from diffdrive_jacobian.kinematics._adjugate import adjugate, refuse_singular
-from diffdrive_jacobian.kinematics._checks import array, floats, leading, not_negative, positive
+from diffdrive_jacobian.kinematics._adjugate import EPS, adjugate, refuse_singular
+from diffdrive_jacobian.kinematics._checks import array, leading, not_negative, positive
+from diffdrive_jacobian.kinematics._elementary import agree, matrix, operand
 from diffdrive_jacobian.kinematics._singular_values import CUTOFF, FILTER, joint_velocities
 from diffdrive_jacobian.kinematics._task_checks import (
     checked_damping,
@@ -71,8 +75,6 @@ __all__ = [
     'redundant',
 ]
 
-_EPSILON = float(np.finfo(np.float64).eps)
-
 Array = NDArray[np.float64]
 
 
@@ -92,12 +94,18 @@ def adjugate_inverse(J: ArrayLike) -> Array:
         ValueError: J has another shape.
     """
     J = array('J', J, 2, 2)
+    if J.ndim == 2:
+        (a, b), (c, d) = J.tolist()
+        if 1e-50 < max(abs(a), abs(b), abs(c), abs(d)) < 1e50:
+            single = a * d - b * c
+            if abs(single) > 4.0 * EPS * (a * a + b * b + c * c + d * d):
+                return matrix(2, 2, d / single, -b / single, -c / single, a / single)
     # By powers of two, so that neither products overflow nor digits are lost.
     _, exponent = np.frexp(np.abs(J).max(axis=(-2, -1)))
     scaled = np.ldexp(J, -exponent[..., np.newaxis, np.newaxis])
     determinant = scaled[..., 0, 0] * scaled[..., 1, 1] - scaled[..., 0, 1] * scaled[..., 1, 0]
     # The condition number is |J|^2 / |det| (in the norm of Frobenius).
-    singular = np.abs(determinant) <= 4.0 * _EPSILON * np.einsum('...ij,...ij->...', scaled, scaled)
+    singular = np.abs(determinant) <= 4.0 * EPS * np.einsum('...ij,...ij->...', scaled, scaled)
     regular = np.where(singular, 1.0, determinant)[..., np.newaxis, np.newaxis]
     with np.errstate(over='ignore', under='ignore'):
         inverse: Array = np.ldexp(adjugate(scaled) / regular, -exponent[..., np.newaxis, np.newaxis])
@@ -144,12 +152,20 @@ def damping(manipulability: ArrayLike, threshold: ArrayLike, maximum: ArrayLike)
     Returns:
         lambda, shape (...), in the units of J: not squared (Nakamura and Hanafusa 1986 square it).
     """
-    w, w_0 = floats('manipulability', manipulability), floats('threshold', threshold)
-    most = floats('maximum', maximum)
-    not_negative('manipulability', w)
-    positive('threshold', w_0)
-    not_negative('maximum', most)
-    leading(manipulability=w.shape, threshold=w_0.shape, maximum=most.shape)
+    w: Any = manipulability
+    w_0: Any = threshold
+    most: Any = maximum
+    single = (
+        type(w) is type(w_0) is type(most) is float
+        and (w >= 0.0 < w_0 and most >= 0.0)
+        and isfinite(w + w_0 + most)
+    )
+    if not single:
+        w, w_0 = operand('manipulability', w, not_negative), operand('threshold', w_0, positive)
+        most = operand('maximum', most, not_negative)
+        single = agree(manipulability=w, threshold=w_0, maximum=most)
+    if single:
+        return np.asarray(most * (1.0 - (w / w_0 if w < w_0 else 1.0)))
     w, w_0 = np.broadcast_arrays(w, w_0)
     return np.asarray(most * (1.0 - np.divide(w, w_0, out=np.ones(w.shape), where=w < w_0)))
 

@@ -14,6 +14,7 @@ Source: document A, 3.2.4, "Mobile Manipulators"; doc/mathematics.md, "Manipulat
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics._checks import array, leading, number, positive
+from diffdrive_jacobian.kinematics._elementary import (
+    components,
+    cos,
+    matrix,
+    operand,
+    sin,
+    vector,
+)
 from diffdrive_jacobian.kinematics.diff_drive import (
     wheel_to_body,
     wheel_to_body_jacobian,
@@ -68,9 +77,7 @@ class MobileManipulator:
             `[x, y, heading]`, shape (..., 3) (m, m, rad).
         """
         base, joints = self._split(q)
-        tip = self.arm.forward_kinematics(joints)
-        tip[..., :2] += self.mount
-        return se2.compose(base, tip)
+        return se2.compose(vector(*base), vector(*self._tip(joints)))
 
     def jacobian(self, q: ArrayLike, heading: bool = False) -> NDArray[np.float64]:
         """Map the velocities of wheels and joints to that of the tip.
@@ -86,22 +93,21 @@ class MobileManipulator:
             The Jacobian, shape (..., 2, 2 + n), or (..., 3, 2 + n) with the heading, over
             `[omega_R, omega_L, q_1_dot, ...]`.
         """
-        base, joints = self._split(q)
-        c, s = np.cos(base[..., 2]), np.sin(base[..., 2])
+        (_, _, theta), joints = self._split(q)
+        c, s = cos(theta), sin(theta)
+        directions = list(accumulate(joints))
+        levers = self.arm._levers(directions)
+        (x, y), (m_x, m_y) = levers[0], self.mount.tolist()
+        x, y = x + m_x, y + m_y
+        (half, _), (ratio, _) = wheel_to_body_jacobian(self.r, self.L).tolist()
         # In the frame of the base: v goes along x, and omega moves the tip across its lever arm.
-        lever = self.arm.forward_kinematics(joints)[..., :2] + self.mount
-        in_base = np.zeros((*joints.shape[:-1], 3, 2 + self.arm.joints))
-        in_base[..., 0, 0] = 1.0
-        in_base[..., 0, 1], in_base[..., 1, 1] = -lever[..., 1], lever[..., 0]
-        in_base[..., 2, 1] = 1.0
-        in_base[..., :2] = in_base[..., :2] @ wheel_to_body_jacobian(self.r, self.L)
-        in_base[..., 2:] = self.arm.jacobian(joints, heading=True)
-        jacobian = np.empty_like(in_base)
-        c, s = c[..., np.newaxis], s[..., np.newaxis]
-        jacobian[..., 0, :] = c * in_base[..., 0, :] - s * in_base[..., 1, :]
-        jacobian[..., 1, :] = s * in_base[..., 0, :] + c * in_base[..., 1, :]
-        jacobian[..., 2, :] = in_base[..., 2, :]
-        return jacobian if heading else jacobian[..., :2, :]
+        columns = [(half - y * ratio, x * ratio), (half + y * ratio, -x * ratio)]
+        columns += [(-across, along) for along, across in levers]
+        entries = [c * along - s * across for along, across in columns]
+        entries += [s * along + c * across for along, across in columns]
+        if heading:
+            entries += [ratio, -ratio] + [1.0] * self.arm.joints
+        return matrix(3 if heading else 2, len(columns), *entries)
 
     def configuration_jacobian(self, q: ArrayLike) -> NDArray[np.float64]:
         """Map the inputs to the velocity of the configuration: `q_dot = G(q) [omega_R, omega_L, ...]`.
@@ -116,9 +122,9 @@ class MobileManipulator:
         Returns:
             G, shape (..., 3 + n, 2 + n).
         """
-        base, joints = self._split(q)
-        jacobian = np.zeros((*joints.shape[:-1], 3 + self.arm.joints, 2 + self.arm.joints))
-        jacobian[..., :3, :2] = wheel_to_world_jacobian(base[..., 2], self.r, self.L)
+        (_, _, theta), _ = self._split(q)
+        jacobian = np.zeros((*np.shape(theta), 3 + self.arm.joints, 2 + self.arm.joints))
+        jacobian[..., :3, :2] = wheel_to_world_jacobian(theta, self.r, self.L)
         jacobian[..., 3:, 2:] = np.eye(self.arm.joints)
         return jacobian
 
@@ -133,13 +139,23 @@ class MobileManipulator:
         Returns:
             Configurations at the end, shape (..., 3 + n), theta wrapped.
         """
-        base, joints = self._split(q)
-        speeds, dt = array('q_dot', q_dot, 2 + self.arm.joints), array('dt', dt)
-        leading(q=base.shape[:-1], q_dot=speeds.shape[:-1], dt=dt.shape)
-        v, omega = wheel_to_body(speeds[..., 0], speeds[..., 1], self.r, self.L)
-        driven = se2.integrate(base, np.stack([v, omega], axis=-1), dt)
-        return np.concatenate([driven, self.arm.integrate(joints, speeds[..., 2:], dt)], axis=-1)
-
-    def _split(self, q: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         checked = array('q', q, 3 + self.arm.joints)
-        return checked[..., :3], checked[..., 3:]
+        speeds, dt = array('q_dot', q_dot, 2 + self.arm.joints), operand('dt', dt)
+        leading(q=checked.shape[:-1], q_dot=speeds.shape[:-1], dt=np.shape(dt))
+        right, left = components('q_dot', speeds[..., :2], 2)
+        twist = vector(*wheel_to_body(right, left, self.r, self.L))
+        driven = se2.integrate(checked[..., :3], twist, dt)
+        return np.concatenate(
+            [driven, self.arm.integrate(checked[..., 3:], speeds[..., 2:], dt)], axis=-1
+        )
+
+    def _split(self, q: ArrayLike) -> tuple[list[Any], list[Any]]:
+        """Return the pose of the base and the joint angles, each entry a float or of shape (...)."""
+        entries = components('q', q, 3 + self.arm.joints)
+        return entries[:3], entries[3:]
+
+    def _tip(self, joints: list[Any]) -> tuple[Any, Any, Any]:
+        """Return the pose of the tip in the frame of the base."""
+        x, y, heading = self.arm._tip(list(accumulate(joints)))
+        m_x, m_y = self.mount.tolist()
+        return x + m_x, y + m_y, heading

@@ -12,15 +12,27 @@ doc/mathematics.md, "Manipulators".
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._adjugate import adjugate, refuse_singular
-from diffdrive_jacobian.kinematics._checks import array, leading, positive
-from diffdrive_jacobian.kinematics._elementary import wrapped
+from diffdrive_jacobian.kinematics._adjugate import EPS, refuse_singular
+from diffdrive_jacobian.kinematics._checks import array, floats, leading, positive
+from diffdrive_jacobian.kinematics._elementary import (
+    agree,
+    components,
+    cos,
+    matrix,
+    maximum,
+    operand,
+    sin,
+    vector,
+    wrapped,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +69,13 @@ class PlanarArm:
         Returns:
             Positions in the frame of the arm, shape (..., n + 1, 2) (m). The first is the base, [0, 0].
         """
-        angles = np.cumsum(self._angles(q), axis=-1)
-        positions = np.zeros((*angles.shape[:-1], self.joints + 1, 2))
-        np.cumsum(self.lengths * np.cos(angles), axis=-1, out=positions[..., 1:, 0])
-        np.cumsum(self.lengths * np.sin(angles), axis=-1, out=positions[..., 1:, 1])
-        return positions
+        x: Any = 0.0
+        y: Any = 0.0
+        entries = [x, y]
+        for length, angle in zip(self.lengths.tolist(), self._directions(q), strict=True):
+            x, y = x + length * cos(angle), y + length * sin(angle)
+            entries += [x, y]
+        return matrix(self.joints + 1, 2, *entries)
 
     def forward_kinematics(self, q: ArrayLike) -> NDArray[np.float64]:
         """Return the pose of the tip (A, D): `x = sum l_i cos(q_1 + ... + q_i)`, y with the sine.
@@ -72,12 +86,11 @@ class PlanarArm:
         Returns:
             `[x, y, heading]`, shape (..., 3) (m, m, rad), the heading wrapped to (-pi, pi].
         """
-        angles = np.cumsum(self._angles(q), axis=-1)
-        pose = np.empty((*angles.shape[:-1], 3))
-        pose[..., 0] = np.cos(angles) @ self.lengths
-        pose[..., 1] = np.sin(angles) @ self.lengths
-        pose[..., 2] = wrapped(angles[..., -1])
-        return pose
+        q = floats('q', q)
+        if q.ndim == 2 and len(q) == 1:
+            # In floats: several times as fast as a batch of one.
+            return self.forward_kinematics(q[0])[np.newaxis]
+        return vector(*self._tip(self._directions(q)))
 
     def jacobian(self, q: ArrayLike, heading: bool = False) -> NDArray[np.float64]:
         """Map joint velocities to the velocity of the tip (A, D).
@@ -92,17 +105,14 @@ class PlanarArm:
         Returns:
             The Jacobian, shape (..., 2, n), or (..., 3, n) with a last row of ones for the heading.
         """
-        angles = np.cumsum(self._angles(q), axis=-1)
-        jacobian = np.ones((*angles.shape[:-1], 3 if heading else 2, self.joints))
-        # From the tip back to the base: a joint turns the part beyond it. Joint by joint, for
-        # loops over the short last axis take longer.
-        along: Any = 0.0
-        across: Any = 0.0
-        for joint in reversed(range(self.joints)):
-            length, angle = self.lengths[joint], angles[..., joint]
-            along, across = along + length * np.cos(angle), across - length * np.sin(angle)
-            jacobian[..., 0, joint], jacobian[..., 1, joint] = across, along
-        return jacobian
+        q = floats('q', q)
+        if q.ndim == 2 and len(q) == 1:
+            return self.jacobian(q[0], heading)[np.newaxis]
+        levers = self._levers(self._directions(q))
+        entries = [-y for _, y in levers] + [x for x, _ in levers]
+        if heading:
+            entries += [1.0] * self.joints
+        return matrix(3 if heading else 2, self.joints, *entries)
 
     def determinant(self, q: ArrayLike) -> NDArray[np.float64]:
         """Return the determinant of the Jacobian of two links: `l1 l2 sin(q_2)` (A).
@@ -117,8 +127,8 @@ class PlanarArm:
             ValueError: The arm has not two links.
         """
         self._need_two('determinant')
-        determinant: NDArray[np.float64] = self.lengths.prod() * np.sin(self._angles(q)[..., 1])
-        return determinant
+        _, q_2 = components('q', q, 2)
+        return np.float64(self._determinant(q_2)) if type(q_2) is float else self._determinant(q_2)
 
     def singular_configurations(self, q_1: ArrayLike = 0.0) -> NDArray[np.float64]:
         """Return the singular configurations of two links: stretched, q_2 = 0, and folded, q_2 = pi (A).
@@ -133,11 +143,8 @@ class PlanarArm:
             ValueError: The arm has not two links.
         """
         self._need_two('singular_configurations')
-        first = array('q_1', q_1)
-        configurations = np.zeros((*first.shape, 2, 2))
-        configurations[..., 0] = first[..., np.newaxis]
-        configurations[..., 1, 1] = np.pi
-        return configurations
+        first = operand('q_1', q_1)
+        return matrix(2, 2, first, 0.0, first, math.pi)
 
     def inverse_velocity(self, q: ArrayLike, x_dot: ArrayLike) -> NDArray[np.float64]:
         """Return joint velocities of two links for a velocity of the tip, by the adjugate (A, 3.2.1).
@@ -154,14 +161,18 @@ class PlanarArm:
             ValueError: The arm has not two links.
         """
         self._need_two('inverse_velocity')
-        q, x_dot = self._angles(q), array('x_dot', x_dot, 2)
-        leading(q=q.shape[:-1], x_dot=x_dot.shape[:-1])
-        determinant = self.determinant(q)
+        q_1, q_2 = components('q', q, 2)
+        along_x, along_y = components('x_dot', x_dot, 2)
+        agree(q=q_2, x_dot=along_x)
+        determinant = self._determinant(q_2)
         # More accurate than from the entries of J: only the rounding of q_2 itself remains.
-        blur = 4.0 * np.finfo(np.float64).eps * np.maximum(1.0, np.abs(q[..., 1]))
-        refuse_singular(determinant, np.abs(determinant) <= blur * self.lengths.prod())
-        turned: NDArray[np.float64] = (adjugate(self.jacobian(q)) @ x_dot[..., np.newaxis])[..., 0]
-        return turned / determinant[..., np.newaxis]
+        blur = 4.0 * EPS * maximum(1.0, abs(q_2))
+        refuse_singular(determinant, abs(determinant) <= blur * math.prod(self.lengths.tolist()))
+        (x, y), (x_2, y_2) = self._levers([q_1, q_1 + q_2])
+        return vector(
+            (x_2 * along_x + y_2 * along_y) / determinant,
+            (-x * along_x - y * along_y) / determinant,
+        )
 
     def joint_torques(self, q: ArrayLike, wrench: ArrayLike) -> NDArray[np.float64]:
         """Return the joint torques of a wrench at the tip: `tau = J^T W` (D, 5).
@@ -174,13 +185,16 @@ class PlanarArm:
         Returns:
             Torques, shape (..., n) (N m).
         """
-        q, wrench = self._angles(q), array('wrench', wrench, 'm')
+        wrench = array('wrench', wrench, 'm')
         if wrench.shape[-1] not in (2, 3):
             raise ValueError(f'wrench must have shape (..., 2) or (..., 3), got {wrench.shape}')
-        leading(q=q.shape[:-1], wrench=wrench.shape[:-1])
-        jacobian = self.jacobian(q, heading=wrench.shape[-1] == 3)
-        torques: NDArray[np.float64] = (wrench[..., np.newaxis, :] @ jacobian)[..., 0, :]
-        return torques
+        directions = self._directions(q)
+        f_x, f_y, *moment = components('wrench', wrench, wrench.shape[-1])
+        agree(q=directions[0], wrench=f_x)
+        torques = [f_y * x - f_x * y for x, y in self._levers(directions)]
+        if moment:
+            torques = [torque + moment[0] for torque in torques]
+        return vector(*torques)
 
     def integrate(self, q: ArrayLike, q_dot: ArrayLike, dt: ArrayLike) -> NDArray[np.float64]:
         """Return the joint angles after a time at constant velocity: `q + q_dot dt` (D, 4.1).
@@ -193,13 +207,37 @@ class PlanarArm:
         Returns:
             Joint angles at the end, shape (..., n) (rad). They are not wrapped.
         """
-        q, q_dot, dt = self._angles(q), array('q_dot', q_dot, self.joints), array('dt', dt)
-        leading(q=q.shape[:-1], q_dot=q_dot.shape[:-1], dt=dt.shape)
-        moved: NDArray[np.float64] = q + q_dot * dt[..., np.newaxis]
+        q, q_dot, dt = self._angles(q), array('q_dot', q_dot, self.joints), operand('dt', dt)
+        leading(q=q.shape[:-1], q_dot=q_dot.shape[:-1], dt=np.shape(dt))
+        moved: NDArray[np.float64] = q + q_dot * (dt if type(dt) is float else dt[..., np.newaxis])
         return moved
 
     def _angles(self, q: ArrayLike) -> NDArray[np.float64]:
         return array('q', q, self.joints)
+
+    def _directions(self, q: ArrayLike) -> list[Any]:
+        """Return the angles of the links to the x axis of the base, floats or of shape (...)."""
+        return list(accumulate(components('q', q, self.joints)))
+
+    def _tip(self, directions: list[Any]) -> tuple[Any, Any, Any]:
+        """Return position and heading of the tip, floats or of shape (...)."""
+        (x, y), *_ = self._levers(directions)
+        return x, y, wrapped(directions[-1])
+
+    def _levers(self, directions: list[Any]) -> list[tuple[Any, Any]]:
+        """Return the position of the tip relative to each joint, floats or of shape (...)."""
+        # Joint by joint, because loops of NumPy over the short last axis take longer.
+        levers = []
+        x: Any = 0.0
+        y: Any = 0.0
+        for length, angle in zip(self.lengths.tolist()[::-1], directions[::-1], strict=True):
+            x, y = x + length * cos(angle), y + length * sin(angle)
+            levers.append((x, y))
+        return levers[::-1]
+
+    def _determinant(self, q_2: Any) -> Any:
+        first, second = self.lengths.tolist()
+        return first * second * sin(q_2)
 
     def _need_two(self, what: str) -> None:
         if self.joints != 2:

@@ -13,6 +13,7 @@ Source: document A, 3.2.3 and 3.2.5; document D, 3; doc/mathematics.md, "Manipul
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -113,7 +114,7 @@ def joint_limit_gradient(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> Ar
     return gradient
 
 
-def _deviation(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array, Array]:
+def _deviation(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array, Any]:
     """Return each joint's distance from the middle of its range in units of the range, the range, and
     the unit of the latter: 1, or smaller where the range of angles might overflow.
     """
@@ -126,9 +127,11 @@ def _deviation(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[Array,
     leading(q=angles.shape, lower=low.shape, upper=high.shape)
     if not (high > low).all():
         raise ValueError(f'upper must be above lower for every joint, got {high} and {low}')
-    largest = np.maximum(np.abs(angles), np.maximum(np.abs(low), np.abs(high)))
-    unit: Array = np.where(largest < _LARGE, 1.0, _UNIT)
-    angles, low, high = angles * unit, low * unit, high * unit
+    unit: Any = 1.0
+    if not all(abs(value).max(initial=0.0) < _LARGE for value in (angles, low, high)):
+        largest = np.maximum(np.abs(angles), np.maximum(np.abs(low), np.abs(high)))
+        unit = np.where(largest < _LARGE, 1.0, _UNIT)
+        angles, low, high = angles * unit, low * unit, high * unit
     span = high - low
     with np.errstate(all='ignore'):
         return (angles - (low + high) / 2.0) / span, span, unit

@@ -11,12 +11,14 @@ J.-J. Slotine, "A general framework for managing multiple tasks in highly redund
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._checks import array, floats, leading, number, positive
+from diffdrive_jacobian.kinematics._elementary import vector
 from diffdrive_jacobian.kinematics._singular_values import (
     gains,
     is_large,
@@ -126,6 +128,13 @@ def limit_velocity(q_dot: ArrayLike, max_velocity: ArrayLike) -> Array:
         )
     if not (most > 0.0).all():
         raise ValueError(f'max_velocity must be positive, got {most}')
+    if q_dot.ndim == 1 and most.ndim < 2:
+        speeds = q_dot.tolist()
+        limits = most.tolist() if most.ndim else [float(most)] * len(speeds)
+        ratio = max([1.0, *(abs(a) / b for a, b in zip(speeds, limits, strict=True))])
+        if ratio < math.inf:
+            pairs = zip(speeds, limits, strict=True)
+            return vector(*(min(max(a / ratio, -b), b) for a, b in pairs))
     leading(q_dot=q_dot.shape, max_velocity=most.shape)
     with np.errstate(over='ignore'):
         excess = (np.abs(q_dot) / most).max(axis=-1, keepdims=True)

@@ -4,16 +4,16 @@ Poses are `[x, y, theta]` (m, m, rad), twists `(v, omega)` (m/s, rad/s), times i
 Wheels are ordered left, right in messages, as is usual in ROS, and right, left in the mathematics. Only
 this module converts between these orders, and only it writes stamps.
 
-The `set_` functions fill an existing message. A node keeps one message per topic, because creating
-nested messages in Python costs more than publishing them. The `from_` functions check what they read.
-They raise MessageError, which reports the value and the range allowed.
+The `set_` functions fill an existing message. The `from_` functions check what they read. They raise
+MessageError, which reports the value and the range allowed. Those with `_values` take the numbers of a
+message instead of the message, for readers of serialized messages (`messages.wire`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,28 +21,21 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     # Fields are accessed by name only, so messages of rosbags work as well as those of rclpy.
     from builtin_interfaces.msg import Time
-    from geometry_msgs.msg import Pose, PoseWithCovariance, Twist, TwistStamped
-    from nav_msgs.msg import Odometry
+    from geometry_msgs.msg import Pose, PoseWithCovariance, Twist
     from sensor_msgs.msg import JointState
-    from std_msgs.msg import Float64MultiArray
 
+from diffdrive_jacobian.messages.errors import MessageError as MessageError
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION as MAX_POSITION
 from diffdrive_jacobian.messages.plausibility import MAX_SPEED as MAX_SPEED
 from diffdrive_jacobian.messages.plausibility import MAX_WHEEL_SPEED as MAX_WHEEL_SPEED
-from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 MAX_WAYPOINTS = 2_000
 """Largest number of poses in a `goals` message: rclpy takes about 20 us to convert each of them."""
 
-# Indices of (x, y, yaw) and of (v, omega) in the row-major 6x6 covariances of ROS.
+# Indices of (x, y, yaw) in the row-major 6x6 covariances of ROS.
 _PLANAR = np.array([6 * row + column for row in (0, 1, 5) for column in (0, 1, 5)])
-_FORWARD_AND_YAW = np.array([0, 5, 30, 35])
-
-
-class MessageError(ValueError):
-    """A message with invalid content."""
 
 
 def quoted(texts: Iterable[str], most: int = 4) -> str:
@@ -65,7 +58,11 @@ def from_time(stamp: Time) -> int:
     Raises:
         MessageError: `sec` is negative, or `nanosec` is a second or more.
     """
-    sec, nanosec = int(stamp.sec), int(stamp.nanosec)
+    return from_time_values(int(stamp.sec), int(stamp.nanosec))
+
+
+def from_time_values(sec: int, nanosec: int) -> int:
+    """Return the time of a stamp (ns), as `from_time`."""
     if sec < 0 or nanosec >= NANOSECONDS:
         raise MessageError(
             'its stamp must have sec of at least 0 and nanosec below 1000000000, '
@@ -81,10 +78,14 @@ def from_twist(message: Twist) -> tuple[float, float]:
         MessageError: A component is NaN or infinite, or v or omega is out of range.
     """
     linear, angular = message.linear, message.angular
-    values = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
+    return from_twist_values(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
+
+
+def from_twist_values(*values: float) -> tuple[float, float]:
+    """Return `(v, omega)` from linear x, y, z and angular x, y, z, as `from_twist`."""
     if not all(map(math.isfinite, values)):
         raise MessageError(f'twist must be finite, got linear {values[:3]}, angular {values[3:]}')
-    return plausible_twist(linear.x, angular.z)
+    return plausible_twist(values[0], values[5])
 
 
 def plausible_twist(v: float, omega: float) -> tuple[float, float]:
@@ -101,17 +102,6 @@ def plausible_twist(v: float, omega: float) -> tuple[float, float]:
     return v, omega
 
 
-def set_twist(message: Twist, twist: tuple[float, float]) -> None:
-    """Write `(v, omega)` into a message."""
-    message.linear.x, message.angular.z = twist
-
-
-def set_twist_stamped(message: TwistStamped, twist: tuple[float, float], stamp: int) -> None:
-    """Write `(v, omega)` and its time (ns) into a message."""
-    set_time(message.header.stamp, stamp)
-    set_twist(message.twist, twist)
-
-
 def from_pose(message: Pose) -> NDArray[np.float64]:
     """Return `[x, y, theta]`, shape (3,); z, roll and pitch are ignored.
 
@@ -119,19 +109,25 @@ def from_pose(message: Pose) -> NDArray[np.float64]:
         MessageError: The position is not finite or out of range, or the quaternion is not of unit
             length.
     """
-    x, y = message.position.x, message.position.y
+    position, q = message.position, message.orientation
+    return from_pose_values(position.x, position.y, q.x, q.y, q.z, q.w)
+
+
+def from_pose_values(
+    x: float, y: float, qx: float, qy: float, qz: float, qw: float
+) -> NDArray[np.float64]:
+    """Return `[x, y, theta]` from x, y and the quaternion x, y, z, w, as `from_pose`."""
     if not (abs(x) <= MAX_POSITION and abs(y) <= MAX_POSITION):
         raise MessageError(
             f'position must be finite and within {MAX_POSITION:g} m, got x {x:g}, y {y:g}'
         )
-    q = message.orientation
-    norm = math.hypot(q.x, q.y, q.z, q.w)
+    norm = math.hypot(qx, qy, qz, qw)
     if not 0.9 <= norm <= 1.1:
         raise MessageError(
             'orientation must be a quaternion of length 1 (0.9 to 1.1), '
-            f'got x {q.x:g}, y {q.y:g}, z {q.z:g}, w {q.w:g}'
+            f'got x {qx:g}, y {qy:g}, z {qz:g}, w {qw:g}'
         )
-    sine, cosine = 2.0 * (q.w * q.z + q.x * q.y), q.w**2 + q.x**2 - q.y**2 - q.z**2
+    sine, cosine = 2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2
     return np.array([x, y, math.atan2(sine, cosine)])
 
 
@@ -171,50 +167,6 @@ def from_pose_with_covariance(
     return pose, (symmetric + symmetric.T) / 2.0
 
 
-def set_pose_with_covariance(
-    message: PoseWithCovariance, pose: NDArray[np.float64], covariance: NDArray[np.float64]
-) -> None:
-    """Write a pose, shape (3,), and its covariance, shape (3, 3). Other variances stay as they are."""
-    set_pose(message.pose, pose)
-    message.covariance[_PLANAR] = covariance.ravel()
-
-
-def set_odometry(message: Odometry, robot: Robot, interval: float) -> None:
-    """Write pose, twist and covariances of a robot.
-
-    Args:
-        message: The message to fill.
-        robot: The robot at the time of the message.
-        interval: Time over which the wheels measured the twist (s).
-    """
-    set_time(message.header.stamp, robot.stamp)
-    set_pose_with_covariance(message.pose, robot.pose, robot.covariance)
-    set_twist(message.twist.twist, robot.twist)
-    message.twist.covariance[_FORWARD_AND_YAW] = robot.twist_covariance(interval).ravel()
-
-
-def set_joint_state(
-    message: JointState, stamp: int, speeds: tuple[float, float], angles: Any = None
-) -> None:
-    """Write the motion of the wheels; the message names the joints left, right.
-
-    Args:
-        message: The message to fill.
-        stamp: Time of the motion (ns).
-        speeds: `(omega_R, omega_L)` (rad/s).
-        angles: Angles of the right and the left wheel (rad); None: not written.
-    """
-    set_time(message.header.stamp, stamp)
-    message.velocity = [speeds[1], speeds[0]]
-    if angles is not None:
-        message.position = [angles[1], angles[0]]
-
-
-def set_wheel_array(message: Float64MultiArray, speeds: tuple[float, float]) -> None:
-    """Write wheel speeds `(omega_R, omega_L)` (rad/s) as `[left, right]`."""
-    message.data = [speeds[1], speeds[0]]
-
-
 def from_joint_state(message: JointState, names: tuple[str, str]) -> tuple[float, float]:
     """Return `(omega_R, omega_L)` (rad/s).
 
@@ -225,16 +177,21 @@ def from_joint_state(message: JointState, names: tuple[str, str]) -> tuple[float
     Raises:
         MessageError: A joint is missing, has no velocity, or its velocity is not finite or out of range.
     """
-    if len(message.velocity) != len(message.name):
+    return from_joint_values(message.name, message.velocity, names)
+
+
+def from_joint_values(
+    joints: Sequence[str], velocities: Sequence[float], names: tuple[str, str]
+) -> tuple[float, float]:
+    """Return `(omega_R, omega_L)` from the fields of a JointState, as `from_joint_state`."""
+    if len(velocities) != len(joints):
         raise MessageError(
-            f'joint command must have a velocity for each name, got {len(message.name)} names '
-            f'and {len(message.velocity)} velocities'
+            f'joint command must have a velocity for each name, got {len(joints)} names '
+            f'and {len(velocities)} velocities'
         )
-    speeds = dict(zip(message.name, message.velocity, strict=True))
-    if any(message.name.count(name) != 1 for name in names):
-        raise MessageError(
-            f'joint command must name each of {quoted(names)} once, got {quoted(message.name)}'
-        )
+    speeds = dict(zip(joints, velocities, strict=True))
+    if any(joints.count(name) != 1 for name in names):
+        raise MessageError(f'joint command must name each of {quoted(names)} once, got {quoted(joints)}')
     left, right = (speeds[name] for name in names)
     if not (math.isfinite(left) and math.isfinite(right)):
         raise MessageError(f'wheel speeds must be finite, got left {left}, right {right}')

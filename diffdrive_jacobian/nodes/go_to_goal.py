@@ -11,6 +11,7 @@ from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.control import Arrival, Controller, LawError, saturate
 from diffdrive_jacobian.messages import conversion as messages
+from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
 from diffdrive_jacobian.nodes.goal import Goal, goal_info, read_goal
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
@@ -52,12 +53,14 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         stamped = self.parameters.enable_stamped_cmd_vel
         self._cmd_vel = self.advertise(TwistStamped if stamped else Twist, 'cmd_vel')
         self._status = self.advertise(GoalStatus, 'goal_status', latched=True)
-        self.subscribe(Odometry, 'odom', self._on_odometry)
+        self.subscribe(Odometry, 'odom', self._on_odometry, fields=wire.ODOMETRY)
         self.subscribe(PoseStamped, 'goal_pose', self._on_goal_pose)
         # As bytes, because creating Python objects from a long message blocks the node for seconds.
         self.subscribe(Goals, 'goals', self._on_goals, raw=True)
         self.provide(Trigger, 'cancel_goal', self._on_cancel)
-        self._message: Twist | TwistStamped = TwistStamped() if stamped else Twist()
+        # Without a frame: the twist is in the body frame, whose name this node does not know.
+        self._stamped_twist = wire.twist_stamped_writer(TwistStamped()) if stamped else None
+        self._twist = wire.twist_writer(Twist())
         self._watchdog = Watchdog(self, self._on_stale_odometry)
         self._configure()
         self.announce(subscribed=['goal_pose', 'goals'], publishing=['cmd_vel'])
@@ -159,25 +162,24 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
 
     # --- Control
 
-    def _on_odometry(self, message: Odometry) -> None:
-        goal = self._goal
+    def _on_odometry(self, frame: str, *values: float) -> None:
+        goal, now = self._goal, self.now()
         try:
-            pose = messages.from_pose(message.pose.pose)
+            pose = messages.from_pose_values(*values)
             underway = self._driving or (goal is not None and goal.executing)
-            if underway and message.header.frame_id != self._odom_frame:
+            if underway and frame != self._odom_frame:
                 raise MessageError(
-                    f"it must stay in frame '{printable(self._odom_frame)}', "
-                    f"got '{printable(message.header.frame_id)}'"
+                    f"it must stay in frame '{printable(self._odom_frame)}', got '{printable(frame)}'"
                 )
-            if goal is not None and self.now() == 0:
+            if goal is not None and now == 0:
                 raise MessageError('simulated time has not begun, nothing was received on /clock')
         except MessageError as error:
             self.get_logger().warning(f'odometry dropped: {error}', throttle_duration_sec=THROTTLE)
             return
-        self._odom_frame = message.header.frame_id
+        self._odom_frame = frame
         if goal is None:
             return
-        self._watchdog.feed(self.now())
+        self._watchdog.feed(now)
         if not goal.executing and not self._begin(goal):
             return
         if goal.stale:
@@ -231,12 +233,10 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
 
     def _publish_command(self, v: float, omega: float) -> None:
         self._driving = (v, omega) != (0.0, 0.0)
-        if isinstance(self._message, TwistStamped):
-            # Without a frame: the twist is in the body frame, whose name this node does not know.
-            messages.set_twist_stamped(self._message, (v, omega), self.now())
+        if self._stamped_twist is None:
+            self._cmd_vel.publish(self._twist(v, omega))
         else:
-            messages.set_twist(self._message, (v, omega))
-        self._cmd_vel.publish(self._message)
+            self._cmd_vel.publish(self._stamped_twist((v, omega), self.now()))
 
     def stop(self, why: str) -> None:
         """Stop the robot and cancel the goal, if there is one."""

@@ -6,8 +6,8 @@ The unicycle model is integrated exactly. The motion depends on the commands and
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
 from geometry_msgs.msg import (
@@ -25,6 +25,7 @@ from std_srvs.srv import Trigger
 from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.messages import conversion as messages
+from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.command_time import command_time
 from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
@@ -33,6 +34,9 @@ from diffdrive_jacobian.ros.rclpy_internals import change_timer_period
 from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import nanoseconds, seconds
+
+Command: TypeAlias = tuple[tuple[float, float], int]
+"""Twist `(v, omega)` (m/s, rad/s) and stamp (ns; 0: none)."""
 
 
 class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
@@ -49,8 +53,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         super().__init__('virtual_robot', VirtualRobotParameters, **kwargs)
         self._robot: Robot | None = None
         self._latest = 0
-        self._odometry, self._states, self._command = Odometry(), JointState(), TwistStamped()
-        self._set_names()
+        self._configure()
         self._odom = self.advertise(Odometry, 'odom')
         self._joint_states = self.advertise(JointState, 'joint_states')
         self._applied = self.advertise(TwistStamped, 'cmd_vel_out')
@@ -59,11 +62,11 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         source = 'cmd_vel'
         if self.parameters.command_interface == 'wheels':
             source = 'joint_command'
-            self.subscribe(JointState, source, self._on_joint_command)
+            self.subscribe(JointState, source, self._on_joint_command, fields=wire.JOINT_STATE)
         elif self.parameters.enable_stamped_cmd_vel:
-            self.subscribe(TwistStamped, source, self._on_twist_stamped)
+            self.subscribe(TwistStamped, source, self._on_twist_stamped, fields=wire.TWIST_STAMPED)
         else:
-            self.subscribe(Twist, source, self._on_twist)
+            self.subscribe(Twist, source, self._on_twist, fields=wire.TWIST)
         self.subscribe(PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose)
         self.provide(Trigger, 'reset_odometry', self._on_reset)
         self._timer = self.create_timer(1.0 / self.parameters.publish_rate, self._on_tick)
@@ -118,11 +121,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     def _publish_start(self, robot: Robot) -> None:
         """Publish the pose and the time at which the odometry starts."""
-        message = PoseWithCovarianceStamped()
-        messages.set_time(message.header.stamp, robot.stamp)
-        message.header.frame_id = self.parameters.odom_frame_id
-        messages.set_pose_with_covariance(message.pose, robot.pose, robot.covariance)
-        self._start_pose.publish(message)
+        self._start_pose.publish(self._serialized_start(robot))
 
     def _on_tick(self) -> None:
         advanced = self._advance()
@@ -130,44 +129,53 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             return
         now, robot = advanced
         state = robot.at(now)
-        messages.set_odometry(self._odometry, state, 1.0 / self.parameters.publish_rate)
-        self._odom.publish(self._odometry)
-        messages.set_joint_state(self._states, now, state.wheel_speeds, state.wheel_angles)
-        self._joint_states.publish(self._states)
+        self._odom.publish(self._serialized_odometry(state, self._period))
+        self._joint_states.publish(self._serialized_joints(now, state.wheel_speeds, state.wheel_angles))
         if self._transforms is not None:
+            messages.set_time(self._odometry.header.stamp, now)
+            messages.set_pose(self._odometry.pose.pose, state.pose)
             self._transforms.sendTransform(transform_of(self._odometry))
 
     # --- Commands
 
-    def _on_twist(self, message: Twist) -> None:
-        self._apply(lambda: (messages.from_twist(message), 0))
+    def _on_twist(self, *fields: float) -> None:
+        self._apply(self._read_twist, fields)
 
-    def _on_twist_stamped(self, message: TwistStamped) -> None:
-        self._apply(
-            lambda: (messages.from_twist(message.twist), messages.from_time(message.header.stamp))
-        )
+    def _on_twist_stamped(self, *fields: Any) -> None:
+        self._apply(self._read_twist_stamped, fields)
 
-    def _on_joint_command(self, message: JointState) -> None:
-        def read() -> tuple[tuple[float, float], int]:
-            speeds = messages.from_joint_state(message, self.parameters.wheel_names)
-            parameters = self.parameters
-            v, omega = wheel_to_body(*speeds, parameters.wheel_radius, parameters.wheel_separation)
-            return messages.plausible_twist(v, omega), messages.from_time(message.header.stamp)
+    def _on_joint_command(self, *fields: Any) -> None:
+        self._apply(self._read_joint_command, fields)
 
-        self._apply(read)
+    @staticmethod
+    def _read_twist(*twist: float) -> Command:
+        return messages.from_twist_values(*twist), 0
 
-    def _apply(self, read: Callable[[], tuple[tuple[float, float], int]]) -> None:
+    @staticmethod
+    def _read_twist_stamped(sec: int, nanosec: int, *twist: float) -> Command:
+        return messages.from_twist_values(*twist), messages.from_time_values(sec, nanosec)
+
+    def _read_joint_command(
+        self, sec: int, nanosec: int, joints: Sequence[str], velocities: Sequence[float]
+    ) -> Command:
+        parameters = self.parameters
+        speeds = messages.from_joint_values(joints, velocities, parameters.wheel_names)
+        v, omega = wheel_to_body(*speeds, parameters.wheel_radius, parameters.wheel_separation)
+        return messages.plausible_twist(v, omega), messages.from_time_values(sec, nanosec)
+
+    def _apply(self, read: Callable[..., Command], fields: tuple[Any, ...]) -> None:
         """Apply a command, or log why it is dropped.
 
         Args:
-            read: Returns the twist `(v, omega)` (m/s, rad/s) and the stamp (ns; 0: none).
+            read: Returns the command in the fields of a message.
+            fields: The fields.
         """
         advanced = self._advance()
         try:
             if advanced is None:
                 raise MessageError(NO_CLOCK)
             now, robot = advanced
-            twist, stamp = read()
+            twist, stamp = read(*fields)
             timeout = robot.model.command_timeout
             time = command_time(stamp, now, robot.stamp, timeout)
         except MessageError as error:
@@ -178,8 +186,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     def _publish_applied(self, robot: Robot) -> None:
         """Publish the command that the robot follows, with the time from which it does."""
-        messages.set_twist_stamped(self._command, robot.twist, robot.stamp)
-        self._applied.publish(self._command)
+        self._applied.publish(self._serialized_command(robot.twist, robot.stamp))
 
     # --- Pose
 
@@ -219,7 +226,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
     def parameters_changed(self, previous: VirtualRobotParameters) -> None:
         """Continue with the new parameters."""
         parameters = self.parameters
-        self._set_names()
+        self._configure()
         if parameters.publish_rate != previous.publish_rate:
             change_timer_period(self._timer, nanoseconds(1.0 / parameters.publish_rate))
         model = self.parameters.model()
@@ -235,13 +242,18 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         parameters = self.parameters
         return np.array([parameters.x, parameters.y, wrap_angle(parameters.theta)])
 
-    def _set_names(self) -> None:
-        """Write the names of frames and joints into the messages that are reused."""
+    def _configure(self) -> None:
+        """Compute from the parameters what every message needs: the names of frames and joints."""
         parameters = self.parameters
-        self._odometry.header.frame_id = parameters.odom_frame_id
-        self._odometry.child_frame_id = parameters.base_frame_id
-        self._command.header.frame_id = parameters.base_frame_id
-        self._states.name = list(parameters.wheel_names)
+        self._period = 1.0 / parameters.publish_rate
+        self._odometry = Odometry(child_frame_id=parameters.base_frame_id)
+        start, command = PoseWithCovarianceStamped(), TwistStamped()
+        self._odometry.header.frame_id = start.header.frame_id = parameters.odom_frame_id
+        command.header.frame_id = parameters.base_frame_id
+        self._serialized_odometry = wire.odometry_writer(self._odometry)
+        self._serialized_start = wire.start_pose_writer(start)
+        self._serialized_command = wire.twist_stamped_writer(command)
+        self._serialized_joints = wire.joint_state_writer(JointState(name=list(parameters.wheel_names)))
 
     def _transform_broadcaster(self) -> Any | None:
         try:

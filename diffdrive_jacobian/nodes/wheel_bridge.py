@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Twist, TwistStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.messages import conversion as messages
+from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.command_time import command_time
 from diffdrive_jacobian.parameters.nodes import WheelBridgeParameters
@@ -30,37 +30,37 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         """Create the bridge. `kwargs` as for `ParameterizedNode`."""
         super().__init__('wheel_bridge', WheelBridgeParameters, **kwargs)
         parameters = self.parameters
-        self._message: JointState | Float64MultiArray = (
-            JointState() if parameters.joint_command_type == 'JointState' else Float64MultiArray()
+        as_joints = parameters.joint_command_type == 'JointState'
+        self._joint_command = self.advertise(
+            JointState if as_joints else Float64MultiArray, 'joint_command'
         )
-        self._joint_command = self.advertise(type(self._message), 'joint_command')
+        self._configure()
         if parameters.enable_stamped_cmd_vel:
-            self.subscribe(TwistStamped, 'cmd_vel', self._on_twist_stamped)
+            self.subscribe(TwistStamped, 'cmd_vel', self._on_twist_stamped, fields=wire.TWIST_STAMPED)
         else:
-            self.subscribe(Twist, 'cmd_vel', self._on_twist)
+            self.subscribe(Twist, 'cmd_vel', self._on_twist, fields=wire.TWIST)
         self._last = 0
         self._moving = False
         self._watchdog = Watchdog(self, self._on_silence)
-        self._watchdog.start(nanoseconds(parameters.cmd_vel_timeout))
+        self._watchdog.start(self._timeout)
         self.announce(subscribed=['cmd_vel'], publishing=['joint_command'])
 
-    def _on_twist(self, message: Twist) -> None:
-        self._apply(message, None)
+    def _on_twist(self, *twist: float) -> None:
+        self._apply(twist, 0, 0)
 
-    def _on_twist_stamped(self, message: TwistStamped) -> None:
-        self._apply(message.twist, message.header.stamp)
+    def _on_twist_stamped(self, sec: int, nanosec: int, *twist: float) -> None:
+        self._apply(twist, sec, nanosec)
 
-    def _apply(self, twist: Twist, time: Time | None) -> None:
+    def _apply(self, twist: tuple[float, ...], sec: int, nanosec: int) -> None:
         now = self.now()
         # The time of the last command is meaningless after time went back.
         last = self._last if self._last <= now else 0
         try:
             if now == 0:
                 raise MessageError(NO_CLOCK)
-            v, omega = messages.from_twist(twist)
-            stamp = 0 if time is None else messages.from_time(time)
-            timeout = nanoseconds(self.parameters.cmd_vel_timeout)
-            self._last = command_time(stamp, now, last, timeout)
+            v, omega = messages.from_twist_values(*twist)
+            stamp = messages.from_time_values(sec, nanosec)
+            self._last = command_time(stamp, now, last, self._timeout)
         except MessageError as error:
             self.get_logger().warning(f'command dropped: {error}', throttle_duration_sec=THROTTLE)
             return
@@ -70,9 +70,8 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
     def _wheel_speeds(self, v: float, omega: float) -> tuple[Any, Any]:
         """Return `(omega_R, omega_L)` of the calibrated wheels, within their limit (rad/s)."""
         parameters = self.parameters
-        r, L = parameters.wheel_radius, parameters.wheel_separation
-        L *= parameters.wheel_separation_multiplier
-        right, left = body_to_wheel(v, omega, r, L)
+        L = parameters.wheel_separation * parameters.wheel_separation_multiplier
+        right, left = body_to_wheel(v, omega, parameters.wheel_radius, L)
         right /= parameters.right_wheel_radius_multiplier
         left /= parameters.left_wheel_radius_multiplier
         excess = max(1.0, max(abs(right), abs(left)) / parameters.wheel_speed_limit)
@@ -80,12 +79,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
 
     def _publish(self, speeds: tuple[Any, Any], stamp: int) -> None:
         self._moving = speeds != (0.0, 0.0)
-        if isinstance(self._message, JointState):
-            self._message.name = list(self.parameters.wheel_names)
-            messages.set_joint_state(self._message, stamp, speeds)
-        else:
-            messages.set_wheel_array(self._message, speeds)
-        self._joint_command.publish(self._message)
+        self._joint_command.publish(self._serialized(stamp, speeds))
 
     def _on_silence(self) -> None:
         if self._moving:
@@ -105,5 +99,17 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
 
     def parameters_changed(self, previous: WheelBridgeParameters) -> None:
         """Change the timeout. Other parameters apply from the next command on."""
+        self._configure()
         if self.parameters.cmd_vel_timeout != previous.cmd_vel_timeout:
-            self._watchdog.change_timeout(nanoseconds(self.parameters.cmd_vel_timeout))
+            self._watchdog.change_timeout(self._timeout)
+
+    def _configure(self) -> None:
+        """Compute from the parameters what every command needs."""
+        parameters = self.parameters
+        self._timeout = nanoseconds(parameters.cmd_vel_timeout)
+        self._serialized: wire.WheelWriter
+        if self._joint_command.msg_type is JointState:
+            names = list(parameters.wheel_names)
+            self._serialized = wire.joint_command_writer(JointState(name=names))
+        else:
+            self._serialized = wire.wheel_array_writer(Float64MultiArray())

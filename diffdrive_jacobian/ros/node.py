@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Generic, TypeVar
 from weakref import WeakKeyDictionary
 
@@ -25,12 +25,14 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 
+from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, changed
 from diffdrive_jacobian.ros import parameters as ros_parameters
 from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.rate_limit import RateLimit
 from diffdrive_jacobian.ros.rclpy_internals import time_reader
+from diffdrive_jacobian.ros.serialization import decoding
 from diffdrive_jacobian.ros.topic_errors import explaining_failure, type_name
 from diffdrive_jacobian.text import printable
 
@@ -115,28 +117,42 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
             )
 
     def subscribe(
-        self, message: type, topic: str, callback: Callable[[Any], None], *, raw: bool = False
+        self,
+        message: type,
+        topic: str,
+        callback: Callable[..., None],
+        *,
+        fields: Sequence[str] | None = None,
+        raw: bool = False,
     ) -> Subscription:
         """Create a subscription with reliable QoS, keep last 10.
+
+        Bytes that are not a message of the type are logged and dropped.
 
         Args:
             message: Type of the messages.
             topic: Name of the topic.
             callback: Called with each message.
+            fields: Paths of the fields that the callback receives instead, one argument each, as
+                `messages.cdr.Reader` returns them. A message object takes several times as long.
             raw: Whether the callback receives the serialized bytes.
 
         Raises:
             ParameterError: As for `advertise`.
         """
+
+        def dropped(error: DecodingError) -> None:
+            self.get_logger().warning(f'{topic} dropped: {error}', throttle_duration_sec=THROTTLE)
+
         self._topics.append((topic, type_name(message), True))
         with explaining_failure(self, message, topic):
             return self.create_subscription(
                 message,
                 topic,
-                callback,
+                callback if raw else decoding(message, fields, callback, dropped),
                 QoSProfile(depth=10),
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-                raw=raw,
+                raw=True,
             )
 
     def provide(self, service: Any, name: str, callback: Callable[[Any, Any], Any]) -> Service:

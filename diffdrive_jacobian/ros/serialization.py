@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import struct
-from typing import TypeVar
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 from builtin_interfaces.msg import Time
+from nav_msgs.msg import Goals
 from rclpy.serialization import deserialize_message
 
-from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.messages.cdr import DecodingError, Reader
+from diffdrive_jacobian.messages.wire import GOALS
 
 T = TypeVar('T')
 
@@ -17,28 +19,63 @@ def deserialized(data: bytes, message_type: type[T]) -> T:
     """Return the message in serialized bytes.
 
     Raises:
-        MessageError: They are not a message of this type.
+        DecodingError: They are not a message of this type.
     """
     try:
         message: T = deserialize_message(data, message_type)
     except RuntimeError as error:
-        raise MessageError(f'it is not a {message_type.__name__} message') from error
+        raise DecodingError(f'it is not a {message_type.__name__} message') from error
     return message
+
+
+def reader(
+    message_type: type[Any], fields: Sequence[str], *, whole: bool = True
+) -> Callable[[bytes], tuple[Any, ...]]:
+    """Return a Reader of these fields, to which rclpy reads the encapsulations that it does not."""
+    return Reader(message_type, fields, whole=whole, deserialize=deserialize_message)
+
+
+def decoding(
+    message_type: type[Any],
+    fields: Sequence[str] | None,
+    callback: Callable[..., None],
+    refused: Callable[[DecodingError], None],
+) -> Callable[[bytes], None]:
+    """Return a callback for serialized messages.
+
+    Args:
+        message_type: Type of the messages.
+        fields: Paths of the fields that are read; None: the message as a whole.
+        callback: Called with the fields, one argument each, or with the message.
+        refused: Called instead if the bytes are not a message of this type.
+    """
+    read: Callable[[bytes], tuple[Any, ...]] = (
+        (lambda data: (deserialized(data, message_type),))
+        if fields is None
+        else reader(message_type, fields)
+    )
+
+    def decode(data: bytes) -> None:
+        try:
+            values = read(data)
+        except DecodingError as error:
+            refused(error)
+            return
+        callback(*values)
+
+    # Reports name a callback.
+    decode.__qualname__ = getattr(callback, '__qualname__', decode.__qualname__)
+    return decode
+
+
+_read_goals = reader(Goals, GOALS, whole=False)
 
 
 def goals_header(data: bytes) -> tuple[Time, int]:
     """Return the stamp and the number of poses of a serialized Goals message without its poses.
 
-    The layout is that of CDR. Of the 4 bytes of the encapsulation the second is odd for little-endian.
-    The stamp follows, then the frame as length and text, and aligned to 4 bytes the number of poses.
-
     Raises:
-        MessageError: The bytes are too short.
+        DecodingError: The bytes end before the poses, or are too few for them.
     """
-    try:
-        order = '<' if data[1] & 1 else '>'
-        sec, nanosec, length = struct.unpack_from(f'{order}iII', data, 4)
-        (count,) = struct.unpack_from(f'{order}I', data, 16 + (length + 3) // 4 * 4)
-    except (IndexError, struct.error) as error:
-        raise MessageError('it is not a Goals message') from error
+    sec, nanosec, count = _read_goals(data)
     return Time(sec=sec, nanosec=nanosec), count

@@ -13,7 +13,7 @@ Scaramuzza, *Introduction to Autonomous Mobile Robots*, 5.2.4.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,6 +35,10 @@ ROUNDING = 1e-8
 """Tolerance on symmetry and semidefiniteness of a covariance, relative to its largest entry."""
 # Taylor coefficients of _sinc_defect in the square of its argument, (-1)^n / (2n + 3)!
 _DEFECT = [(-1.0) ** n / math.factorial(2 * n + 3) for n in range(9)]
+
+
+Entries: TypeAlias = tuple[float, float, float, float, float, float]
+"""Entries xx, xy, xt, yy, yt, tt of the covariance of a pose."""
 
 
 def twist_covariance(
@@ -72,16 +76,17 @@ def _twist_covariance(v: Any, omega: Any, L: Any, k: Any, interval: Any) -> tupl
     return (right + left) / (4.0 * interval), cross, cross, (right + left) / (L * L * interval)
 
 
-def twist_covariance_checked(
+def twist_covariance_entries(
     twist: tuple[float, float], L: float, wheel_travel_variance: float, interval: float
-) -> NDArray[np.float64]:
-    """Compute what `twist_covariance` returns for one robot whose values were checked before.
+) -> tuple[float, float, float, float]:
+    """Compute what `twist_covariance` returns for one robot whose values were checked before, by rows.
 
     Raises:
         ValueError: The result overflows.
     """
     operands = *twist, L, wheel_travel_variance, interval
-    return _matrix(*evaluated(True, 'twist and interval', _twist_covariance, *operands))
+    vv, vw, wv, ww = evaluated(True, 'twist and interval', _twist_covariance, *operands)
+    return vv, vw, wv, ww
 
 
 def propagate_covariance(
@@ -124,22 +129,29 @@ def propagate_covariance(
     return _matrix(*evaluated(single, names, _propagated, *entries, theta, v, omega, dt, L, k))
 
 
-def propagate_checked(
-    covariance: NDArray[np.float64],
+def propagated_entries(
+    entries: Entries,
     theta: float,
     twist: tuple[float, float],
     dt: float,
     L: float,
     wheel_travel_variance: float,
-) -> NDArray[np.float64]:
+) -> Entries | None:
     """Compute what `propagate_covariance` returns for one robot whose values were checked before.
 
-    Raises:
-        ValueError: The result overflows.
+    Entries are xx, xy, xt, yy, yt, tt.
+
+    Returns:
+        The entries at the end. None: they overflow.
     """
-    (pxx, pxy, pxt), (_, pyy, pyt), (_, _, ptt) = covariance.tolist()
-    operands = pxx, pxy, pxt, pyy, pyt, ptt, theta, *twist, dt, L, wheel_travel_variance
-    return _matrix(*evaluated(True, 'twist and time', _propagated, *operands))
+    try:
+        xx, xy, xt, _, yy, yt, _, _, tt = _propagated(
+            *entries, theta, *twist, dt, L, wheel_travel_variance
+        )
+    except (OverflowError, ValueError, ZeroDivisionError):
+        return None
+    made = xx, xy, xt, yy, yt, tt
+    return made if all(map(math.isfinite, made)) else None
 
 
 def covariance_entries(name: str, covariance: ArrayLike) -> tuple[Any, ...]:

@@ -7,18 +7,23 @@ timestamps. Times are integer nanoseconds, so that Unix time loses no precision.
 The state is stored at the last event (command, timeout, placement). Every later state is computed from
 it along one exact arc, so the motion does not depend, to the last bit, on when states are computed.
 
+A state is computed in floats, and its covariance and its arrays when they are first read. A node that
+needs no arrays reads `pose_tuple` and `covariance_tuple`.
+
 Source: doc/mathematics.md, "Motion".
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.control.saturation import VelocityLimits, saturate
+from diffdrive_jacobian.kinematics._arc import arc_end
 from diffdrive_jacobian.kinematics._checks import (
     array,
     floats,
@@ -31,15 +36,13 @@ from diffdrive_jacobian.kinematics._checks import (
 )
 from diffdrive_jacobian.kinematics._elementary import components, operand
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
-from diffdrive_jacobian.kinematics.se2 import integrate
-from diffdrive_jacobian.simulation.odometry_noise import (
-    covariance_entries,
-    propagate_checked,
-    twist_covariance_checked,
-)
+from diffdrive_jacobian.simulation._uncertainty import Uncertainty
+from diffdrive_jacobian.simulation.odometry_noise import covariance_entries, twist_covariance_entries
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 STANDSTILL = (0.0, 0.0)
+_State: TypeAlias = tuple[tuple[float, float, float], tuple[float, float], Uncertainty]
+"""Pose, wheel angles and uncertainty at a time."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -106,9 +109,10 @@ class Robot:
     stamp: int
     """Time of this state (ns)."""
     pose: NDArray[np.float64]
-    """`[x, y, theta]`, shape (3,)."""
+    """`[x, y, theta]`, shape (3,), read-only. `pose_tuple` has the same numbers without an array."""
     covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 3)))
-    """Covariance of the pose, shape (3, 3)."""
+    """Covariance of the pose, shape (3, 3), read-only. Computed when it is first read, which raises
+    ValueError if it overflows."""
     wheel_angles: tuple[float, float] = (0.0, 0.0)
     """`(right, left)`, unwrapped (rad)."""
     command: tuple[float, float] = STANDSTILL
@@ -117,6 +121,11 @@ class Robot:
     """The applied twist: the command after saturation."""
     commanded_at: int | None = None
     """Time at which the command took effect (ns); None: it is zero."""
+    pose_tuple: tuple[float, float, float] = field(init=False, repr=False)
+    """`(x, y, theta)`, the pose as floats (m, m, rad)."""
+    _uncertainty: Uncertainty = field(init=False, repr=False)
+    # The last state that was computed from this one, because often the same one is needed next.
+    _ahead: tuple[int, _State] | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
         """Check every value. The methods below construct their results without these checks."""
@@ -127,11 +136,14 @@ class Robot:
         covariance = floats('covariance', self.covariance)
         if covariance.ndim != 2:
             raise ValueError(f'covariance must have shape (3, 3), got {covariance.shape}')
-        covariance_entries('covariance', covariance)
+        entries = covariance_entries('covariance', covariance)
+        pose, covariance = read_only(pose), read_only(covariance)
         values: dict[str, Any] = {
             'stamp': nanoseconds('stamp', self.stamp),
-            'pose': read_only(pose),
-            'covariance': read_only(covariance),
+            'pose': pose,
+            'covariance': covariance,
+            'pose_tuple': tuple(pose.tolist()),
+            '_uncertainty': Uncertainty(entries),
         }
         for name in ('wheel_angles', 'command', 'twist'):
             values[name] = _pair(name, getattr(self, name))
@@ -139,6 +151,30 @@ class Robot:
             values['commanded_at'] = nanoseconds('commanded_at', self.commanded_at)
         for name, value in values.items():
             object.__setattr__(self, name, value)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Create the arrays when they are first read: their slots are empty until then."""
+            if name == 'pose':
+                array = np.array(self.pose_tuple)
+            elif name == 'covariance':
+                array = np.array(self.covariance_tuple).reshape(3, 3)
+            else:
+                raise AttributeError(f"'Robot' object has no attribute {name!r}")
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+            return array
+
+    @property
+    def covariance_tuple(self) -> tuple[float, ...]:
+        """The nine entries of the covariance by rows, as floats.
+
+        Raises:
+            ValueError: The covariance overflows.
+        """
+        xx, xy, xt, yy, yt, tt = self._uncertainty.entries()
+        return xx, xy, xt, xy, yy, yt, xt, yt, tt
 
     @property
     def expiry(self) -> int | None:
@@ -151,9 +187,11 @@ class Robot:
     @property
     def wheel_speeds(self) -> tuple[float, float]:
         """`(omega_R, omega_L)` (rad/s), by the inverse wheel Jacobian."""
-        omega_R, omega_L = body_to_wheel(
-            *self.twist, self.model.wheel_radius, self.model.wheel_separation
-        )
+        (v, omega), r, L = self.twist, self.model.wheel_radius, self.model.wheel_separation
+        half = omega * L / 2.0
+        omega_R, omega_L = (v + half) / r, (v - half) / r
+        if not (math.isfinite(omega_R) and math.isfinite(omega_L)):
+            raise ValueError('twist must give finite wheel speeds, but they overflow')
         return omega_R, omega_L
 
     def twist_covariance(self, interval: float) -> NDArray[np.float64]:
@@ -162,11 +200,19 @@ class Robot:
         Raises:
             ValueError: The interval is not positive and finite, or the result overflows.
         """
+        return np.array(self.twist_covariance_tuple(interval)).reshape(2, 2)
+
+    def twist_covariance_tuple(self, interval: float) -> tuple[float, float, float, float]:
+        """Return the four entries of `twist_covariance` by rows, as floats.
+
+        Raises:
+            ValueError: As `twist_covariance`.
+        """
         model = self.model
         interval = operand('interval', interval, positive)
         if type(interval) is not float:
             raise ValueError(f'interval must be a single number, got shape {np.shape(interval)}')
-        return twist_covariance_checked(
+        return twist_covariance_entries(
             self.twist, model.wheel_separation, model.wheel_travel_variance, interval
         )
 
@@ -180,16 +226,10 @@ class Robot:
             ValueError: The time is earlier than this state, is not an integer, or so late that the
                 motion overflows.
         """
-        stamp = nanoseconds('stamp', stamp)
-        if stamp < self.stamp:
-            raise ValueError(f'stamp cannot go back from {self.stamp} ns to {stamp} ns')
-        expiry = self.expiry
-        if expiry is None or expiry > stamp:
-            return self._moved(stamp)
-        there = self._moved(expiry)
-        return _robot(
-            there.model, stamp, there.pose, there.covariance, there.wheel_angles, STANDSTILL, STANDSTILL
-        )
+        stamp, state, expired = self._advanced(stamp)
+        if expired:
+            return _robot(self.model, stamp, state, STANDSTILL, STANDSTILL)
+        return _robot(self.model, stamp, state, self.command, self.twist, self.commanded_at)
 
     def commanded(self, command: ArrayLike, stamp: int) -> Robot:
         """Apply a command from a time on, within the limits.
@@ -202,17 +242,10 @@ class Robot:
             ValueError: The command has another shape or is not finite; or as `at`.
         """
         v, omega = _pair('command', command)
-        here, model = self.at(stamp), self.model
-        return _robot(
-            model,
-            here.stamp,
-            here.pose,
-            here.covariance,
-            here.wheel_angles,
-            (v, omega),
-            saturate(v, omega, model.limits, model.wheel_radius, model.wheel_separation),
-            None if v == omega == 0.0 else here.stamp,
-        )
+        stamp, state, _ = self._advanced(stamp)
+        model = self.model
+        twist = saturate(v, omega, model.limits, model.wheel_radius, model.wheel_separation)
+        return _robot(model, stamp, state, (v, omega), twist, None if v == omega == 0.0 else stamp)
 
     def placed(self, pose: ArrayLike, covariance: ArrayLike, stamp: int) -> Robot:
         """Restart at a pose, with the same command and wheel angles.
@@ -227,16 +260,8 @@ class Robot:
         """
         here = self.at(stamp)
         placed = Robot(model=self.model, stamp=here.stamp, pose=pose, covariance=covariance)  # type: ignore[arg-type]
-        return _robot(
-            here.model,
-            here.stamp,
-            placed.pose,
-            placed.covariance,
-            here.wheel_angles,
-            here.command,
-            here.twist,
-            here.commanded_at,
-        )
+        state = placed.pose_tuple, here.wheel_angles, placed._uncertainty
+        return _robot(here.model, here.stamp, state, here.command, here.twist, here.commanded_at)
 
     def remodelled(self, model: RobotModel, stamp: int, *, wheels_commanded: bool = False) -> Robot:
         """Change the model. Its limits and timeout apply to the current command.
@@ -253,16 +278,8 @@ class Robot:
         if wheels_commanded:
             speeds = body_to_wheel(*command, self.model.wheel_radius, self.model.wheel_separation)
             command = wheel_to_body(*speeds, model.wheel_radius, model.wheel_separation)
-        return _robot(
-            model,
-            here.stamp,
-            here.pose,
-            here.covariance,
-            here.wheel_angles,
-            command,
-            model.limited(command),
-            here.commanded_at,
-        )
+        limited = model.limited(command)
+        return _robot(model, here.stamp, here._present, command, limited, here.commanded_at)
 
     def restarted(self, stamp: int) -> Robot:
         """Stop at the same pose, at a time that may be earlier.
@@ -271,29 +288,44 @@ class Robot:
             ValueError: The time is not an integer (ns).
         """
         stamp = nanoseconds('stamp', stamp)
-        return _robot(
-            self.model, stamp, self.pose, self.covariance, self.wheel_angles, STANDSTILL, STANDSTILL
-        )
+        return _robot(self.model, stamp, self._present, STANDSTILL, STANDSTILL)
 
-    def _moved(self, stamp: int) -> Robot:
+    @property
+    def _present(self) -> _State:
+        return self.pose_tuple, self.wheel_angles, self._uncertainty
+
+    def _advanced(self, stamp: int) -> tuple[int, _State, bool]:
+        """Return a time (ns), the state at that time, and whether the timeout stopped the robot before.
+
+        Raises:
+            ValueError: As `at`.
+        """
+        stamp = nanoseconds('stamp', stamp)
+        if stamp < self.stamp:
+            raise ValueError(f'stamp cannot go back from {self.stamp} ns to {stamp} ns')
+        expiry = self.expiry
+        if expiry is None or expiry > stamp:
+            return stamp, self._state(stamp), False
+        return stamp, self._state(expiry), True
+
+    def _state(self, stamp: int) -> _State:
+        """Compute the state at a time up to the timeout."""
+        ahead = self._ahead
+        if ahead is not None and ahead[0] == stamp:
+            return ahead[1]
         dt = (stamp - self.stamp) / NANOSECONDS
-        model, pose, covariance, angles = self.model, self.pose, self.covariance, self.wheel_angles
-        if dt != 0.0 and self.twist != STANDSTILL:
-            (right, left), (omega_R, omega_L) = angles, self.wheel_speeds
-            angles = _pair('wheel_angles', (right + omega_R * dt, left + omega_L * dt))
-            covariance = propagate_checked(
-                covariance,
-                float(pose[2]),
-                self.twist,
-                dt,
-                model.wheel_separation,
-                model.wheel_travel_variance,
-            )
-            pose = integrate(pose, self.twist, dt)
-            pose.flags.writeable = covariance.flags.writeable = False
-        return _robot(
-            model, stamp, pose, covariance, angles, self.command, self.twist, self.commanded_at
-        )
+        twist = v, omega = self.twist
+        if dt == 0.0 or twist == STANDSTILL:
+            return self._present
+        model, (x, y, theta), (right, left) = self.model, self.pose_tuple, self.wheel_angles
+        omega_R, omega_L = self.wheel_speeds
+        angles = right + omega_R * dt, left + omega_L * dt
+        if not (math.isfinite(angles[0]) and math.isfinite(angles[1])):
+            raise ValueError(f'wheel_angles must be finite, got {list(angles)}')
+        arc = theta, twist, dt, model.wheel_separation, model.wheel_travel_variance
+        state = arc_end(x, y, theta, v, omega, dt), angles, self._uncertainty.after(arc)
+        _set(self, '_ahead', (stamp, state))
+        return state
 
 
 _set = object.__setattr__
@@ -302,32 +334,35 @@ _set = object.__setattr__
 def _robot(
     model: RobotModel,
     stamp: int,
-    pose: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    wheel_angles: tuple[float, float],
+    state: _State,
     command: tuple[float, float],
     twist: tuple[float, float],
     commanded_at: int | None = None,
 ) -> Robot:
     """Return a robot with checked values, without checking them again for every message."""
     robot = object.__new__(Robot)
+    pose, angles, uncertainty = state
     _set(robot, 'model', model)
     _set(robot, 'stamp', stamp)
-    _set(robot, 'pose', pose)
-    _set(robot, 'covariance', covariance)
-    _set(robot, 'wheel_angles', wheel_angles)
+    _set(robot, 'pose_tuple', pose)
+    _set(robot, '_uncertainty', uncertainty)
+    _set(robot, 'wheel_angles', angles)
     _set(robot, 'command', command)
     _set(robot, 'twist', twist)
     _set(robot, 'commanded_at', commanded_at)
+    _set(robot, '_ahead', None)
     return robot
 
 
-def _pair(name: str, value: ArrayLike) -> tuple[float, float]:
+def _pair(name: str, value: Any) -> tuple[float, float]:
     """Return two finite numbers as a tuple of floats.
 
     Raises:
         ValueError: It is something else.
     """
+    pair = type(value) is tuple and len(value) == 2 and type(value[0]) is type(value[1]) is float
+    if pair and math.isfinite(value[0]) and math.isfinite(value[1]):
+        return value[0], value[1]
     first, second = components(name, value, 2)
     if type(first) is not float:
         raise ValueError(f'{name} must have shape (2,), got {np.shape(value)}')

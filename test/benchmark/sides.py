@@ -106,9 +106,9 @@ class CountedRobot(VirtualRobot):
 
     received = 0
 
-    def _on_twist(self, message: Twist) -> None:
+    def _on_twist(self, *fields: float) -> None:
         self.received += 1
-        super()._on_twist(message)
+        super()._on_twist(*fields)
 
 
 class CountedController(GoToGoal):
@@ -116,9 +116,9 @@ class CountedController(GoToGoal):
 
     received = 0
 
-    def _on_odometry(self, message: Odometry) -> None:
+    def _on_odometry(self, *fields: Any) -> None:
         self.received += 1
-        super()._on_odometry(message)
+        super()._on_odometry(*fields)
 
 
 def our_controller(**kwargs: Any) -> CountedController:

@@ -1,0 +1,309 @@
+"""Reading single fields of serialized messages."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable
+from collections.abc import Sequence as Values
+from operator import attrgetter, itemgetter
+from typing import Any, NamedTuple
+
+from diffdrive_jacobian.messages.cdr_types import (
+    COUNT,
+    ENCAPSULATION,
+    LITTLE_ENDIAN,
+    Array,
+    FieldType,
+    Number,
+    Sequence,
+    Structure,
+    Text,
+    least_size,
+    structure,
+)
+from diffdrive_jacobian.messages.errors import MessageError
+
+_MAX_LAYOUTS = 16
+"""Layouts that a Reader keeps, one for each size of message."""
+_MAX_VALUES = 256
+"""Largest number of values of a layout that is kept."""
+_LENGTH = re.compile(r'len\(([\w.]+)\)')
+
+
+class DecodingError(MessageError):
+    """Bytes that are not a message of the type."""
+
+
+class Reader:
+    """Reads fields of serialized messages.
+
+    Where the fields are depends on the lengths of the strings and sequences before them. These are
+    usually the same in each message. So the layout of the last message of the same size is tried first:
+    one unpacking gives the lengths and the fields, and the fields are right if the lengths are.
+    """
+
+    def __init__(
+        self,
+        message_class: Any,
+        fields: Values[str],
+        *,
+        whole: bool = True,
+        deserialize: Callable[[bytes, Any], Any] | None = None,
+    ) -> None:
+        """Compile a reader.
+
+        Args:
+            message_class: Type of the messages.
+            fields: Paths such as `header.stamp.sec`. A path to a number gives a number, to a string a
+                str, to an array or sequence of them a tuple. `len(goals)` gives the length of a
+                sequence.
+            whole: Whether what follows the last field must be valid too.
+            deserialize: Reads the encapsulations that this class does not, such as big-endian
+                (`rclpy.serialization.deserialize_message`). None: they are invalid.
+
+        Raises:
+            ValueError: A field does not exist, or cannot be read on its own.
+            TypeError: The message has a type of field that is not supported.
+        """
+        self._class = message_class
+        self._type = structure(message_class)
+        self._fields = tuple(fields)
+        for field in self._fields:
+            _check_readable(self._type, field)
+        self._whole = whole
+        self._deserialize = deserialize
+        self._layouts: dict[int, _Layout] = {}
+
+    def __call__(self, data: bytes) -> tuple[Any, ...]:
+        """Return the fields of a message, in the order in which they were asked for.
+
+        As in rclpy, bytes after the message are ignored, strings end at the first NUL, and invalid UTF-8
+        is replaced by U+FFFD.
+
+        Raises:
+            DecodingError: The bytes are not a message of this type.
+        """
+        layout = self._layouts.get(len(data))
+        if layout is None:
+            return self._read_new(data)
+        values = layout.unpack_from(data)
+        if layout.lengths(values) != layout.expected:
+            return self._read_new(data)
+        return layout.fields(values)
+
+    def _read_new(self, data: bytes) -> tuple[Any, ...]:
+        """Read a message whose layout is not known."""
+        if len(data) >= ENCAPSULATION and data[:2] != LITTLE_ENDIAN:
+            return self._read_other_encapsulation(data)
+        try:
+            layout = _Walk(data, self._fields, self._whole).layout(self._type)
+        except struct.error as error:
+            raise self._undecodable() from error
+        values = layout.unpack_from(data)
+        if len(values) <= _MAX_VALUES:
+            if len(self._layouts) >= _MAX_LAYOUTS:
+                self._layouts.clear()
+            self._layouts[len(data)] = layout
+        return layout.fields(values)
+
+    def _read_other_encapsulation(self, data: bytes) -> tuple[Any, ...]:
+        if self._deserialize is None:
+            raise self._undecodable()
+        try:
+            message = self._deserialize(data, self._class)
+        except RuntimeError as error:
+            raise self._undecodable() from error
+        return tuple(_value(message, field) for field in self._fields)
+
+    def _undecodable(self) -> DecodingError:
+        return DecodingError(f'it is not a {self._type.name} message')
+
+
+class _Layout(NamedTuple):
+    """Where the fields are in messages with certain lengths of strings and sequences."""
+
+    unpack_from: Callable[[bytes], tuple[Any, ...]]
+    lengths: Callable[[tuple[Any, ...]], Any]
+    """Returns the encapsulation and the lengths among the unpacked values."""
+    expected: Any
+    fields: Callable[[tuple[Any, ...]], tuple[Any, ...]]
+    """Returns the fields among the unpacked values."""
+
+
+class _Walk:
+    """One pass over a message, which collects its layout. Raises struct.error where the bytes end."""
+
+    def __init__(self, data: bytes, fields: tuple[str, ...], whole: bool) -> None:
+        self._data = data
+        self._fields = fields
+        self._missing = set(fields)
+        self._whole = whole
+        self._offset = ENCAPSULATION
+        self._format = ['<2s']
+        self._formatted = 2
+        self._values = 1
+        self._lengths = [0]
+        self._picks: dict[str, Any] = {}
+        self._texts: set[str] = set()
+
+    def layout(self, kind: Structure) -> _Layout:
+        self._walk(kind, '')
+        self._skip_to(self._offset)
+        compiled = struct.Struct(''.join(self._format))
+        lengths = itemgetter(*self._lengths)
+        expected = lengths(compiled.unpack_from(self._data))
+        return _Layout(compiled.unpack_from, lengths, expected, self._picker())
+
+    def _picker(self) -> Callable[[tuple[Any, ...]], tuple[Any, ...]]:
+        picks = [self._picks[field] for field in self._fields]
+        # An itemgetter of one index returns no tuple.
+        pick: Any = itemgetter(*picks) if len(picks) > 1 else _few(picks)
+        texts = [number for number, field in enumerate(self._fields) if field in self._texts]
+        if not texts:
+            picker: Callable[[tuple[Any, ...]], tuple[Any, ...]] = pick
+            return picker
+
+        def pick_texts(values: tuple[Any, ...]) -> tuple[Any, ...]:
+            picked = list(pick(values))
+            for number in texts:
+                raw = picked[number]
+                picked[number] = _text(raw) if type(raw) is bytes else tuple(map(_text, raw))
+            return tuple(picked)
+
+        return pick_texts
+
+    def _walk(self, kind: FieldType, path: str) -> None:
+        wanted = path in self._missing
+        match kind:
+            case Structure():
+                for name, field in kind.fields:
+                    if not (self._missing or self._whole):
+                        return
+                    self._walk(field, f'{path}.{name}' if path else name)
+            case Number():
+                self._numbers(kind, 1, wanted)
+                if wanted:
+                    self._picks[path] = self._values - 1
+            case Text():
+                self._text(wanted)
+                if wanted:
+                    self._picks[path] = self._values - 1
+            case Array():
+                self._elements(kind.element, kind.count, path)
+            case Sequence():
+                length = f'len({path})'
+                count = self._length()
+                if length in self._missing:
+                    self._picks[length] = self._values - 1
+                    self._missing.discard(length)
+                    if not (self._missing or self._whole):
+                        return
+                self._elements(kind.element, count, path)
+        if wanted:
+            self._missing.discard(path)
+            if isinstance(kind, Text) or isinstance(getattr(kind, 'element', None), Text):
+                self._texts.add(path)
+
+    def _elements(self, kind: FieldType, count: int, path: str) -> None:
+        # Without this check a large number would take long, or much memory.
+        if count * least_size(kind) > len(self._data) - self._offset:
+            raise struct.error('more elements than bytes')
+        wanted = path in self._missing
+        first = self._values
+        if isinstance(kind, Number):
+            self._numbers(kind, count, wanted)
+            if wanted:
+                self._picks[path] = slice(first, self._values)
+        elif isinstance(kind, Text):
+            for _ in range(count):
+                self._text(wanted)
+            if wanted:
+                # Each string comes after its length.
+                self._picks[path] = slice(first + 1, self._values, 2)
+        else:
+            for _ in range(count):
+                self._walk(kind, f'{path}[]')
+
+    def _numbers(self, kind: Number, count: int, wanted: bool) -> None:
+        if count:
+            self._align(kind.size)
+        self._take(f'{count}{kind.code}' if wanted else '', count * kind.size)
+        if wanted:
+            self._values += count
+
+    def _text(self, wanted: bool) -> None:
+        size = self._length()
+        self._take(f'{size}s' if wanted else '', size)
+        if wanted:
+            self._values += 1
+
+    def _length(self) -> int:
+        self._align(COUNT.size)
+        (length,) = struct.unpack_from('<I', self._data, self._offset)
+        self._lengths.append(self._values)
+        self._take('I', COUNT.size)
+        self._values += 1
+        return int(length)
+
+    def _take(self, code: str, size: int) -> None:
+        """Advance by a value, which is unpacked unless its format is empty."""
+        start = self._offset
+        self._offset += size
+        if self._offset > len(self._data):
+            raise struct.error('the bytes end within the message')
+        if code:
+            self._skip_to(start)
+            self._format.append(code)
+            self._formatted = self._offset
+
+    def _align(self, size: int) -> None:
+        self._offset += (ENCAPSULATION - self._offset) % size
+
+    def _skip_to(self, offset: int) -> None:
+        if offset > self._formatted:
+            self._format.append(f'{offset - self._formatted}x')
+            self._formatted = offset
+
+
+def _few(indices: Values[Any]) -> Callable[[tuple[Any, ...]], tuple[Any, ...]]:
+    return lambda values: tuple(values[index] for index in indices)
+
+
+def _text(raw: bytes) -> str:
+    return raw.partition(b'\0')[0].decode('utf-8', 'replace')
+
+
+def _value(message: Any, field: str) -> Any:
+    """Return a field of a message object, as the Reader returns it."""
+    length = _LENGTH.fullmatch(field)
+    value = attrgetter(length[1] if length else field)(message)
+    if length:
+        return len(value)
+    if isinstance(value, (str, bytes, int, float)):
+        return value
+    return tuple(value.tolist() if hasattr(value, 'tolist') else value)
+
+
+def _check_readable(kind: Structure, field: str) -> None:
+    """Raise ValueError unless a Reader can return this field."""
+    length = _LENGTH.fullmatch(field)
+    found: FieldType = kind
+    for name in (length[1] if length else field).split('.'):
+        inner = dict(found.fields) if isinstance(found, Structure) else {}
+        if name not in inner:
+            raise ValueError(
+                f"a field of {kind.name} must be a path to one of its fields, got '{field}'; "
+                f'{name!r} is none of {list(inner)}'
+            )
+        found = inner[name]
+    if length:
+        readable = isinstance(found, Sequence)
+    else:
+        simple = found.element if isinstance(found, (Array, Sequence)) else found
+        readable = isinstance(simple, (Number, Text))
+    if not readable:
+        raise ValueError(
+            f'a field of {kind.name} must be a number, a string, an array or sequence of them, or '
+            f"len() of a sequence, got '{field}'"
+        )

@@ -1,0 +1,5 @@
+"""Errors of messages."""
+
+
+class MessageError(ValueError):
+    """A message with invalid content."""

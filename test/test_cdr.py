@@ -1,0 +1,392 @@
+"""Fields read from and written into serialized messages, compared with rclpy's own conversion."""
+
+from __future__ import annotations
+
+import copy
+import struct
+import tracemalloc
+from functools import cache
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import (
+    Pose,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Twist,
+    TwistStamped,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from nav_msgs.msg import Goals, Odometry
+from rclpy.serialization import deserialize_message, serialize_message
+from rosgraph_msgs.msg import Clock
+from rosidl_parser import definition
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Empty, Float64MultiArray, Header, String
+
+from diffdrive_jacobian.messages.cdr import DecodingError, Reader, Writer
+
+CLASSES = (
+    *(Odometry, Twist, TwistStamped, JointState, Clock, Pose, PoseStamped, PoseWithCovarianceStamped),
+    *(Goals, Float64MultiArray, GoalStatus),
+)
+by_class = pytest.mark.parametrize('message_class', CLASSES, ids=lambda one: one.__name__)
+quickly = settings(max_examples=25, deadline=None)
+ENCAPSULATIONS = (b'\0\0', b'\0\1', b'\0\2', b'\0\3', b'\0\6', b'\0\7', b'\0\10', b'\0\11', b'\1\1')
+"""Plain CDR, parameter lists and version 2, in both byte orders, and an unknown one."""
+
+INTEGERS = {
+    name: st.integers(low, high)
+    for bits in (8, 16, 32, 64)
+    for name, low, high in (
+        (f'int{bits}', -(1 << bits - 1), (1 << bits - 1) - 1),
+        (f'uint{bits}', 0, (1 << bits) - 1),
+    )
+}
+
+
+def is_number(kind):
+    return isinstance(kind, definition.BasicType)
+
+
+def is_text(kind):
+    return isinstance(kind, definition.UnboundedString)
+
+
+def message_type(kind):
+    module = __import__('.'.join(kind.namespaces), fromlist=[kind.name])
+    return getattr(module, kind.name)
+
+
+def values(kind):
+    """Return a strategy for a field, from the types of rosidl."""
+    if is_number(kind):
+        return INTEGERS[kind.typename] if kind.typename in INTEGERS else st.floats()
+    if is_text(kind):
+        return st.text(max_size=20)
+    if isinstance(kind, definition.NamespacedType):
+        return messages(message_type(kind))
+    if isinstance(kind, definition.Array):
+        # A few different ones, repeated: drawing 36 takes long.
+        few = st.lists(values(kind.value_type), min_size=1, max_size=5)
+        return few.map(lambda some: [some[number % len(some)] for number in range(kind.size)])
+    return st.lists(values(kind.value_type), max_size=4)
+
+
+@cache
+def messages(message_class):
+    names = message_class.get_fields_and_field_types()
+    fields = {name: values(kind) for name, kind in zip(names, message_class.SLOT_TYPES, strict=True)}
+    return st.builds(message_class, **fields)
+
+
+@cache
+def readable(message_class, prefix=''):
+    """Return the paths of all fields that a Reader can return."""
+    paths = []
+    names = message_class.get_fields_and_field_types()
+    for name, kind in zip(names, message_class.SLOT_TYPES, strict=True):
+        path = prefix + name
+        if isinstance(kind, definition.NamespacedType):
+            paths += readable(message_type(kind), f'{path}.')
+            continue
+        if isinstance(kind, definition.UnboundedSequence):
+            paths.append(f'len({path})')
+        element = getattr(kind, 'value_type', kind)
+        if is_number(element) or is_text(element):
+            paths.append(path)
+    return paths
+
+
+def numbers(message, prefix=''):
+    """Return the paths of all numbers of a message that a Writer can write."""
+    paths = []
+    names = message.get_fields_and_field_types()
+    for name, kind in zip(names, message.SLOT_TYPES, strict=True):
+        path, value = prefix + name, getattr(message, name)
+        if is_number(kind):
+            paths.append((path, kind))
+        elif isinstance(kind, definition.NamespacedType):
+            paths += numbers(value, f'{path}.')
+        elif not is_text(kind):
+            for number, one in enumerate(value):
+                if is_number(kind.value_type):
+                    paths.append((f'{path}[{number}]', kind.value_type))
+                elif isinstance(kind.value_type, definition.NamespacedType):
+                    paths += numbers(one, f'{path}[{number}].')
+    return paths
+
+
+def bits(value):
+    """Return a value such that equal means equal bits, also for NaN."""
+    if isinstance(value, float):
+        return struct.pack('<d', value)
+    if hasattr(value, 'get_fields_and_field_types'):
+        return tuple(bits(getattr(value, name)) for name in value.get_fields_and_field_types())
+    if isinstance(value, (str, int, bytes)):
+        return value
+    return tuple(bits(one) for one in (value.tolist() if hasattr(value, 'tolist') else value))
+
+
+def field(message, path):
+    if path.startswith('len('):
+        return len(field(message, path[4:-1]))
+    for name in path.split('.'):
+        message = getattr(message, name)
+    return message
+
+
+def replaced(message, path, value):
+    """Assign a number by its path, such as `goals[1].pose.position.x`."""
+    *way, last = path.replace('[', '.').replace(']', '').split('.')
+    for name in way:
+        message = message[int(name)] if name.isdecimal() else getattr(message, name)
+    if last.isdecimal():
+        message[int(last)] = value
+    else:
+        setattr(message, last, value)
+
+
+def outcome(read, data):
+    """Return the bits that a function reads, or None if it refuses the bytes as it should."""
+    try:
+        return bits(read(data))
+    except DecodingError:
+        return None
+
+
+def rclpy_outcome(message_class, fields, data):
+    try:
+        message = deserialize_message(data, message_class)
+    except RuntimeError:
+        return None
+    return tuple(bits(field(message, path)) for path in fields)
+
+
+def assert_same_verdict(ours, theirs, message_class):
+    """Compare outcomes. A sequence of a nested message that is too long is read as empty by rclpy."""
+    assert ours == theirs or (ours is None and message_class is Float64MultiArray)
+
+
+def reader(message_class, fields):
+    return Reader(message_class, fields, deserialize=deserialize_message)
+
+
+# --- Reading
+
+
+@by_class
+@quickly
+@given(data=st.data())
+def test_any_fields_are_read_as_rclpy_reads_them(message_class, data):
+    fields = data.draw(st.lists(st.sampled_from(readable(message_class)), unique=True))
+    read = reader(message_class, fields)
+    for message in data.draw(st.lists(messages(message_class), min_size=1, max_size=3)):
+        serialized = serialize_message(message)
+        expected = rclpy_outcome(message_class, fields, serialized)
+        assert expected is not None
+        # The second time with the layout of the first.
+        assert outcome(read, serialized) == outcome(read, serialized) == expected
+
+
+@by_class
+@quickly
+@given(data=st.data())
+def test_damaged_bytes_are_refused_or_read_as_by_rclpy(message_class, data):
+    """Cut off, prolonged, overwritten (lengths too), or under another encapsulation."""
+    fields = readable(message_class)
+    read = reader(message_class, fields)
+    serialized = serialize_message(data.draw(messages(message_class)))
+    # A layout to be misled by.
+    read(serialized)
+    damaged = bytearray(serialized)
+    if data.draw(st.booleans()):
+        word = data.draw(st.one_of(st.binary(min_size=1, max_size=8), st.sampled_from(LENGTHS)))
+        place = data.draw(st.integers(4, len(damaged)) | st.integers(4, 40))
+        damaged[place : place + len(word)] = word
+    if data.draw(st.booleans()):
+        del damaged[data.draw(st.integers(0, len(damaged))) :]
+    if data.draw(st.booleans()):
+        damaged += data.draw(st.binary(max_size=9))
+    damaged[:2] = data.draw(st.just(damaged[:2]) | st.sampled_from(ENCAPSULATIONS))
+    damaged = bytes(damaged)
+    theirs = rclpy_outcome(message_class, fields, damaged)
+    assert_same_verdict(outcome(read, damaged), theirs, message_class)
+
+
+LENGTHS = [
+    struct.pack('<I', one) for one in (0, 1, 2, 3, 5, 8, 255, 1 << 16, (1 << 31) - 1, (1 << 32) - 1)
+]
+
+
+@by_class
+@quickly
+@given(data=st.binary(max_size=300), plain=st.booleans())
+def test_random_bytes_are_refused_or_read_as_by_rclpy(message_class, data, plain):
+    fields = readable(message_class)
+    data = b'\0\1\0\0' * plain + data
+    ours = outcome(reader(message_class, fields), data)
+    assert_same_verdict(ours, rclpy_outcome(message_class, fields, data), message_class)
+
+
+@by_class
+def test_bytes_cut_off_anywhere_are_refused_as_by_rclpy(message_class):
+    fields = readable(message_class)
+    read = reader(message_class, fields)
+    message = message_class()
+    if hasattr(message, 'header'):
+        message.header.frame_id = 'odom'
+    if message_class is JointState:
+        message.name, message.velocity = ['left', 'right'], [1.0, 2.0]
+    if message_class is Goals:
+        message.goals = [PoseStamped()]
+    serialized = serialize_message(message)
+    verdicts = [outcome(read, serialized[:size]) for size in range(len(serialized) + 1)]
+    assert verdicts == [
+        rclpy_outcome(message_class, fields, serialized[:size]) for size in range(len(serialized) + 1)
+    ]
+    assert verdicts[0] is None
+    assert verdicts[-1] is not None
+
+
+@pytest.mark.parametrize(
+    'content',
+    [b'\0\0\0\0', b'\1\0\0\0a', b'\4\0\0\0a\0b\0', b'\4\0\0\0abcd', b'\4\0\0\0a\xff\xfe\0'],
+    ids=['no NUL', 'one byte', 'NUL inside', 'no NUL at the end', 'invalid UTF-8'],
+)
+def test_unusual_strings_are_read_as_rclpy_reads_them(content):
+    data = b'\0\1\0\0' + content
+    assert Reader(String, ['data'])(data) == (deserialize_message(data, String).data,)
+
+
+@pytest.mark.parametrize('encapsulation', ENCAPSULATIONS[:-1])
+def test_other_encapsulations_are_left_to_rclpy(encapsulation):
+    big = not encapsulation[1] & 1
+    data = encapsulation + struct.pack('>2xiII5s' if big else '<2xiII5s', 12, 34, 5, b'odom\0')
+    fields = ['stamp.sec', 'stamp.nanosec', 'frame_id']
+    assert reader(Header, fields)(data) == (12, 34, 'odom')
+    if encapsulation != b'\0\1':
+        with pytest.raises(DecodingError, match='not a Header message'):
+            Reader(Header, fields)(data)
+
+
+def test_a_huge_length_takes_no_memory():
+    data = b'\0\1\0\0' + bytes(8) + b'\1\0\0\0\0\0\0\0'
+    read = Reader(JointState, ['name', 'position', 'velocity'])
+    tracemalloc.start()
+    try:
+        for lengths in (b'\xff\xff\xff\xff', bytes(4) + b'\xff\xff\xff\xff', b'\xff\xff\xff\x7f'):
+            with pytest.raises(DecodingError):
+                read(data + lengths + bytes(64))
+        assert tracemalloc.get_traced_memory()[1] < 100_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_layouts_of_messages_of_many_sizes_take_little_memory():
+    read = Reader(JointState, ['name', 'velocity'])
+    for count in (*range(300), 5000):
+        message = JointState(name=[str(one) for one in range(count)], velocity=[0.5] * count)
+        assert read(serialize_message(message)) == (tuple(message.name), tuple(message.velocity))
+    assert len(read._layouts) <= 16
+
+
+def test_the_start_of_a_message_can_be_read_without_the_rest():
+    message = Goals(goals=[PoseStamped()] * 3)
+    message.header.stamp.sec = 7
+    data = serialize_message(message)[:24]
+    fields = ['header.stamp.sec', 'len(goals)']
+    assert Reader(Goals, fields, whole=False)(data) == (7, 3)
+    with pytest.raises(DecodingError):
+        Reader(Goals, fields)(data)
+
+
+@pytest.mark.parametrize(
+    'wrong',
+    ['pose', 'header', 'pose.pose.position.q', 'header.stamp.sec.x', 'len(header)', 'len(q)', ''],
+)
+def test_a_field_that_cannot_be_read_is_an_error(wrong):
+    with pytest.raises(ValueError, match='a field of Odometry must be'):
+        Reader(Odometry, [wrong])
+
+
+# --- Writing
+
+
+@by_class
+@quickly
+@given(data=st.data())
+def test_numbers_are_written_as_rclpy_writes_them(message_class, data):
+    template = data.draw(messages(message_class))
+    kinds = dict(numbers(template))
+    subset = st.sets(st.sampled_from(list(kinds)), max_size=8) if kinds else st.just(set())
+    paths = data.draw(subset)
+    chosen = [(path, kind) for path, kind in kinds.items() if path in paths]
+    write = Writer(template, [path for path, _ in chosen])
+    message = copy.deepcopy(template)
+    for _ in range(2):
+        new = [data.draw(values(kind)) for _, kind in chosen]
+        for (path, _), value in zip(chosen, new, strict=True):
+            replaced(message, path, value)
+        ours, theirs = write(*new), serialize_message(message)
+        assert bits(deserialize_message(ours, message_class)) == bits(
+            deserialize_message(theirs, message_class)
+        )
+        # Padding is not set by rclpy, which also appends bytes that are not part of the message.
+        differing = [mine for mine, other in zip(ours, theirs, strict=False) if mine != other]
+        assert not any(differing)
+        assert len(ours) <= len(theirs)
+        with pytest.raises(RuntimeError):
+            deserialize_message(ours[:-1], message_class)
+
+
+def test_messages_without_padding_are_written_byte_for_byte():
+    for message in (Twist(), Clock(), Odometry()):
+        assert len(Writer(message, [])()) == len(serialize_message(message))
+    twist, clock = Twist(), Clock()
+    twist.linear.x, twist.angular.z = -0.25, np.float64(1e-310)
+    clock.clock.sec, clock.clock.nanosec = 5, 999_999_999
+    assert Writer(Twist(), ['linear.x', 'angular.z'])(-0.25, 1e-310) == serialize_message(twist)
+    fields = ['clock.sec', 'clock.nanosec']
+    assert Writer(Clock(), fields)(5, 999_999_999) == serialize_message(clock)
+
+
+def test_an_array_takes_a_number_for_each_element():
+    message = JointState(name=['left', 'right'], velocity=[0.0, 0.0])
+    write = Writer(message, ['header.stamp.sec', 'velocity'])
+    read = Reader(JointState, ['header.stamp.sec', 'name', 'position', 'velocity'])
+    assert read(write(3, 0.5, -0.5)) == (3, ('left', 'right'), (), (0.5, -0.5))
+    # The next message does not change the bytes of the last one.
+    first = write(3, 0.5, -0.5)
+    second = write(4, 1, np.float64(2.0))
+    assert read(first) == (3, ('left', 'right'), (), (0.5, -0.5))
+    assert read(second) == (4, ('left', 'right'), (), (1.0, 2.0))
+
+
+@pytest.mark.parametrize(
+    ('fields', 'error'),
+    [
+        (['linear.q'], 'a field must be a number'),
+        (['linear'], 'a field must be a number'),
+        (['angular.z', 'linear.x'], 'in the order of the message'),
+        (['linear.x', 'linear.x'], 'in the order of the message'),
+    ],
+)
+def test_a_field_that_cannot_be_written_is_an_error(fields, error):
+    with pytest.raises(ValueError, match=error):
+        Writer(Twist(), fields)
+
+
+@pytest.mark.parametrize('numbers', [(), (1.0, 2.0), ('1',), (None,)])
+def test_wrong_numbers_are_an_error_of_the_message(numbers):
+    with pytest.raises(ValueError, match='Twist cannot be serialized'):
+        Writer(Twist(), ['linear.x'])(*numbers)
+    with pytest.raises(ValueError, match='Clock cannot be serialized'):
+        Writer(Clock(), ['clock.sec'])(1 << 31)
+
+
+def test_types_that_are_not_supported_are_an_error():
+    with pytest.raises(TypeError, match='Empty has no fields'):
+        Reader(Empty, [])
