@@ -18,12 +18,12 @@ HOUSE = Path(diffdrive_jacobian.__file__).parent
 # From the ground up: each layer may import itself and what stands before it.
 LAYERS = (
     *('kinematics', 'control', 'simulation', 'sweeps', 'messages', 'parameters', 'bags'),
-    *('recovery', 'reading'),
+    *('recovery', 'reading', 'diagnosis'),
     *('plots', 'ros', 'nodes', 'recording', 'replay', 'lockstep', 'drives', 'testing', 'tools'),
 )
 PURE = LAYERS[:3]
 # These may load rosbags and what it needs, but nothing of ROS, and matplotlib only when they draw.
-WITHOUT_ROS = ('messages', 'parameters', 'bags', 'recovery', 'reading', 'plots')
+WITHOUT_ROS = ('messages', 'parameters', 'bags', 'recovery', 'reading', 'diagnosis', 'plots')
 # Modules beside the layers, and the layers they may import.
 DOORS = {
     '__init__': (),

@@ -162,9 +162,13 @@ def test_topics_and_services(lockstep, name):
     assert documented == own | {alternative for topic, alternative in other.items() if topic in own}
 
 
+COMMON = {'-h', '--help', '--version'}
+"""Options of every tool, which the rules for all of them mention."""
+
+
 def options_of(tool):
     parser = importlib.import_module(f'diffdrive_jacobian.tools.{tool}')._parser()
-    return {option for action in parser._actions for option in action.option_strings} - {'-h', '--help'}
+    return {option for action in parser._actions for option in action.option_strings} - COMMON
 
 
 @pytest.mark.parametrize('tool', TOOLS)

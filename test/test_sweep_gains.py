@@ -589,10 +589,10 @@ def test_missing_permission_is_reported_before_the_batch(folder, capsys, monkeyp
 def test_a_file_that_cannot_be_written_does_not_keep_the_other(folder, capsys, monkeypatch, undrawn):
     inner = sweep_gains.create
 
-    def full(path, data):
+    def full(path, data, **options):
         if path.suffix == '.csv':
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        inner(path, data)
+        inner(path, data, **options)
 
     monkeypatch.setattr(sweep_gains, 'create', full)
     assert run(*QUICK, '-o', 'a.png', '--csv', 'a.csv') == 1

@@ -31,6 +31,8 @@ from diffdrive_jacobian.text import format_size, printable
 
 MAX_SQLITE_PATH = 504
 """Length of the longest resolved path that SQLite opens (bytes)."""
+BAG_SUFFIXES = ('.mcap', '.db3', '.zstd', '.db3-shm', '.db3-wal', '.db3-journal')
+"""Endings of the files of a bag besides metadata.yaml."""
 REMAINDER = 10_000
 """Length of metadata.yaml without its topics and custom data, at most (characters)."""
 ESCAPED = 20
@@ -55,19 +57,24 @@ class Summary:
     """Descriptions of records that are not in the bag because readers would refuse it with them."""
 
 
-def check_target(target: Path, storage: str) -> None:
+def check_target(target: Path, storage: str, *, replace: bool = False) -> None:
     """Check that a bag can have this path, before anything is recorded for it.
 
     Args:
         target: The bag's directory.
         storage: `mcap` or `sqlite3`.
+        replace: Whether it may replace another bag.
 
     Raises:
-        FileExistsError: It exists, possibly as a broken symbolic link.
+        FileExistsError: It exists, possibly as a broken symbolic link, and is not to be replaced or
+            is not a bag.
         OSError: Its name is not UTF-8, as metadata.yaml must be, or its path is too long for SQLite.
     """
     if os.path.lexists(target):
-        raise FileExistsError(f'{target} exists already')
+        if not replace:
+            raise FileExistsError(f'{target} exists already')
+        if not _is_nothing_but_a_bag(target):
+            raise FileExistsError(f'{target} exists already and is not a bag: it is not replaced')
     try:
         target.name.encode()
     except UnicodeEncodeError:
@@ -88,21 +95,35 @@ def _scratch_prefix(target: Path) -> str:
     return f'.{target.name[:40]}.building-'
 
 
-def build_bag(records: Callable[[], Iterable[Record]], target: Path, storage: str) -> Summary:
+def _is_nothing_but_a_bag(path: Path) -> bool:
+    """Return whether a path is a directory with files of a bag only."""
+    if path.is_symlink() or not path.is_dir():
+        return False
+    files = list(path.iterdir())
+    return bool(files) and all(
+        file.is_file() and (file.name == 'metadata.yaml' or file.suffix in BAG_SUFFIXES)
+        for file in files
+    )
+
+
+def build_bag(
+    records: Callable[[], Iterable[Record]], target: Path, storage: str, *, replace: bool = False
+) -> Summary:
     """Write records to a new bag, and give it its name after it was read back as readers do.
 
     Messages and custom data that exceed the limits of the readers are left out.
 
     Args:
         records: Returns all records, with each call from the beginning.
-        target: The bag's directory; it must not exist.
+        target: The bag's directory.
         storage: `mcap` or `sqlite3`.
+        replace: Whether it may replace another bag, which stays until the new one is complete.
 
     Raises:
-        FileExistsError: `target` exists.
+        FileExistsError: `target` exists, and is not to be replaced or is not a bag.
         OSError: It cannot be written, or is not read back as it was written. It is removed then.
     """
-    check_target(target, storage)
+    check_target(target, storage, replace=replace)
     channels = {record.id: record for record in records() if isinstance(record, Channel)}
     scratch = Path(tempfile.mkdtemp(prefix=_scratch_prefix(target), dir=target.parent))
     try:
@@ -115,8 +136,17 @@ def build_bag(records: Callable[[], Iterable[Record]], target: Path, storage: st
             _sync(path)
         _sync(bag)
         # Renaming would replace an empty directory that was created meanwhile.
-        check_target(target, storage)
-        os.rename(bag, target)
+        check_target(target, storage, replace=replace)
+        if replace and target.exists():
+            old = scratch / 'replaced'
+            os.rename(target, old)
+            try:
+                os.rename(bag, target)
+            except OSError:
+                os.rename(old, target)
+                raise
+        else:
+            os.rename(bag, target)
         _sync(target.parent)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""Files that a tool writes: completely or not at all, and never in the place of an existing one."""
+"""Files that a tool writes: completely or not at all, and in the place of another one only if asked."""
 
 from __future__ import annotations
 
@@ -13,20 +13,29 @@ from pathlib import Path
 
 FORMATS = ('png', 'svg', 'pdf')
 """File name extensions of figures."""
+NOT_OVERWRITTEN = 'it is not overwritten (--force overwrites files)'
 
 
-def create(path: Path, data: bytes) -> None:
+def create(path: Path, data: bytes, *, replace: bool = False) -> None:
     """Write a new file, which appears only when it is complete.
+
+    Args:
+        path: The file.
+        data: Its content.
+        replace: Whether to replace it if it exists.
 
     Raises:
         FileExistsError: It exists, and is not changed.
         OSError: It cannot be written.
     """
-    if os.path.lexists(path):
+    if os.path.lexists(path) and not replace:
         raise FileExistsError(f'{path} exists already')
     scratch = path.with_name(f'.{path.name[:100]}.{secrets.token_hex(4)}')
     try:
         _write(scratch, data)
+        if replace:
+            os.replace(scratch, path)
+            return
         try:
             # Renaming would replace a file that was created meanwhile.
             os.link(scratch, path)
@@ -72,13 +81,14 @@ def extension(path: Path) -> str:
     return path.suffix.lower().removeprefix('.')
 
 
-def new_file(name: str, formats: Sequence[str], what: str) -> Path:
+def new_file(name: str, formats: Sequence[str], what: str, *, replace: bool = False) -> Path:
     """Check, before a long calculation, that a new file can be written, and return its path.
 
     Args:
         name: Name of the file.
         formats: Allowed file name extensions.
         what: What the file contains, for the error message.
+        replace: Whether it may replace another file.
 
     Raises:
         ValueError: The file name has another extension.
@@ -97,8 +107,8 @@ def new_file(name: str, formats: Sequence[str], what: str) -> Path:
     except OSError as error:
         error.filename = str(path)
         raise
-    if exists:
-        raise FileExistsError(f'{path} exists already; it is not overwritten')
+    if exists and not (replace and path.is_file()):
+        raise FileExistsError(f'{path} exists already; {NOT_OVERWRITTEN}')
     return path
 
 

@@ -61,12 +61,13 @@ _ARROW: Any = {
 }
 
 
-def draw(runs: Sequence[Run], path: Path) -> None:
+def draw(runs: Sequence[Run], path: Path, *, replace: bool = False) -> None:
     """Draw runs into one set of axes, and write the figure to a new file.
 
     Args:
         runs: One or more, with odometry.
         path: Ends in .png, .svg or .pdf.
+        replace: Whether to replace the file if it exists.
 
     Raises:
         BagError: A run has no odometry.
@@ -78,7 +79,7 @@ def draw(runs: Sequence[Run], path: Path) -> None:
     ending = path.suffix.lower().removeprefix('.')
     if ending not in FORMATS:
         raise ValueError(f'{path} must end in .{", .".join(FORMATS)}')
-    if path.exists():
+    if path.exists() and not replace:
         raise FileExistsError(f'{path} exists already')
     drawn = io.BytesIO()
     with warnings.catch_warnings(), styled():
@@ -87,7 +88,7 @@ def draw(runs: Sequence[Run], path: Path) -> None:
         # With many runs there may be no room for their names.
         warnings.filterwarnings('ignore', message='constrained_layout not applied')
         figure(runs).savefig(drawn, format=ending, dpi=DPI)
-    create(path, drawn.getvalue())
+    create(path, drawn.getvalue(), replace=replace)
 
 
 def names(paths: Sequence[Path]) -> list[str]:

@@ -88,10 +88,10 @@ def _decimal(value: float) -> str:
     return '0' if text == '-0' else text
 
 
-def write_csv(run: Run, path: Path) -> None:
+def write_csv(run: Run, path: Path, *, replace: bool = False) -> None:
     """Write a run to a new CSV file with a header line; the fields of unknown values are empty.
 
-    Times are exact, values are rounded to `DECIMALS` places.
+    Times are exact, values are rounded to `DECIMALS` places. `replace`: as for `draw`.
 
     Raises:
         BagError: The run has no odometry.
@@ -104,4 +104,4 @@ def write_csv(run: Run, path: Path) -> None:
     stamps = (run.odometry.stamps - run.odometry.stamps[0]).tolist()
     for stamp, (_, *values) in zip(stamps, table(run).tolist(), strict=True):
         writer.writerow([decimal_seconds(stamp), *map(_decimal, values)])
-    create(path, text.getvalue().encode())
+    create(path, text.getvalue().encode(), replace=replace)

@@ -38,7 +38,12 @@ class Status(NamedTuple):
 
 
 def open_recording(
-    prefix: str, output: str | None, storage: str, *, lossless: bool = False
+    prefix: str,
+    output: str | None,
+    storage: str,
+    *,
+    lossless: bool = False,
+    replace: bool = False,
 ) -> Recording:
     """Start a recording to a path of the user, or to a new one that is named by the time.
 
@@ -47,6 +52,7 @@ def open_recording(
         output: Path of the bag. None: `PREFIX_DATE-TIME` in the current directory.
         storage: `mcap` or `sqlite3`.
         lossless: Whether to wait for a slow disk, as in simulated time, or to drop messages.
+        replace: Whether a path of the user may be that of another bag, which is replaced at the end.
 
     Raises:
         OSError: The bag exists or cannot be written. The message names it.
@@ -54,7 +60,7 @@ def open_recording(
     try:
         if output is None:
             return Recording.named_by_time(prefix, storage, lossless=lossless)
-        return Recording(Path(output), storage, lossless=lossless)
+        return Recording(Path(output), storage, lossless=lossless, replace=replace)
     except OSError as error:
         where = output or 'this directory'
         raise OSError(f'cannot record to {where}: {(error.strerror or str(error)).lower()}') from error
@@ -89,6 +95,7 @@ def record(
     ros_arguments: Sequence[str] = (),
     signals: Signals | None = None,
     on_status: Callable[[Status], object] | None = None,
+    on_end: Callable[[], object] | None = None,
 ) -> Summary:
     """Record until a signal is caught, the time is over, ROS is shut down or the disk fails.
 
@@ -99,6 +106,7 @@ def record(
         ros_arguments: ROS arguments of the node.
         signals: Counter of the signals that end the recording. None: no signal does.
         on_status: Receives the status, several times a second.
+        on_end: Called when nothing more is received, before the bag is written.
 
     Returns:
         What the bag contains.
@@ -118,6 +126,8 @@ def record(
                 max_duration,
                 on_status or (lambda status: None),
             )
+    if on_end is not None:
+        on_end()
     return recording.finish()
 
 

@@ -55,21 +55,28 @@ class Recording:
     """
 
     def __init__(
-        self, bag: Path, storage: str, *, lossless: bool = False, capacity: int = CAPACITY
+        self,
+        bag: Path,
+        storage: str,
+        *,
+        lossless: bool = False,
+        replace: bool = False,
+        capacity: int = CAPACITY,
     ) -> None:
         """Start to record. The directory of the bag is created at the end.
 
         Args:
-            bag: Directory of the bag. Neither it nor its journal may exist.
+            bag: Directory of the bag. Its journal must not exist.
             storage: `mcap` or `sqlite3`.
             lossless: Whether `add` waits for a disk that is too slow. Otherwise messages are dropped.
+            replace: Whether the bag may replace another one, which stays until then.
             capacity: Memory for messages that wait to be written (bytes).
 
         Raises:
-            FileExistsError: The bag or its journal exists.
+            FileExistsError: The journal exists, or the bag, and it is not to be replaced or is no bag.
             OSError: They cannot be written there.
         """
-        check_target(bag, storage)
+        check_target(bag, storage, replace=replace)
         journal = journal_of(bag)
         if journal.exists():
             raise FileExistsError(
@@ -78,6 +85,7 @@ class Recording:
         self.bag = bag
         self.journal = JournalWriter(journal)
         self._storage = storage
+        self._replace = replace
         self.started = time.monotonic()
         self._channels: dict[int, str] = {}
         self._added: Counter[int] = Counter()
@@ -161,7 +169,7 @@ class Recording:
             self._raise_gone()
         try:
             self._count_unwritten()
-            summary = build_bag(self._records, self.bag, self._storage)
+            summary = build_bag(self._records, self.bag, self._storage, replace=self._replace)
         # Whatever rosbags raises: the user must know that the journal exists.
         except Exception as error:
             why = getattr(error, 'strerror', None) or str(error) or repr(error)

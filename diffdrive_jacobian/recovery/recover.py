@@ -67,6 +67,7 @@ def recover(
     output: Path | None = None,
     storage: str | None = None,
     *,
+    replace: bool = False,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> Recovery:
     """Write a new bag with what can be read of another one, which stays as it is.
@@ -75,13 +76,14 @@ def recover(
         what: A bag's directory, one of its files, a journal, or the bag that a journal belongs to.
         output: The new bag's directory. By default it is beside the old one.
         storage: `mcap` or `sqlite3`. By default that of the old bag.
+        replace: Whether the new bag may replace another one than the old one.
         interrupted: Is called for each record; once it returns True nothing is left of the new bag.
 
     Raises:
         NotABagError: There is nothing like a bag.
         NothingToSaveError: The bag is complete, or not a message can be read.
         JournalError: The journal is not one of record_run.
-        FileExistsError: The new bag exists.
+        FileExistsError: The new bag exists, and is not to be replaced or is the old one.
         OSError: The old bag cannot be read, or the new one not be written.
         RecoveryInterruptedError: `interrupted` returned True.
     """
@@ -90,8 +92,10 @@ def recover(
     with tempfile.TemporaryDirectory(prefix='recover_run_') as scratch:
         old = DamagedBag(what, Path(scratch))
         target = output or _default_target(what, old.kind)
-        if target.exists():
+        if target.exists() and not replace:
             raise FileExistsError(f'{target} exists already')
+        if target.exists() and target.resolve() in (what.resolve(), what.resolve().parent):
+            raise FileExistsError(f'{target} is the bag to recover: it is not replaced')
         if old.kind == 'journal' and is_being_written(old.files[0]):
             raise NothingToSaveError(f'{what} is being recorded now: end record_run first')
 
@@ -114,7 +118,9 @@ def recover(
             raise NothingToSaveError(f'{what} holds no message that can be saved', *lost)
         # The file may still grow: the same records as in the survey are written.
         surveyed = survey.kinds.total()
-        summary = build_bag(lambda: islice(records(), surveyed), target, storage or old.storage)
+        summary = build_bag(
+            lambda: islice(records(), surveyed), target, storage or old.storage, replace=replace
+        )
         return Recovery(
             bag=target,
             summary=summary,

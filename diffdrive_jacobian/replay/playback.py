@@ -9,7 +9,7 @@ from rclpy.expand_topic_name import expand_topic_name
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
-from diffdrive_jacobian.bags.bag_reader import BagError, base_name
+from diffdrive_jacobian.bags.bag_reader import BagError, base_name, namespace_of
 from diffdrive_jacobian.ros.rclpy_internals import reason
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -39,6 +39,9 @@ class Playback:
     """Base names of the topics; None: all."""
     topics: tuple[str, ...] = ()
     """Fully qualified names of the topics, instead of `names`."""
+    namespace: str | None = None
+    """Namespace of the topics of `names`, such as `/robot1`. With all names also the namespaces in it.
+    None: every namespace."""
     remap: Mapping[str, str] = field(default_factory=dict)
     """Topics to the other names under which they are published. A relative topic is in the namespace /,
     a relative new name in that of the node."""
@@ -70,7 +73,9 @@ class Playback:
         if not any(connection.msgcount for connection in chosen):
             if not reader.message_count:
                 raise NothingToPlayError(f'nothing to play: {reader.path} has no messages')
-            wanted = ' or '.join(self.topics or self.names or ())
+            wanted = ' or '.join(self.topics or self.names or ('any topic',))
+            if self.namespace is not None:
+                wanted += f' in the namespace {self.namespace}'
             full = sorted({one.topic for one in reader.connections if one.msgcount})
             raise NothingToPlayError(
                 f'nothing to play: {reader.path} has no messages of {wanted}, only of '
@@ -143,4 +148,7 @@ class Playback:
     def _wants(self, topic: str) -> bool:
         if self.topics:
             return topic in self.topics
-        return self.names is None or base_name(topic) in self.names
+        namespace = self.namespace
+        if self.names is None:
+            return namespace in (None, '/') or topic.startswith(f'{namespace}/')
+        return base_name(topic) in self.names and namespace in (None, namespace_of(topic))

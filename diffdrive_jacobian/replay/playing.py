@@ -197,6 +197,12 @@ class _Session:
             if found != counts:
                 quiet, counts = now, found
             complete = min(counts.values()) > 0 and now - quiet >= MATCH_QUIET
+            without = ', '.join(topic for topic, count in counts.items() if not count)
+            self._progress.waiting(
+                f'no subscription to {without} (starting after {patience:g} s without it)'
+                if without
+                else 'further subscriptions may be discovered'
+            )
             return bool(complete or now - started >= patience or self._signals.count)
 
         self._runner.spin(over)

@@ -7,12 +7,13 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from action_msgs.msg import GoalStatus
 from numpy.typing import ArrayLike
 
+from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.ros.goal_client import (
     DRIVEN_POINT_PARAMETERS,
     SILENCE,
@@ -32,10 +33,16 @@ PATIENCE = 10.0
 """Default of the longest wait for a controller (s)."""
 ANSWER_PATIENCE = 5.0
 """Longest time in which a controller may accept a goal, or confirm that it canceled (s)."""
+CONFIRMATION_PERIOD = 0.1
+"""Time between two checks whether the goal was acknowledged (s)."""
 PARAMETER_PATIENCE = 1.0
 """Longest time in which a controller may report its parameters (s)."""
 DISCOVERY_PERIOD = 1.0
 """Time between two queries of the publishers of goal_status (s)."""
+
+
+HEADING_PARAMETERS = (*DRIVEN_POINT_PARAMETERS, 'use_goal_heading')
+"""Parameters of a controller that also determine whether it takes the heading of a goal."""
 
 
 class Result(Enum):
@@ -95,7 +102,10 @@ class RemoteProgress(Protocol):
     """Receives the progress of a goal."""
 
     def waiting(self, reason: str) -> None:
-        """Receive what is missing before the goal can be sent, many times a second."""
+        """Receive what is waited for, many times a second."""
+
+    def heading_ignored(self, controller: str) -> None:
+        """Receive the name of a controller that ignores the heading of the goal, once."""
 
     def driving(self, distance: float) -> None:
         """Receive the distance from the driven point to the goal (m), many times a second."""
@@ -112,6 +122,7 @@ def send_goal(
     patience: float = PATIENCE,
     timeout: float = math.inf,
     follow: bool = True,
+    heading_matters: bool = False,
     ros_arguments: Sequence[str] = (),
     signals: Signals | None = None,
     progress: RemoteProgress | None = None,
@@ -125,6 +136,7 @@ def send_goal(
         patience: Longest wait for the controller and for the subscriptions (s).
         timeout: Time after which the goal is canceled (s).
         follow: Whether to wait for the end. Otherwise for the acknowledgement only.
+        heading_matters: Whether to report a controller that ignores the heading of the goal.
         ros_arguments: ROS arguments of the node.
         signals: Counter of the signals that cancel the goal. None: no signal does.
         progress: Receives the progress. None: nothing does.
@@ -150,13 +162,16 @@ def send_goal(
             )
         )
         session = _Session(client, runner, signals or Signals(), progress or _Silent())
-        return session.run(patience, timeout, follow=follow)
+        return session.run(patience, timeout, follow=follow, heading_matters=heading_matters)
 
 
 class _Silent:
     """A progress that is not shown."""
 
     def waiting(self, reason: str) -> None:
+        pass
+
+    def heading_ignored(self, controller: str) -> None:
         pass
 
     def driving(self, distance: float) -> None:
@@ -180,7 +195,7 @@ class _Session:
         self._duplicates: dict[str, float] = {}
         self._warned: set[str] = set()
 
-    def run(self, patience: float, timeout: float, *, follow: bool) -> GoalResult:
+    def run(self, patience: float, timeout: float, *, follow: bool, heading_matters: bool) -> GoalResult:
         client, signals = self._client, self._signals
         if not self._spin(patience, self._ready):
             if signals.count:
@@ -188,21 +203,25 @@ class _Session:
             return self._result(Result.NOT_SENT, reason=client.obstacle() or '')
         controllers = client.controllers()
         client.send()
-        if not follow:
-            acknowledged = client.confirmed(ANSWER_PATIENCE)
-            return self._result(Result.SENT if acknowledged else Result.UNCONFIRMED)
         names = sorted(set(controllers.values()) - {''})
-        liveness = Liveness(client, names, DRIVEN_POINT_PARAMETERS)
+        parameters = HEADING_PARAMETERS if heading_matters else DRIVEN_POINT_PARAMETERS
+        liveness = Liveness(client, names, parameters)
+        if not follow:
+            acknowledged = self._confirmed()
+            if heading_matters:
+                self._learn_parameters(liveness)
+            return self._result(Result.SENT if acknowledged else Result.UNCONFIRMED)
 
         def accepted() -> bool:
             liveness.silence()
+            self._progress.waiting(f'no answer on {client.resolve_topic_name("goal_status")}')
             return bool(client.status != GoalStatus.STATUS_UNKNOWN)
 
         if not self._spin(ANSWER_PATIENCE, accepted):
             if signals.count:
                 return self._cancel(Result.INTERRUPTED)
             return self._result(Result.NO_ANSWER)
-        self._learn_driven_point(liveness)
+        self._learn_parameters(liveness)
         self._follow(liveness, controllers, timeout)
         if client.ended:
             return self._result(Result.ENDED)
@@ -218,15 +237,32 @@ class _Session:
             self._progress.waiting(obstacle)
         return obstacle is None
 
-    def _learn_driven_point(self, liveness: Liveness) -> None:
-        """Wait until the controller has reported which point of the robot it drives."""
+    def _confirmed(self) -> bool:
+        """Wait until the goal is acknowledged by every subscription; return whether it is."""
+        deadline = time.monotonic() + ANSWER_PATIENCE
+        while not self._client.confirmed(CONFIRMATION_PERIOD):
+            if self._signals.count or time.monotonic() > deadline:
+                return False
+            topic = self._client.resolve_topic_name('goal_pose')
+            self._progress.waiting(f'not every subscription to {topic} has acknowledged the goal')
+        return True
+
+    def _learn_parameters(self, liveness: Liveness) -> None:
+        """Wait until the controller has reported which point of the robot it drives.
+
+        If the heading of the goal matters, report a controller that ignores it.
+        """
 
         def known() -> bool:
             liveness.silence()
+            self._progress.waiting('the controller has not reported its parameters')
             return liveness.answered
 
         self._spin(PARAMETER_PATIENCE, known)
         self._use(liveness)
+        for name, values in sorted(liveness.values.items()):
+            if ignores_heading(values):
+                self._progress.heading_ignored(name)
 
     def _use(self, liveness: Liveness) -> None:
         """Use the parameters that the first controller has reported last."""
@@ -252,6 +288,8 @@ class _Session:
             self._use(liveness)
             if client.robot is not None and not missing:
                 self._progress.driving(client.distance)
+            elif client.robot is None:
+                self._progress.waiting(f'no odometry on {client.resolve_topic_name("odom")}')
             if client.ended:
                 return True
             if now - queried >= DISCOVERY_PERIOD:
@@ -286,7 +324,12 @@ class _Session:
         client.cancel()
         before = signals.count
         deadline = time.monotonic() + ANSWER_PATIENCE
-        self._runner.spin(lambda: client.ended or signals.count > before or time.monotonic() > deadline)
+
+        def over() -> bool:
+            self._progress.waiting('the controller has not confirmed that it canceled')
+            return client.ended or signals.count > before or time.monotonic() > deadline
+
+        self._runner.spin(over)
         return self._result(result, distance=distance, canceled=client.ended)
 
     def _distance(self) -> float | None:
@@ -322,3 +365,17 @@ class _Session:
 
         self._runner.spin(over)
         return reached
+
+
+def ignores_heading(values: Mapping[str, Any]) -> bool:
+    """Return whether a controller ignores the heading of goals.
+
+    Args:
+        values: Values of its `HEADING_PARAMETERS`. Other controllers than the built-in ones may take it.
+    """
+    controller = BUILT_IN.get(str(values.get('controller')))
+    return (
+        values.get('use_goal_heading') is False
+        and controller is not None
+        and not controller.takes_heading
+    )

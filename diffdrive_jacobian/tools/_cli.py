@@ -5,15 +5,29 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import re
 import sys
 from collections.abc import Sequence
+from typing import Any
 
+from diffdrive_jacobian import __version__
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION
+from diffdrive_jacobian.parameters.configurations import configurations
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 
 DONE, FAILED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
 """Exit codes: done, not done, wrong arguments, interrupted by a signal."""
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser with the option that every tool has."""
+
+    def __init__(self, *, prog: str, **kwargs: Any) -> None:
+        """Add `--version`. Arguments as for `argparse.ArgumentParser`."""
+        super().__init__(prog=prog, **kwargs)
+        version = f'{prog} (diffdrive_jacobian) {__version__}'
+        self.add_argument('--version', action='version', version=version, help='print the version')
 
 
 def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -82,15 +96,81 @@ def number(text: str) -> float:
     return float(text)
 
 
-def heading(text: str) -> float:
-    """Parse a heading (rad). More than one turn is rejected: it is probably in degrees."""
-    value = number(text)
+def add_heading(parser: argparse.ArgumentParser, text: str) -> None:
+    """Add the options for a heading, which `given_heading` evaluates."""
+    parser.add_argument('--heading', metavar='RAD', type=number, help=text)
+    parser.add_argument(
+        '--degrees', action='store_true', help='the heading is in degrees (default: radians)'
+    )
+
+
+def given_heading(parser: argparse.ArgumentParser, options: argparse.Namespace) -> float | None:
+    """Return the heading that was given (rad); None: none was.
+
+    More than one turn is rejected: in radians it is probably meant in degrees.
+    """
+    value: float | None = options.heading
+    if value is None:
+        if options.degrees:
+            parser.error('--degrees needs --heading, whose unit it changes')
+        return None
+    if options.degrees:
+        if abs(value) > 360.0:
+            parser.error(f"argument --heading: must be from -360 to 360 degrees, got '{value:g}'")
+        return math.radians(value)
     if abs(value) > math.tau:
-        raise argparse.ArgumentTypeError(
-            f'must be in radians, from -2 pi to 2 pi, got {text.strip()!r} '
-            f'({value:g} degrees are {math.radians(value):.6g} rad)'
+        parser.error(
+            f"argument --heading: must be in radians, from -2 pi to 2 pi, got '{value:g}' "
+            f'({value:g} degrees are {math.radians(value):.6g} rad); --degrees accepts them'
         )
     return value
+
+
+def add_force(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add the option to overwrite files.
+
+    Args:
+        parser: The parser.
+        what: What is overwritten.
+    """
+    parser.add_argument('--force', action='store_true', help=f'overwrite {what} (default: refuse)')
+
+
+def refuse_without(
+    parser: argparse.ArgumentParser, options: argparse.Namespace, option: str, *needed: str
+) -> None:
+    """Refuse an option that has no effect without one of others.
+
+    Args:
+        parser: The parser.
+        options: The parsed options.
+        option: The option, as `--force`.
+        needed: The others.
+    """
+    if _is_given(options, option) and not any(_is_given(options, one) for one in needed):
+        parser.error(f'{option} has no effect without {" or ".join(needed)}')
+
+
+def refuse_with(
+    parser: argparse.ArgumentParser, options: argparse.Namespace, option: str, *others: str
+) -> None:
+    """Refuse an option that has no effect beside one of others.
+
+    Args:
+        parser: The parser.
+        options: The parsed options.
+        option: The option.
+        others: The others.
+    """
+    for other in others:
+        if _is_given(options, option) and _is_given(options, other):
+            parser.error(f'{option} has no effect with {other}')
+
+
+def _is_given(options: argparse.Namespace, option: str) -> bool:
+    """Return whether an option was given whose default is None, False or an empty list."""
+    value = getattr(options, option.lstrip('-').replace('-', '_'))
+    return not (value is None or value is False or value == [] or value == math.inf)
 
 
 def bag_folder(text: str) -> str:
@@ -169,11 +249,55 @@ def readable_file(text: str) -> str:
     return text
 
 
-def add_params_file(parser: argparse.ArgumentParser) -> None:
-    """Add the option for a parameter file without `--ros-args`."""
-    parser.add_argument(
-        '--params-file', metavar='FILE', type=readable_file, help='file of ROS parameters (YAML)'
+def add_params_file(
+    parser: argparse.ArgumentParser, text: str = 'file of ROS parameters (YAML)'
+) -> None:
+    """Add the options for a parameter file without `--ros-args`: by its path, or by the robot's name.
+
+    Args:
+        parser: The parser.
+        text: What the file contains.
+    """
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument('--params-file', metavar='FILE', type=readable_file, help=text)
+    names = ', '.join(configurations()) or 'none is installed'
+    group.add_argument(
+        '--robot',
+        metavar='NAME',
+        dest='params_file',
+        type=_configuration,
+        help=f'the installed parameter file of a robot: {names}',
     )
+
+
+def _configuration(name: str) -> str:
+    """Return the path of the installed parameter file of a robot."""
+    installed = configurations()
+    if name not in installed:
+        raise argparse.ArgumentTypeError(
+            f'must be one of {", ".join(installed) or "none, no file is installed"}, got {name!r}'
+        )
+    return str(installed[name])
+
+
+def add_namespace(parser: argparse.ArgumentParser) -> None:
+    """Add the option for a bag of several robots."""
+    parser.add_argument(
+        '--namespace',
+        metavar='NS',
+        type=namespace,
+        help='namespace of the robot in a bag of several, as /robot1 (default: that of the only robot)',
+    )
+
+
+def namespace(text: str) -> str:
+    """Parse a namespace of ROS; return it with a leading slash, the root as `/`."""
+    found = '/' + text.strip('/')
+    if not re.fullmatch(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+', found):
+        raise argparse.ArgumentTypeError(
+            f'must be a namespace of letters, digits and _, as /robot1, got {text!r}'
+        )
+    return found
 
 
 def with_params_file(ros: list[str], options: argparse.Namespace) -> list[str]:

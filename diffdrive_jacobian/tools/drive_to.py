@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.nodes import CONTROLLERS
+from diffdrive_jacobian.plots.output_files import NOT_OVERWRITTEN
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools._waiting import busy
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.drives import Outcome
@@ -30,6 +32,10 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     options = _cli.parse(parser, own)
     if len(options.coordinates) % 2:
         parser.error(f'coordinates must be pairs X Y, got {len(options.coordinates)} of them')
+    heading = _cli.given_heading(parser, options)
+    for option in ('--output', '--force'):
+        _cli.refuse_with(parser, options, option, '--no-record')
+    _cli.refuse_without(parser, options, '--force', '--output')
     if options.lockstep and options.open:
         parser.error('--lockstep and --open exclude each other: other processes have another clock')
     ros = ['--ros-args', '--log-level', 'warn', '--', *_cli.with_params_file(ros, options)]
@@ -37,16 +43,23 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     from diffdrive_jacobian.drives import DriveError, drive, waypoints_through
     from diffdrive_jacobian.recording.record import open_recording, saved_on_error
 
-    goals = waypoints_through(np.reshape(options.coordinates, (-1, 2)), options.heading or 0.0)
+    goals = waypoints_through(np.reshape(options.coordinates, (-1, 2)), heading or 0.0)
     recording = None
     try:
         if not options.no_record:
-            recording = open_recording('drive', options.output, 'mcap', lossless=options.lockstep)
+            recording = open_recording(
+                'drive',
+                options.output,
+                'mcap',
+                lossless=options.lockstep,
+                replace=options.force,
+            )
     except OSError as error:
         return _cli.complain(PROGRAM, error)
-    if recording is not None and not options.no_plot and _picture(recording).exists():
+    kept = recording is None or options.no_plot or options.force
+    if recording is not None and not kept and (picture := _picture(recording)).exists():
         recording.discard()
-        return _cli.complain(PROGRAM, f'{_picture(recording)} exists already; it is not overwritten')
+        return _cli.complain(PROGRAM, f'{picture} exists already; {NOT_OVERWRITTEN}')
     outcome = None
     try:
         with saved_on_error(recording), _Progress(goals, ros, wall=not options.lockstep) as progress:
@@ -70,7 +83,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     code = _cli.FAILED if outcome is None else _report(outcome, options)
     if recording is None:
         return code
-    saved = _save(recording, plot=not options.no_plot)
+    saved = _save(recording, plot=not options.no_plot, replace=options.force)
     # An interruption remains one.
     return code if code == _cli.INTERRUPTED else saved or code
 
@@ -121,7 +134,7 @@ def _picture(recording: Recording) -> Path:
     return recording.bag.with_name(recording.bag.name + '.png')
 
 
-def _save(recording: Recording, *, plot: bool) -> int:
+def _save(recording: Recording, *, plot: bool, replace: bool) -> int:
     """Write the bag and its picture, and print their names; return the exit code."""
     from diffdrive_jacobian.plots.run_figure import draw
     from diffdrive_jacobian.reading.reader import BagError, read_run
@@ -129,7 +142,8 @@ def _save(recording: Recording, *, plot: bool) -> int:
 
     code = _cli.DONE
     try:
-        recording.finish()
+        with busy(PROGRAM, f'writing {recording.bag}'):
+            recording.finish()
         print(f'recorded: {recording.bag}')
     except RecordingError as error:
         print(f'{PROGRAM}: error: {error}', file=sys.stderr)
@@ -141,7 +155,8 @@ def _save(recording: Recording, *, plot: bool) -> int:
         return code
     picture = _picture(recording)
     try:
-        draw([read_run(recording.bag)], picture)
+        with busy(PROGRAM, f'drawing {picture}'):
+            draw([read_run(recording.bag)], picture, replace=replace)
         print(f'drawn: {picture}')
     except ModuleNotFoundError:
         print("not drawn: matplotlib is not installed: pip install 'diffdrive_jacobian[plot]'")
@@ -188,7 +203,7 @@ def _reason(outcome: Outcome, timeout: float) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} X Y [X Y ...] [options] [--ros-args ...]',
         description='Drive the virtual robot to goals, in order: robot, controller and wheel bridge '
@@ -211,12 +226,7 @@ def _parser() -> argparse.ArgumentParser:
         type=_cli.tolerance,
         help='distance to a goal that counts as arrived (m) (default: 0.02, unless a file sets it)',
     )
-    parser.add_argument(
-        '--heading',
-        metavar='RAD',
-        type=_cli.heading,
-        help='heading at the last goal (rad) (default: any)',
-    )
+    _cli.add_heading(parser, 'heading at the last goal (rad) (default: any)')
     parser.add_argument(
         '--controller',
         choices=CONTROLLERS,
@@ -232,6 +242,7 @@ def _parser() -> argparse.ArgumentParser:
         help='directory of the rosbag2 bag to record to; the picture is BAG.png '
         '(default: drive_DATE-TIME)',
     )
+    _cli.add_force(parser, 'BAG and BAG.png, at the end of the drive')
     parser.add_argument('--no-record', action='store_true', help='neither record nor draw')
     parser.add_argument('--no-plot', action='store_true', help='record, but do not draw')
     parser.add_argument(

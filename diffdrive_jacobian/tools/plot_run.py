@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from diffdrive_jacobian.bags.bag_reader import BagError
-from diffdrive_jacobian.plots.output_files import FORMATS
+from diffdrive_jacobian.plots.output_files import FORMATS, NOT_OVERWRITTEN
 from diffdrive_jacobian.plots.run_figure import draw, names
 from diffdrive_jacobian.plots.run_table import DECIMALS, write_csv
 from diffdrive_jacobian.reading.reader import read_run
@@ -18,6 +18,7 @@ from diffdrive_jacobian.reading.trace import trace
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools._waiting import busy
 from diffdrive_jacobian.tools.entry_points import OUTPUT_ERROR
 
 PROGRAM = 'plot_run'
@@ -47,18 +48,22 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     try:
         if len({bag.resolve() for bag in bags}) < len(bags):
             raise UsageError(f'each bag can be given once, got {" ".join(map(str, bags))}')
-        picture = _picture(options.output, bags)
-        tables = [] if options.csv is None else _tables(options.csv, bags)
+        given = [name for name, _ in options.topics]
+        if repeated := [name for name in given if given.count(name) > 1]:
+            raise UsageError(f'--topic can be given once for each name, got {repeated[0]} again')
+        picture = _picture(options, bags)
+        tables = [] if options.csv is None else _tables(options, bags)
         runs: list[Run] = []
         for bag in bags:
-            runs.append(read_run(bag, dict(options.topics)))
+            with busy(PROGRAM, f'reading {printable(bag, PATH_LIMIT)}'):
+                runs.append(read_run(bag, dict(options.topics), namespace=options.namespace))
             # A run without odometry is reported before the others are read.
             trace(runs[-1])
             for note in runs[-1].notes:
                 print(f'{PROGRAM}: {printable(bag, PATH_LIMIT)}: {note}', file=sys.stderr)
             if signals.count:
                 return _interrupted()
-        return _write(runs, picture, tables, signals)
+        return _write(runs, picture, tables, signals, replace=options.force)
     except (BagError, UsageError) as error:
         return _cli.complain(PROGRAM, printable(error, PATH_LIMIT))
     except ModuleNotFoundError as error:
@@ -69,15 +74,20 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         )
 
 
-def _write(runs: Sequence[Run], picture: Path, tables: Sequence[Path], signals: Signals) -> int:
+def _write(
+    runs: Sequence[Run], picture: Path, tables: Sequence[Path], signals: Signals, *, replace: bool
+) -> int:
     """Write the picture, then the tables, and return the exit code."""
-    writers = [partial(draw, runs, picture)]
-    writers += [partial(_write_table, *pair) for pair in zip(runs, tables, strict=bool(tables))]
+    writers = [partial(draw, runs, picture, replace=replace)]
+    writers += [
+        partial(_write_table, *pair, replace=replace) for pair in zip(runs, tables, strict=bool(tables))
+    ]
     for path, write in zip([picture, *tables], writers, strict=True):
         if signals.count:
             return _interrupted()
         try:
-            write()
+            with busy(PROGRAM, f'writing {printable(path, PATH_LIMIT)}'):
+                write()
         except OSError as error:
             message = f'{path} cannot be written: {error.strerror or error}'
             return _cli.complain(PROGRAM, printable(message, PATH_LIMIT), _cli.FAILED)
@@ -91,9 +101,9 @@ def _write(runs: Sequence[Run], picture: Path, tables: Sequence[Path], signals: 
     return _cli.DONE
 
 
-def _write_table(run: Run, path: Path) -> None:
+def _write_table(run: Run, path: Path, *, replace: bool) -> None:
     path.parent.mkdir(exist_ok=True)
-    write_csv(run, path)
+    write_csv(run, path, replace=replace)
 
 
 def _interrupted() -> int:
@@ -101,13 +111,16 @@ def _interrupted() -> int:
     return _cli.INTERRUPTED
 
 
-def _picture(output: str | None, bags: Sequence[Path]) -> Path:
+def _picture(options: argparse.Namespace, bags: Sequence[Path]) -> Path:
     """Return the path of the picture, which by default is beside the first bag.
 
     Raises:
         UsageError: It exists, is a directory, or has another ending than a picture.
     """
+    output = options.output
     name = '_and_'.join(bag.resolve().name for bag in bags)
+    if options.namespace not in (None, '/'):
+        name += options.namespace.replace('/', '_')
     path = bags[0].resolve().parent / f'{name}.png' if output is None else Path(output)
     if output is not None and (output.endswith('/') or path.is_dir()):
         raise UsageError(
@@ -115,21 +128,22 @@ def _picture(output: str | None, bags: Sequence[Path]) -> Path:
         )
     if path.suffix.lower().removeprefix('.') not in FORMATS:
         raise UsageError(f'the picture must end in .{", .".join(FORMATS)}, got {output!r}')
-    return _new(path)
+    return _checked(path, replace=options.force)
 
 
-def _tables(output: str, bags: Sequence[Path]) -> list[Path]:
+def _tables(options: argparse.Namespace, bags: Sequence[Path]) -> list[Path]:
     """Return the paths of the CSV files, one for each run.
 
     Raises:
         UsageError: One of them exists, or `output` is neither a CSV file nor a directory.
     """
+    output = options.csv
     path = Path(output)
     if path.is_dir() or output.endswith('/') or not path.suffix:
         if path.exists() and not path.is_dir():
             raise UsageError(f'{path} exists already; a CSV file ends in .csv')
         labels = (name.replace('/', '_') for name in names(bags))
-        return [_new(path / f'{label}.csv') for label in labels]
+        return [_checked(path / f'{label}.csv', replace=options.force) for label in labels]
     if path.suffix.lower() != '.csv':
         raise UsageError(
             f'--csv must be a file that ends in .csv or a directory, got {output!r} (a directory exists '
@@ -137,12 +151,13 @@ def _tables(output: str, bags: Sequence[Path]) -> list[Path]:
         )
     if len(bags) > 1:
         raise UsageError(f'--csv must be a directory for {len(bags)} runs, got {output!r}')
-    return [_new(path)]
+    return [_checked(path, replace=options.force)]
 
 
-def _new(path: Path) -> Path:
-    if path.exists() or path.is_symlink():
-        raise UsageError(f'{path} exists already; it is not overwritten')
+def _checked(path: Path, *, replace: bool) -> Path:
+    """Return a path, unless something is there that is not to be replaced."""
+    if (path.exists() or path.is_symlink()) and not (replace and path.is_file()):
+        raise UsageError(f'{path} exists already; {NOT_OVERWRITTEN}')
     return path
 
 
@@ -156,13 +171,13 @@ def _topic(text: str) -> tuple[str, str]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=PROGRAM,
         description='Draw runs that record_run or ros2 bag record has written: the path with its goals, '
         'and over time the distance to the goal, the heading error, the speeds and their limits. '
-        'Several runs are drawn into the same axes. Existing files are not overwritten. Exit code 0: '
-        'drawn; 1: a file cannot be written; 2: wrong arguments, or a bag cannot be read; 130: '
-        'interrupted.',
+        'Several runs are drawn into the same axes. Existing files are not overwritten without --force. '
+        'Exit code 0: drawn; 1: a file cannot be written; 2: wrong arguments, or a bag cannot be read; '
+        '130: interrupted.',
     )
     parser.add_argument('bags', metavar='BAG', nargs='+', help='directory of a bag')
     parser.add_argument(
@@ -177,6 +192,8 @@ def _parser() -> argparse.ArgumentParser:
         help='also write the values over time: to FILE.csv, or to BAG.csv for each bag in a directory. '
         f'Times are exact, values are rounded to {DECIMALS} decimal places (default: none)',
     )
+    _cli.add_force(parser, 'the picture and the tables')
+    _cli.add_namespace(parser)
     parser.add_argument(
         '--topic',
         dest='topics',

@@ -6,6 +6,7 @@ import argparse
 import re
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 from diffdrive_jacobian.errors import UserError
@@ -13,6 +14,7 @@ from diffdrive_jacobian.recording.selection import RUN_TOPICS, Selection
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools._waiting import Waiting, busy
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.recording.record import Status
@@ -32,15 +34,19 @@ class StatusLine:
         self._terminal = sys.stdout.isatty()
         self._shown = 0.0
         self._messages = 0
+        self._waiting = Waiting()
 
     def show(self, status: Status) -> None:
         """Print the status if it is due."""
+        if not status.topics and not self._terminal:
+            self._waiting.show('none of the topics has a publisher')
         elapsed = status.seconds - self._shown
         if elapsed < STATUS_PERIOD[self._terminal]:
             return
         rate = (status.messages - self._messages) / elapsed
         self._shown, self._messages = status.seconds, status.messages
-        line = (
+        line = 'waiting for a publisher of the topics: ' * (not status.topics)
+        line += (
             f'{_cli.counted(status.messages, "message")} of {_cli.counted(status.topics, "topic")}, '
             f'{rate:.0f} per second, {status.size / 1e6:.1f} MB, {status.seconds:.0f} s'
         )
@@ -59,7 +65,12 @@ class StatusLine:
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
     own, ros = _cli.split_arguments(arguments)
-    options = _cli.parse(_parser(), own)
+    parser = _parser()
+    options = _cli.parse(parser, own)
+    _cli.refuse_without(parser, options, '--force', '--output')
+    for option in ('--regex', 'topics'):
+        if options.all and getattr(options, option.lstrip('-')):
+            parser.error(f'{option.replace("topics", "TOPIC")} has no effect with --all')
     # Not above: --help needs no ROS.
     from diffdrive_jacobian.recording.record import open_recording, record
     from diffdrive_jacobian.recording.recording import RecordingError
@@ -72,12 +83,12 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         pattern=options.regex or '',
     )
     try:
-        recording = open_recording('run', options.output, options.storage)
+        recording = open_recording('run', options.output, options.storage, replace=options.force)
     except OSError as error:
         return _cli.complain(PROGRAM, error)
     bag = recording.bag
     print(f'recording to {printable(bag, PATH_LIMIT)}; Ctrl-C ends it', flush=True)
-    line = StatusLine()
+    line, ending = StatusLine(), ExitStack()
     try:
         try:
             summary = record(
@@ -87,8 +98,10 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                 ros_arguments=ros,
                 signals=signals,
                 on_status=line.show,
+                on_end=lambda: ending.enter_context(busy(PROGRAM, f'writing {bag}')),
             )
         finally:
+            ending.close()
             line.end()
     except UserError as error:
         return _cli.complain(PROGRAM, error)
@@ -112,7 +125,7 @@ def _pattern(text: str) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} [TOPIC ...] [options] [--ros-args ...]',
         description='Record topics as a rosbag2 bag until Ctrl-C. Messages are on the disk within a '
@@ -132,6 +145,7 @@ def _parser() -> argparse.ArgumentParser:
         type=_cli.bag_folder,
         help='directory of the bag (default: run_DATE-TIME)',
     )
+    _cli.add_force(parser, 'BAG, at the end of the recording')
     parser.add_argument(
         '-s',
         '--storage',

@@ -22,6 +22,7 @@ from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._bags import describe
+from diffdrive_jacobian.tools._waiting import busy
 
 PROGRAM = 'recover_run'
 MAX_LOSSES = 50
@@ -34,12 +35,14 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool and return its exit code."""
     options = _parser().parse_args(arguments)
     try:
-        recovery = recover(
-            options.what,
-            options.output,
-            options.storage,
-            interrupted=lambda: bool(signals.count),
-        )
+        with busy(PROGRAM, f'reading {printable(options.what, PATH_LIMIT)}'):
+            recovery = recover(
+                options.what,
+                options.output,
+                options.storage,
+                replace=options.force,
+                interrupted=lambda: bool(signals.count),
+            )
     except RecoveryInterruptedError:
         print(f'{PROGRAM}: interrupted: no bag was written', file=sys.stderr)
         return _cli.INTERRUPTED
@@ -80,7 +83,7 @@ def _listed(losses: Sequence[str], prefix: str = '') -> list[str]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} BAG [options]',
         description='Write a complete bag with all messages that can be read of one that a crash or a '
@@ -104,6 +107,7 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         help=f'directory to write (default: BAG{RECOVERED}, for a journal the bag it belongs to)',
     )
+    _cli.add_force(parser, 'NEW, which must not be BAG')
     parser.add_argument(
         '-s', '--storage', choices=sorted(STORAGES), help='storage format (default: that of BAG)'
     )

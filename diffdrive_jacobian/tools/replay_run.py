@@ -30,6 +30,7 @@ def _replay(bag: Path, options: argparse.Namespace, ros: Sequence[str], signals:
     playback = Playback(
         names=None if options.all_topics else GOALS if options.goals else COMMANDS,
         topics=tuple(options.topics or ()),
+        namespace=options.namespace,
         remap=dict(options.remap),
         rate=options.rate,
         start_offset=options.start_offset,
@@ -123,6 +124,10 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     options = _cli.parse(parser, own)
     if options.timeout is not None and options.readers is None:
         parser.error('--timeout needs -w: it is the longest wait for the subscriptions of -w')
+    _cli.refuse_with(parser, options, '--namespace', '--topics')
+    _cli.refuse_with(parser, options, '--wait-for-all-acked', '--loop')
+    if options.start_paused and not (sys.stdin and sys.stdin.isatty()):
+        parser.error('--start-paused needs a terminal: Enter resumes')
     # Not above: --help needs no ROS.
     from diffdrive_jacobian.bags.bag_reader import BagError
 
@@ -148,7 +153,7 @@ def _not_negative(text: str) -> float:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} BAG [options] [--ros-args ...]',
         description='Replay a recorded run: the commands (cmd_vel), unless an option selects other '
@@ -163,6 +168,7 @@ def _parser() -> argparse.ArgumentParser:
         '--topics', nargs='+', metavar='TOPIC', help='play these topics (fully qualified names)'
     )
     what.add_argument(VERIFY, action='store_true', help='run verify_run instead, with its options')
+    _cli.add_namespace(parser)
     parser.add_argument(
         '-r', '--rate', type=_cli.positive, default=1.0, help='factor on the speed (default: 1.0)'
     )

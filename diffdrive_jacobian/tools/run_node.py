@@ -101,9 +101,10 @@ def _parser(name: str, program: Program) -> argparse.ArgumentParser:
             f'  {ros_name}',
             *textwrap.wrap(text, 90, initial_indent='      ', subsequent_indent='      '),
         ]
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=name,
-        usage=f'{name} [-h] [--params-file FILE] [--ros-args -p PARAMETER:=VALUE -r NAME:=NAME ...]',
+        usage=f'{name} [-h] [--params-file FILE | --robot NAME] '
+        '[--ros-args -p PARAMETER:=VALUE -r NAME:=NAME ...]',
         description=textwrap.fill(program.description, 90),
         epilog='\n'.join(['parameters:', *lines]),
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.tools import _cli
 
 if TYPE_CHECKING:
@@ -20,19 +22,23 @@ PROGRAM = 'send_goal'
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
     own, ros = _cli.split_arguments(arguments)
-    options = _cli.parse(_parser(), own)
+    parser = _parser()
+    options = _cli.parse(parser, own)
+    heading = _cli.given_heading(parser, options)
+    _cli.refuse_with(parser, options, '--timeout', '--no-wait')
     # Not above: --help needs no ROS.
     from diffdrive_jacobian.ros.remote_goal import send_goal
 
     try:
         with _Progress(f'goal ({options.x:g}, {options.y:g})') as progress:
             result = send_goal(
-                [options.x, options.y, options.heading],
+                [options.x, options.y, heading or 0.0],
                 frame=options.frame,
                 readers=options.readers or 1,
                 patience=options.wait,
                 timeout=options.timeout,
                 follow=not options.no_wait,
+                heading_matters=heading is not None,
                 ros_arguments=ros,
                 signals=signals,
                 progress=progress,
@@ -66,6 +72,14 @@ class _Progress:
 
     def waiting(self, reason: str) -> None:
         self._waiting.show(reason)
+
+    def heading_ignored(self, controller: str) -> None:
+        print(
+            f'{PROGRAM}: warning: {printable(controller)} ignores --heading: set its parameter '
+            'use_goal_heading to true, or its controller to pose',
+            file=sys.stderr,
+            flush=True,
+        )
 
     def driving(self, distance: float) -> None:
         self._bar.show(self._goal, distance)
@@ -119,7 +133,7 @@ def _hint(result: GoalResult) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} X Y [options] [--ros-args ...]',
         description='Send a goal to a running go_to_goal and wait until it has ended. Ctrl-C cancels '
@@ -128,12 +142,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('x', metavar='X', type=_cli.coordinate, help='x of the goal (m)')
     parser.add_argument('y', metavar='Y', type=_cli.coordinate, help='y of the goal (m)')
     _cli.add_wait_matching(parser, 'goal_pose has', '1')
-    parser.add_argument(
-        '--heading',
-        metavar='RAD',
-        type=_cli.heading,
-        default=0.0,
-        help='heading at the goal (rad), used if the controller has use_goal_heading (default: 0.0)',
+    _cli.add_heading(
+        parser, 'heading at the goal (rad), used if the controller has use_goal_heading (default: 0.0)'
     )
     parser.add_argument(
         '--frame', default='', help='frame of the goal (default: the frame of the odometry)'

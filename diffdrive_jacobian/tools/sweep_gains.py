@@ -21,6 +21,7 @@ from diffdrive_jacobian.simulation import RobotModel
 from diffdrive_jacobian.sweeps.sweep import Setup, Sweep, SweptControllers, describe, sweep, table
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._progress import Batch
+from diffdrive_jacobian.tools._waiting import busy
 
 PROGRAM = 'sweep_gains'
 
@@ -32,14 +33,17 @@ class InterruptedByUserError(Exception):
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
     own, ros = _cli.split_arguments(arguments)
-    options = _cli.parse(_parser(), [*own, *ros], ros=False)
+    parser = _parser()
+    options = _cli.parse(parser, [*own, *ros], ros=False)
+    _cli.refuse_without(parser, options, '--force', '--output', '--csv')
     try:
         # Before the sweep, which takes a while.
         picture, numbers = _files(options)
         if picture is not None:
             importlib.import_module('matplotlib.figure')
         swept = _sweep(options, signals)
-        drawn = b'' if picture is None else sweep_figure.draw(swept, extension(picture))
+        with busy(PROGRAM, 'drawing'):
+            drawn = b'' if picture is None else sweep_figure.draw(swept, extension(picture))
         rows = b'' if numbers is None else table(swept).encode()
         if signals.count:
             raise InterruptedByUserError
@@ -61,7 +65,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         )
     except OSError as error:
         return _cannot_write(error.filename, error)
-    code = _write([(numbers, rows), (picture, drawn)])
+    code = _write([(numbers, rows), (picture, drawn)], replace=options.force)
     print(describe(swept))
     return code
 
@@ -125,12 +129,12 @@ def _files(options: argparse.Namespace) -> tuple[Path | None, Path | None]:
         stem = free_stem('sweep', ('png', 'csv'))
         output, csv = f'{stem}.png', f'{stem}.csv'
     return (
-        None if output is None else new_file(output, FORMATS, 'picture'),
-        None if csv is None else new_file(csv, ('csv',), 'table'),
+        None if output is None else new_file(output, FORMATS, 'picture', replace=options.force),
+        None if csv is None else new_file(csv, ('csv',), 'table', replace=options.force),
     )
 
 
-def _write(contents: Sequence[tuple[Path | None, bytes]]) -> int:
+def _write(contents: Sequence[tuple[Path | None, bytes]], *, replace: bool) -> int:
     """Write files and print their names; return the exit code.
 
     A file that cannot be written does not prevent the others from being written.
@@ -141,7 +145,7 @@ def _write(contents: Sequence[tuple[Path | None, bytes]]) -> int:
         if path is None:
             continue
         try:
-            create(path, content)
+            create(path, content, replace=replace)
             written.append(path)
         except OSError as error:
             code = _cannot_write(path, error)
@@ -164,15 +168,15 @@ def _whole(text: str) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} [options]',
         description='Sweep the gains kp and kv of a control law over a grid: thousands of closed loops '
         'are simulated at once, from starts all around the goal. Time to the goal, path length and '
         'overshoot are drawn as heat maps, with the boundary beyond which the robot spirals in, and '
         'written as CSV. Without -o and --csv both are written, as sweep_DATE-TIME.png and .csv. '
-        'Existing files are not overwritten. Exit code 0: done; 1: a file cannot be written; 2: wrong '
-        'arguments; 130: interrupted, and nothing was written.',
+        'Existing files are not overwritten without --force. Exit code 0: done; 1: a file cannot be '
+        'written; 2: wrong arguments; 130: interrupted, and nothing was written.',
     )
     usual = Setup()
     for name, what in (('kp', 'heading error'), ('kv', 'distance')):
@@ -247,11 +251,9 @@ def _parser() -> argparse.ArgumentParser:
         type=_cli.positive,
         help='limit of the yaw rate (rad/s) (default: no limit)',
     )
-    parser.add_argument(
-        '--params-file',
-        metavar='FILE',
-        type=_cli.readable_file,
-        help='parameter file (YAML) with the limits and wheels of virtual_robot, as in config/ '
+    _cli.add_params_file(
+        parser,
+        'parameter file (YAML) with the limits and wheels of virtual_robot, as in config/ '
         '(default: the defaults of virtual_robot)',
     )
     default = 'sweep_DATE-TIME.{}, unless {} is given'
@@ -261,6 +263,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar='FILE',
         help=f'picture, .{", .".join(FORMATS)} (default: {default.format("png", "--csv")})',
     )
+    _cli.add_force(parser, 'the picture and the table')
     parser.add_argument(
         '--csv', metavar='FILE', help=f'table, .csv (default: {default.format("csv", "-o")})'
     )

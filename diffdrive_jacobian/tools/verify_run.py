@@ -15,7 +15,9 @@ from diffdrive_jacobian.parameters.file import robot_parameters
 from diffdrive_jacobian.reading.reader import read_run
 from diffdrive_jacobian.reading.verification import BY_RECORDING_TIME, EXACT, Verification, verify
 from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools._waiting import busy
 
 PROGRAM = 'verify_run'
 
@@ -53,7 +55,8 @@ def report(verification: Verification, tolerance: float, yaw_tolerance: float) -
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool and return its exit code."""
-    return _run(_parser().parse_args(arguments), PROGRAM)
+    parser = _parser()
+    return _run(parser, parser.parse_args(arguments))
 
 
 def run_as_option(program: str, option: str, arguments: Sequence[str]) -> int:
@@ -68,15 +71,24 @@ def run_as_option(program: str, option: str, arguments: Sequence[str]) -> int:
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
         parser.error(f'not allowed with {option}: {" ".join(word.strip() for word in unknown)}')
-    return _run(options, program)
+    return _run(parser, options)
 
 
-def _run(options: argparse.Namespace, program: str) -> int:
+def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     try:
         parameters = None if options.params_file is None else robot_parameters(options.params_file)
-        verification = verify(read_run(options.bag), parameters)
+        with busy(parser.prog, f'reading {printable(options.bag, PATH_LIMIT)}'):
+            run = read_run(options.bag, namespace=options.namespace)
+        if parameters is not None and len(run.cmd_vel_out):
+            return _cli.complain(
+                parser.prog,
+                '--params-file and --robot have no effect: the bag has cmd_vel_out, the commands as the '
+                'robot applied them',
+            )
+        with busy(parser.prog, 'simulating the run'):
+            verification = verify(run, parameters)
     except (UserError, BagError, ParameterError) as error:
-        return _cli.complain(program, error)
+        return _cli.complain(parser.prog, error)
     allowed = verification.allowed
     tolerance = allowed if options.tolerance is None else options.tolerance
     yaw_tolerance = allowed if options.yaw_tolerance is None else options.yaw_tolerance
@@ -85,7 +97,7 @@ def _run(options: argparse.Namespace, program: str) -> int:
 
 
 def _parser(program: str = PROGRAM, option: str = '') -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=program,
         usage=' '.join([program, *option.split(), 'BAG [options]']),
         description='Simulate a recorded run again from its commands, and compare the path with the '
@@ -106,11 +118,10 @@ def _parser(program: str = PROGRAM, option: str = '') -> argparse.ArgumentParser
         type=_cli.positive,
         help=f'largest allowed difference of the heading in rad (default: {default})',
     )
-    parser.add_argument(
-        '--params-file',
-        metavar='FILE',
-        type=_cli.readable_file,
-        help='ROS parameters of virtual_robot (YAML), if cmd_vel_out was not recorded '
+    _cli.add_params_file(
+        parser,
+        'ROS parameters of virtual_robot (YAML), if cmd_vel_out was not recorded '
         '(default: those recorded in the bag)',
     )
+    _cli.add_namespace(parser)
     return parser

@@ -1,0 +1,189 @@
+"""Topics that do not connect: types, quality of service, missing ends, several publishers, names."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+
+from diffdrive_jacobian.diagnosis.description import (
+    CLOCK,
+    INTERNAL,
+    Endpoint,
+    Finding,
+    Graph,
+    Quality,
+    base_name,
+    listed,
+)
+
+START_READER = {
+    'cmd_vel': 'start virtual_robot, wheel_bridge or the driver of your robot',
+    'joint_command': 'start virtual_robot with -p command_interface:=wheels, or your motor driver',
+    'goal_pose': 'start go_to_goal',
+    'goals': 'start go_to_goal',
+}
+"""What to start where nobody is subscribed to a topic, by its base name."""
+START_PUBLISHER = {
+    'odom': 'start virtual_robot or the driver of your robot',
+    'joint_command': 'start wheel_bridge, or use -p command_interface:=cmd_vel',
+}
+"""What to start where nobody publishes a topic, by its base name."""
+SAME_NAMES = 'in the same namespace, or remap the topic ({}:=NAME)'
+ONE_PUBLISHER = {
+    'odom': 'their poses alternate; stop one of them, or give each robot a namespace (-r __ns:=/NAME)',
+    'joint_command': 'their commands alternate; stop one of them, or give each robot a namespace',
+    'start_pose': 'give each robot a namespace (-r __ns:=/NAME)',
+    'goal_status': 'two controllers drive one robot; stop one of them, or give each a namespace',
+}
+"""What to do about several publishers of a topic that should have one, by its base name."""
+
+
+def check_topics(graph: Graph) -> Iterator[Finding]:
+    """Yield what keeps nodes from communicating."""
+    yield from _check_names(graph)
+    for topic in graph.topics():
+        yield from _check_types(graph, topic)
+        yield from _check_quality(graph, topic)
+        yield from _check_number_of_publishers(graph, topic)
+        yield from _check_missing(graph, topic)
+
+
+def _check_names(graph: Graph) -> Iterator[Finding]:
+    names = Counter(node.name for node in graph.nodes)
+    for name, count in sorted(names.items()):
+        if count > 1:
+            yield Finding(
+                f'{count} nodes have the name {name}',
+                'stop one of them, or give each a name or a namespace of its own (-r __node:=NAME, '
+                '-r __ns:=/NAME); one that was killed disappears within 20 s',
+            )
+
+
+def _check_types(graph: Graph, topic: str) -> Iterator[Finding]:
+    publishers: dict[str, list[str]] = {}
+    subscriptions: dict[str, list[str]] = {}
+    for one in graph.publishers(topic):
+        publishers.setdefault(one.kind, []).append(one.node)
+    for one in graph.subscriptions(topic):
+        subscriptions.setdefault(one.kind, []).append(one.node)
+    for theirs, sources in sorted(publishers.items()):
+        for ours, sinks in sorted(subscriptions.items()):
+            if theirs != ours:
+                yield Finding(
+                    f'{listed(sources)} publishes {topic} as {theirs}, but {listed(sinks)} subscribes '
+                    f'to it as {ours}: no message arrives',
+                    type_remedy(theirs, ours),
+                )
+
+
+def type_remedy(first: str, second: str) -> str:
+    """Return what to do about two types of one topic."""
+    if 'Twist' in first and 'Twist' in second:
+        return (
+            'set enable_stamped_cmd_vel of both to the same value (true: TwistStamped, false: Twist); '
+            'teleop_twist_keyboard has -p stamped:=true'
+        )
+    if 'Joint' in first + second or 'MultiArray' in first + second:
+        return 'set joint_command_type of wheel_bridge to the type that the other one uses'
+    return 'use one type, or remap one of the topics to another name'
+
+
+def mismatch(offered: Quality, requested: Quality) -> list[str]:
+    """Return the policies for which a publisher offers less than a subscription requests, in words."""
+    reasons = []
+    if (offered.reliability, requested.reliability) == ('BEST_EFFORT', 'RELIABLE'):
+        reasons.append('reliability: it offers best effort, reliable is requested')
+    if (offered.durability, requested.durability) == ('VOLATILE', 'TRANSIENT_LOCAL'):
+        reasons.append('durability: it offers volatile, transient local is requested')
+    if offered.deadline > requested.deadline:
+        reasons.append(
+            f'deadline: it offers {_duration(offered.deadline)}, {_duration(requested.deadline)} is '
+            'requested'
+        )
+    if (offered.liveliness, requested.liveliness) == ('AUTOMATIC', 'MANUAL_BY_TOPIC'):
+        reasons.append('liveliness: it offers automatic, manual by topic is requested')
+    if offered.lease > requested.lease:
+        reasons.append(
+            f'lease of the liveliness: it offers {_duration(offered.lease)}, '
+            f'{_duration(requested.lease)} is requested'
+        )
+    return reasons
+
+
+def _duration(nanoseconds: int) -> str:
+    return 'no limit' if nanoseconds >= INFINITE_FROM else f'{nanoseconds / 1e9:g} s'
+
+
+INFINITE_FROM = 2**62
+"""Durations from here on mean no limit (ns): implementations of DDS round the largest one."""
+
+
+def _check_quality(graph: Graph, topic: str) -> Iterator[Finding]:
+    for subscription in graph.subscriptions(topic):
+        publishers = [one for one in graph.publishers(topic) if one.kind == subscription.kind]
+        bad = [one for one in publishers if mismatch(one.quality, subscription.quality)]
+        for publisher in bad:
+            reasons = mismatch(publisher.quality, subscription.quality)
+            rest = ' It receives the other publishers.' if len(bad) < len(publishers) else ''
+            yield Finding(
+                f'{subscription.node} receives nothing of {publisher.node} on {topic}, because their '
+                f'quality of service does not match ({"; ".join(reasons)}).{rest}',
+                f'change one of both; for nodes of this package as in -p '
+                f'qos_overrides.{topic}.subscription.{_changed_policy(reasons[0])}',
+            )
+
+
+def _changed_policy(reason: str) -> str:
+    return {
+        'reliability': 'reliability:=best_effort',
+        'durability': 'durability:=volatile',
+    }.get(reason.split(':')[0], 'POLICY:=VALUE')
+
+
+def _check_number_of_publishers(graph: Graph, topic: str) -> Iterator[Finding]:
+    nodes = [one.node for one in graph.publishers(topic)]
+    name = base_name(topic)
+    if len(nodes) < 2 or topic == CLOCK:
+        return
+    if name in ONE_PUBLISHER:
+        yield Finding(f'{listed(nodes)} publish {topic}', ONE_PUBLISHER[name])
+    elif name == 'cmd_vel':
+        yield Finding(
+            f'{listed(nodes)} publish {topic}: the robot follows the last command of either',
+            'drive by hand only while no goal is active, or use a multiplexer such as twist_mux',
+            problem=False,
+        )
+
+
+def _check_missing(graph: Graph, topic: str) -> Iterator[Finding]:
+    publishers, subscriptions = graph.publishers(topic), graph.subscriptions(topic)
+    name = base_name(topic)
+    if topic in INTERNAL:
+        return
+    if publishers and not subscriptions and name in START_READER:
+        yield Finding(
+            f'{listed([one.node for one in publishers])} publishes {topic}, but nobody subscribes to it',
+            f'{START_READER[name]} {SAME_NAMES.format(name)}{_namesake(graph, topic, publishes=False)}',
+            # Tools that publish goals come and go.
+            problem=name in ('cmd_vel', 'joint_command'),
+        )
+    if subscriptions and not publishers and name in START_PUBLISHER:
+        yield Finding(
+            f'{listed([one.node for one in subscriptions])} subscribes to {topic}, but nobody publishes '
+            'it',
+            f'{START_PUBLISHER[name]} {SAME_NAMES.format(name)}'
+            f'{_namesake(graph, topic, publishes=True)}',
+        )
+
+
+def _namesake(graph: Graph, topic: str, *, publishes: bool) -> str:
+    """Return a hint to a topic of the same base name that has the missing end."""
+    others: list[Endpoint] = [
+        one
+        for one in graph.endpoints
+        if one.publishes == publishes and one.topic != topic and base_name(one.topic) == base_name(topic)
+    ]
+    if not others:
+        return ''
+    verb = 'publishes' if publishes else 'subscribes to'
+    return f'; {others[0].node} {verb} {others[0].topic}'

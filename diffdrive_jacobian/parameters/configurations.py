@@ -1,0 +1,40 @@
+"""The parameter files of robots that are installed with this package."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+
+PACKAGE = 'diffdrive_jacobian'
+SHARE = Path('share', PACKAGE, 'config')
+"""Directory of the files below the prefix of an installation."""
+
+
+def configurations() -> dict[str, Path]:
+    """Return the parameter files by the names of the robots, sorted."""
+    found: dict[str, Path] = {}
+    for file in _files():
+        found.setdefault(file.stem, file)
+    return dict(sorted(found.items()))
+
+
+def _files() -> Iterator[Path]:
+    """Yield the files of the clone, of the ROS installation and of the Python installation."""
+    # An editable installation has no copy of them.
+    clone = Path(__file__).parents[2]
+    if (clone / 'setup.py').is_file():
+        yield from (clone / 'config').glob('*.yaml')
+    for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
+        if prefix:
+            yield from (Path(prefix) / SHARE).glob('*.yaml')
+    try:
+        files = metadata.distribution(PACKAGE).files or ()
+    except metadata.PackageNotFoundError:
+        return
+    for file in files:
+        if file.suffix == '.yaml' and file.parent.parts[-len(SHARE.parts) :] == SHARE.parts:
+            path = Path(str(file.locate())).resolve()
+            if path.is_file():
+                yield path

@@ -1,0 +1,252 @@
+"""Observation of the graph for a while: nodes, endpoints, clocks, and what they publish."""
+
+from __future__ import annotations
+
+import os
+import struct
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from rcl_interfaces.srv import GetParameters
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Imu, JointState, LaserScan
+
+from diffdrive_jacobian.diagnosis.description import (
+    CLOCK,
+    ClockMessages,
+    Endpoint,
+    Graph,
+    Participant,
+    Quality,
+    Stream,
+)
+from diffdrive_jacobian.ros.runner import ros_context, running
+from diffdrive_jacobian.ros.topic_errors import type_name
+from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.text import printable
+
+PERIOD = 0.25
+"""Time between two looks at the graph (s)."""
+MAX_NODES = 200
+"""Number of nodes that are asked for their clock."""
+MAX_TOPICS = 50
+"""Number of topics that are received."""
+STAMPED = (Odometry, TwistStamped, JointState, LaserScan, Imu)
+"""Types of messages that are received. They begin with the stamp."""
+RECEIVED = {type_name(one): one for one in (*STAMPED, Twist, Clock)}
+_TIME = {True: struct.Struct('<xxxxiI'), False: struct.Struct('>xxxxiI')}
+"""Encapsulation and time at the beginning of a message, by whether it is little endian."""
+
+
+def observe(
+    seconds: float, *, ros_arguments: Sequence[str] = (), signals: Signals | None = None
+) -> Graph:
+    """Observe the graph and return its description.
+
+    Args:
+        seconds: Duration (s). An older process is discovered within 3 s.
+        ros_arguments: ROS arguments of the node.
+        signals: Counter of the signals that end the observation. None: no signal does.
+
+    Raises:
+        UserError: The ROS arguments or the environment are invalid.
+    """
+    signals = signals or Signals()
+    # Names of nodes that begin with _ are hidden.
+    name = f'_doctor_{os.getpid()}'
+    with (
+        ros_context([name, *ros_arguments]) as context,
+        running(context, isolated=False) as runner,
+    ):
+        observer = runner.add(lambda: Observer(name, context=context))
+        start = time.monotonic()
+        runner.spin(lambda: time.monotonic() - start >= seconds or signals.count > 0)
+        return observer.describe(time.monotonic() - start)
+
+
+class Observer(Node):  # type: ignore[misc]
+    """A node that receives what others publish, and asks them for their clock."""
+
+    def __init__(self, name: str, **kwargs: Any) -> None:
+        """Start to observe. `kwargs` as for `rclpy.node.Node`."""
+        super().__init__(name, enable_rosout=False, start_parameter_services=False, **kwargs)
+        self._received: dict[str, _Received] = {}
+        self._simulated = _ClockReceived()
+        self._use_sim_time: dict[str, bool] = {}
+        self._parameter_clients: dict[str, Any] = {}
+        self._asked: set[str] = set()
+        self.create_timer(PERIOD, self._look)
+
+    def _look(self) -> None:
+        """Subscribe to new topics, and ask new nodes."""
+        for topic, kinds in self.get_topic_names_and_types():
+            known = next((kind for kind in kinds if kind in RECEIVED), None)
+            if known is None or topic in self._received or len(self._received) >= MAX_TOPICS:
+                continue
+            if any(info.node_name != self.get_name() for info in self._publishers_of(topic)):
+                self._subscribe(topic, known)
+        for name in self._names()[:MAX_NODES]:
+            if name not in self._parameter_clients and '/_' not in name:
+                self._parameter_clients[name] = self.create_client(
+                    GetParameters, f'{name}/get_parameters'
+                )
+        for name, client in self._parameter_clients.items():
+            if name not in self._asked and client.service_is_ready():
+                self._asked.add(name)
+                future = client.call_async(GetParameters.Request(names=['use_sim_time']))
+                future.add_done_callback(partial(self._on_answer, name))
+
+    def _subscribe(self, topic: str, kind: str) -> None:
+        received = self._received[topic] = _Received(stamped=RECEIVED[kind] in STAMPED)
+        # It matches every publisher.
+        profile = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+        callback: Callable[[bytes], None] = partial(received.add, self._simulated)
+        if topic == CLOCK:
+            callback = self._simulated.add
+        self.create_subscription(RECEIVED[kind], topic, callback, profile, raw=True)
+
+    def _on_answer(self, name: str, future: Any) -> None:
+        values = future.result().values
+        # 1: PARAMETER_BOOL
+        if len(values) == 1 and values[0].type == 1:
+            self._use_sim_time[name] = values[0].bool_value
+
+    def _publishers_of(self, topic: str) -> list[Any]:
+        return list(self.get_publishers_info_by_topic(topic))
+
+    def _names(self) -> list[str]:
+        """Return the fully qualified names of the other nodes, repeated if several have one."""
+        names = [_full_name(namespace, name) for name, namespace in self.get_node_names_and_namespaces()]
+        return sorted(name for name in names if name != self.get_fully_qualified_name())
+
+    def describe(self, seconds: float) -> Graph:
+        """Return the graph as it is now, with what was received in the time before (s)."""
+        endpoints = []
+        for topic, _ in self.get_topic_names_and_types():
+            for publishes in (True, False):
+                query = self._publishers_of if publishes else self.get_subscriptions_info_by_topic
+                endpoints += [
+                    _endpoint(info, topic, publishes)
+                    for info in query(topic)
+                    if info.node_name != self.get_name()
+                ]
+        return Graph(
+            nodes=tuple(
+                Participant(printable(name), self._use_sim_time.get(name))
+                for name in self._names()
+                if '/_' not in name
+            ),
+            endpoints=tuple(sorted(endpoints, key=lambda one: (one.topic, not one.publishes, one.node))),
+            streams=tuple(
+                received.describe(printable(topic), seconds)
+                for topic, received in sorted(self._received.items())
+                if topic != CLOCK
+            ),
+            clock=self._simulated.describe(),
+            seconds=seconds,
+        )
+
+
+class _ClockReceived:
+    """What was received on /clock."""
+
+    def __init__(self) -> None:
+        self._messages = 0
+        self._went_back = 0
+        self._first = 0
+        self.last = 0
+        """The last time (ns); 0: none was received."""
+
+    def add(self, data: bytes) -> None:
+        """Receive a serialized message."""
+        now = _stamp(data)
+        if self._messages:
+            self._went_back += now < self.last
+        else:
+            self._first = now
+        self._messages += 1
+        self.last = now
+
+    def describe(self) -> ClockMessages:
+        """Return the description."""
+        return ClockMessages(
+            messages=self._messages,
+            advanced=(self.last - self._first) / 1e9,
+            went_back=self._went_back,
+        )
+
+
+class _Received:
+    """What was received on a topic."""
+
+    def __init__(self, *, stamped: bool) -> None:
+        self._stamped = stamped
+        self._messages = 0
+        self._first = 0.0
+        self._last = 0.0
+        self._age: float | None = None
+        self._simulated_age: float | None = None
+
+    def add(self, clock: _ClockReceived, data: bytes) -> None:
+        """Receive a serialized message."""
+        now = time.monotonic()
+        self._first = self._first or now
+        self._last = now
+        self._messages += 1
+        stamp = _stamp(data) if self._stamped else 0
+        if stamp == 0:
+            return
+        # The youngest one: this process may be late, and others may be.
+        self._age = _nearer(self._age, (time.time_ns() - stamp) / 1e9)
+        if clock.last:
+            self._simulated_age = _nearer(self._simulated_age, (clock.last - stamp) / 1e9)
+
+    def describe(self, topic: str, seconds: float) -> Stream:
+        """Return the description."""
+        duration = self._last - self._first
+        return Stream(
+            topic=topic,
+            messages=self._messages,
+            rate=(self._messages - 1) / duration if duration > 0.0 else self._messages / seconds,
+            age=self._age,
+            simulated_age=self._simulated_age,
+        )
+
+
+def _nearer(one: float | None, other: float) -> float:
+    return other if one is None else min(one, other, key=abs)
+
+
+def _stamp(data: bytes) -> int:
+    """Return the time at the beginning of a serialized message (ns); 0: it is too short."""
+    if len(data) < 12:
+        return 0
+    seconds, nanoseconds = _TIME[bool(data[1] & 1)].unpack_from(data)
+    return int(seconds) * 10**9 + int(nanoseconds)
+
+
+def _endpoint(info: Any, topic: str, publishes: bool) -> Endpoint:
+    quality = info.qos_profile
+    return Endpoint(
+        node=printable(_full_name(info.node_namespace, info.node_name)),
+        topic=printable(topic),
+        kind=printable(info.topic_type),
+        publishes=publishes,
+        quality=Quality(
+            reliability=quality.reliability.name,
+            durability=quality.durability.name,
+            liveliness=quality.liveliness.name,
+            deadline=quality.deadline.nanoseconds,
+            lease=quality.liveliness_lease_duration.nanoseconds,
+        ),
+    )
+
+
+def _full_name(namespace: str, name: str) -> str:
+    return f'{namespace.rstrip("/")}/{name}'

@@ -1,0 +1,174 @@
+"""Find out why nodes do not communicate: who is there, who talks to whom, and what does not match."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+
+from diffdrive_jacobian.diagnosis.clocks import check_clocks
+from diffdrive_jacobian.diagnosis.description import Finding, Graph, Participant
+from diffdrive_jacobian.diagnosis.environment import Environment, check_environment, environment
+from diffdrive_jacobian.diagnosis.machine import (
+    check_network,
+    check_shared_memory,
+    interfaces,
+    multicast_error,
+    shared_memory,
+)
+from diffdrive_jacobian.diagnosis.topics import check_topics
+from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.tools import _cli
+
+PROGRAM = 'doctor'
+DISCOVERY = 3.5
+"""Time within which every node is discovered (s): an older participant is announced every 3 s."""
+INSTALL = "source a ROS installation, or pip install '.[jazzy]' in a clone of diffdrive_jacobian"
+MAX_LISTED = 100
+"""Number of nodes and of topics that are listed."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Diagnosis:
+    """What was found."""
+
+    environment: Environment
+    rmw: str
+    """The implementation of the middleware. Empty: ROS cannot be used."""
+    graph: Graph
+    findings: tuple[Finding, ...]
+
+    @property
+    def problems(self) -> list[Finding]:
+        """The findings because of which something does not work."""
+        return [one for one in self.findings if one.problem]
+
+
+def main(arguments: Sequence[str], signals: Signals) -> int:
+    """Run the tool; return the exit code."""
+    own, ros = _cli.split_arguments(arguments)
+    options = _cli.parse(_parser(), own)
+    found = environment()
+    if not options.json:
+        print(*_heading(found), sep='\n', flush=True)
+    findings = [
+        *check_environment(found),
+        *check_shared_memory(shared_memory()),
+        *check_network(interfaces(), found.reach, multicast_error() if found.reach == 'SUBNET' else ''),
+    ]
+    rmw, graph = '', Graph()
+    if not any(one.problem for one in check_environment(found)):
+        try:
+            rmw, graph = _observe(options, ros, signals)
+        except UserError as error:
+            return _cli.complain(PROGRAM, error)
+        except (ImportError, OSError, RuntimeError) as error:
+            why = printable(' '.join(str(error).split()), 300)
+            findings.append(Finding(f'ROS cannot be used: {why}', INSTALL))
+    findings += [*check_topics(graph), *check_clocks(graph)]
+    if signals.count:
+        return _cli.INTERRUPTED
+    diagnosis = Diagnosis(environment=found, rmw=rmw, graph=graph, findings=tuple(findings))
+    if options.json:
+        print(json.dumps(asdict(diagnosis), indent=2))
+    else:
+        print(*_report(diagnosis), sep='\n')
+    return _cli.FAILED if diagnosis.problems else _cli.DONE
+
+
+def _observe(options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> tuple[str, Graph]:
+    """Return the name of the middleware, and the graph."""
+    # Not above: --help needs no ROS, and a diagnosis without ROS is one as well.
+    from rclpy import get_rmw_implementation_identifier
+
+    from diffdrive_jacobian.ros.observation import observe
+
+    if not options.json:
+        print(
+            f'waiting {options.timeout:g} s for the discovery of other nodes '
+            f'(those that run already are announced every 3 s)',
+            flush=True,
+        )
+    return get_rmw_implementation_identifier(), observe(
+        options.timeout, ros_arguments=ros, signals=signals
+    )
+
+
+def _heading(found: Environment) -> Iterator[str]:
+    versions = ', '.join(f'{name} {version}' for name, version in found.versions.items())
+    sources = sorted(set(found.sources.values()))
+    yield f'python {found.python}, {versions}'
+    yield (
+        f'ROS from: {" and ".join(sources) or "nowhere"}; domain {printable(found.domain)}, '
+        f'discovery range {found.reach}'
+    )
+
+
+def _report(diagnosis: Diagnosis) -> Iterator[str]:
+    """Yield the lines of a report."""
+    graph = diagnosis.graph
+    if diagnosis.rmw:
+        yield f'middleware: {diagnosis.rmw}'
+        yield f'{_cli.counted(len(graph.nodes), "node")} found'
+    else:
+        yield 'nodes were not searched, see the problems'
+    yield from _shortened([_node(node) for node in graph.nodes])
+    yield from _shortened(_topics(graph))
+    for what, findings in (
+        ('problem', diagnosis.problems),
+        ('note', [one for one in diagnosis.findings if not one.problem]),
+    ):
+        for number, one in enumerate(findings, 1):
+            yield f'{what} {number}: {one.what}'
+            yield f'  remedy: {one.remedy}'
+    yield f'{_cli.counted(len(diagnosis.problems), "problem")} found'
+
+
+def _shortened(lines: list[str]) -> Iterator[str]:
+    yield from lines[:MAX_LISTED]
+    if len(lines) > MAX_LISTED:
+        yield f'  ... and {len(lines) - MAX_LISTED} more'
+
+
+def _node(node: Participant) -> str:
+    clock = {True: ' (simulated time)', None: ' (clock unknown)'}.get(node.use_sim_time, '')
+    return f'  {node.name}{clock}'
+
+
+def _topics(graph: Graph) -> list[str]:
+    """Return a line for each topic: who publishes it, who is subscribed to it, and how often."""
+    rates = {one.topic: one for one in graph.streams}
+    lines = []
+    for topic in graph.topics():
+        publishers, subscriptions = graph.publishers(topic), graph.subscriptions(topic)
+        kinds = ' or '.join(sorted({one.kind for one in (*publishers, *subscriptions)}))
+        sources = ', '.join(one.node for one in publishers) or 'nobody'
+        sinks = ', '.join(one.node for one in subscriptions) or 'nobody'
+        stream = rates.get(topic)
+        rate = '' if stream is None else ', silent' if not stream.messages else f', {stream.rate:.3g} Hz'
+        lines.append(f'  {topic} ({kinds}{rate}): {sources} -> {sinks}')
+    return lines
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _cli.Parser(
+        prog=PROGRAM,
+        usage=f'{PROGRAM} [options] [--ros-args ...]',
+        description='Report which nodes run, who communicates with whom, and what prevents it: types '
+        'and quality of service that do not match, topics that nobody reads or publishes, several '
+        'publishers, clocks, discovery, versions, shared memory and network. Each problem is named with '
+        'its remedy. Exit code 0: no problem was found; 1: there are problems; 2: wrong arguments; 130: '
+        'interrupted.',
+    )
+    parser.add_argument(
+        '--timeout',
+        metavar='SECONDS',
+        type=_cli.positive,
+        default=DISCOVERY,
+        help='duration of the discovery and of the observation (s) (default: %(default)g)',
+    )
+    parser.add_argument('--json', action='store_true', help='print the report as JSON')
+    return parser

@@ -1,0 +1,115 @@
+"""The tool doctor: its report, its exit codes, and what its node observes."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from diffdrive_jacobian.diagnosis.description import Graph, Participant
+from diffdrive_jacobian.diagnosis.machine import SharedMemory
+from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.tools import doctor
+
+
+@pytest.fixture
+def observed(monkeypatch):
+    """Set what the tool observes, in an environment without problems."""
+    monkeypatch.delenv('FASTRTPS_DEFAULT_PROFILES_FILE', raising=False)
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    graph = Graph()
+    monkeypatch.setattr(doctor, 'shared_memory', lambda: SharedMemory(size=10**9, free=10**9))
+    monkeypatch.setattr(doctor, '_observe', lambda *_: ('rmw_fastrtps_cpp', graph))
+
+    def observe(value):
+        nonlocal graph
+        graph = value
+
+    return observe
+
+
+def test_an_observer_describes_what_it_sees(ros):
+    from rclpy.node import Node
+    from sensor_msgs.msg import JointState
+
+    from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+    from diffdrive_jacobian.ros.observation import Observer
+
+    observer = ros.add(Observer, name='_doctor')
+    ros.add(VirtualRobot, parameters={'publish_rate': 100.0})
+    ros.add(Node, node_name='simulated', parameters={'use_sim_time': True})
+    states = ros.peer.create_publisher(JointState, 'joint_command', 10)
+    message = JointState()
+    message.header.stamp.sec = 5
+    ros.peer.create_timer(0.05, lambda: states.publish(message))
+
+    def described():
+        return observer.describe(1.0)
+
+    def complete():
+        graph = described()
+        streams = {one.topic: one.messages for one in graph.streams}
+        return all(streams.get(topic, 0) > 2 for topic in ('/odom', '/joint_command')) and all(
+            node.use_sim_time is not None for node in graph.nodes
+        )
+
+    ros.until(complete, 'messages and clocks are known')
+    graph = described()
+    clocks = {node.name: node.use_sim_time for node in graph.nodes}
+    assert clocks == {'/peer': False, '/simulated': True, '/virtual_robot': False}
+    ends = {(one.node, one.topic, one.publishes) for one in graph.endpoints}
+    assert {('/virtual_robot', '/odom', True), ('/virtual_robot', '/cmd_vel', False)} <= ends
+    assert not any('_doctor' in node for node, *_ in ends)
+    (start,) = graph.publishers('/start_pose')
+    assert (start.kind, start.quality.durability) == (
+        'geometry_msgs/msg/PoseWithCovarianceStamped',
+        'TRANSIENT_LOCAL',
+    )
+    streams = {one.topic: one for one in graph.streams}
+    assert abs(streams['/odom'].age) < 10.0
+    assert streams['/joint_command'].age > 1e6
+    assert streams['/odom'].rate > 1.0
+
+
+def test_exit_code_and_report_depend_on_problems(observed, capsys):
+    assert doctor.main([], Signals()) == 0
+    assert capsys.readouterr().out.endswith('\n0 problems found\n')
+    observed(Graph(nodes=(Participant('/a', True), Participant('/a', None))))
+    assert doctor.main([], Signals()) == 1
+    said = capsys.readouterr().out
+    assert '2 nodes found\n  /a (simulated time)\n  /a (clock unknown)\n' in said
+    assert 'problem 1: 2 nodes have the name /a\n  remedy: stop one of them' in said
+    assert said.endswith('\n2 problems found\n')
+
+
+def test_the_report_as_json(observed, capsys):
+    observed(Graph(nodes=(Participant('/a', True),)))
+    assert doctor.main(['--json'], Signals()) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert report['graph']['nodes'] == [{'name': '/a', 'use_sim_time': True}]
+    assert [one['problem'] for one in report['findings'] if 'clock' in one['what']] == [True]
+    assert report['environment']['versions']['diffdrive_jacobian']
+
+
+def test_an_environment_in_which_no_node_can_start_is_a_diagnosis(monkeypatch, capsys):
+    monkeypatch.setenv('ROS_DOMAIN_ID', 'lab')
+    monkeypatch.setattr(doctor, '_observe', lambda *_: pytest.fail('nodes were searched'))
+    assert doctor.main([], Signals()) == 1
+    said = capsys.readouterr().out
+    assert "ROS_DOMAIN_ID must be in 0 to 232, got 'lab'" in said
+    assert 'nodes were not searched' in said
+
+
+def test_an_import_that_fails_is_a_problem(observed, monkeypatch, capsys):
+    def fail(*_):
+        raise ImportError('librmw_fastrtps_cpp.so: cannot open\nshared object file')
+
+    monkeypatch.setattr(doctor, '_observe', fail)
+    assert doctor.main([], Signals()) == 1
+    assert 'ROS cannot be used: librmw_fastrtps_cpp.so: cannot open shared' in capsys.readouterr().out
+
+
+def test_an_interruption_is_reported_by_its_exit_code(observed, capsys):
+    signals = Signals()
+    signals.count = 1
+    assert doctor.main([], signals) == 130
