@@ -14,6 +14,7 @@ from action_msgs.msg import GoalStatus
 from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.control.controllers import BUILT_IN
+from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
 from diffdrive_jacobian.ros.goal_client import (
     DRIVEN_POINT_PARAMETERS,
     SILENCE,
@@ -147,6 +148,7 @@ def send_goal(
     """
     goals = np.asarray(goal, dtype=np.float64)[np.newaxis]
     with (
+        fast_heartbeats(),  # A goal that is not followed ends with its acknowledgement.
         ros_context([NAME, *ros_arguments]) as context,
         running(context, isolated=False) as runner,
     ):
