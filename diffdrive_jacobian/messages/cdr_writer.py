@@ -61,7 +61,7 @@ class Writer:
         self._tail = (tail,) if any(tail) else ()
         self._pack = struct.Struct(layout).pack
         self._head = constants[:1]
-        self._first = slice(runs[0].count if len(runs) > 1 else None)
+        self._first = slice(runs[0].numbers if len(runs) > 1 else None)
         self._more = list(zip(constants, _parts(runs), strict=True))[1:]
 
     def __call__(self, *values: Any) -> bytes:
@@ -132,7 +132,7 @@ class _Run(NamedTuple):
     start: int
     end: int
     format: str
-    count: int
+    numbers: int
 
 
 def _runs(encoder: _Encoder, fields: Values[str]) -> list[_Run]:
@@ -161,6 +161,6 @@ def _runs(encoder: _Encoder, fields: Values[str]) -> list[_Run]:
 
 def _parts(runs: list[_Run]) -> list[slice]:
     """Return which of the values are those of each run. Those after the last one are left to it."""
-    ends = list(accumulate(run.count for run in runs))
+    ends = list(accumulate(run.numbers for run in runs))
     starts = [0, *ends[:-1]][: len(runs)]
     return [slice(*pair) for pair in zip(starts, [*ends[:-1], None], strict=False)]
