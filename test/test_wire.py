@@ -76,7 +76,7 @@ def test_names_change_with_the_parameters(lockstep):
     for changes in (
         {},
         {'odom_frame_id': 'Ö', 'base_frame_id': 'ein längerer Name'},
-        {'left_wheel_name': '', 'right_wheel_name': 'rechts'},
+        {'left_wheel_name': 'l', 'right_wheel_name': 'räder rechts'},
     ):
         assert not changes or change(robot, **changes).successful
         names['odom'] = changes.get('odom_frame_id', names['odom'])
