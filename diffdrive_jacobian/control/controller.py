@@ -199,6 +199,8 @@ class Controller:
                 ) from error
             try:
                 v, omega = twist
+                if type(v) is type(omega) is float and math.isfinite(v + omega):
+                    return v, omega
                 v, omega = _number(v), _number(omega)
             except (TypeError, ValueError) as error:
                 raise LawError(

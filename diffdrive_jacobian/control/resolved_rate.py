@@ -26,6 +26,7 @@ from diffdrive_jacobian.kinematics._checks import (
     not_negative,
     number,
     positive,
+    positive_or_infinite,
     read_only,
 )
 from diffdrive_jacobian.kinematics._elementary import (
@@ -85,7 +86,7 @@ def resolved_rate(
     m = J.shape[-2]
     tip, wanted = components('x', x, m), components('x_desired', x_desired, m)
     forward, K = components('x_dot_desired', x_dot_desired, m), operand('gain', gain, not_negative)
-    longest = operand('max_correction', max_correction, _positive_or_infinite)
+    longest = operand('max_correction', max_correction, positive_or_infinite)
     single = agree(
         x=tip[0], x_desired=wanted[0], x_dot_desired=forward[0], gain=K, max_correction=longest
     )
@@ -109,11 +110,6 @@ def resolved_rate(
         return q_dot
     finite_result('J, the velocity of the tip, damping and weights', 'joint velocity', q_dot)
     return limit_velocity(q_dot, max_velocity)
-
-
-def _positive_or_infinite(name: str, value: Any) -> None:
-    if not np.all(value > 0.0):
-        raise ValueError(f'{name} must be positive, got {value}')
 
 
 def _tip_velocity(

@@ -25,6 +25,7 @@ from diffdrive_jacobian.kinematics._checks import offset, positive
 from diffdrive_jacobian.kinematics._elementary import (
     agree,
     alike,
+    angle_and_radius,
     components,
     cos,
     evaluated,
@@ -121,10 +122,7 @@ def single_wheel_jacobian(theta: ArrayLike, r: ArrayLike) -> NDArray[np.float64]
     Raises:
         ValueError: r is not positive and finite.
     """
-    single = type(theta) is type(r) is float and r > 0.0 and isfinite(theta + r)
-    if not single:
-        theta, r = operand('theta', theta), operand('r', r, positive)
-        agree(theta=theta, r=r)
+    theta, r = angle_and_radius('theta', theta, r)
     return matrix(3, 2, r * cos(theta), 0.0, r * sin(theta), 0.0, 0.0, 1.0)
 
 
@@ -165,10 +163,8 @@ def offset_point(pose: ArrayLike, d: ArrayLike) -> NDArray[np.float64]:
         ValueError: Something is not finite, or shapes do not broadcast.
     """
     x, y, theta = components('pose', pose, 3)
-    single = type(x) is type(d) is float and isfinite(d)
-    if not single:
-        d = operand('d', d)
-        single = agree(pose=x, d=d)
+    d = operand('d', d)
+    single = type(x) is type(d) is float or agree(pose=x, d=d)
     return stack(*evaluated(single, 'pose and d', _point, x, y, theta, d))
 
 
@@ -196,15 +192,9 @@ def offset_point_jacobian(
     Raises:
         ValueError: r or L is not positive and finite, d is 0 or not finite.
     """
-    single = (
-        type(theta) is type(r) is type(L) is type(d) is float
-        and (r > 0.0 < L and d != 0.0)
-        and isfinite(theta + r + L + d)
-    )
-    if not single:
-        theta, r, L = operand('theta', theta), operand('r', r, positive), operand('L', L, positive)
-        d = operand('d', d, offset)
-        single = agree(theta=theta, r=r, L=L, d=d)
+    theta, r, L, single = _heading_and_geometry(theta, r, L)
+    d = operand('d', d, offset)
+    single = (single and type(d) is float) or agree(theta=theta, r=r, L=L, d=d)
     return matrix(2, 2, *evaluated(single, 'r, L and d', _offset_jacobian, theta, r, L, d))
 
 
@@ -326,7 +316,9 @@ def rolling_constraints(
     if not single:
         theta, r, L = alike(theta, r, L)
     c, s = cos(theta), sin(theta)
-    over_pose = matrix(3, 3, s, -c, 0.0, c, s, L / 2.0, c, s, -L / 2.0)
+    separation: Any = L
+    half = separation / 2.0
+    over_pose = matrix(3, 3, s, -c, 0.0, c, s, half, c, s, -half)
     over_wheels = matrix(3, 2, 0.0, 0.0, r, 0.0, 0.0, r)
     return over_pose, over_wheels
 
