@@ -63,7 +63,9 @@ def wheel_to_body_jacobian(r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
         ValueError: r or L is not positive and finite.
     """
     r, L, single = _geometry(r, L)
-    half, ratio = evaluated(single, 'r and L', lambda r, L: (r / 2.0, r / L), r, L)
+    (ratio,) = evaluated(single, 'r and L', lambda r, L: (r / L,), r, L)
+    radius: Any = r
+    half = radius / 2.0
     return matrix(2, 2, half, half, ratio, -ratio)
 
 
