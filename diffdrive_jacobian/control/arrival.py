@@ -85,8 +85,9 @@ class Arrival:
             ValueError: An argument is not finite, shapes do not broadcast, or the distance overflows.
         """
         if type(x) is type(y) is type(theta) is type(x_goal) is type(y_goal) is float and isfinite(
-            x + y + theta + x_goal + y_goal
+            theta
         ):
+            # It is not finite if one of the positions or the offset is not.
             distance = self._distance(x, y, theta, x_goal, y_goal)
             if type(distance) is float and isfinite(distance):
                 return distance

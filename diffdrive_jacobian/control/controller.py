@@ -192,7 +192,7 @@ class Controller:
 
         def bound(pose: NDArray[np.float64], goal: NDArray[np.float64]) -> tuple[float, float]:
             try:
-                twist = law(pose, goal[:size], *values)
+                twist = law(pose, goal if len(goal) == size else goal[:size], *values)
             except Exception as error:
                 raise LawError(
                     f'the law of controller {self.name!r} failed: {_reason(error)}'

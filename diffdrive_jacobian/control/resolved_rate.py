@@ -12,7 +12,7 @@ doc/mathematics.md, "Control laws".
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -164,6 +164,7 @@ class StraightLine:
     """Shape (..., m) (m), read-only."""
     speed: Any
     """Speed along the line, shape (...) (m/s), read-only."""
+    _duration: NDArray[np.float64] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check and copy every value."""
@@ -182,11 +183,12 @@ class StraightLine:
             raise ValueError('start, end and speed must give a finite duration, but it overflows')
         for name, value in (('start', start), ('end', end), ('speed', speed)):
             object.__setattr__(self, name, read_only(value))
+        object.__setattr__(self, '_duration', read_only(duration))
 
     @property
     def duration(self) -> NDArray[np.float64]:
         """Time from start to end, shape (...) (s)."""
-        return np.asarray(np.linalg.norm(self.end - self.start, axis=-1) / self.speed)
+        return np.array(self._duration)
 
     def position(self, t: float) -> NDArray[np.float64]:
         """Return the position at a time, shape (..., m) (m).
@@ -198,7 +200,11 @@ class StraightLine:
             ValueError: t is not a single finite number.
         """
         t = number('t', t, finite)
-        duration = self.duration[..., np.newaxis]
+        if self._duration.ndim == 0:
+            whole = float(self._duration)
+            share = max(t, 0.0) / whole if t < whole and whole > 0.0 else 1.0
+            return np.asarray(self.start + share * (self.end - self.start))
+        duration = self._duration[..., np.newaxis]
         moving = t < duration
         part = np.where(moving, max(t, 0.0) / np.where(duration > 0.0, duration, 1.0), 1.0)
         return np.asarray(self.start + part * (self.end - self.start))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import isfinite
+from math import inf, isfinite
 from typing import Any
 
 import numpy as np
@@ -184,7 +184,8 @@ def _saturated(
     divisor = _excess(v, omega, limits, r, L, 1.0, maximum)
     if type(divisor) is float and divisor == 1.0:
         return v, omega
-    if _any(divisor == np.inf):
+    infinite = divisor == inf
+    if infinite is not False and _any(infinite):
         v, omega, divisor = _scaled_down(v, omega, limits, r, L, divisor, maximum)
     # The quotient may round to one unit in the last place beyond the limit.
     v = minimum(maximum(v / divisor, limits.min_v), limits.max_v)

@@ -167,6 +167,10 @@ def offset_point(pose: ArrayLike, d: ArrayLike) -> NDArray[np.float64]:
     x, y, theta = components('pose', pose, 3)
     d = operand('d', d)
     single = type(x) is type(d) is float or agree(pose=x, d=d)
+    if single:
+        point = _point(x, y, theta, d)
+        if isfinite(point[0] + point[1]):
+            return np.array(point)
     return stack(*evaluated(single, 'pose and d', _point, x, y, theta, d))
 
 

@@ -143,9 +143,13 @@ class MobileManipulator:
         base, joints = self._split(q)
         right, left, *speeds = components('q_dot', q_dot, 2 + self.arm.joints)
         dt = operand('dt', dt)
-        agree(q=base[0], q_dot=right, dt=dt)
+        if not type(base[0]) is type(right) is type(dt) is float:
+            agree(q=base[0], q_dot=right, dt=dt)
         v, omega = wheel_to_body(right, left, self.r, self.L)
-        driven = se2.integrate(vector(*base), vector(v, omega), dt)
+        # Tuples of floats need no arrays.
+        pose = tuple(base) if type(base[0]) is float else vector(*base)
+        twist = (v, omega) if type(v) is float else vector(v, omega)
+        driven = se2.integrate(pose, twist, dt)
         moved = [joint + speed * dt for joint, speed in zip(joints, speeds, strict=True)]
         return vector(*components('q', driven, 3), *moved)
 

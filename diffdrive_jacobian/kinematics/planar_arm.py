@@ -111,8 +111,8 @@ class PlanarArm:
         levers = self._levers(self._directions(q))
         entries = [-y for _, y in levers] + [x for x, _ in levers]
         if heading:
-            entries += [1.0] * self.joints
-        return matrix(3 if heading else 2, self.joints, *entries)
+            entries += [1.0] * len(levers)
+        return matrix(3 if heading else 2, len(levers), *entries)
 
     def determinant(self, q: ArrayLike) -> NDArray[np.float64]:
         """Return the determinant of the Jacobian of two links: `l1 l2 sin(q_2)` (A).
@@ -210,7 +210,8 @@ class PlanarArm:
         """
         angles, speeds = components('q', q, self.joints), components('q_dot', q_dot, self.joints)
         dt = operand('dt', dt)
-        agree(q=angles[0], q_dot=speeds[0], dt=dt)
+        if not type(angles[0]) is type(speeds[0]) is type(dt) is float:
+            agree(q=angles[0], q_dot=speeds[0], dt=dt)
         return vector(*[angle + speed * dt for angle, speed in zip(angles, speeds, strict=True)])
 
     def _directions(self, q: ArrayLike) -> list[Any]:
@@ -226,10 +227,12 @@ class PlanarArm:
         """Return the position of the tip relative to each joint, floats or of shape (...)."""
         # Joint by joint, because loops of NumPy over the short last axis take longer.
         levers = []
+        of_floats = type(directions[0]) is float
+        cosine, sine = (math.cos, math.sin) if of_floats else (np.cos, np.sin)
         x: Any = 0.0
         y: Any = 0.0
         for length, angle in zip(self._links[::-1], directions[::-1], strict=True):
-            x, y = x + length * cos(angle), y + length * sin(angle)
+            x, y = x + length * cosine(angle), y + length * sine(angle)
             levers.append((x, y))
         return levers[::-1]
 

@@ -142,11 +142,14 @@ def _deviation(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[Any, A
     if angles.ndim == 1 and low.ndim < 2 and high.ndim < 2:
         # Lists of floats.
         sides = [v.tolist() if v.ndim else [float(v)] * len(angles) for v in (angles, low, high)]
-        entries = list(zip(*sides, strict=True))
-        if all(a < b and min(x, a) > -_LARGE and max(x, b) < _LARGE for x, a, b in entries):
-            spans = [b - a for _, a, b in entries]
-            if min(spans) > _UNIT:
-                return [(x - (a + b) / 2.0) / (b - a) for x, a, b in entries], spans, 1.0
+        deviations, spans = [], []
+        for x, a, b in zip(*sides, strict=True):
+            if not (b - a > _UNIT and min(x, a) > -_LARGE and max(x, b) < _LARGE):
+                break
+            deviations.append((x - (a + b) / 2.0) / (b - a))
+            spans.append(b - a)
+        else:
+            return deviations, spans, 1.0
     leading(q=angles.shape, lower=low.shape, upper=high.shape)
     if not (high > low).all():
         raise ValueError(f'upper must be above lower for every joint, got {high} and {low}')
