@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.kinematics._checks import FLOAT64, finite, floats, leading, positive
+from diffdrive_jacobian.kinematics._checks import FLOAT64, finite, floats, leading
 
 TURN = 2.0 * math.pi
 
@@ -93,18 +93,6 @@ def agree(**values: Any) -> bool:
         return True
     leading(**{name: np.shape(value) for name, value in values.items()})
     return False
-
-
-def angle_and_radius(name: str, angle: Any, r: Any) -> tuple[Any, Any]:
-    """Check an angle of this name, and the radius `r`.
-
-    Raises:
-        ValueError: The angle is not finite, r is not positive and finite, or they do not broadcast.
-    """
-    if not (type(angle) is type(r) is float and r > 0.0 and math.isfinite(angle + r)):
-        angle, r = operand(name, angle), operand('r', r, positive)
-        agree(**{name: angle, 'r': r})
-    return angle, r
 
 
 def evaluated(

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._checks import positive
+from diffdrive_jacobian.kinematics._dimensions import angle_and_radius
 from diffdrive_jacobian.kinematics._elementary import (
     agree,
-    angle_and_radius,
     cos,
     matrix,
     operand,

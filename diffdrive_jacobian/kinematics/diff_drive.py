@@ -22,10 +22,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._checks import offset, positive
+from diffdrive_jacobian.kinematics._dimensions import (
+    angle_and_radius,
+    dimensions,
+    heading_and_dimensions,
+)
 from diffdrive_jacobian.kinematics._elementary import (
     agree,
     alike,
-    angle_and_radius,
     components,
     cos,
     evaluated,
@@ -62,7 +66,7 @@ def wheel_to_body_jacobian(r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    r, L, single = _geometry(r, L)
+    r, L, single = dimensions(r, L)
     (ratio,) = evaluated(single, 'r and L', lambda r, L: (r / L,), r, L)
     radius: Any = r
     half = radius / 2.0
@@ -82,7 +86,7 @@ def body_to_wheel_jacobian(r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    r, L, single = _geometry(r, L)
+    r, L, single = dimensions(r, L)
     along, across = evaluated(single, 'r and L', lambda r, L: (1.0 / r, L / (2.0 * r)), r, L)
     return matrix(2, 2, along, across, along, -across)
 
@@ -101,7 +105,7 @@ def wheel_to_world_jacobian(theta: ArrayLike, r: ArrayLike, L: ArrayLike) -> NDA
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    theta, r, L, single = _heading_and_geometry(theta, r, L)
+    theta, r, L, single = heading_and_dimensions(theta, r, L)
     x, y, turn = evaluated(single, 'r and L', _wheel_to_world, theta, r, L)
     return matrix(3, 2, x, x, y, y, turn, -turn)
 
@@ -146,7 +150,7 @@ def wheel_to_position_jacobian(theta: ArrayLike, r: ArrayLike, L: ArrayLike) -> 
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    theta, r, L, single = _heading_and_geometry(theta, r, L)
+    theta, r, L, single = heading_and_dimensions(theta, r, L)
     x, y, _ = evaluated(single, 'r and L', _wheel_to_world, theta, r, L)
     return matrix(2, 2, x, x, y, y)
 
@@ -198,7 +202,7 @@ def offset_point_jacobian(
     Raises:
         ValueError: r or L is not positive and finite, d is 0 or not finite.
     """
-    theta, r, L, single = _heading_and_geometry(theta, r, L)
+    theta, r, L, single = heading_and_dimensions(theta, r, L)
     d = operand('d', d, offset)
     single = (single and type(d) is float) or agree(theta=theta, r=r, L=L, d=d)
     return matrix(2, 2, *evaluated(single, 'r, L and d', _offset_jacobian, theta, r, L, d))
@@ -318,7 +322,7 @@ def rolling_constraints(
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    theta, r, L, single = _heading_and_geometry(theta, r, L)
+    theta, r, L, single = heading_and_dimensions(theta, r, L)
     if not single:
         theta, r, L = alike(theta, r, L)
     c, s = cos(theta), sin(theta)
@@ -327,21 +331,3 @@ def rolling_constraints(
     over_pose = matrix(3, 3, s, -c, 0.0, c, s, half, c, s, -half)
     over_wheels = matrix(3, 2, 0.0, 0.0, r, 0.0, 0.0, r)
     return over_pose, over_wheels
-
-
-def _geometry(r: Any, L: Any) -> tuple[Any, Any, bool]:
-    """Check radius and separation. Return whether both are floats, too."""
-    single = type(r) is type(L) is float and r > 0.0 < L and isfinite(r + L)
-    if not single:
-        r, L = operand('r', r, positive), operand('L', L, positive)
-        single = agree(r=r, L=L)
-    return r, L, single
-
-
-def _heading_and_geometry(theta: Any, r: Any, L: Any) -> tuple[Any, Any, Any, bool]:
-    """Check heading, radius and separation. Return whether all are floats, too."""
-    single = type(theta) is type(r) is type(L) is float and r > 0.0 < L and isfinite(theta + r + L)
-    if not single:
-        theta, r, L = operand('theta', theta), operand('r', r, positive), operand('L', L, positive)
-        single = agree(theta=theta, r=r, L=L)
-    return theta, r, L, single
