@@ -240,3 +240,42 @@ def test_wrong_shapes_are_refused_or_broadcast(call, valid, name):
         else:
             assert error[0] is ValueError
             assert any(argument in error[1] for argument in valid)
+
+
+@pytest.mark.parametrize('heading', [False, True])
+@pytest.mark.parametrize('limits', [None, (-2.0, 2.0)])
+def test_inverse_kinematics_of_one_target_is_that_of_a_batch(heading, limits):
+    """The same steps: reached at once, after restarts, at limits, or out of reach."""
+    arm, rng = PlanarArm([0.5, 0.4, 0.3]), np.random.default_rng(3)
+    entries = 3 if heading else 2
+
+    def forward(q):
+        return arm.forward_kinematics(q)[..., :entries]
+
+    targets = forward(rng.uniform(-1.5, 1.5, (12, 3)))
+    targets[0, :2], targets[1] = 3.0, forward(np.zeros(3))
+    starts = rng.uniform(-1.9, 1.9, (12, 3))
+    starts[2], starts[3] = 0.0, [2.0, -2.0, 2.0]
+    options = {'limits': limits, 'restarts': 3, 'max_iterations': 100}
+    if heading:
+        options |= {'difference': inverse_kinematics.pose_difference, 'mask': [1.0, 4.0, 0.5]}
+
+    def jacobian(q):
+        return arm.jacobian(q, heading=heading)
+
+    batch = inverse_kinematics.solve(forward, jacobian, targets, starts, **options)
+    assert batch.converged.any()
+    for index, (target, start) in enumerate(zip(targets, starts, strict=True)):
+        single = inverse_kinematics.solve(forward, jacobian, target, start, **options)
+        for name in ('converged', 'iterations', 'restarts', 'start'):
+            assert getattr(single, name) == getattr(batch, name)[index]
+        np.testing.assert_allclose(single.q, batch.q[index], rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(single.error, batch.error[index], rtol=1e-6, atol=1e-12)
+
+
+def test_the_law_of_one_step_of_the_node_takes_floats_alone():
+    """Its results are floats, not NumPy's: messages and saturation take floats."""
+    for pose in (POSE, np.array(POSE), list(POSE)):
+        twist = control.go_to_goal(pose, GOAL, 3.0, 0.5)
+        twist = control.saturate(*twist, LIMITS, **WHEELS)
+        assert [type(entry) for entry in twist] == [float, float]
