@@ -197,13 +197,15 @@ class Controller:
             if not accepts_tuples:
                 pose, goal = np.asarray(pose), np.asarray(goal)
             try:
-                twist = law(pose, goal[:size], *values)
+                twist = law(pose, goal if len(goal) == size else goal[:size], *values)
             except Exception as error:
                 raise LawError(
                     f'the law of controller {self.name!r} failed: {_reason(error)}'
                 ) from error
             try:
                 v, omega = twist
+                if type(v) is type(omega) is float and math.isfinite(v + omega):
+                    return v, omega
                 v, omega = _number(v), _number(omega)
             except (TypeError, ValueError) as error:
                 raise LawError(

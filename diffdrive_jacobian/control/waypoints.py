@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from math import isfinite
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -81,9 +82,11 @@ class Waypoints:
         x, y, theta = components('pose', pose, 3)
         if type(theta) is not float:
             raise ValueError(f'pose must have shape (3,), got {np.shape(pose)}')
-        function('law', law)
-        instance('arrival', arrival, Arrival)
-        turning_gain = operand('turning_gain', turning_gain)
+        if not callable(law) or type(arrival) is not Arrival:
+            function('law', law)
+            instance('arrival', arrival, Arrival)
+        if type(turning_gain) is not float or not isfinite(turning_gain):
+            turning_gain = operand('turning_gain', turning_gain)
         here = self
         if here.turning and not arrival.use_heading:
             # The heading no longer counts, and the position was reached.

@@ -38,6 +38,7 @@ def components(name: str, value: Any, size: int) -> list[Any]:
         ValueError: The last axis has another length, or there is none, or an entry is infinite, NaN
             or no number.
     """
+    entries: list[Any]
     if type(value) is np.ndarray and value.dtype is FLOAT64 and value.shape == (size,):
         entries = value.tolist()
     elif type(value) is tuple and len(value) == size and _are_floats(value):
@@ -167,10 +168,13 @@ def matrix(rows: int, columns: int, *entries: Any) -> NDArray[np.float64]:
     """
     if _are_floats(entries):
         return np.array(entries).reshape(rows, columns)
-    shape = np.broadcast_shapes(*map(np.shape, entries))
-    matrices = np.empty((*shape, rows, columns))
+    shapes = {entry.shape for entry in entries if type(entry) is not float}
+    shape = shapes.pop() if len(shapes) == 1 else np.broadcast_shapes(*shapes)
+    constants = any(type(entry) is float for entry in entries)
+    matrices = (np.zeros if constants else np.empty)((*shape, rows, columns))
     for index, entry in enumerate(entries):
-        matrices[..., index // columns, index % columns] = entry
+        if type(entry) is not float or entry != 0.0:
+            matrices[..., index // columns, index % columns] = entry
     return matrices
 
 
