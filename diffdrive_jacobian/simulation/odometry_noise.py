@@ -1,4 +1,7 @@
-"""Odometry covariance: the covariance of pose and twist, propagated with the Jacobians of the motion.
+"""Odometry covariance of first order: propagated with the Jacobians of the motion.
+
+The covariance of the pose is right while the standard deviation of the heading is small, and too small
+afterwards. It is here for comparison. The robot publishes the exact one of `exact_moments`.
 
 Model: the variance of the distance travelled by each wheel grows by `k |ds|` (m^2; k in m),
 independently of the other wheel. The covariance is the integral along the exact arc, not a sum over
@@ -13,7 +16,7 @@ Scaramuzza, *Introduction to Autonomous Mobile Robots*, 5.2.4.
 from __future__ import annotations
 
 import math
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,10 +38,6 @@ ROUNDING = 1e-8
 """Tolerance on symmetry and semidefiniteness of a covariance, relative to its largest entry."""
 # Taylor coefficients of _sinc_defect in the square of its argument, (-1)^n / (2n + 3)!
 _DEFECT = [(-1.0) ** n / math.factorial(2 * n + 3) for n in range(9)]
-
-
-Entries: TypeAlias = tuple[float, float, float, float, float, float]
-"""Entries xx, xy, xt, yy, yt, tt of the covariance of a pose."""
 
 
 def twist_covariance(
@@ -127,31 +126,6 @@ def propagate_covariance(
     single = agree(covariance=entries[0], pose=theta, twist=v, dt=dt, L=L, wheel_travel_variance=k)
     names = 'covariance, pose, twist, dt, L and wheel_travel_variance'
     return _matrix(*evaluated(single, names, _propagated, *entries, theta, v, omega, dt, L, k))
-
-
-def propagated_entries(
-    entries: Entries,
-    theta: float,
-    twist: tuple[float, float],
-    dt: float,
-    L: float,
-    wheel_travel_variance: float,
-) -> Entries | None:
-    """Compute what `propagate_covariance` returns for one robot whose values were checked before.
-
-    Entries are xx, xy, xt, yy, yt, tt.
-
-    Returns:
-        The entries at the end. None: they overflow.
-    """
-    try:
-        xx, xy, xt, _, yy, yt, _, _, tt = _propagated(
-            *entries, theta, *twist, dt, L, wheel_travel_variance
-        )
-    except (OverflowError, ValueError, ZeroDivisionError):
-        return None
-    made = xx, xy, xt, yy, yt, tt
-    return made if all(map(math.isfinite, made)) else None
 
 
 def covariance_entries(name: str, covariance: ArrayLike) -> tuple[Any, ...]:
