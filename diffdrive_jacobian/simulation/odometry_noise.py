@@ -30,14 +30,12 @@ from diffdrive_jacobian.kinematics._elementary import (
     operand,
     sin,
     sinc,
+    sinc_defect,
     stack,
-    where,
 )
 
 ROUNDING = 1e-8
 """Tolerance on symmetry and semidefiniteness of a covariance, relative to its largest entry."""
-# Taylor coefficients of _sinc_defect in the square of its argument, (-1)^n / (2n + 3)!
-_DEFECT = [(-1.0) ** n / math.factorial(2 * n + 3) for n in range(9)]
 
 
 def twist_covariance(
@@ -220,7 +218,7 @@ def _noise_at_end(v: Any, omega: Any, dt: Any, L: Any, wheel_travel_variance: An
 
     With the remaining turn phi = omega (T - s), the columns of g are `[cos phi, -sin phi, 0]` and
     `[v (1 - cos phi) / omega, v sin(phi) / omega, 1]`. The integrals over s are written so that no
-    digits cancel as omega goes to zero. Terms that would cancel are in `_sinc_defect`.
+    digits cancel as omega goes to zero. Terms that would cancel are in `sinc_defect`.
     """
     right, left = _wheel_variances(v, omega, L, wheel_travel_variance)
     # W = [[vv, vw], [vw, ww]], times the duration.
@@ -231,7 +229,7 @@ def _noise_at_end(v: Any, omega: Any, dt: Any, L: Any, wheel_travel_variance: An
     )
     turn, path = omega * dt, v * dt
     whole, half = sinc(turn), sinc(turn / 2.0)
-    once, twice = _sinc_defect(turn), _sinc_defect(2.0 * turn)
+    once, twice = sinc_defect(turn), sinc_defect(2.0 * turn)
     cosine = cos(turn)
     return (
         vv * (1.0 + whole * cosine) / 2.0
@@ -245,16 +243,6 @@ def _noise_at_end(v: Any, omega: Any, dt: Any, L: Any, wheel_travel_variance: An
         -vw * turn / 2.0 * half**2 + ww * path * half**2 / 2.0,
         ww,
     )
-
-
-def _sinc_defect(angle: Any) -> Any:
-    """Compute (1 - sin(x)/x) / x^2, which is 1/6 at zero, to full precision."""
-    square: Any = angle * angle
-    series: Any = 0.0
-    for coefficient in reversed(_DEFECT):
-        series = series * square + coefficient
-    far = where(square < 1.0, 1.0, angle)
-    return where(square < 1.0, series, (1.0 - sin(far) / far) / far**2)
 
 
 def _matrix(*entries: Any) -> NDArray[np.float64]:
