@@ -188,12 +188,14 @@ def _saturated(
     if infinite is not False and _any(infinite):
         v, omega, divisor = _scaled_down(v, omega, limits, r, L, divisor, maximum)
     # The quotient may round to one unit in the last place beyond the limit.
-    v = minimum(maximum(v / divisor, limits.min_v), limits.max_v)
-    omega = minimum(maximum(omega / divisor, limits.min_omega), limits.max_omega)
+    v_low, v_high, omega_low, omega_high = limits._bounds
+    v = minimum(maximum(v / divisor, v_low), v_high)
+    omega = minimum(maximum(omega / divisor, omega_low), omega_high)
     if limits._wheels:
         # So may the wheel speeds. Shrink by one unit in the last place, then by two, four, and so on.
         step = 2.0**-53
-        while _any(above := _fastest(v, omega, r, L) > limits.max_wheel_speed):
+        most = limits.max_wheel_speed
+        while _any(above := _fastest(v, omega, r, L) > most):
             v, omega = where(above, v - step * v, v), where(above, omega - step * omega, omega)
             step *= 2.0
     return v, omega
