@@ -100,7 +100,9 @@ def busy(seconds):
 
 
 @pytest.fixture
-def served():
+def served(monkeypatch):
+    # Moves back as soon as there is nothing to do, where the time on the other executor is short, too.
+    monkeypatch.setattr(guarded_executor, 'WINDOW', 0.001)
     with ros_context(['test']) as context:
         world = Served(context)
         yield world
@@ -114,6 +116,7 @@ def quick(monkeypatch):
     """Short times until the nodes move back."""
     monkeypatch.setattr(guarded_executor, 'FIRST_HOLD', 0.05)
     monkeypatch.setattr(guarded_executor, 'QUIET', 0.05)
+    monkeypatch.setattr(guarded_executor, 'WINDOW', 0.05)
 
 
 # --- When nodes move

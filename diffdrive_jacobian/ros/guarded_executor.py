@@ -50,6 +50,8 @@ LONGEST_HOLD = 60.0
 SingleThreadedExecutor can handle may be fewer than the EventsExecutor can."""
 QUIET = 5.0
 """An episode is over if the nodes ran on the EventsExecutor for this long (s)."""
+WINDOW = 0.5
+"""It is quiet if the SingleThreadedExecutor waited for half of the last time of this length (s)."""
 TASK_PERIOD = 0.01
 """Period at which tasks of the EventsExecutor are executed while the nodes are on the other one (s)."""
 LOG_BURST, LOG_PERIOD = 3, 60.0
@@ -86,6 +88,7 @@ class GuardedExecutor:
         self._fair = self._fair_only = False
         # Whether a callback was executed in the present round of the SingleThreadedExecutor.
         self._executed = True
+        self._observed = self._idle = 0.0
         # On the EventsExecutor.
         self._sample: Task | None = None
         self._sampled = self._last = time.monotonic()
@@ -180,15 +183,29 @@ class GuardedExecutor:
             self._next_tasks = now + TASK_PERIOD
             self._run_tasks()
         self._handled += 1
-        # Tasks, such as coroutines that wait, are continued on this executor only.
-        if now - self._moved < self.hold or self._fair_only or has_tasks(single):
+        if self._fair_only or has_tasks(single):
+            # Tasks, such as coroutines that wait, are continued on this executor only.
             single.spin_once(timeout_sec=timeout_sec)
         elif execute_ready(single):
             self._executed = True
-        else:
-            quiet, self._executed = not self._executed, False
-            if quiet or (now - self._moved > LONGEST_HOLD and self._renewed()):
+        elif self._executed:
+            self._executed = False
+            if now - self._moved > LONGEST_HOLD and self._renewed():
                 self._use_events()
+        elif now - self._moved > self.hold and self._was_quiet(now):
+            self._use_events()
+        else:
+            single.spin_once(timeout_sec=timeout_sec)
+            self._idle += time.monotonic() - now
+
+    def _was_quiet(self, now: float) -> bool:
+        """Return whether the executor waited for callbacks most of the time lately."""
+        elapsed = now - self._observed
+        if elapsed < WINDOW:
+            return False
+        quiet = self._idle > 0.5 * elapsed
+        self._observed, self._idle = now, 0.0
+        return quiet
 
     def _renewed(self) -> bool:
         """Return whether no message is left that was received before the nodes came here.
@@ -219,6 +236,7 @@ class GuardedExecutor:
         for node in self._nodes:
             self._single_threaded().add_node(node)
         self._fair, self._executed = True, True
+        self._observed, self._idle = time.monotonic(), 0.0
         self._sample = self._most = None
         self._handled = 0
         self._moved = time.monotonic()
