@@ -2,8 +2,8 @@
 
 Within a process Fast DDS puts a message into the queues of its subscriptions before `publish` returns.
 So whoever observes `Publisher.publish` knows which subscriptions may have received something, and in
-which order. The messages are taken from there directly: an event of the EventsExecutor costs five times
-as much.
+which order. The messages are taken from there directly: an event of the EventsExecutor takes several
+times as long.
 """
 
 from __future__ import annotations

@@ -13,9 +13,9 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration
+from rclpy.event_handler import EventHandler
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.task import Task
@@ -28,11 +28,10 @@ from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._facade import Facade
 from diffdrive_jacobian.lockstep._served import Served
 from diffdrive_jacobian.lockstep._tasks import Tasks
+from diffdrive_jacobian.lockstep._timers import Timers, is_due
 from diffdrive_jacobian.ros.rclpy_internals import (
-    RCLError,
     TimerHandle,
     events_executor,
-    timer_handle,
     wrap_calls,
 )
 
@@ -63,14 +62,13 @@ class QuiescentExecutor:
         self._served: dict[Node, Served] = {}
         self._facade = Facade(self._note_change, self.create_task)
         self._changed = False
+        self._has_actions = False
         self._tasks = Tasks()
         self.deliveries = Deliveries(self.create_task)
         """The messages that wait."""
         self._restore_calls = wrap_calls(self._noting)
         self.clocks = Clocks()
-        # With their handles, whose methods take a third of the time of those of the timers.
-        self._sim_timers: list[tuple[TimerHandle, Timer]] = []
-        self._wall_timers: list[tuple[TimerHandle, Timer]] = []
+        self._timers = Timers()
 
     def _noting(self, send: Callable[..., Any]) -> Callable[..., Any]:
         """Return a method that sends a request or a response, and takes its place among the messages."""
@@ -123,37 +121,58 @@ class QuiescentExecutor:
         self._facade.released = node
         node.executor = None
 
-    def set_time(self, message: Clock) -> None:
-        """Set the clocks of the nodes."""
-        self.clocks.set(message)
-
     # --- Work
 
-    def settle(self, *, after: bool = False) -> int | None:
+    def settle(self) -> int | None:
         """Execute all callbacks that are due at the current time, and all that they cause.
-
-        Args:
-            after: Whether nothing but `set_time` was called since the last time.
 
         Returns:
             Time until the next timer in simulated time expires (ns); None: there is no such timer.
         """
-        settled = False
-        if not after or self._changed or self._tasks or self.deliveries.pending:
-            self._handle_all()
-            settled = True
-        while True:
-            due, until_next = self._due_timers()
-            if due:
-                for handle, timer in due:
-                    if _is_due(handle):
-                        self._call(handle, timer)
-                        self._handle_all()
-            elif settled:
+        self._handle_all()
+        return self._call_timers()[1]
+
+    def catch_up(self) -> int | None:
+        """Settle, after little or nothing was done since the last time.
+
+        It takes a tenth of the time of `settle` if no message or request was sent, no task or entity was
+        created, and no timer is due.
+        """
+        if not self._has_work():
+            due, until_next = self._timers.due()
+            if not due:
                 return until_next
-            else:
-                self._handle_all()
-            settled = True
+        return self.settle()
+
+    def advance(self, message: Clock) -> int | None:
+        """Set the clocks of the nodes, and settle."""
+        self.clocks.set(message)
+        if not self._has_work():
+            called, until_next = self._call_timers()
+            if called:
+                return until_next
+        return self.settle()
+
+    def _has_work(self) -> bool:
+        """Return whether anything waits to be executed, or may wait without having been noticed."""
+        return bool(self.deliveries.pending or self._changed or self._tasks or self._has_actions)
+
+    def _call_timers(self) -> tuple[bool, int | None]:
+        """Call the timers that are due, and execute all callbacks that they cause.
+
+        Returns:
+            Whether there were any, and the time until the next timer expires, as of `settle`.
+        """
+        called = False
+        while True:
+            due, until_next = self._timers.due()
+            if not due:
+                return called, until_next
+            for handle, timer in due:
+                if is_due(handle):
+                    called = True
+                    self._call(handle, timer)
+                    self._handle_all()
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
         """Schedule a function or a coroutine for the current time. Return its future."""
@@ -199,25 +218,6 @@ class QuiescentExecutor:
             events += 1
         return events > 1
 
-    def _due_timers(self) -> tuple[list[tuple[TimerHandle, Timer]], int | None]:
-        """Return the due timers, the most overdue first, and the time until the next one (ns)."""
-        due, until_next = [], None
-        for pair in self._sim_timers:
-            left = pair[0].time_until_next_call()
-            if left is None:
-                continue
-            if left <= 0:
-                due.append((left, pair))
-            elif until_next is None or left < until_next:
-                until_next = left
-        for pair in self._wall_timers:
-            left = pair[0].time_until_next_call()
-            if left is not None and left <= 0:
-                due.append((left, pair))
-        # Sorting is stable: timers that are due at the same time stay in the order of their creation.
-        due.sort(key=lambda item: item[0])
-        return [pair for _, pair in due], until_next
-
     def _call(self, handle: TimerHandle, timer: Timer) -> None:
         handle.call_timer()
         result = timer.callback()
@@ -257,20 +257,17 @@ class QuiescentExecutor:
         for reader in sorted(new, key=lambda reader: reader.latched):
             self.deliveries.admit(reader)
             self._drain()
-        timers = [timer for node in self._served for timer in node.timers]
-        self._sim_timers = [(timer_handle(timer), timer) for timer in timers if _follows_sim_time(timer)]
-        self._wall_timers = [
-            (timer_handle(timer), timer) for timer in timers if not _follows_sim_time(timer)
-        ]
+        # Actions, or a user's own entities. Who sends them something is not known.
+        self._has_actions = any(
+            not isinstance(waitable, EventHandler)
+            for node in self._served
+            for waitable in node.waitables
+        )
+        self._timers.update(self._served)
 
 
 def _nothing() -> None:
     """Do nothing, as a task."""
-
-
-def _follows_sim_time(timer: Timer) -> bool:
-    clock = timer.clock
-    return clock.clock_type == ClockType.ROS_TIME and bool(clock.ros_time_is_active)
 
 
 def _is_destroyed(node: Node) -> bool:
@@ -279,12 +276,3 @@ def _is_destroyed(node: Node) -> bool:
     except InvalidHandle:
         return True
     return False
-
-
-def _is_due(handle: TimerHandle) -> bool:
-    try:
-        left = handle.time_until_next_call()
-    except RCLError:
-        # A callback has destroyed the timer.
-        return False
-    return left is not None and left <= 0

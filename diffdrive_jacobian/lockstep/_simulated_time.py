@@ -55,6 +55,12 @@ class SimulatedTime:
         with self._watched():
             self._until_next = self._executor.settle()
 
+    def _catch_up(self) -> None:
+        """Execute what was caused since the last callback."""
+        self._check_open()
+        with self._watched():
+            self._until_next = self._executor.catch_up()
+
     def step(self, at_most: float | None = None) -> None:
         """Advance to the time at which the next timer expires.
 
@@ -66,7 +72,7 @@ class SimulatedTime:
             LockstepError: No timer is running and `at_most` is not given, or time cannot advance.
         """
         end = math.inf if at_most is None else self._now + checked_nanoseconds('at_most', at_most)
-        self.settle()
+        self._catch_up()
         if self._until_next is None and at_most is None:
             raise LockstepError('no timer is running, so step needs at_most')
         self._advance(end)
@@ -104,7 +110,7 @@ class SimulatedTime:
                     f'not within {timeout:g} s of simulated time: {what}\n{self.report()}'
                 )
             # The condition may have published something.
-            self.settle()
+            self._catch_up()
             self._advance(end)
 
     def jump(self, seconds: float) -> None:
@@ -136,8 +142,7 @@ class SimulatedTime:
     def _publish_clock(self) -> None:
         set_time(self._clock.clock, self._now)
         with self._watched():
-            self._executor.set_time(self._clock)
-            self._until_next = self._executor.settle(after=True)
+            self._until_next = self._executor.advance(self._clock)
 
     @contextmanager
     def _watched(self) -> Iterator[None]:

@@ -1,0 +1,61 @@
+"""The timers of the nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from rclpy.timer import Timer
+
+from diffdrive_jacobian.ros.rclpy_internals import RCLError, TimerHandle, timer_handle
+
+
+class Timers:
+    """The timers of the nodes, in the order of their creation."""
+
+    def __init__(self) -> None:
+        """Start without timers."""
+        # With their handles, whose methods take a third of the time of those of the timers.
+        self._sim_timers: list[tuple[TimerHandle, Timer]] = []
+        self._wall_timers: list[tuple[TimerHandle, Timer]] = []
+
+    def update(self, nodes: Iterable[Node]) -> None:
+        """Find the timers of the nodes."""
+        timers = [(timer_handle(timer), timer) for node in nodes for timer in node.timers]
+        self._sim_timers = [pair for pair in timers if _follows_sim_time(pair[1])]
+        self._wall_timers = [pair for pair in timers if not _follows_sim_time(pair[1])]
+
+    def due(self) -> tuple[list[tuple[TimerHandle, Timer]], int | None]:
+        """Return the due timers, the most overdue first, and the time until the next one (ns)."""
+        due, until_next = [], None
+        for pair in self._sim_timers:
+            left = pair[0].time_until_next_call()
+            if left is None:
+                continue
+            if left <= 0:
+                due.append((left, pair))
+            elif until_next is None or left < until_next:
+                until_next = left
+        for pair in self._wall_timers:
+            left = pair[0].time_until_next_call()
+            if left is not None and left <= 0:
+                due.append((left, pair))
+        # Sorting is stable: timers that are due at the same time stay in the order of their creation.
+        due.sort(key=lambda item: item[0])
+        return [pair for _, pair in due], until_next
+
+
+def is_due(handle: TimerHandle) -> bool:
+    """Return whether a timer is due."""
+    try:
+        left = handle.time_until_next_call()
+    except RCLError:
+        # A callback has destroyed the timer.
+        return False
+    return left is not None and left <= 0
+
+
+def _follows_sim_time(timer: Timer) -> bool:
+    clock = timer.clock
+    return clock.clock_type == ClockType.ROS_TIME and bool(clock.ros_time_is_active)
