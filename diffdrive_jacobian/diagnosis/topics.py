@@ -156,7 +156,13 @@ def _check_number_of_publishers(graph: Graph, topic: str) -> Iterator[Finding]:
 
 
 def _check_missing(graph: Graph, topic: str) -> Iterator[Finding]:
-    publishers, subscriptions = graph.publishers(topic), graph.subscriptions(topic)
+    publishers = graph.publishers(topic)
+    # A node that listens to what it publishes itself, as go_to_goal may, does not act on it.
+    subscriptions = [
+        one
+        for one in graph.subscriptions(topic)
+        if one.node not in {publisher.node for publisher in publishers}
+    ]
     name = base_name(topic)
     if topic in INTERNAL:
         return

@@ -9,6 +9,7 @@ each, so that a release of rclpy that differs fails there first. Tried with rclp
 
 from __future__ import annotations
 
+import inspect
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import redirect_stderr
@@ -221,6 +222,26 @@ def waiting_messages(subscription: Subscription) -> Iterator[tuple[bytes, dict[s
     with handle:
         while (taken := handle.take_message(message_type, True)) is not None:
             yield taken
+
+
+def with_message_info(
+    callback: Callable[[bytes, Mapping[str, Any]], None],
+) -> Callable[..., None]:
+    """Return a callback for a raw subscription that receives the message and its info.
+
+    Relies on `Subscription.callback` deciding by the signature whether the info is passed, and on the
+    executors: the SingleThreadedExecutor passes two arguments, the EventsExecutor of Jazzy one tuple.
+    """
+
+    def received(data: Any, info: Mapping[str, Any] | None = None) -> None:
+        if info is None:
+            data, info = data
+        callback(data, info)
+
+    kind = inspect.Parameter.POSITIONAL_ONLY
+    parameters = [inspect.Parameter(name, kind) for name in ('data', 'info')]
+    vars(received)['__signature__'] = inspect.Signature(parameters)
+    return received
 
 
 # --- Executors
