@@ -256,13 +256,15 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._cmd_vel.publish(command)
 
     def _on_other_driver(self, names: str) -> None:
-        """Cancel the goal: whoever drives by hand takes over. A zero would stop the other's motion."""
-        self._driving = False
+        """Cancel the goal and stop the robot: whoever drives by hand takes over.
+
+        Without the zero the robot might follow the last command of this node, not of the other one.
+        """
         topic = self._cmd_vel.topic_name
         self.log_event_warning(
             'other driver',
-            f'{names} drives the robot by {topic}, so the goal is canceled; to drive to goals, stop it, '
-            'or remap its topic',
+            f'{names} drives the robot by {topic}, so the goal is canceled: send it again when the other '
+            'one has stopped, or remap its topic',
         )
         self._end(GoalStatus.STATUS_CANCELED, 'canceled')
 
