@@ -195,6 +195,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         if goal is None:
             return
         self._watchdog.feed(now)
+        self._others.search(now)
         if not goal.executing and not self._begin(goal):
             return
         if goal.stale:
@@ -263,8 +264,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         topic = self._cmd_vel.topic_name
         self.log_event_warning(
             'other driver',
-            f'{names} drives the robot by {topic}, so the goal is canceled: send it again when the other '
-            'one has stopped, or remap its topic',
+            f'{names} drives the robot by {topic}, so the goal is canceled: send it again later, or '
+            'remap the topic of the other one',
         )
         self._end(GoalStatus.STATUS_CANCELED, 'canceled')
 

@@ -14,8 +14,8 @@ from diffdrive_jacobian.messages.conversion import MessageError, from_twist_valu
 from diffdrive_jacobian.ros.graph_faults import publishers_of
 from diffdrive_jacobian.ros.serialization import reader
 
-PERIOD = 1.0
-"""Time between two searches for other publishers (s)."""
+PERIOD = 1_000_000_000
+"""Shortest time between two searches for other publishers (ns)."""
 REMEMBERED = 64
 """Number of own commands that are remembered. At most as many as the queue is long arrive later."""
 
@@ -46,8 +46,7 @@ class OtherDrivers:
         stamped = len(wire.TWIST_STAMPED) - len(wire.TWIST)
         self._skipped = stamped if kind.__name__ == 'TwistStamped' else 0
         self._read = reader(kind, wire.TWIST_STAMPED if self._skipped else wire.TWIST)
-        # On the time of the node, so that simulated runs are repeatable.
-        self._timer = node.create_timer(PERIOD, self._search, autostart=False)
+        self._searched = 0
 
     @property
     def subscriptions(self) -> int:
@@ -55,19 +54,26 @@ class OtherDrivers:
         return int(self._subscribed)
 
     def start(self) -> None:
-        """Search for other drivers from now on."""
+        """Search for other drivers, now and in `search`."""
         self._active = True
         self._search()
-        self._timer.reset()
 
     def stop(self) -> None:
         """Ignore other drivers from now on."""
         self._active = False
-        self._timer.cancel()
 
     def sent(self, command: bytes) -> None:
         """Remember a command of the node itself."""
         self._sent.append(command)
+
+    def search(self, now: int) -> None:
+        """Search for other drivers if that is due at a time of the node (ns).
+
+        It is called for each odometry. With a timer a simulated run would take longer.
+        """
+        if not 0 <= now - self._searched < PERIOD:
+            self._searched = now
+            self._search()
 
     def _search(self) -> None:
         topic = self._publisher.topic_name

@@ -28,7 +28,7 @@ Check: TypeAlias = Callable[[], str | None]
 ALTERNATION_PATIENCE = 3
 """Number of checks with alternating commands before that is reported: a driver may take over."""
 MIN_FALLS = 2
-"""Number of falls of the sequence numbers within a second that a restarted publisher does not explain."""
+"""Number of falls of the sequence numbers within a second that no restarted publisher explains."""
 
 
 def unread(publisher: Publisher, own: Callable[[], int] = lambda: 0) -> Check:
