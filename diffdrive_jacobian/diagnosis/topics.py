@@ -25,7 +25,7 @@ START_READER = {
 """What to start where nobody is subscribed to a topic, by its base name."""
 START_PUBLISHER = {
     'odom': 'start virtual_robot or the driver of your robot',
-    'joint_command': 'start wheel_bridge, or use -p command_interface:=cmd_vel',
+    'joint_command': 'start wheel_bridge (or the robot without command_interface:=wheels)',
 }
 """What to start where nobody publishes a topic, by its base name."""
 SAME_NAMES = 'in the same namespace, or remap the topic ({}:=NAME)'
