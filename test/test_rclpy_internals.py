@@ -514,6 +514,24 @@ def _internals_in(path):
     return found
 
 
+def test_a_raw_subscription_receives_the_info_of_messages(ros, executor_kind):
+    """Two publishers count their messages separately."""
+    received = []
+
+    def on_message(data, info):
+        text = deserialize_message(data, String).data
+        received.append((text, info['publication_sequence_number']))
+
+    callback = internals.with_message_info(on_message)
+    ros.peer.create_subscription(String, 'words', callback, 10, raw=True)
+    publishers = [ros.talk(String, 'words') for _ in range(2)]
+    for text in ('a', 'b', 'c'):
+        for publisher in publishers:
+            publisher.publish(String(data=text))
+    ros.until(lambda: len(received) == 6, 'all are received')
+    assert received == [('a', 1), ('a', 1), ('b', 2), ('b', 2), ('c', 3), ('c', 3)]
+
+
 def test_the_search_for_internals_finds_those_of_the_adapter():
     found = _internals_in(PACKAGE / 'ros' / 'rclpy_internals.py')
     assert {'rclpy.impl.implementation_singleton', '_parameters', '_time_source', '_clock_sub'} <= found

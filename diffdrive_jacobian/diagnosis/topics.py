@@ -25,7 +25,7 @@ START_READER = {
 """What to start where nobody is subscribed to a topic, by its base name."""
 START_PUBLISHER = {
     'odom': 'start virtual_robot or the driver of your robot',
-    'joint_command': 'start wheel_bridge, or use -p command_interface:=cmd_vel',
+    'joint_command': 'start wheel_bridge (or the robot without command_interface:=wheels)',
 }
 """What to start where nobody publishes a topic, by its base name."""
 SAME_NAMES = 'in the same namespace, or remap the topic ({}:=NAME)'
@@ -156,7 +156,13 @@ def _check_number_of_publishers(graph: Graph, topic: str) -> Iterator[Finding]:
 
 
 def _check_missing(graph: Graph, topic: str) -> Iterator[Finding]:
-    publishers, subscriptions = graph.publishers(topic), graph.subscriptions(topic)
+    publishers = graph.publishers(topic)
+    # A node that listens to what it publishes itself, as go_to_goal may, does not act on it.
+    subscriptions = [
+        one
+        for one in graph.subscriptions(topic)
+        if one.node not in {publisher.node for publisher in publishers}
+    ]
     name = base_name(topic)
     if topic in INTERNAL:
         return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from action_msgs.msg import GoalInfo, GoalStatus
@@ -13,9 +14,11 @@ from diffdrive_jacobian.control import Arrival, Controller, LawError, saturate
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
-from diffdrive_jacobian.nodes.goal import Goal, goal_info, read_goal
+from diffdrive_jacobian.nodes.goal import Goal, goal_info, pose_fields, read_goal
+from diffdrive_jacobian.nodes.other_drivers import OtherDrivers
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 from diffdrive_jacobian.ros import serialization
+from diffdrive_jacobian.ros.graph_faults import several_publishers, unread
 from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.text import printable
@@ -27,7 +30,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
     `cancel_goal` stops.
 
     While a goal is active, every odometry message is answered by one command; without one the node is
-    silent, so that others may drive.
+    silent, so that others may drive. A command of another node that is not zero cancels the goal.
     """
 
     def __init__(self, *, controller: Controller | None = None, **kwargs: Any) -> None:
@@ -62,7 +65,11 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._stamped_twist = wire.twist_stamped_writer(TwistStamped()) if stamped else None
         self._twist = wire.twist_writer(Twist())
         self._watchdog = Watchdog(self, self._on_stale_odometry)
+        self._others = OtherDrivers(self, self._cmd_vel, self._on_other_driver)
         self._configure()
+        self.watch(unread(self._cmd_vel, lambda: self._others.subscriptions))
+        self.watch(several_publishers(self, 'odom'))
+        self.watch(several_publishers(self, 'goal_status'))
         self.announce(subscribed=['goal_pose', 'goals'], publishing=['cmd_vel'])
 
     @property
@@ -79,6 +86,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
         info = goal_info(message.header.stamp)
+        self._warn_of_integers('goal_pose', [message])
         try:
             goal = Goal(info, *read_goal(message.header.frame_id, [message]))
             self._match_frames(goal)
@@ -98,12 +106,17 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             if count > MAX_WAYPOINTS:
                 raise MessageError(f'goals must contain at most {MAX_WAYPOINTS} poses, got {count}')
             message = serialization.deserialized(data, Goals)
+            self._warn_of_integers('goals', message.goals)
             goal = Goal(info, *read_goal(message.header.frame_id, message.goals))
             self._match_frames(goal)
         except MessageError as error:
             self._refuse(info, error)
             return
         self._accept(goal)
+
+    def _warn_of_integers(self, topic: str, goals: Sequence[PoseStamped]) -> None:
+        for goal in goals:
+            self.warn_of_integers(f'a pose on {topic}', *pose_fields(goal))
 
     def _refuse(self, info: GoalInfo, error: MessageError) -> None:
         """Publish that a goal is aborted. The active goal is kept."""
@@ -121,6 +134,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             # While the robot moves the watchdog runs already, and a new goal is no sign of odometry.
             self._watchdog.start(nanoseconds(self.parameters.odom_timeout))
         self._goal = goal
+        self._others.start()
         self._publish_status(goal.info, GoalStatus.STATUS_ACCEPTED)
         x, y, _ = goal.waypoints.poses[-1]
         count = len(goal.waypoints.poses)
@@ -151,6 +165,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._publish_status(self._goal.info, status)
             self._goal = None
             self._watchdog.stop()
+            self._others.stop()
             self.log_event_info(f'goal {what}', f'goal {what}')
 
     def _publish_status(self, info: GoalInfo, status: int) -> None:
@@ -180,6 +195,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         if goal is None:
             return
         self._watchdog.feed(now)
+        self._others.search(now)
         if not goal.executing and not self._begin(goal):
             return
         if goal.stale:
@@ -234,9 +250,24 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
     def _publish_command(self, v: float, omega: float) -> None:
         self._driving = (v, omega) != (0.0, 0.0)
         if self._stamped_twist is None:
-            self._cmd_vel.publish(self._twist(v, omega))
+            command = self._twist(v, omega)
         else:
-            self._cmd_vel.publish(self._stamped_twist((v, omega), self.now()))
+            command = self._stamped_twist((v, omega), self.now())
+        self._others.sent(command)
+        self._cmd_vel.publish(command)
+
+    def _on_other_driver(self, names: str) -> None:
+        """Cancel the goal and stop the robot: whoever drives by hand takes over.
+
+        Without the zero the robot might follow the last command of this node, not of the other one.
+        """
+        topic = self._cmd_vel.topic_name
+        self.log_event_warning(
+            'other driver',
+            f'{names} drives the robot by {topic}, so the goal is canceled: send it again later, or '
+            'remap the topic of the other one',
+        )
+        self._end(GoalStatus.STATUS_CANCELED, 'canceled')
 
     def stop(self, why: str) -> None:
         """Stop the robot and cancel the goal, if there is one."""

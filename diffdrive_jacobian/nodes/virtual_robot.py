@@ -22,6 +22,7 @@ from rclpy.duration import Duration
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
+from diffdrive_jacobian.diagnosis.lasting import Interleaving
 from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.messages import conversion as messages
@@ -29,6 +30,13 @@ from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.command_time import command_time
 from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
+from diffdrive_jacobian.ros.graph_faults import (
+    ALTERNATION_PATIENCE,
+    alternating_commands,
+    goals_without_controller,
+    several_publishers,
+    unpublished,
+)
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import change_timer_period
 from diffdrive_jacobian.simulation.robot import Robot
@@ -59,14 +67,22 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self._applied = self.advertise(TwistStamped, 'cmd_vel_out')
         self._start_pose = self.advertise(PoseWithCovarianceStamped, 'start_pose', latched=True)
         self._transforms = self._transform_broadcaster() if self.parameters.enable_odom_tf else None
-        source = 'cmd_vel'
+        source, numbers = 'cmd_vel', Interleaving()
+        self._commands = numbers
         if self.parameters.command_interface == 'wheels':
             source = 'joint_command'
-            self.subscribe(JointState, source, self._on_joint_command, fields=wire.JOINT_STATE)
+            wheels = self.subscribe(
+                JointState, source, self._on_joint_command, fields=wire.JOINT_STATE, numbers=numbers
+            )
+            self.watch(unpublished(wheels, self.count_publishers))
         elif self.parameters.enable_stamped_cmd_vel:
-            self.subscribe(TwistStamped, source, self._on_twist_stamped, fields=wire.TWIST_STAMPED)
+            fields = wire.TWIST_STAMPED
+            self.subscribe(TwistStamped, source, self._on_twist_stamped, fields=fields, numbers=numbers)
         else:
-            self.subscribe(Twist, source, self._on_twist, fields=wire.TWIST)
+            self.subscribe(Twist, source, self._on_twist, fields=wire.TWIST, numbers=numbers)
+        self.watch(alternating_commands(self, source, numbers), ALTERNATION_PATIENCE)
+        self.watch(several_publishers(self, 'odom'))
+        self.watch(goals_without_controller(self, 'goal_pose', 'goals'))
         self.subscribe(PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose)
         self.provide(Trigger, 'reset_odometry', self._on_reset)
         self._timer = self.create_timer(1.0 / self.parameters.publish_rate, self._on_tick)
@@ -181,6 +197,9 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         except MessageError as error:
             self.get_logger().warning(f'command dropped: {error}', throttle_duration_sec=THROTTLE)
             return
+        if twist[0] or twist[1]:
+            self._commands.count()
+            self.warn_of_integers('a command', *twist)
         self._robot = robot.commanded(twist, time)
         self._publish_applied(self._robot)
 

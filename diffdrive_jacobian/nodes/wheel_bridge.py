@@ -8,12 +8,14 @@ from geometry_msgs.msg import Twist, TwistStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
+from diffdrive_jacobian.diagnosis.lasting import Interleaving
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.command_time import command_time
 from diffdrive_jacobian.parameters.nodes import WheelBridgeParameters
+from diffdrive_jacobian.ros.graph_faults import ALTERNATION_PATIENCE, alternating_commands, unread
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.time_units import nanoseconds
@@ -35,10 +37,16 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
             JointState if as_joints else Float64MultiArray, 'joint_command'
         )
         self._configure()
+        self._commands = numbers = Interleaving()
         if parameters.enable_stamped_cmd_vel:
-            self.subscribe(TwistStamped, 'cmd_vel', self._on_twist_stamped, fields=wire.TWIST_STAMPED)
+            fields = wire.TWIST_STAMPED
+            self.subscribe(
+                TwistStamped, 'cmd_vel', self._on_twist_stamped, fields=fields, numbers=numbers
+            )
         else:
-            self.subscribe(Twist, 'cmd_vel', self._on_twist, fields=wire.TWIST)
+            self.subscribe(Twist, 'cmd_vel', self._on_twist, fields=wire.TWIST, numbers=numbers)
+        self.watch(unread(self._joint_command))
+        self.watch(alternating_commands(self, 'cmd_vel', numbers), ALTERNATION_PATIENCE)
         self._last = 0
         self._moving = False
         self._watchdog = Watchdog(self, self._on_silence)
@@ -65,6 +73,9 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
             self.get_logger().warning(f'command dropped: {error}', throttle_duration_sec=THROTTLE)
             return
         self._watchdog.feed(now)
+        if v or omega:
+            self._commands.count()
+            self.warn_of_integers('a command on cmd_vel', v, omega)
         self._publish(self._wheel_speeds(v, omega), self._last)
 
     def _wheel_speeds(self, v: float, omega: float) -> tuple[Any, Any]:

@@ -1,21 +1,19 @@
 """Base class of the nodes: its parameters are one value, and it reports silent failures.
 
 ROS reports neither a topic whose publisher and subscription differ in type, nor simulated time for which
-nobody publishes /clock. Nodes check for both once a second of wall time, and report each once.
+nobody publishes /clock, nor a node that was forgotten. Nodes check for that once a second of wall time,
+and report each once.
 """
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Generic, TypeVar
-from weakref import WeakKeyDictionary
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -25,7 +23,9 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 
+from diffdrive_jacobian.diagnosis.lasting import Interleaving, LastingFault
 from diffdrive_jacobian.messages.cdr import DecodingError
+from diffdrive_jacobian.messages.integers import integer_warning
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, changed
 from diffdrive_jacobian.ros import parameters as ros_parameters
 from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
@@ -34,7 +34,7 @@ from diffdrive_jacobian.ros.rate_limit import RateLimit
 from diffdrive_jacobian.ros.rclpy_internals import time_reader
 from diffdrive_jacobian.ros.serialization import decoding
 from diffdrive_jacobian.ros.topic_errors import explaining_failure, type_name
-from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.ros.type_mismatches import TypeMismatches
 
 P = TypeVar('P', bound=NodeParameters)
 
@@ -48,8 +48,8 @@ WATCH_PERIOD = 1.0
 """Period of the checks of the graph and of the clock (s)."""
 CLOCK_PATIENCE = 5
 """Number of checks without a message on /clock before that is reported."""
-NAME_PATIENCE = 3
-"""Number of checks for the name of a node before it is reported without one."""
+FAULT_PATIENCE = 5
+"""Number of checks with a fault of the graph before it is reported: nodes may start in any order."""
 NO_CLOCK = 'simulated time has not started, nothing was received on /clock'
 """Why a node with `use_sim_time` drops a message."""
 
@@ -83,10 +83,9 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         self.add_pre_set_parameters_callback(self._convert_parameters)
         self.add_on_set_parameters_callback(self._validate_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
-        self._topics: list[tuple[str, str, bool]] = []
-        self._mismatches: dict[tuple[str, str, str], int] = {}
-        self._reported: set[tuple[str, str, str]] = set()
+        self._types = TypeMismatches(self)
         self._checks_without_clock = 0
+        self._faults: list[tuple[LastingFault, Callable[[], str | None]]] = []
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(WATCH_PERIOD, self._check_graph, clock=steady)
 
@@ -101,7 +100,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         Raises:
             ParameterError: The topic has another type in this process, or `qos_overrides` are invalid.
         """
-        self._topics.append((topic, type_name(message), False))
+        self._types.add(topic, type_name(message), subscribed=False)
         profile = QoSProfile(depth=10)
         if latched:
             profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
@@ -121,6 +120,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         *,
         fields: Sequence[str] | None = None,
         raw: bool = False,
+        numbers: Interleaving | None = None,
     ) -> Subscription:
         """Create a subscription with reliable QoS, keep last 10.
 
@@ -133,6 +133,8 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
             fields: Paths of the fields that the callback receives instead, one argument each, as
                 `messages.cdr.Reader` returns them. A message object takes several times as long.
             raw: Whether the callback receives the serialized bytes.
+            numbers: Receives the sequence number of each message before the callback is called. Not
+                with `raw`.
 
         Raises:
             ParameterError: As for `advertise`.
@@ -141,12 +143,12 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         def dropped(error: DecodingError) -> None:
             self.get_logger().warning(f'{topic} dropped: {error}', throttle_duration_sec=THROTTLE)
 
-        self._topics.append((topic, type_name(message), True))
+        self._types.add(topic, type_name(message), subscribed=True)
         with explaining_failure(self, message, topic):
             return self.create_subscription(
                 message,
                 topic,
-                callback if raw else decoding(message, fields, callback, dropped),
+                callback if raw else decoding(message, fields, callback, dropped, numbers),
                 QoSProfile(depth=10),
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
                 raw=True,
@@ -161,6 +163,25 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         # create_service raises UnboundLocalError for an invalid name.
         self.resolve_service_name(name)
         return self.create_service(service, name, callback)
+
+    def watch(self, check: Callable[[], str | None], patience: int = FAULT_PATIENCE) -> None:
+        """Check for a fault once a second of wall time, and warn when it has lasted.
+
+        Args:
+            check: Returns a description of the fault with its remedy. None: there is none.
+            patience: Number of consecutive checks with the same fault before it is reported.
+        """
+        self._faults.append((LastingFault(patience), check))
+
+    def warn_of_integers(self, what: str, *values: float) -> None:
+        """Warn, throttled, if a value is an integer that was assigned to a field of floats.
+
+        Args:
+            what: What has the values.
+            values: The values of the fields.
+        """
+        if warning := integer_warning(what, *values):
+            self.get_logger().warning(warning, throttle_duration_sec=THROTTLE)
 
     def log_event_info(self, event: str, text: str) -> None:
         """Log an event at level info, at a limited rate.
@@ -219,41 +240,10 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
 
     def _check_graph(self) -> None:
         self._check_clock()
-        mismatches: dict[tuple[str, str, str], int] = {}
-        types = _topic_types(self)
-        for topic, wanted, subscribed in self._topics:
-            name = self.resolve_topic_name(topic)
-            if types.get(name) == [wanted]:
-                continue
-            endpoints = (
-                self.get_publishers_info_by_topic if subscribed else self.get_subscriptions_info_by_topic
-            )
-            for other in endpoints(name):
-                mismatch = (name, wanted, other.topic_type)
-                if other.topic_type == wanted or mismatch in mismatches:
-                    continue
-                mismatches[mismatch] = self._mismatches.get(mismatch, 0) + 1
-                # The name of a node may be discovered later than its topics.
-                named = not other.node_name.startswith('_') or mismatches[mismatch] == NAME_PATIENCE
-                if named and mismatch not in self._reported:
-                    self._reported.add(mismatch)
-                    self._report_mismatch(mismatch, other, subscribed)
-        self._mismatches = mismatches
-        self._reported &= mismatches.keys()
-
-    def _report_mismatch(self, mismatch: tuple[str, str, str], other: Any, subscribed: bool) -> None:
-        name, wanted, theirs = mismatch
-        node = printable(f'{other.node_namespace.rstrip("/")}/{other.node_name}')
-        they_do, this_does = (
-            ('publishes', 'subscribes to') if subscribed else ('subscribes to', 'publishes')
-        )
-        hint = ''
-        if 'Twist' in wanted and 'Twist' in theirs:
-            hint = '; enable_stamped_cmd_vel selects Twist or TwistStamped'
-        self.get_logger().error(
-            f'{node} {they_do} {name} as {printable(theirs)}, but this node {this_does} it as {wanted}: '
-            f'no message will arrive{hint}'
-        )
+        for fault, check in self._faults:
+            if report := fault.check(check()):
+                self.get_logger().warning(report)
+        self._types.check()
 
     def _check_clock(self) -> None:
         if self.now() != 0:
@@ -267,20 +257,3 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
                 f'use_sim_time is true, but nothing came on /clock for {CLOCK_PATIENCE} s: this node '
                 'does nothing until it does; publish /clock or set use_sim_time to false'
             )
-
-
-def _topic_types(node: Node) -> dict[str, list[str]]:
-    """Return the types of all topics in the graph, by name.
-
-    The nodes of a context share the result. A query takes time proportional to the number of topics, so
-    with many nodes in a process the queries would cost more than the nodes.
-    """
-    now = time.monotonic()
-    queried, types = _topic_types_of.get(node.context, (-math.inf, {}))
-    if now - queried > WATCH_PERIOD / 2:
-        types = dict(node.get_topic_names_and_types())
-        _topic_types_of[node.context] = now, types
-    return types
-
-
-_topic_types_of: WeakKeyDictionary[Context, tuple[float, dict[str, list[str]]]] = WeakKeyDictionary()

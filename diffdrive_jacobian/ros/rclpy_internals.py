@@ -296,6 +296,26 @@ def waiting_messages(subscription: Subscription) -> Iterator[tuple[bytes, dict[s
             yield taken
 
 
+def with_message_info(
+    callback: Callable[[bytes, Mapping[str, Any]], None],
+) -> Callable[..., None]:
+    """Return a callback for a raw subscription that receives the message and its info.
+
+    Relies on `Subscription.callback` deciding by the signature whether the info is passed, and on the
+    executors: the SingleThreadedExecutor passes two arguments, the EventsExecutor of Jazzy one tuple.
+    """
+
+    def received(data: Any, info: Mapping[str, Any] | None = None) -> None:
+        if info is None:
+            data, info = data
+        callback(data, info)
+
+    kind = inspect.Parameter.POSITIONAL_ONLY
+    parameters = [inspect.Parameter(name, kind) for name in ('data', 'info')]
+    vars(received)['__signature__'] = inspect.Signature(parameters)
+    return received
+
+
 # --- Executors
 
 

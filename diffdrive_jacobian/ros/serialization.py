@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from builtin_interfaces.msg import Time
 from nav_msgs.msg import Goals
 from rclpy.serialization import deserialize_message
 
+from diffdrive_jacobian.diagnosis.lasting import Interleaving
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader
 from diffdrive_jacobian.messages.wire import GOALS
+from diffdrive_jacobian.ros.rclpy_internals import with_message_info
 
 T = TypeVar('T')
 
@@ -40,7 +42,8 @@ def decoding(
     fields: Sequence[str] | None,
     callback: Callable[..., None],
     refused: Callable[[DecodingError], None],
-) -> Callable[[bytes], None]:
+    numbers: Interleaving | None = None,
+) -> Callable[..., None]:
     """Return a callback for serialized messages.
 
     Args:
@@ -48,6 +51,7 @@ def decoding(
         fields: Paths of the fields that are read; None: the message as a whole.
         callback: Called with the fields, one argument each, or with the message.
         refused: Called instead if the bytes are not a message of this type.
+        numbers: Receives the sequence number of each message.
     """
     read: Callable[[bytes], tuple[Any, ...]] = (
         (lambda data: (deserialized(data, message_type),))
@@ -63,9 +67,18 @@ def decoding(
             return
         callback(*values)
 
+    chosen: Callable[..., None] = decode
+    if numbers is not None:
+
+        def decode_numbered(data: bytes, info: Mapping[str, Any]) -> None:
+            # None where the middleware does not number messages.
+            numbers.number = info.get('publication_sequence_number')
+            decode(data)
+
+        chosen = with_message_info(decode_numbered)
     # Reports name a callback.
-    decode.__qualname__ = getattr(callback, '__qualname__', decode.__qualname__)
-    return decode
+    chosen.__qualname__ = getattr(callback, '__qualname__', chosen.__qualname__)
+    return chosen
 
 
 _read_goals = reader(Goals, GOALS, whole=False)

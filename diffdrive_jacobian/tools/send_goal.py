@@ -128,7 +128,7 @@ def _end(result: GoalResult) -> str:
 def _hint(result: GoalResult) -> str:
     return {
         'aborted': " (the controller's log says why)",
-        'canceled': ' (by another process, or replaced by another goal)',
+        'canceled': ' (by another process, by commands of another node, or replaced by another goal)',
     }.get(_end(result), '')
 
 

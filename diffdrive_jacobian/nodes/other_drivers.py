@@ -1,0 +1,97 @@
+"""Commands of other nodes while this one drives a robot."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+
+from diffdrive_jacobian.messages import wire
+from diffdrive_jacobian.messages.cdr import DecodingError
+from diffdrive_jacobian.messages.conversion import MessageError, from_twist_values
+from diffdrive_jacobian.ros.graph_faults import publishers_of
+from diffdrive_jacobian.ros.serialization import reader
+
+PERIOD = 1_000_000_000
+"""Shortest time between two searches for other publishers (ns)."""
+REMEMBERED = 64
+"""Number of own commands that are remembered. At most as many as the queue is long arrive later."""
+
+
+class OtherDrivers:
+    """Calls a function when another node sends a command that is not zero.
+
+    It is subscribed to the commands only once another node publishes them, and while it is active. So
+    its usual cost is that of remembering a command.
+    """
+
+    def __init__(self, node: Node, publisher: Publisher, callback: Callable[[str], None]) -> None:
+        """Start inactive.
+
+        Args:
+            node: The node.
+            publisher: Its publisher of commands, Twist or TwistStamped.
+            callback: Receives the names of the other nodes that publish commands.
+        """
+        self._node = node
+        self._publisher = publisher
+        self._callback = callback
+        self._active = False
+        self._subscribed = False
+        # Serialized, as they arrive again.
+        self._sent: deque[bytes] = deque(maxlen=REMEMBERED)
+        kind = publisher.msg_type
+        stamped = len(wire.TWIST_STAMPED) - len(wire.TWIST)
+        self._skipped = stamped if kind.__name__ == 'TwistStamped' else 0
+        self._read = reader(kind, wire.TWIST_STAMPED if self._skipped else wire.TWIST)
+        self._searched = 0
+
+    @property
+    def subscriptions(self) -> int:
+        """Number of subscriptions to the commands that belong to the node itself."""
+        return int(self._subscribed)
+
+    def start(self) -> None:
+        """Search for other drivers, now and in `search`."""
+        self._active = True
+        self._search()
+
+    def stop(self) -> None:
+        """Ignore other drivers from now on."""
+        self._active = False
+
+    def sent(self, command: bytes) -> None:
+        """Remember a command of the node itself."""
+        self._sent.append(command)
+
+    def search(self, now: int) -> None:
+        """Search for other drivers if that is due at a time of the node (ns).
+
+        It is called for each odometry. With a timer a simulated run would take longer.
+        """
+        if not 0 <= now - self._searched < PERIOD:
+            self._searched = now
+            self._search()
+
+    def _search(self) -> None:
+        topic = self._publisher.topic_name
+        if self._subscribed or self._node.count_publishers(topic) < 2:
+            return
+        self._subscribed = True
+        kind = self._publisher.msg_type
+        self._node.create_subscription(kind, topic, self._on_command, 10, raw=True)
+
+    def _on_command(self, data: bytes) -> None:
+        if not self._active or data in self._sent:
+            return
+        try:
+            v, omega = from_twist_values(*self._read(data)[self._skipped :])
+        except (DecodingError, MessageError):
+            # The robot drops it as well.
+            return
+        # A joystick that nobody touches may send zeros.
+        if v or omega:
+            names = publishers_of(self._node, self._publisher.topic_name, others=True)
+            self._callback(' or '.join(names) or 'another node')

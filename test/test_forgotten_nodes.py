@@ -1,0 +1,303 @@
+"""What is silent in ROS is said: forgotten nodes, several publishers, driving by hand, integers."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from lockstep_nodes import ACCEPTED, CANCELED, EXECUTING, SUCCEEDED, Controller, Topics, make
+from nav_msgs.msg import Goals, Odometry
+from rclpy.serialization import serialize_message
+from ros_messages import goal, goals, odometry, twist, twists
+from sensor_msgs.msg import JointState
+
+from diffdrive_jacobian.diagnosis.lasting import Interleaving, LastingFault
+from diffdrive_jacobian.messages.integers import integer_warning
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.ros.node import FAULT_PATIENCE
+
+INTEGER = 5e-324
+
+
+def check(node, times=FAULT_PATIENCE):
+    """Let a node check the graph, as its timer does once a second."""
+    for _ in range(times):
+        node._check_graph()
+
+
+def said(capfd):
+    return capfd.readouterr().err
+
+
+@pytest.fixture
+def node(lockstep):
+    """Another node, and a way to create publishers and subscriptions of it."""
+    return lockstep.node
+
+
+# --- Faults
+
+
+def test_a_fault_is_reported_once_after_it_has_lasted_and_again_after_it_was_gone():
+    fault = LastingFault(3)
+    present = ['a'] * 5 + [None] + ['a'] * 4 + ['b'] * 2 + ['a'] * 2 + ['b'] * 3
+    reports = [fault.check(one) for one in present]
+    assert [(index, one) for index, one in enumerate(reports) if one] == [(2, 'a'), (8, 'a'), (16, 'b')]
+
+
+def test_alternating_publishers_are_told_by_their_sequence_numbers():
+    def falls(*numbers):
+        commands = Interleaving()
+        for commands.number in numbers:
+            commands.count()
+        found = commands.falls()
+        assert commands.falls() == 0
+        return found
+
+    assert falls() == falls(1, 2, 3, 5, 90) == 0
+    # A publisher that was restarted.
+    assert falls(7, 8, 1, 2, 3) == 1
+    assert falls(1, 1, 2, 2, 3, 3) == 3
+    assert falls(1000, 4, 1001, 5, 1002, 6) == 3
+    # Middleware without sequence numbers.
+    assert falls(None, None) == 0
+
+
+@pytest.mark.parametrize(
+    ('value', 'integer'),
+    [
+        (INTEGER, True),
+        (-INTEGER, True),
+        (4.9e-323, True),
+        (0.0, False),
+        (1.0, False),
+        (1e-300, False),
+        (float('nan'), False),
+    ],
+)
+def test_integers_in_fields_of_floats_are_told(value, integer):
+    assert (integer_warning('it', 0.0, value) is not None) == integer
+
+
+# --- Forgotten nodes
+
+
+def test_a_controller_whose_commands_nobody_reads_says_so_once(lockstep, add, capfd):
+    controller = add(GoToGoal)
+    check(controller, FAULT_PATIENCE - 1)
+    assert 'no node is subscribed' not in said(capfd)
+    check(controller, 3 * FAULT_PATIENCE)
+    text = said(capfd)
+    assert text.count('no node is subscribed to /cmd_vel: start virtual_robot') == 1
+    assert 'in the same namespace, or remap the topic (cmd_vel:=NAME)' in text
+    commands = lockstep.listen(Twist, 'cmd_vel')
+    check(controller)
+    assert commands == []
+    assert said(capfd) == ''
+
+
+def test_a_bridge_whose_wheels_nobody_drives_says_so(add, capfd):
+    check(add(WheelBridge))
+    assert 'no node is subscribed to /joint_command: start virtual_robot with' in said(capfd)
+
+
+def test_a_robot_without_its_bridge_says_so(add, capfd):
+    check(add(VirtualRobot, command_interface='wheels'))
+    assert 'no node publishes /joint_command: start wheel_bridge' in said(capfd)
+
+
+def test_two_robots_on_one_odom_are_named(add, node, capfd):
+    robot, controller = add(VirtualRobot), add(GoToGoal)
+    check(robot)
+    check(controller)
+    assert 'publish /odom' not in said(capfd)
+    node.create_publisher(Odometry, 'odom', 10)
+    names = f'{node.get_fully_qualified_name()} and /virtual_robot'
+    for one in (robot, controller):
+        check(one, 2 * FAULT_PATIENCE)
+        assert said(capfd).count(f'{names} publish /odom: their poses alternate') == 1
+
+
+def test_two_controllers_of_one_robot_are_named(add, node, capfd):
+    controller = add(GoToGoal)
+    node.create_publisher(GoalStatus, 'goal_status', 10)
+    check(controller)
+    names = f'/go_to_goal and {node.get_fully_qualified_name()}'
+    assert f'{names} publish /goal_status: two controllers' in said(capfd)
+
+
+def test_goals_without_a_controller_are_reported_by_the_robot(lockstep, add, node, capfd):
+    robot = add(VirtualRobot)
+    publisher = node.create_publisher(PoseStamped, 'goal_pose', 10)
+    check(robot)
+    text = said(capfd)
+    assert f'{node.get_fully_qualified_name()} publishes /goal_pose, but no controller is' in text
+    assert 'start go_to_goal' in text
+    add(GoToGoal)
+    check(robot, 2 * FAULT_PATIENCE)
+    assert 'no controller' not in said(capfd)
+    node.destroy_publisher(publisher)
+
+
+def test_nothing_is_reported_of_a_complete_team(lockstep, team, capfd):
+    lockstep.publish('goals', goals(goal(0.2, 0.0)))
+    lockstep.run_until(lambda: team.statuses[-1:] == [SUCCEEDED], 30.0, 'arrival')
+    for one in (team.robot, team.bridge, team.controller):
+        check(one, 2 * FAULT_PATIENCE)
+    assert '[WARN]' not in said(capfd)
+
+
+# --- Several drivers
+
+
+@pytest.mark.parametrize('node_class', [VirtualRobot, WheelBridge])
+@pytest.mark.parametrize('stamped', [False, True])
+def test_alternating_commands_are_reported_and_zeros_are_not(
+    lockstep, add, node, capfd, node_class, stamped
+):
+    driven = add(node_class, enable_stamped_cmd_vel=stamped)
+    lockstep.listen(JointState, 'joint_command')
+    kind = TwistStamped if stamped else Twist
+    drivers = [node.create_publisher(kind, 'cmd_vel', 10) for _ in range(2)]
+
+    def drive(*speeds):
+        for _ in range(4):
+            for publisher, speed in zip(drivers, speeds, strict=True):
+                publisher.publish(
+                    TwistStamped(twist=twist(speed, 0.0)) if stamped else twist(speed, 0.0)
+                )
+        lockstep.run_for(0.1)
+        check(driven, 1)
+
+    for _ in range(5):
+        drive(0.5, 0.0)
+    assert 'alternate' not in said(capfd)
+    for _ in range(5):
+        drive(0.5, 0.3)
+    text = said(capfd)
+    assert text.count('publish /cmd_vel, and their commands alternate: stop one of them') == 1
+    assert f'{node.get_fully_qualified_name()} (2 times)' in text
+
+
+def test_driving_by_hand_cancels_the_goal(lockstep, add, node, capfd):
+    team = Topics(lockstep)
+    add(VirtualRobot)
+    add(GoToGoal, linear__x__max_velocity=0.5)
+    lockstep.publish('goals', goals(goal(50.0, 0.0)))
+    lockstep.run_for(0.5)
+    assert team.statuses[-1] == EXECUTING
+    # As of a joystick that nobody touches.
+    joystick = node.create_publisher(Twist, 'cmd_vel', 10)
+    joystick.publish(Twist())
+    lockstep.run_for(1.5)
+    joystick.publish(Twist())
+    lockstep.run_for(0.1)
+    assert team.statuses[-1] == EXECUTING
+    joystick.publish(twist(0.25, 0.0))
+    lockstep.run_for(0.1)
+    assert team.statuses[-1] == CANCELED
+    text = said(capfd)
+    assert f'{node.get_fully_qualified_name()} drives the robot by /cmd_vel, so the goal' in text
+    # Which of both commands came last is unknown, so the robot is stopped, once.
+    assert twists(team.commands)[-1] == (0.0, 0.0)
+    before = len(team.commands)
+    lockstep.run_for(0.2)
+    assert len(team.commands) == before
+    # Without a goal the hand drives.
+    joystick.publish(twist(0.1, 0.0))
+    lockstep.run_for(0.1)
+    assert team.odom[-1].twist.twist.linear.x == 0.1
+    assert 'drives the robot' not in said(capfd)
+
+
+@pytest.mark.parametrize('command', [Twist, TwistStamped])
+def test_a_controller_beside_an_idle_driver_knows_its_own_commands(lockstep, node, command):
+    node.create_publisher(command, 'cmd_vel', 10)
+    stamped = command is TwistStamped
+    controller = Controller(lockstep, command, enable_stamped_cmd_vel=stamped)
+    controller.send(goals(goal(1.0, 0.3)))
+    for step in range(100):
+        controller.at(0.001 * step, 0.0)
+        lockstep.run_for(0.02)
+    assert [status for _, status in controller.statuses] == [ACCEPTED, EXECUTING]
+    assert controller.node._others.subscriptions == 1
+
+
+def test_a_controller_alone_does_not_receive_commands(lockstep, team):
+    lockstep.publish('goals', goals(goal(0.3, 0.0)))
+    lockstep.run_for(2.0)
+    topics = [one.topic_name for one in team.controller.subscriptions]
+    assert '/cmd_vel' not in topics
+
+
+def test_its_own_subscription_is_no_reader_of_a_controller(lockstep, node, add, capfd):
+    node.create_publisher(Twist, 'cmd_vel', 10)
+    controller = add(GoToGoal)
+    node.create_publisher(Odometry, 'odom', 10)
+    lockstep.publish('goals', goals(goal(1.0, 0.0)))
+    assert controller._others.subscriptions == 1
+    check(controller)
+    assert 'no node is subscribed to /cmd_vel' in said(capfd)
+
+
+# --- Integers
+
+
+def integers(message, *values):
+    """Serialize a message with these values in place of 1.0, 2.0, ... in its fields."""
+    data = bytes(serialize_message(message))
+    for number, value in enumerate(values, 1):
+        marker = struct.pack('<d', float(number))
+        assert data.count(marker) == 1
+        data = data.replace(marker, struct.pack('<d', value))
+    return data
+
+
+@pytest.mark.parametrize('node_class', [VirtualRobot, WheelBridge])
+def test_an_integer_as_a_command_is_reported(lockstep, add, node, capfd, node_class):
+    add(node_class)
+    publisher = node.create_publisher(Twist, 'cmd_vel', 10)
+    publisher.publish(twist(0.5, 0.0))
+    lockstep.settle()
+    assert 'was an int' not in said(capfd)
+    publisher.publish(integers(twist(1.0, 0.0), INTEGER))
+    publisher.publish(integers(twist(1.0, 0.0), INTEGER))
+    lockstep.settle()
+    text = said(capfd)
+    assert text.count('has the value 4.94e-324: was an int assigned to a float field?') == 1
+
+
+@pytest.mark.parametrize('kind', [PoseStamped, Goals])
+def test_an_integer_in_a_goal_is_reported_and_taken_as_it_is(lockstep, node, capfd, kind):
+    controller = Controller(lockstep)
+    topic = 'goals' if kind is Goals else 'goal_pose'
+    publisher = node.create_publisher(kind, topic, 10)
+    pose = goal(2.0, 0.0)
+    pose.pose.orientation.z, pose.pose.orientation.w = 0.6, 0.8
+    publisher.publish(integers_of(pose if kind is PoseStamped else goals(pose)))
+    lockstep.settle()
+    assert f'a pose on {topic} has the value 4.94e-324' in said(capfd)
+    assert [status for _, status in controller.statuses] == [ACCEPTED]
+
+
+def integers_of(message):
+    data = bytes(serialize_message(message))
+    marker = struct.pack('<d', 2.0)
+    assert data.count(marker) == 1
+    return data.replace(marker, struct.pack('<d', INTEGER))
+
+
+def test_topics_of_a_controller_that_sees_odometry(lockstep):
+    """The usual pair stays as cheap as it was: nothing is created after the start."""
+    topics = Topics(lockstep)
+    controller = lockstep.add(make(GoToGoal))
+    before = len(list(controller.subscriptions))
+    lockstep.publish('goals', goals(goal(1.0, 0.0)))
+    lockstep.publish('odom', odometry(0.0, 0.0, 0.0))
+    lockstep.run_for(1.5)
+    assert topics.commands
+    assert len(list(controller.subscriptions)) == before
