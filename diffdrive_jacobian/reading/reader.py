@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from diffdrive_jacobian.bags.decoding import (
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.parameter_values import changed_parameters
 from diffdrive_jacobian.reading.rows import PARAMETER_EVENTS, ROW_READERS, SERIES_TOPICS
-from diffdrive_jacobian.reading.run import COLUMNS, Run, Series
+from diffdrive_jacobian.reading.run import COLUMNS, COVARIANCES, Run, Series
 from diffdrive_jacobian.text import printable
 
 __all__ = [
@@ -97,11 +97,17 @@ def read_run(path: str | Path, topics: Mapping[str, str] | None = None) -> Run:
             else:
                 rows[topic].extend((received, stamp or received, values) for stamp, values in read)
         notes = tally.notes(connections)
-    series = {
-        name: _series(_in_order(rows, SERIES_TOPICS[name]), columns) for name, columns in COLUMNS.items()
-    }
+    columns = COLUMNS | {'odometry': COLUMNS['odometry'] + COVARIANCES}
+    series = {name: _series(_in_order(rows, SERIES_TOPICS[name]), columns[name]) for name in columns}
+    count = len(COLUMNS['odometry'])
+    odometry = series['odometry']
+    covariances = odometry.values[:, count:].copy()
+    series['odometry'] = replace(
+        odometry, values=odometry.values[:, :count].copy(), columns=COLUMNS['odometry']
+    )
     return Run(
         path=path,
+        odometry_covariances=covariances,
         parameters=parameters,
         parameter_events=tuple(events),
         skipped=dict(tally.skipped),

@@ -28,7 +28,15 @@ def _twist_stamped(message: Any, _: tuple[str, str]) -> Rows:
 
 def _odometry(message: Any, _: tuple[str, str]) -> Rows:
     pose, twist = from_pose(message.pose.pose), from_twist(message.twist.twist)
-    yield from_time(message.header.stamp), [*pose.tolist(), *twist]
+    of_pose, of_twist = message.pose.covariance, message.twist.covariance
+    yield (
+        from_time(message.header.stamp),
+        [
+            *(*pose.tolist(), *twist),
+            *(of_pose[0], of_pose[1], of_pose[5], of_pose[7], of_pose[11], of_pose[35]),
+            *(of_twist[0], of_twist[5], of_twist[35]),
+        ],
+    )
 
 
 def _pose(message: Any, _: tuple[str, str]) -> Rows:
