@@ -97,17 +97,18 @@ def read_run(path: str | Path, topics: Mapping[str, str] | None = None) -> Run:
             else:
                 rows[topic].extend((received, stamp or received, values) for stamp, values in read)
         notes = tally.notes(connections)
-    columns = COLUMNS | {'odometry': COLUMNS['odometry'] + COVARIANCES}
-    series = {name: _series(_in_order(rows, SERIES_TOPICS[name]), columns[name]) for name in columns}
-    count = len(COLUMNS['odometry'])
-    odometry = series['odometry']
-    covariances = odometry.values[:, count:].copy()
-    series['odometry'] = replace(
-        odometry, values=odometry.values[:, :count].copy(), columns=COLUMNS['odometry']
-    )
+    beside = {'odometry': COVARIANCES, 'start_pose': COVARIANCES[:6]}
+    series, covariances = {}, {}
+    for name, columns in COLUMNS.items():
+        more = beside.get(name, ())
+        one = _series(_in_order(rows, SERIES_TOPICS[name]), columns + more)
+        count = len(columns)
+        covariances[name] = one.values[:, count:].copy()
+        series[name] = replace(one, values=one.values[:, :count].copy(), columns=columns)
     return Run(
         path=path,
-        odometry_covariances=covariances,
+        odometry_covariances=covariances['odometry'],
+        start_covariances=covariances['start_pose'],
         parameters=parameters,
         parameter_events=tuple(events),
         skipped=dict(tally.skipped),
