@@ -115,7 +115,7 @@ def _of_wheels(covariances: Array, breaks: Indices) -> bool:
         return False
     growth = np.diff(covariances[:, COVARIANCES.index('tt')])
     growth[breaks - 1] = 0.0
-    if not (np.all(growth >= 0.0) and np.any(growth > 0.0)):
+    if not (np.all(growth >= 0.0) and np.any(growth > 0.0) and np.any(covariances[:, 8] > 0.0)):
         return False
     try:
         for row in covariances[[0, -1]]:
@@ -138,6 +138,9 @@ def _along(poses: Array, covariances: Array, knots: Indices, wanted: Indices) ->
     """Return the uncertainty at some of the knots."""
     growth = np.diff(covariances[:, 5], prepend=covariances[0, 5])
     rates = covariances[:, 6:] / np.where(covariances[:, 8] > 0.0, covariances[:, 8], np.inf)[:, None]
+    # A robot that has stopped since the message before moved as it did then.
+    stopped = np.flatnonzero(covariances[1:, 8] <= 0.0) + 1
+    rates[stopped] = rates[stopped - 1]
     rates[:, 2] = 1.0
     added = np.cumsum(growth[:, None] * rates, axis=0)
     noise = np.diff(added[knots], axis=0)

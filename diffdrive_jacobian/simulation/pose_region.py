@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 PROBABILITY = 0.95
 ELLIPSE_LEVEL = -2.0 * math.log(1.0 - PROBABILITY)
 """Level of the ellipse that holds 95 % of a Gaussian in the plane: a quantile of chi-squared."""
-RUNS = 4000
+RUNS = 10_000
 """Number of runs that are drawn."""
 _THINNEST = 1e-4
 """Least ratio of the standard deviations of the position at a given heading."""
