@@ -14,7 +14,8 @@ from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
 from diffdrive_jacobian.kinematics.se2 import integrate, wrap_angle
 from diffdrive_jacobian.simulation import Robot, RobotModel
 from diffdrive_jacobian.simulation._uncertainty import MAX_PENDING
-from diffdrive_jacobian.simulation.odometry_noise import propagate_covariance, twist_covariance
+from diffdrive_jacobian.simulation.exact_moments import gaussian, propagate_moments
+from diffdrive_jacobian.simulation.odometry_noise import twist_covariance
 
 SECOND = 1_000_000_000
 LIMITS = VelocityLimits(min_v=-0.1, max_v=0.22, min_omega=-2.0, max_omega=2.0, max_wheel_speed=10.0)
@@ -115,8 +116,9 @@ def test_between_events_the_state_is_one_exact_arc_with_its_covariance():
     there = robot.at(7 + 2 * SECOND)
     assert np.array_equal(there.pose, integrate(START, (0.15, 1.1), 2.0))
     k, separation = HELD.wheel_travel_variance, HELD.wheel_separation
-    expected = propagate_covariance(COVARIANCE, START, (0.15, 1.1), 2.0, separation, k)
-    assert np.array_equal(there.covariance, expected)
+    expected = propagate_moments(gaussian(COVARIANCE), START, (0.15, 1.1), 2.0, separation, k)
+    assert there.moments == expected
+    assert np.array_equal(there.covariance, expected.second_moment)
     expected = twist_covariance((0.15, 1.1), separation, k, 0.02)
     assert np.array_equal(robot.twist_covariance(0.02), expected)
 

@@ -217,10 +217,63 @@ def test_a_million_steps_keep_the_heading_wrapped_and_the_pose_finite():
 # --- Shapes
 
 
+# --- Adjoint and the Jacobians of exp
+
+TWISTS = [
+    [vx, vy, turn]
+    for vx, vy in ((0.0, 0.0), (1.5, -0.7), (100.0, 30.0))
+    for turn in (0.0, 1e-300, 1e-9, -1e-4, 0.3, -0.99, 1.01, 3.1, -6.0, 9.5)
+]
+
+
+@deterministic
+@given(poses, twists, poses)
+def test_the_adjoint_carries_a_motion_into_the_world_and_is_a_homomorphism(pose, twist, other):
+    moved = se2.compose(pose, se2.exp(twist))
+    carried = se2.compose(se2.exp(se2.adjoint(pose) @ twist), pose)
+    scale = size(pose, twist, np.array([np.pi * 1e3, 0.0]))
+    assert_same_pose(carried, moved, 10.0 * scale)
+    product = se2.adjoint(pose) @ se2.adjoint(other)
+    np.testing.assert_allclose(product, se2.adjoint(se2.compose(pose, other)), rtol=0.0, atol=1e-11)
+    back = se2.adjoint(pose) @ se2.adjoint(se2.inverse(pose))
+    np.testing.assert_allclose(back, np.eye(3), rtol=0.0, atol=1e-11)
+
+
+@pytest.mark.parametrize('twist', TWISTS, ids=str)
+def test_the_jacobians_of_exp_are_its_finite_differences(twist):
+    step = 1e-6
+    columns = []
+    for h in step * np.eye(3):
+        ahead, behind = se2.exp(twist + h), se2.exp(twist - h)
+        body = se2.log(se2.compose(se2.inverse(behind), ahead)) / (2.0 * step)
+        columns.append(body)
+    length = 1.0 + math.hypot(twist[0], twist[1])
+    right = se2.right_jacobian(twist)
+    np.testing.assert_allclose(right, np.column_stack(columns), rtol=0.0, atol=3e-9 * length)
+    # Both Jacobians describe one motion, in B and in W.
+    left = se2.left_jacobian(twist)
+    carried = se2.adjoint(se2.exp(twist)) @ right
+    np.testing.assert_allclose(left, carried, rtol=0.0, atol=1e-13 * length)
+    # Along the twist itself both are the identity.
+    np.testing.assert_allclose(left @ twist, twist, rtol=0.0, atol=1e-14 * length * 10.0)
+    np.testing.assert_allclose(right @ twist, twist, rtol=0.0, atol=1e-14 * length * 10.0)
+
+
+@pytest.mark.parametrize('turn', [1e-2, 1e-5, 1e-9, 1e-200, 0.0])
+def test_the_jacobians_of_exp_lose_no_digits_near_zero(turn):
+    """The series `J = sum of ad^n / (n + 1)!`, ad the matrix of the Lie bracket."""
+    vx, vy = 2.0, -3.0
+    ad = np.array([[0.0, -turn, vy], [turn, 0.0, -vx], [0.0, 0.0, 0.0]])
+    series = sum(np.linalg.matrix_power(ad, n) / math.factorial(n + 1) for n in range(9))
+    left = se2.left_jacobian([vx, vy, turn])
+    np.testing.assert_allclose(left, series, rtol=1e-14, atol=1e-300)
+
+
 def test_every_function_broadcasts_over_leading_axes():
     rng = np.random.default_rng(2)
     a, b, twist, dt = (rng.normal(size=shape) for shape in [(4, 1, 3), (5, 3), (4, 1, 2), (5,)])
-    unary = (se2.exp, se2.log, se2.inverse, se2.homogeneous)
+    unary = (se2.exp, se2.log, se2.inverse, se2.homogeneous, se2.adjoint)
+    unary += (se2.left_jacobian, se2.right_jacobian)
     held = list(zip(b, dt, strict=True))
     for at_once, looped in [
         *((function(b), [function(row) for row in b]) for function in unary),

@@ -85,27 +85,32 @@ class Arrival:
             ValueError: An argument is not finite, shapes do not broadcast, or the distance overflows.
         """
         if type(x) is type(y) is type(theta) is type(x_goal) is type(y_goal) is float and isfinite(
-            x + y + theta + x_goal + y_goal
+            theta
         ):
-            (distance,) = self._distance(x, y, theta, x_goal, y_goal)
+            # It is not finite if one of the positions or the offset is not.
+            distance = self._distance(x, y, theta, x_goal, y_goal)
             if type(distance) is float and isfinite(distance):
                 return distance
         x, y, theta = operand('x', x), operand('y', y), operand('theta', theta)
         x_goal, y_goal = operand('x_goal', x_goal), operand('y_goal', y_goal)
         single = agree(x=x, y=y, theta=theta, x_goal=x_goal, y_goal=y_goal, offset=self.offset)
         (distance,) = evaluated(
-            single, 'x, y, x_goal, y_goal and offset', self._distance, x, y, theta, x_goal, y_goal
+            single,
+            'x, y, x_goal, y_goal and offset',
+            lambda *arguments: (self._distance(*arguments),),
+            *(x, y, theta, x_goal, y_goal),
         )
         return distance
 
-    def _distance(self, x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any) -> tuple[Any]:
-        if type(self.offset) is not float or self.offset != 0.0:
-            x, y = x + self.offset * cos(theta), y + self.offset * sin(theta)
-        return (hypot(x_goal - x, y_goal - y),)
+    def _distance(self, x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any) -> Any:
+        offset = self.offset
+        if type(offset) is not float or offset != 0.0:
+            x, y = x + offset * cos(theta), y + offset * sin(theta)
+        return hypot(x_goal - x, y_goal - y)
 
     def reached(self, x: float, y: float, theta: float, x_goal: float, y_goal: float) -> bool:
         """Return whether the distance to a goal is within the tolerance, without checks."""
-        return bool(self._distance(x, y, theta, x_goal, y_goal)[0] <= self.xy_tolerance)
+        return bool(self._distance(x, y, theta, x_goal, y_goal) <= self.xy_tolerance)
 
     def faces(self, theta: Any, heading: Any) -> Any:
         """Return whether the robot has the heading of a goal.
@@ -120,10 +125,12 @@ class Arrival:
         Raises:
             ValueError: An argument is not finite, shapes do not broadcast, or the difference overflows.
         """
-        single = type(theta) is type(heading) is float and isfinite(theta + heading)
-        if not single:
-            theta, heading = operand('theta', theta), operand('heading', heading)
-            single = agree(theta=theta, heading=heading)
+        if type(theta) is type(heading) is float and isfinite(theta + heading):
+            error = wrapped(heading - theta)
+            if isfinite(error):
+                return abs(error) <= self.yaw_tolerance
+        theta, heading = operand('theta', theta), operand('heading', heading)
+        single = agree(theta=theta, heading=heading)
         (error,) = evaluated(single, 'theta and heading', _heading_error, theta, heading)
         return abs(error) <= self.yaw_tolerance
 

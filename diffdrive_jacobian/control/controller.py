@@ -22,14 +22,14 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.kinematics._checks import boolean, function, instance, number, positive, short
 
 Law = Callable[..., tuple[Any, Any]]
 """`law(poses, goals, *gains) -> (v, omega)`, as described above."""
-BoundLaw = Callable[[NDArray[np.float64], NDArray[np.float64]], tuple[float, float]]
+BoundLaw = Callable[[ArrayLike, ArrayLike], tuple[float, float]]
 """A law with its gains: one pose, shape (3,), and one goal, shape (3,), to `(v, omega)`."""
 GAINS = ('kp', 'kv', 'offset')
 """Parameters that a law can take."""
@@ -185,20 +185,27 @@ class Controller:
             gains: The gains, such as the parameters of go_to_goal.
 
         Returns:
-            A function of a pose, shape (3,), and a goal, shape (3,), that returns `(v, omega)`. It
-            raises LawError if the law raises an exception or does not return two finite numbers.
+            A function of a pose, shape (3,), and a goal, shape (3,), that returns `(v, omega)`. They
+            are arrays or tuples of floats. It raises LawError if the law raises an exception or does
+            not return two finite numbers.
         """
         law, values, size = self.law, self.values(gains), 3 if self.takes_heading else 2
+        # The laws of this package accept tuples, which take less time. Others may index arrays.
+        accepts_tuples = str(getattr(law, '__module__', '')).startswith(f'{__package__}.')
 
-        def bound(pose: NDArray[np.float64], goal: NDArray[np.float64]) -> tuple[float, float]:
+        def bound(pose: Any, goal: Any) -> tuple[float, float]:
+            if not accepts_tuples:
+                pose, goal = np.asarray(pose), np.asarray(goal)
             try:
-                twist = law(pose, goal[:size], *values)
+                twist = law(pose, goal if len(goal) == size else goal[:size], *values)
             except Exception as error:
                 raise LawError(
                     f'the law of controller {self.name!r} failed: {_reason(error)}'
                 ) from error
             try:
                 v, omega = twist
+                if type(v) is type(omega) is float and math.isfinite(v + omega):
+                    return v, omega
                 v, omega = _number(v), _number(omega)
             except (TypeError, ValueError) as error:
                 raise LawError(

@@ -49,12 +49,23 @@ def go_to_goal(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any) -> tuple[Any
         ValueError: The last axis of state or goal has a wrong length, shapes do not broadcast,
             something is not finite, or the twist overflows.
     """
-    x, y, theta = components('state', state, 3)
-    x_goal, y_goal = components('goal', goal, 2)
-    if type(x) is type(x_goal) is type(Kp) is type(Kv) is float and isfinite(Kp + Kv):
+    # Tuples are unpacked here, because a call would take as long as the law.
+    x, y, theta = (
+        state if isinstance(state, tuple) and len(state) == 3 else components('state', state, 3)
+    )
+    x_goal, y_goal = goal if isinstance(goal, tuple) and len(goal) == 2 else components('goal', goal, 2)
+    if (
+        type(x) is type(y) is type(theta) is type(x_goal) is type(y_goal) is float
+        and type(Kp) is type(Kv) is float
+        and isfinite(x + y + theta + x_goal + y_goal + Kp + Kv)
+    ):
         v, omega = _law(x, y, theta, x_goal, y_goal, Kp, Kv)
         if isfinite(v + omega):
             return v, omega
+    if isinstance(state, tuple):
+        x, y, theta = components('state', state, 3)
+    if isinstance(goal, tuple):
+        x_goal, y_goal = components('goal', goal, 2)
     Kp, Kv = operand('Kp', Kp), operand('Kv', Kv)
     single = agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv)
     v, omega = evaluated(single, 'state, goal, Kp and Kv', _law, x, y, theta, x_goal, y_goal, Kp, Kv)

@@ -46,12 +46,24 @@ def offset_point(state: ArrayLike, goal: ArrayLike, k: Any, d: Any) -> tuple[Any
         ValueError: d is 0, the last axis of state or goal has a wrong length, shapes do not broadcast,
             something is not finite, or the twist overflows.
     """
-    x, y, theta = components('state', state, 3)
-    x_goal, y_goal = components('goal', goal, 2)
-    if type(x) is type(x_goal) is type(k) is type(d) is float and d != 0.0 and isfinite(k + d):
+    # Tuples are unpacked here, because a call would take as long as the law.
+    x, y, theta = (
+        state if isinstance(state, tuple) and len(state) == 3 else components('state', state, 3)
+    )
+    x_goal, y_goal = goal if isinstance(goal, tuple) and len(goal) == 2 else components('goal', goal, 2)
+    if (
+        type(x) is type(y) is type(theta) is type(x_goal) is type(y_goal) is float
+        and type(k) is type(d) is float
+        and d != 0.0
+        and isfinite(x + y + theta + x_goal + y_goal + k + d)
+    ):
         v, omega = _law(x, y, theta, x_goal, y_goal, k, d)
         if isfinite(v + omega):
             return v, omega
+    if isinstance(state, tuple):
+        x, y, theta = components('state', state, 3)
+    if isinstance(goal, tuple):
+        x_goal, y_goal = components('goal', goal, 2)
     k, d = operand('k', k), operand('d', d, offset)
     single = agree(state=x, goal=x_goal, k=k, d=d)
     v, omega = evaluated(single, 'state, goal, k and d', _law, x, y, theta, x_goal, y_goal, k, d)

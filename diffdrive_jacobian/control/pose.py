@@ -75,17 +75,27 @@ def go_to_pose(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any, h: Any = Non
         ValueError: A gain is not positive, the last axis of state or goal has a wrong length, shapes do
             not broadcast, something is not finite, or the twist overflows.
     """
-    x, y, theta = components('state', state, 3)
-    x_goal, y_goal, heading = components('goal', goal, 3)
+    # Tuples are unpacked here, because a call would take as long as the law.
+    x, y, theta = (
+        state if isinstance(state, tuple) and len(state) == 3 else components('state', state, 3)
+    )
+    x_goal, y_goal, heading = (
+        goal if isinstance(goal, tuple) and len(goal) == 3 else components('goal', goal, 3)
+    )
     if (
-        type(x) is type(x_goal) is type(Kp) is type(Kv) is float
+        type(x) is type(y) is type(theta) is type(x_goal) is type(y_goal) is type(heading) is float
+        and type(Kp) is type(Kv) is float
         and Kp > 0.0 < Kv
         and (h is None or (type(h) is float and h > 0.0))
-        and isfinite(Kp + Kv + (h or 0.0))
+        and isfinite(x + y + theta + x_goal + y_goal + heading + Kp + Kv + (h or 0.0))
     ):
         v, omega = _law(x, y, theta, x_goal, y_goal, heading, Kp, Kv, h)
         if isfinite(v + omega):
             return v, omega
+    if isinstance(state, tuple):
+        x, y, theta = components('state', state, 3)
+    if isinstance(goal, tuple):
+        x_goal, y_goal, heading = components('goal', goal, 3)
     Kp, Kv = operand('Kp', Kp, positive), operand('Kv', Kv, positive)
     names = 'state, goal, Kp and Kv'
     if h is None:

@@ -12,7 +12,7 @@ doc/mathematics.md, "Control laws".
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from diffdrive_jacobian.kinematics._checks import (
     not_negative,
     number,
     positive,
+    positive_or_infinite,
     read_only,
 )
 from diffdrive_jacobian.kinematics._elementary import (
@@ -85,7 +86,7 @@ def resolved_rate(
     m = J.shape[-2]
     tip, wanted = components('x', x, m), components('x_desired', x_desired, m)
     forward, K = components('x_dot_desired', x_dot_desired, m), operand('gain', gain, not_negative)
-    longest = operand('max_correction', max_correction, _positive_or_infinite)
+    longest = operand('max_correction', max_correction, positive_or_infinite)
     single = agree(
         x=tip[0], x_desired=wanted[0], x_dot_desired=forward[0], gain=K, max_correction=longest
     )
@@ -109,11 +110,6 @@ def resolved_rate(
         return q_dot
     finite_result('J, the velocity of the tip, damping and weights', 'joint velocity', q_dot)
     return limit_velocity(q_dot, max_velocity)
-
-
-def _positive_or_infinite(name: str, value: Any) -> None:
-    if not np.all(value > 0.0):
-        raise ValueError(f'{name} must be positive, got {value}')
 
 
 def _tip_velocity(
@@ -168,6 +164,7 @@ class StraightLine:
     """Shape (..., m) (m), read-only."""
     speed: Any
     """Speed along the line, shape (...) (m/s), read-only."""
+    _duration: NDArray[np.float64] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check and copy every value."""
@@ -186,11 +183,12 @@ class StraightLine:
             raise ValueError('start, end and speed must give a finite duration, but it overflows')
         for name, value in (('start', start), ('end', end), ('speed', speed)):
             object.__setattr__(self, name, read_only(value))
+        object.__setattr__(self, '_duration', read_only(duration))
 
     @property
     def duration(self) -> NDArray[np.float64]:
         """Time from start to end, shape (...) (s)."""
-        return np.asarray(np.linalg.norm(self.end - self.start, axis=-1) / self.speed)
+        return np.array(self._duration)
 
     def position(self, t: float) -> NDArray[np.float64]:
         """Return the position at a time, shape (..., m) (m).
@@ -202,7 +200,11 @@ class StraightLine:
             ValueError: t is not a single finite number.
         """
         t = number('t', t, finite)
-        duration = self.duration[..., np.newaxis]
+        if self._duration.ndim == 0:
+            whole = float(self._duration)
+            share = max(t, 0.0) / whole if t < whole and whole > 0.0 else 1.0
+            return np.asarray(self.start + share * (self.end - self.start))
+        duration = self._duration[..., np.newaxis]
         moving = t < duration
         part = np.where(moving, max(t, 0.0) / np.where(duration > 0.0, duration, 1.0), 1.0)
         return np.asarray(self.start + part * (self.end - self.start))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import isfinite
+from math import inf, isfinite
 from typing import Any
 
 import numpy as np
@@ -57,9 +57,9 @@ class VelocityLimits:
     alike: bool = field(init=False, repr=False, compare=False)
     """Whether every limit is a number, equal for all robots."""
     _bounds: tuple[Any, ...] = field(init=False, repr=False, compare=False)
-    """For v, then omega: bounds that clip, lower and upper, and bounds that scale, lower and upper."""
-    _clips: bool = field(init=False, repr=False, compare=False)
-    """Whether there are bounds that clip: a limit is zero."""
+    """Bounds that scale: lower and upper for v, then for omega."""
+    _clips: tuple[Any, ...] | None = field(init=False, repr=False, compare=False)
+    """Bounds that clip, likewise: those that are zero. None if no limit is zero."""
     _wheels: bool = field(init=False, repr=False, compare=False)
     """Whether the wheel speeds have a limit."""
 
@@ -81,18 +81,12 @@ class VelocityLimits:
         object.__setattr__(self, 'unlimited', unlimited)
         object.__setattr__(self, 'alike', all(type(limit) is float for limit in self.all()))
         # Computed once, because every message needs it.
-        bounds = (
-            (
-                where(low == 0.0, 0.0, -np.inf),
-                where(high == 0.0, 0.0, np.inf),
-                where(low == 0.0, -np.inf, low),
-                where(high == 0.0, np.inf, high),
-            )
-            for low, high in ((self.min_v, self.max_v), (self.min_omega, self.max_omega))
-        )
-        object.__setattr__(self, '_bounds', tuple(bounds))
-        clips = any(bool(np.any(limit == 0.0)) for limit in self.all())
-        object.__setattr__(self, '_clips', clips)
+        signed = ((self.min_v, -1.0), (self.max_v, 1.0), (self.min_omega, -1.0), (self.max_omega, 1.0))
+        bounds = tuple(where(limit == 0.0, sign * np.inf, limit) for limit, sign in signed)
+        object.__setattr__(self, '_bounds', bounds)
+        clips = tuple(where(limit == 0.0, 0.0, sign * np.inf) for limit, sign in signed)
+        zero = any(bool(np.any(limit == 0.0)) for limit, _ in signed)
+        object.__setattr__(self, '_clips', clips if zero else None)
         wheels = type(self.max_wheel_speed) is not float or self.max_wheel_speed < np.inf
         object.__setattr__(self, '_wheels', wheels)
 
@@ -183,14 +177,15 @@ def saturate(
 def _saturated(
     v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, maximum: Select, minimum: Select
 ) -> tuple[Any, Any]:
-    (v_floor, v_ceiling, *_), (omega_floor, omega_ceiling, *_) = limits._bounds
-    if limits._clips:
+    if limits._clips is not None:
+        v_floor, v_ceiling, omega_floor, omega_ceiling = limits._clips
         v = minimum(maximum(v, v_floor), v_ceiling)
         omega = minimum(maximum(omega, omega_floor), omega_ceiling)
     divisor = _excess(v, omega, limits, r, L, 1.0, maximum)
     if type(divisor) is float and divisor == 1.0:
         return v, omega
-    if _any(divisor == np.inf):
+    infinite = divisor == inf
+    if infinite is not False and _any(infinite):
         v, omega, divisor = _scaled_down(v, omega, limits, r, L, divisor, maximum)
     # The quotient may round to one unit in the last place beyond the limit.
     v = minimum(maximum(v / divisor, limits.min_v), limits.max_v)
@@ -208,7 +203,7 @@ def _excess(
     v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, least: Any, maximum: Select
 ) -> Any:
     """Compute the factor by which a twist exceeds the limits; at least `least`."""
-    (_, _, v_low, v_high), (_, _, omega_low, omega_high) = limits._bounds
+    v_low, v_high, omega_low, omega_high = limits._bounds
     of_wheels: Any = 0.0
     if limits._wheels:
         limit = limits.max_wheel_speed

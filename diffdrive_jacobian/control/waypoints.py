@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from math import isfinite
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,10 @@ from diffdrive_jacobian.kinematics._checks import (
 )
 from diffdrive_jacobian.kinematics._elementary import components, operand
 
-Law = Callable[[NDArray[np.float64], NDArray[np.float64]], tuple[Any, Any]]
-"""A control law with its gains: pose, shape (3,), and goal, shape (3,), to `(v, omega)`."""
+Pose: TypeAlias = NDArray[np.float64] | tuple[float, float, float]
+Law: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
+"""A control law with its gains: pose, shape (3,), and goal, shape (3,), to `(v, omega)`. Both are arrays
+or both are tuples, as the pose that is given to `follow`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,6 +43,8 @@ class Waypoints:
     """Index of the waypoint that is driven to."""
     turning: bool = False
     """Whether the last position was reached and only the heading remains."""
+    _goal: tuple[float, float, float] = field(init=False, repr=False)
+    """The waypoint that is driven to."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -53,15 +58,16 @@ class Waypoints:
         if not 0 <= index < len(poses):
             raise ValueError(f'index must be in 0 to {len(poses) - 1}, got {short(index)}')
         object.__setattr__(self, 'index', int(index))
+        object.__setattr__(self, '_goal', tuple(self.poses[index].tolist()))
         object.__setattr__(self, 'turning', boolean('turning', self.turning))
 
     def follow(
-        self, pose: NDArray[np.float64], law: Law, arrival: Arrival, turning_gain: float
+        self, pose: Pose, law: Law, arrival: Arrival, turning_gain: float
     ) -> tuple[Waypoints, tuple[Any, Any] | None]:
         """Compute the next command.
 
         Args:
-            pose: Pose of the robot, shape (3,).
+            pose: Pose of the robot, shape (3,), as an array or as a tuple of floats.
             law: The control law that drives to a waypoint.
             arrival: Arrival criterion.
             turning_gain: Gain of the turn in place (1/s).
@@ -76,25 +82,26 @@ class Waypoints:
         x, y, theta = components('pose', pose, 3)
         if type(theta) is not float:
             raise ValueError(f'pose must have shape (3,), got {np.shape(pose)}')
-        function('law', law)
-        instance('arrival', arrival, Arrival)
-        turning_gain = operand('turning_gain', turning_gain)
+        if not callable(law) or type(arrival) is not Arrival:
+            function('law', law)
+            instance('arrival', arrival, Arrival)
+        if type(turning_gain) is not float or not isfinite(turning_gain):
+            turning_gain = operand('turning_gain', turning_gain)
         here = self
         if here.turning and not arrival.use_heading:
             # The heading no longer counts, and the position was reached.
             return here, None
         while not here.turning:
-            goal = here.poses[here.index]
-            x_goal, y_goal, _ = goal.tolist()
-            if not arrival.reached(x, y, theta, x_goal, y_goal):
-                return here, law(pose, goal)
+            goal = here._goal
+            if not arrival.reached(x, y, theta, goal[0], goal[1]):
+                return here, law(pose, goal if type(pose) is tuple else here.poses[here.index])
             if here.index + 1 < len(here.poses):
                 here = here._progressed(here.index + 1, turning=False)
             elif arrival.use_heading:
                 here = here._progressed(here.index, turning=True)
             else:
                 return here, None
-        heading = float(here.poses[here.index, 2])
+        heading = here._goal[2]
         if arrival.faces(theta, heading):
             return here, None
         return here, turn_in_place(theta, heading, turning_gain)
@@ -109,6 +116,8 @@ class Waypoints:
     def _progressed(self, index: int, *, turning: bool) -> Waypoints:
         # Without checks and copies, which would cost time in proportion to the number of poses.
         progressed = object.__new__(Waypoints)
-        for name, value in (('poses', self.poses), ('index', index), ('turning', turning)):
+        goal = tuple(self.poses[index].tolist())
+        values = (('poses', self.poses), ('index', index), ('turning', turning), ('_goal', goal))
+        for name, value in values:
             object.__setattr__(progressed, name, value)
         return progressed

@@ -30,6 +30,17 @@ def positive(name: str, value: Any) -> None:
         raise ValueError(f'{name} must be positive and finite, got {_first(value, inside)}')
 
 
+def positive_or_infinite(name: str, value: Any) -> None:
+    """Require a number to be positive. Infinity means no limit.
+
+    Raises:
+        ValueError: An entry is zero, negative or NaN.
+    """
+    inside = value > 0.0
+    if inside is not True and not np.all(inside):
+        raise ValueError(f'{name} must be positive, got {value}')
+
+
 def not_negative(name: str, value: Any) -> None:
     """Require a number to be zero or positive, and finite.
 

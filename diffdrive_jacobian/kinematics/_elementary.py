@@ -29,6 +29,8 @@ from numpy.typing import NDArray
 from diffdrive_jacobian.kinematics._checks import FLOAT64, finite, floats, leading
 
 TURN = 2.0 * math.pi
+# Taylor coefficients of sinc_defect in the square of its argument, (-1)^n / (2n + 3)!
+_DEFECT = [(-1.0) ** n / math.factorial(2 * n + 3) for n in range(9)]
 
 
 def components(name: str, value: Any, size: int) -> list[Any]:
@@ -38,6 +40,7 @@ def components(name: str, value: Any, size: int) -> list[Any]:
         ValueError: The last axis has another length, or there is none, or an entry is infinite, NaN
             or no number.
     """
+    entries: list[Any]
     if type(value) is np.ndarray and value.dtype is FLOAT64 and value.shape == (size,):
         entries = value.tolist()
     elif type(value) is tuple and len(value) == size and _are_floats(value):
@@ -167,10 +170,13 @@ def matrix(rows: int, columns: int, *entries: Any) -> NDArray[np.float64]:
     """
     if _are_floats(entries):
         return np.array(entries).reshape(rows, columns)
-    shape = np.broadcast_shapes(*map(np.shape, entries))
-    matrices = np.empty((*shape, rows, columns))
+    shapes = {entry.shape for entry in entries if type(entry) is not float}
+    shape = shapes.pop() if len(shapes) == 1 else np.broadcast_shapes(*shapes)
+    constants = any(type(entry) is float for entry in entries)
+    matrices = (np.zeros if constants else np.empty)((*shape, rows, columns))
     for index, entry in enumerate(entries):
-        matrices[..., index // columns, index % columns] = entry
+        if type(entry) is not float or entry != 0.0:
+            matrices[..., index // columns, index % columns] = entry
     return matrices
 
 
@@ -206,6 +212,16 @@ def sinc(angle: Any) -> Any:
     # The result is exactly 1 for a tiny angle, which replaces zero.
     angle = angle + (angle == 0.0) * 1e-20
     return sin(angle) / angle
+
+
+def sinc_defect(angle: Any) -> Any:
+    """Compute (1 - sin(x)/x) / x^2, which is 1/6 at zero, to full precision."""
+    square: Any = angle * angle
+    series: Any = 0.0
+    for coefficient in reversed(_DEFECT):
+        series = series * square + coefficient
+    far = where(square < 1.0, 1.0, angle)
+    return where(square < 1.0, series, (1.0 - sin(far) / far) / far**2)
 
 
 def sqrt(x: Any) -> Any:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffdrive_jacobian.kinematics._ik_single import take_steps
 from diffdrive_jacobian.kinematics._ik_task import EPS, Flags, Floats, Integers, Task, norm
 from diffdrive_jacobian.kinematics._singular_values import joint_velocities
 
@@ -105,7 +106,13 @@ class Search:
         still = still.keep(np.isfinite(error) & (error > self.tolerance))
         ended: Flags = np.zeros(len(still.which), dtype=np.bool_)
         self._differentiate(still, ~ended)
-        for count in range(max_iterations):
+        done = 0
+        if len(ended) == 1 and self.method == 'levenberg_marquardt':
+            most = min(max_iterations, SECOND_ORDER_AFTER)
+            still, done = take_steps(self, still, found, most, STATIONARY[self.method])
+            if still.error[0] <= self.tolerance:
+                return found
+        for count in range(done, max_iterations):
             J, gradient = self._free(still)
             ended |= ~self._movable(still, J, gradient)
             again = None

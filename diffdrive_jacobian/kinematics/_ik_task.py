@@ -44,16 +44,16 @@ class Task:
         e = np.full_like(target, np.nan)
         if len(q):
             # A copy, as the function may write to its argument.
-            pose = _returned('forward', self.forward(q.copy()), target.shape, q)
+            pose = returned('forward', self.forward(q.copy()), target.shape, q)
             good = np.isfinite(pose).all(axis=-1)
             if good.all():
                 e[:] = self._differences(target, pose, q)
             elif good.any():
                 e[good] = self._differences(target[good], pose[good], q[good])
-        e = self._weighted(e)
+        e = self.weighted(e)
         return e, norm(e)
 
-    def _weighted(self, values: Floats) -> Floats:
+    def weighted(self, values: Floats) -> Floats:
         """Return what counts of errors, shape (k, m), or Jacobians, shape (k, m, n)."""
         if not self.rows.all():
             values = values[:, self.rows]
@@ -61,7 +61,7 @@ class Task:
         return values * self.roots.reshape(-1, *[1] * (values.ndim - 2))
 
     def _differences(self, target: Floats, pose: Floats, q: Floats) -> Floats:
-        return _returned('difference', self.difference(target, pose), pose.shape, q)
+        return returned('difference', self.difference(target, pose), pose.shape, q)
 
     def jacobians(self, q: Floats) -> Floats:
         """Return the Jacobians of joints of shape (k, n), by differences if the caller gave none."""
@@ -69,15 +69,15 @@ class Task:
         if self.jacobian is None:
             jacobian = self._central_differences(q, shape)
         else:
-            jacobian = _returned('jacobian', self.jacobian(q.copy()), shape, q)
-        return self._weighted(jacobian)
+            jacobian = returned('jacobian', self.jacobian(q.copy()), shape, q)
+        return self.weighted(jacobian)
 
     def _central_differences(self, q: Floats, shape: tuple[int, ...]) -> Floats:
         """Return Jacobians from forward alone, NaN where it is not finite near q."""
         k, m, n = shape
         around, width = self.around(q, STEP)
         around = around.reshape(-1, n)
-        pose = _returned('forward', self.forward(around), (k * 2 * n, m), around)
+        pose = returned('forward', self.forward(around), (k * 2 * n, m), around)
         pose = pose.reshape(k, 2, n, m)
         good = np.isfinite(pose).all(axis=(1, 2, 3))
         jacobian = np.full(shape, np.nan)
@@ -106,7 +106,7 @@ def norm(vectors: Floats) -> Floats:
     return np.asarray(np.sqrt(np.einsum('kn,kn->k', vectors, vectors)))
 
 
-def _returned(name: str, value: Any, shape: tuple[int, ...], q: Floats) -> Floats:
+def returned(name: str, value: Any, shape: tuple[int, ...], q: Floats) -> Floats:
     """Check what a function of the caller returned."""
     values = floats(f'what {name} returns', value)
     if values.shape != shape:

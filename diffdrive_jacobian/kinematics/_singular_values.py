@@ -111,7 +111,8 @@ def joint_velocities(J: Array, x_dot: Array, damping: Array, q_dot_0: Array | No
         # Floats: several times as fast as arrays of one.
         secondary = [] if q_dot_0 is None else q_dot_0.tolist()
         columns = list(zip(*J.tolist(), strict=True))
-        single, exact = _two_rows(columns, *x_dot.tolist(), float(damping), secondary)
+        one, other = x_dot.tolist()
+        single, exact = _two_rows(columns, one, other, float(damping), secondary)
         if exact:
             return np.array(single)
     method = _columns if J.shape[-2] == 2 else _by_svd

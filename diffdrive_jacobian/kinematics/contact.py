@@ -14,13 +14,19 @@ Source: document C, "Kinematic structure of mobile robots"; doc/mathematics.md, 
 
 from __future__ import annotations
 
-from math import isfinite
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._checks import positive
-from diffdrive_jacobian.kinematics._elementary import agree, cos, matrix, operand, sin, vector
+from diffdrive_jacobian.kinematics._dimensions import angle_and_radius
+from diffdrive_jacobian.kinematics._elementary import (
+    agree,
+    cos,
+    matrix,
+    operand,
+    sin,
+    vector,
+)
 
 AT_GROUND = np.pi
 """The angle phi of the point that touches the ground (rad)."""
@@ -40,10 +46,8 @@ def wheel_contact_position(x: ArrayLike, phi: ArrayLike, r: ArrayLike) -> NDArra
     Raises:
         ValueError: r is not positive and finite, or x or phi is not finite.
     """
-    single = type(x) is type(phi) is type(r) is float and r > 0.0 and isfinite(x + phi + r)
-    if not single:
-        x, phi, r = operand('x', x), operand('phi', phi), operand('r', r, positive)
-        agree(x=x, phi=phi, r=r)
+    x, (phi, r) = operand('x', x), angle_and_radius('phi', phi, r)
+    agree(x=x, phi=phi, r=r)
     return vector(x + r * sin(phi), r + r * cos(phi), 0.0)
 
 
@@ -60,11 +64,8 @@ def wheel_contact_jacobian(phi: ArrayLike, r: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ValueError: r is not positive and finite, or phi is not finite.
     """
-    single = type(phi) is type(r) is float and r > 0.0 and isfinite(phi + r)
-    if not single:
-        phi, r = operand('phi', phi), operand('r', r, positive)
-        agree(phi=phi, r=r)
-    return matrix(3, 2, 1.0, r * cos(phi), 0.0, -r * sin(phi), 0.0, 0.0)
+    phi, r = angle_and_radius('phi', phi, r)
+    return matrix(3, 2, 1.0, r * cos(phi), 0.0, -(r * sin(phi)), 0.0, 0.0)
 
 
 def rolling_direction(r: ArrayLike) -> NDArray[np.float64]:

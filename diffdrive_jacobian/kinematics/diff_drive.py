@@ -22,6 +22,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._checks import offset, positive
+from diffdrive_jacobian.kinematics._dimensions import (
+    angle_and_radius,
+    dimensions,
+    heading_and_dimensions,
+)
 from diffdrive_jacobian.kinematics._elementary import (
     agree,
     alike,
@@ -61,8 +66,10 @@ def wheel_to_body_jacobian(r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    r, L, single = _geometry(r, L)
-    half, ratio = evaluated(single, 'r and L', lambda r, L: (r / 2.0, r / L), r, L)
+    r, L, single = dimensions(r, L)
+    (ratio,) = evaluated(single, 'r and L', lambda r, L: (r / L,), r, L)
+    radius: Any = r
+    half = radius / 2.0
     return matrix(2, 2, half, half, ratio, -ratio)
 
 
@@ -79,7 +86,7 @@ def body_to_wheel_jacobian(r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    r, L, single = _geometry(r, L)
+    r, L, single = dimensions(r, L)
     along, across = evaluated(single, 'r and L', lambda r, L: (1.0 / r, L / (2.0 * r)), r, L)
     return matrix(2, 2, along, across, along, -across)
 
@@ -98,7 +105,7 @@ def wheel_to_world_jacobian(theta: ArrayLike, r: ArrayLike, L: ArrayLike) -> NDA
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    theta, r, L, single = _heading_and_geometry(theta, r, L)
+    theta, r, L, single = heading_and_dimensions(theta, r, L)
     x, y, turn = evaluated(single, 'r and L', _wheel_to_world, theta, r, L)
     return matrix(3, 2, x, x, y, y, turn, -turn)
 
@@ -121,10 +128,7 @@ def single_wheel_jacobian(theta: ArrayLike, r: ArrayLike) -> NDArray[np.float64]
     Raises:
         ValueError: r is not positive and finite.
     """
-    single = type(theta) is type(r) is float and r > 0.0 and isfinite(theta + r)
-    if not single:
-        theta, r = operand('theta', theta), operand('r', r, positive)
-        agree(theta=theta, r=r)
+    theta, r = angle_and_radius('theta', theta, r)
     return matrix(3, 2, r * cos(theta), 0.0, r * sin(theta), 0.0, 0.0, 1.0)
 
 
@@ -146,7 +150,7 @@ def wheel_to_position_jacobian(theta: ArrayLike, r: ArrayLike, L: ArrayLike) -> 
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    theta, r, L, single = _heading_and_geometry(theta, r, L)
+    theta, r, L, single = heading_and_dimensions(theta, r, L)
     x, y, _ = evaluated(single, 'r and L', _wheel_to_world, theta, r, L)
     return matrix(2, 2, x, x, y, y)
 
@@ -165,10 +169,12 @@ def offset_point(pose: ArrayLike, d: ArrayLike) -> NDArray[np.float64]:
         ValueError: Something is not finite, or shapes do not broadcast.
     """
     x, y, theta = components('pose', pose, 3)
-    single = type(x) is type(d) is float and isfinite(d)
-    if not single:
-        d = operand('d', d)
-        single = agree(pose=x, d=d)
+    d = operand('d', d)
+    single = type(x) is type(d) is float or agree(pose=x, d=d)
+    if single:
+        point = _point(x, y, theta, d)
+        if isfinite(point[0] + point[1]):
+            return np.array(point)
     return stack(*evaluated(single, 'pose and d', _point, x, y, theta, d))
 
 
@@ -196,15 +202,9 @@ def offset_point_jacobian(
     Raises:
         ValueError: r or L is not positive and finite, d is 0 or not finite.
     """
-    single = (
-        type(theta) is type(r) is type(L) is type(d) is float
-        and (r > 0.0 < L and d != 0.0)
-        and isfinite(theta + r + L + d)
-    )
-    if not single:
-        theta, r, L = operand('theta', theta), operand('r', r, positive), operand('L', L, positive)
-        d = operand('d', d, offset)
-        single = agree(theta=theta, r=r, L=L, d=d)
+    theta, r, L, single = heading_and_dimensions(theta, r, L)
+    d = operand('d', d, offset)
+    single = (single and type(d) is float) or agree(theta=theta, r=r, L=L, d=d)
     return matrix(2, 2, *evaluated(single, 'r, L and d', _offset_jacobian, theta, r, L, d))
 
 
@@ -322,28 +322,12 @@ def rolling_constraints(
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    theta, r, L, single = _heading_and_geometry(theta, r, L)
+    theta, r, L, single = heading_and_dimensions(theta, r, L)
     if not single:
         theta, r, L = alike(theta, r, L)
     c, s = cos(theta), sin(theta)
-    over_pose = matrix(3, 3, s, -c, 0.0, c, s, L / 2.0, c, s, -L / 2.0)
+    separation: Any = L
+    half = separation / 2.0
+    over_pose = matrix(3, 3, s, -c, 0.0, c, s, half, c, s, -half)
     over_wheels = matrix(3, 2, 0.0, 0.0, r, 0.0, 0.0, r)
     return over_pose, over_wheels
-
-
-def _geometry(r: Any, L: Any) -> tuple[Any, Any, bool]:
-    """Check radius and separation. Return whether both are floats, too."""
-    single = type(r) is type(L) is float and r > 0.0 < L and isfinite(r + L)
-    if not single:
-        r, L = operand('r', r, positive), operand('L', L, positive)
-        single = agree(r=r, L=L)
-    return r, L, single
-
-
-def _heading_and_geometry(theta: Any, r: Any, L: Any) -> tuple[Any, Any, Any, bool]:
-    """Check heading, radius and separation. Return whether all are floats, too."""
-    single = type(theta) is type(r) is type(L) is float and r > 0.0 < L and isfinite(theta + r + L)
-    if not single:
-        theta, r, L = operand('theta', theta), operand('r', r, positive), operand('L', L, positive)
-        single = agree(theta=theta, r=r, L=L)
-    return theta, r, L, single

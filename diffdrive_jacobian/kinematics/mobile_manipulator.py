@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics import se2
-from diffdrive_jacobian.kinematics._checks import array, leading, number, positive
+from diffdrive_jacobian.kinematics._checks import array, number, positive
 from diffdrive_jacobian.kinematics._elementary import (
+    agree,
     components,
     cos,
     matrix,
@@ -139,15 +140,18 @@ class MobileManipulator:
         Returns:
             Configurations at the end, shape (..., 3 + n), theta wrapped.
         """
-        checked = array('q', q, 3 + self.arm.joints)
-        speeds, dt = array('q_dot', q_dot, 2 + self.arm.joints), operand('dt', dt)
-        leading(q=checked.shape[:-1], q_dot=speeds.shape[:-1], dt=np.shape(dt))
-        right, left = components('q_dot', speeds[..., :2], 2)
-        twist = vector(*wheel_to_body(right, left, self.r, self.L))
-        driven = se2.integrate(checked[..., :3], twist, dt)
-        return np.concatenate(
-            [driven, self.arm.integrate(checked[..., 3:], speeds[..., 2:], dt)], axis=-1
-        )
+        base, joints = self._split(q)
+        right, left, *speeds = components('q_dot', q_dot, 2 + self.arm.joints)
+        dt = operand('dt', dt)
+        if not type(base[0]) is type(right) is type(dt) is float:
+            agree(q=base[0], q_dot=right, dt=dt)
+        v, omega = wheel_to_body(right, left, self.r, self.L)
+        # Tuples of floats need no arrays.
+        pose = tuple(base) if type(base[0]) is float else vector(*base)
+        twist = (v, omega) if type(v) is float else vector(v, omega)
+        driven = se2.integrate(pose, twist, dt)
+        moved = [joint + speed * dt for joint, speed in zip(joints, speeds, strict=True)]
+        return vector(*components('q', driven, 3), *moved)
 
     def _split(self, q: ArrayLike) -> tuple[list[Any], list[Any]]:
         """Return the pose of the base and the joint angles, each entry a float or of shape (...)."""

@@ -13,7 +13,7 @@ doc/mathematics.md, "Manipulators".
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import accumulate
 from typing import Any
 
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._adjugate import EPS, refuse_singular
-from diffdrive_jacobian.kinematics._checks import array, floats, leading, positive
+from diffdrive_jacobian.kinematics._checks import array, positive
 from diffdrive_jacobian.kinematics._elementary import (
     agree,
     components,
@@ -45,6 +45,7 @@ class PlanarArm:
 
     lengths: NDArray[np.float64]
     """Distances from joint to joint, the last to the tip, shape (n,) (m). Read-only."""
+    _links: list[float] = field(init=False, repr=False)
 
     def __init__(self, lengths: ArrayLike) -> None:
         """Take the lengths of the links, shape (n,), n >= 1 (m)."""
@@ -54,6 +55,7 @@ class PlanarArm:
         positive('lengths', checked)
         checked.flags.writeable = False
         object.__setattr__(self, 'lengths', checked)
+        object.__setattr__(self, '_links', checked.tolist())
 
     @property
     def joints(self) -> int:
@@ -72,7 +74,7 @@ class PlanarArm:
         x: Any = 0.0
         y: Any = 0.0
         entries = [x, y]
-        for length, angle in zip(self.lengths.tolist(), self._directions(q), strict=True):
+        for length, angle in zip(self._links, self._directions(q), strict=True):
             x, y = x + length * cos(angle), y + length * sin(angle)
             entries += [x, y]
         return matrix(self.joints + 1, 2, *entries)
@@ -86,8 +88,7 @@ class PlanarArm:
         Returns:
             `[x, y, heading]`, shape (..., 3) (m, m, rad), the heading wrapped to (-pi, pi].
         """
-        q = floats('q', q)
-        if q.ndim == 2 and len(q) == 1:
+        if type(q) is np.ndarray and q.ndim == 2 and len(q) == 1:
             # In floats: several times as fast as a batch of one.
             return self.forward_kinematics(q[0])[np.newaxis]
         return vector(*self._tip(self._directions(q)))
@@ -105,14 +106,13 @@ class PlanarArm:
         Returns:
             The Jacobian, shape (..., 2, n), or (..., 3, n) with a last row of ones for the heading.
         """
-        q = floats('q', q)
-        if q.ndim == 2 and len(q) == 1:
+        if type(q) is np.ndarray and q.ndim == 2 and len(q) == 1:
             return self.jacobian(q[0], heading)[np.newaxis]
         levers = self._levers(self._directions(q))
         entries = [-y for _, y in levers] + [x for x, _ in levers]
         if heading:
-            entries += [1.0] * self.joints
-        return matrix(3 if heading else 2, self.joints, *entries)
+            entries += [1.0] * len(levers)
+        return matrix(3 if heading else 2, len(levers), *entries)
 
     def determinant(self, q: ArrayLike) -> NDArray[np.float64]:
         """Return the determinant of the Jacobian of two links: `l1 l2 sin(q_2)` (A).
@@ -128,7 +128,8 @@ class PlanarArm:
         """
         self._need_two('determinant')
         _, q_2 = components('q', q, 2)
-        return np.float64(self._determinant(q_2)) if type(q_2) is float else self._determinant(q_2)
+        determinant: NDArray[np.float64] = self._determinant(q_2) * np.float64(1.0)
+        return determinant
 
     def singular_configurations(self, q_1: ArrayLike = 0.0) -> NDArray[np.float64]:
         """Return the singular configurations of two links: stretched, q_2 = 0, and folded, q_2 = pi (A).
@@ -167,7 +168,7 @@ class PlanarArm:
         determinant = self._determinant(q_2)
         # More accurate than from the entries of J: only the rounding of q_2 itself remains.
         blur = 4.0 * EPS * maximum(1.0, abs(q_2))
-        refuse_singular(determinant, abs(determinant) <= blur * math.prod(self.lengths.tolist()))
+        refuse_singular(determinant, abs(determinant) <= blur * math.prod(self._links))
         (x, y), (x_2, y_2) = self._levers([q_1, q_1 + q_2])
         return vector(
             (x_2 * along_x + y_2 * along_y) / determinant,
@@ -207,13 +208,11 @@ class PlanarArm:
         Returns:
             Joint angles at the end, shape (..., n) (rad). They are not wrapped.
         """
-        q, q_dot, dt = self._angles(q), array('q_dot', q_dot, self.joints), operand('dt', dt)
-        leading(q=q.shape[:-1], q_dot=q_dot.shape[:-1], dt=np.shape(dt))
-        moved: NDArray[np.float64] = q + q_dot * (dt if type(dt) is float else dt[..., np.newaxis])
-        return moved
-
-    def _angles(self, q: ArrayLike) -> NDArray[np.float64]:
-        return array('q', q, self.joints)
+        angles, speeds = components('q', q, self.joints), components('q_dot', q_dot, self.joints)
+        dt = operand('dt', dt)
+        if not type(angles[0]) is type(speeds[0]) is type(dt) is float:
+            agree(q=angles[0], q_dot=speeds[0], dt=dt)
+        return vector(*[angle + speed * dt for angle, speed in zip(angles, speeds, strict=True)])
 
     def _directions(self, q: ArrayLike) -> list[Any]:
         """Return the angles of the links to the x axis of the base, floats or of shape (...)."""
@@ -228,15 +227,17 @@ class PlanarArm:
         """Return the position of the tip relative to each joint, floats or of shape (...)."""
         # Joint by joint, because loops of NumPy over the short last axis take longer.
         levers = []
+        of_floats = type(directions[0]) is float
+        cosine, sine = (math.cos, math.sin) if of_floats else (np.cos, np.sin)
         x: Any = 0.0
         y: Any = 0.0
-        for length, angle in zip(self.lengths.tolist()[::-1], directions[::-1], strict=True):
-            x, y = x + length * cos(angle), y + length * sin(angle)
+        for length, angle in zip(self._links[::-1], directions[::-1], strict=True):
+            x, y = x + length * cosine(angle), y + length * sine(angle)
             levers.append((x, y))
         return levers[::-1]
 
     def _determinant(self, q_2: Any) -> Any:
-        first, second = self.lengths.tolist()
+        first, second = self._links
         return first * second * sin(q_2)
 
     def _need_two(self, what: str) -> None:

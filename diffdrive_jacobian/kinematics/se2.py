@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics import _elementary
+from diffdrive_jacobian.kinematics._checks import array
 from diffdrive_jacobian.kinematics._elementary import (
     agree,
     components,
@@ -131,6 +132,69 @@ def inverse(pose: ArrayLike) -> NDArray[np.float64]:
 def _inverse(x: Any, y: Any, theta: Any) -> tuple[Any, ...]:
     c, s = cos(theta), sin(theta)
     return -c * x - s * y, s * x - c * y, wrapped(-theta)
+
+
+def adjoint(pose: ArrayLike) -> NDArray[np.float64]:
+    """Return the adjoint of a pose: it maps a twist in B to the same motion as a twist in W.
+
+    `compose(pose, exp(twist)) = compose(exp(adjoint(pose) @ twist), pose)`.
+
+    Args:
+        pose: Pose of B in W, shape (..., 3).
+
+    Returns:
+        Matrices over `[vx, vy, omega]`, shape (..., 3, 3).
+    """
+    x, y, theta = components('pose', pose, 3)
+    c, s = cos(theta), sin(theta)
+    matrix = np.zeros((*np.shape(x), 3, 3))
+    matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2] = c, -s, y
+    matrix[..., 1, 0], matrix[..., 1, 1], matrix[..., 1, 2] = s, c, -x
+    matrix[..., 2, 2] = 1.0
+    return matrix
+
+
+def left_jacobian(twist: ArrayLike) -> NDArray[np.float64]:
+    """Return the left Jacobian of `exp`: `exp(t + d) = compose(exp(J d), exp(t))` to first order in d.
+
+    Source: Barfoot and Furgale, "Associating uncertainty with three-dimensional poses for use in
+    estimation problems", 2014, for SE(3); here for SE(2).
+
+    Args:
+        twist: `[vx, vy, omega]`, shape (..., 3): velocity in B times time (m, m, rad).
+
+    Returns:
+        Jacobians J, shape (..., 3, 3).
+    """
+    vx, vy, turn = components('twist', twist, 3)
+    single = type(turn) is float
+    along, across, bent, bowed = evaluated(single, 'twist', _exp_coefficients, turn)
+    matrix = np.zeros((*np.shape(turn), 3, 3))
+    matrix[..., 0, 0] = matrix[..., 1, 1] = along
+    matrix[..., 0, 1], matrix[..., 1, 0] = -across, across
+    # The bowed part grows with the turn, the bent one does not vanish with it.
+    matrix[..., 0, 2], matrix[..., 1, 2] = evaluated(
+        single,
+        'twist',
+        lambda: (bowed * vx + bent * vy, bowed * vy - bent * vx),
+    )
+    matrix[..., 2, 2] = 1.0
+    return matrix
+
+
+def right_jacobian(twist: ArrayLike) -> NDArray[np.float64]:
+    """Return the right Jacobian of `exp`: `exp(t + d) = compose(exp(t), exp(J d))` to first order in d.
+
+    Arguments and results as for `left_jacobian`, which is this one at the negative twist.
+    """
+    return left_jacobian(-array('twist', twist, 3))
+
+
+def _exp_coefficients(turn: Any) -> tuple[Any, ...]:
+    """Compute sin(a)/a, (1 - cos(a))/a, (1 - cos(a))/a^2 and (a - sin(a))/a^2 of a turn a."""
+    chord = _elementary.sinc(turn / 2.0)
+    across = chord * sin(turn / 2.0)
+    return chord * cos(turn / 2.0), across, chord * chord / 2.0, turn * _elementary.sinc_defect(turn)
 
 
 def homogeneous(pose: ArrayLike) -> NDArray[np.float64]:

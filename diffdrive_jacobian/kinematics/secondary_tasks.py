@@ -12,6 +12,7 @@ Source: document A, 3.2.3 and 3.2.5; document D, 3; doc/mathematics.md, "Manipul
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -88,6 +89,14 @@ def joint_limit_cost(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> Array:
         The cost, shape (...): 0 in the middle, 1/8 with every joint at a limit.
     """
     deviation, _, _ = _deviation(q, lower, upper)
+    if type(deviation) is list:
+        squares = 0.0
+        for entry in deviation:
+            squares += entry * entry
+        single = np.asarray(squares / len(deviation) / 2.0)[()]
+        if not math.isfinite(single):
+            finite_result('q, lower and upper', 'cost', single)
+        return single
     with np.errstate(all='ignore'):
         cost: Array = (deviation * deviation).mean(axis=-1) / 2.0
     finite_result('q, lower and upper', 'cost', cost)
@@ -108,13 +117,19 @@ def joint_limit_gradient(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> Ar
         The gradients, shape (..., n) (1/rad).
     """
     deviation, span, unit = _deviation(q, lower, upper)
+    if type(deviation) is list:
+        n = len(deviation)
+        slopes = [entry / (width * n) for entry, width in zip(deviation, span, strict=True)]
+        if not math.isfinite(sum(slopes)):
+            finite_result('q, lower and upper', 'gradient', np.array(slopes))
+        return np.array(slopes)
     with np.errstate(all='ignore'):
         gradient: Array = deviation / (span * deviation.shape[-1]) * unit
     finite_result('q, lower and upper', 'gradient', gradient)
     return gradient
 
 
-def _deviation(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array, Any]:
+def _deviation(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[Any, Any, Any]:
     """Return each joint's distance from the middle of its range in units of the range, the range, and
     the unit of the latter: 1, or smaller where the range of angles might overflow.
     """
@@ -124,6 +139,17 @@ def _deviation(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[Array,
         if value.shape[-1:] not in ((), angles.shape[-1:]):
             allowed = f'() or (..., {angles.shape[-1]})'
             raise ValueError(f'{name} must have shape {allowed}, got {value.shape}')
+    if angles.ndim == 1 and low.ndim < 2 and high.ndim < 2:
+        # Lists of floats.
+        sides = [v.tolist() if v.ndim else [float(v)] * len(angles) for v in (angles, low, high)]
+        deviations, spans = [], []
+        for x, a, b in zip(*sides, strict=True):
+            if not (b - a > _UNIT and min(x, a) > -_LARGE and max(x, b) < _LARGE):
+                break
+            deviations.append((x - (a + b) / 2.0) / (b - a))
+            spans.append(b - a)
+        else:
+            return deviations, spans, 1.0
     leading(q=angles.shape, lower=low.shape, upper=high.shape)
     if not (high > low).all():
         raise ValueError(f'upper must be above lower for every joint, got {high} and {low}')

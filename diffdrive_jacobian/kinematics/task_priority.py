@@ -17,8 +17,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import array, floats, leading, number, positive
-from diffdrive_jacobian.kinematics._elementary import vector
+from diffdrive_jacobian.kinematics._checks import array, leading, number, positive, positive_or_infinite
+from diffdrive_jacobian.kinematics._elementary import operand, vector
 from diffdrive_jacobian.kinematics._singular_values import (
     gains,
     is_large,
@@ -121,13 +121,12 @@ def limit_velocity(q_dot: ArrayLike, max_velocity: ArrayLike) -> Array:
     Returns:
         Joint velocities, shape (..., n), no entry larger than its limit, not even by rounding.
     """
-    q_dot, most = array('q_dot', q_dot, 'n'), floats('max_velocity', max_velocity)
+    q_dot = array('q_dot', q_dot, 'n')
+    most = np.asarray(operand('max_velocity', max_velocity, positive_or_infinite))
     if most.shape[-1:] not in ((), q_dot.shape[-1:]):
         raise ValueError(
             f'max_velocity must have shape () or (..., {q_dot.shape[-1]}), got {most.shape}'
         )
-    if not (most > 0.0).all():
-        raise ValueError(f'max_velocity must be positive, got {most}')
     if q_dot.ndim == 1 and most.ndim < 2:
         speeds = q_dot.tolist()
         limits = most.tolist() if most.ndim else [float(most)] * len(speeds)

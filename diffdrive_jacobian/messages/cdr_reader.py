@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import re
 import struct
 from collections.abc import Callable
 from collections.abc import Sequence as Values
-from operator import attrgetter, itemgetter
+from functools import lru_cache
+from operator import itemgetter
 from typing import Any, NamedTuple
 
+from diffdrive_jacobian.messages.cdr_fields import check_readable, field_value
 from diffdrive_jacobian.messages.cdr_types import (
     COUNT,
     ENCAPSULATION,
@@ -28,7 +29,8 @@ _MAX_LAYOUTS = 16
 """Layouts that a Reader keeps, one for each size of message."""
 _MAX_VALUES = 256
 """Largest number of values of a layout that is kept."""
-_LENGTH = re.compile(r'len\(([\w.]+)\)')
+_MAX_REMEMBERED = 1024
+"""Largest message whose texts are remembered (bytes)."""
 
 
 class DecodingError(MessageError):
@@ -70,7 +72,7 @@ class Reader:
         self._type = structure(message_class)
         self._fields = tuple(fields)
         for field in self._fields:
-            _check_readable(self._type, field)
+            check_readable(self._type, field)
         self._whole = whole
         self._deserialize = deserialize
         self._layouts: dict[int, _Layout] = {}
@@ -114,7 +116,7 @@ class Reader:
             message = self._deserialize(data, self._class)
         except RuntimeError as error:
             raise self._undecodable() from error
-        return tuple(_value(message, field) for field in self._fields)
+        return tuple(field_value(message, field) for field in self._fields)
 
     def _undecodable(self) -> DecodingError:
         return DecodingError(f'it is not a {self._type.name} message')
@@ -164,11 +166,13 @@ class _Walk:
             picker: Callable[[tuple[Any, ...]], tuple[Any, ...]] = pick
             return picker
 
+        # A short message has few texts, and usually the same ones as before.
+        convert = _converted_before if self._offset <= _MAX_REMEMBERED else _converted
+
         def pick_texts(values: tuple[Any, ...]) -> tuple[Any, ...]:
             picked = list(pick(values))
             for number in texts:
-                raw = picked[number]
-                picked[number] = _text(raw) if type(raw) is bytes else tuple(map(_text, raw))
+                picked[number] = convert(picked[number])
             return tuple(picked)
 
         return pick_texts
@@ -270,40 +274,12 @@ def _few(indices: Values[Any]) -> Callable[[tuple[Any, ...]], tuple[Any, ...]]:
     return lambda values: tuple(values[index] for index in indices)
 
 
+def _converted(raw: bytes | tuple[bytes, ...]) -> str | tuple[str, ...]:
+    return _text(raw) if isinstance(raw, bytes) else tuple(map(_text, raw))
+
+
+_converted_before = lru_cache(maxsize=64)(_converted)
+
+
 def _text(raw: bytes) -> str:
     return raw.partition(b'\0')[0].decode('utf-8', 'replace')
-
-
-def _value(message: Any, field: str) -> Any:
-    """Return a field of a message object, as the Reader returns it."""
-    length = _LENGTH.fullmatch(field)
-    value = attrgetter(length[1] if length else field)(message)
-    if length:
-        return len(value)
-    if isinstance(value, (str, bytes, int, float)):
-        return value
-    return tuple(value.tolist() if hasattr(value, 'tolist') else value)
-
-
-def _check_readable(kind: Structure, field: str) -> None:
-    """Raise ValueError unless a Reader can return this field."""
-    length = _LENGTH.fullmatch(field)
-    found: FieldType = kind
-    for name in (length[1] if length else field).split('.'):
-        inner = dict(found.fields) if isinstance(found, Structure) else {}
-        if name not in inner:
-            raise ValueError(
-                f"a field of {kind.name} must be a path to one of its fields, got '{field}'; "
-                f'{name!r} is none of {list(inner)}'
-            )
-        found = inner[name]
-    if length:
-        readable = isinstance(found, Sequence)
-    else:
-        simple = found.element if isinstance(found, (Array, Sequence)) else found
-        readable = isinstance(simple, (Number, Text))
-    if not readable:
-        raise ValueError(
-            f'a field of {kind.name} must be a number, a string, an array or sequence of them, or '
-            f"len() of a sequence, got '{field}'"
-        )

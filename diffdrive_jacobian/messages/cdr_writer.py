@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
 from collections.abc import Sequence as Values
-from itertools import pairwise
-from typing import Any
+from itertools import accumulate, pairwise
+from typing import Any, NamedTuple
 
 from diffdrive_jacobian.messages.cdr_types import (
     COUNT,
@@ -49,9 +48,21 @@ class Writer:
         except (struct.error, OverflowError, UnicodeEncodeError) as error:
             raise MessageError(f'{kind.name} cannot be serialized: {error}') from error
         self._name = kind.name
-        self._buffer = encoder.buffer
-        self._runs = _runs(encoder, fields)
-        self._single = self._runs[0][:2] if len(self._runs) == 1 else None
+        runs = _runs(encoder, fields)
+        content = bytes(encoder.buffer)
+        # All is packed at once: what does not change as strings of bytes, between the runs of numbers.
+        layout, end, constants = '<', 0, []
+        for run in runs:
+            constants.append(content[end : run.start])
+            layout += f'{run.start - end}s{run.format}'
+            end = run.end
+        tail = content[end:]
+        layout += f'{len(tail)}s' if any(tail) else f'{len(tail)}x'
+        self._tail = (tail,) if any(tail) else ()
+        self._pack = struct.Struct(layout).pack
+        self._head = constants[:1]
+        self._first = slice(runs[0].numbers if len(runs) > 1 else None)
+        self._more = list(zip(constants, _parts(runs), strict=True))[1:]
 
     def __call__(self, *values: Any) -> bytes:
         """Return the message with these numbers, one for each field or element of a field.
@@ -59,17 +70,16 @@ class Writer:
         Raises:
             MessageError: A number is out of range for its field, or their count is wrong.
         """
-        buffer = self._buffer
         try:
-            if self._single is not None:
-                pack_into, offset = self._single
-                pack_into(buffer, offset, *values)
-            else:
-                for pack_into, offset, part in self._runs:
-                    pack_into(buffer, offset, *values[part])
+            if not self._more:
+                return self._pack(*self._head, *values, *self._tail)
+            arguments = [*self._head, *values[self._first]]
+            for constant, part in self._more:
+                arguments.append(constant)
+                arguments += values[part]
+            return self._pack(*arguments, *self._tail)
         except (struct.error, OverflowError) as error:
             raise MessageError(f'{self._name} cannot be serialized: {error}') from error
-        return bytes(buffer)
 
 
 class _Encoder:
@@ -116,15 +126,20 @@ class _Encoder:
         self.buffer += bytes((ENCAPSULATION - len(self.buffer)) % size)
 
 
-_Run = tuple[Callable[..., None], int, slice]
-"""A function that packs numbers into a buffer, the offset of the first, and which values they are."""
+class _Run(NamedTuple):
+    """Numbers that are packed without anything else but zeros between them."""
+
+    start: int
+    end: int
+    format: str
+    numbers: int
 
 
 def _runs(encoder: _Encoder, fields: Values[str]) -> list[_Run]:
-    """Compile the packing of fields, with as few calls as possible.
+    """Return the runs of the fields, as few as possible.
 
-    Packing writes zeros between the numbers, so numbers are packed together where the template has
-    nothing else between them.
+    Raises:
+        ValueError: A field is no number, or is not in the order of the message.
     """
     paths = [path for field in fields for path in encoder.arrays.get(field, [field])]
     unknown = [path for path in paths if path not in encoder.numbers]
@@ -134,16 +149,18 @@ def _runs(encoder: _Encoder, fields: Values[str]) -> list[_Run]:
     if any(offset >= after for (offset, _), (after, _) in pairwise(slots)):
         raise ValueError(f'fields must be in the order of the message, got {list(fields)}')
     runs: list[_Run] = []
-    first = 0
-    while first < len(slots):
-        start, kind = slots[first]
-        text, end, last = f'<{kind.code}', start + kind.size, first + 1
-        while last < len(slots):
-            offset, kind = slots[last]
-            if any(encoder.buffer[end:offset]):
-                break
-            text += f'{offset - end}x{kind.code}'
-            end, last = offset + kind.size, last + 1
-        runs.append((struct.Struct(text).pack_into, start, slice(first, last)))
-        first = last
+    for offset, kind in slots:
+        if runs and not any(encoder.buffer[runs[-1].end : offset]):
+            start, end, text, count = runs.pop()
+            text += f'{offset - end}x'
+        else:
+            start, text, count = offset, '', 0
+        runs.append(_Run(start, offset + kind.size, text + kind.code, count + 1))
     return runs
+
+
+def _parts(runs: list[_Run]) -> list[slice]:
+    """Return which of the values are those of each run. Those after the last one are left to it."""
+    ends = list(accumulate(run.numbers for run in runs))
+    starts = [0, *ends[:-1]][: len(runs)]
+    return [slice(*pair) for pair in zip(starts, [*ends[:-1], None], strict=False)]

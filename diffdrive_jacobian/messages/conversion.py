@@ -81,11 +81,18 @@ def from_twist(message: Twist) -> tuple[float, float]:
     return from_twist_values(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
 
 
-def from_twist_values(*values: float) -> tuple[float, float]:
-    """Return `(v, omega)` from linear x, y, z and angular x, y, z, as `from_twist`."""
-    if not all(map(math.isfinite, values)):
-        raise MessageError(f'twist must be finite, got linear {values[:3]}, angular {values[3:]}')
-    return plausible_twist(values[0], values[5])
+def from_twist_values(
+    x: float, y: float, z: float, roll: float, pitch: float, yaw: float
+) -> tuple[float, float]:
+    """Return `(v, omega)` from the linear and the angular components, as `from_twist`."""
+    # A sum that is finite has finite terms.
+    if not math.isfinite(x + y + z + roll + pitch + yaw):
+        linear, angular = (x, y, z), (roll, pitch, yaw)
+        if not all(map(math.isfinite, linear + angular)):
+            raise MessageError(f'twist must be finite, got linear {linear}, angular {angular}')
+    if abs(x) <= MAX_SPEED and abs(yaw) <= MAX_SPEED:
+        return x, yaw
+    return plausible_twist(x, yaw)
 
 
 def plausible_twist(v: float, omega: float) -> tuple[float, float]:
@@ -110,13 +117,13 @@ def from_pose(message: Pose) -> NDArray[np.float64]:
             length.
     """
     position, q = message.position, message.orientation
-    return from_pose_values(position.x, position.y, q.x, q.y, q.z, q.w)
+    return np.array(from_pose_values(position.x, position.y, q.x, q.y, q.z, q.w))
 
 
 def from_pose_values(
     x: float, y: float, qx: float, qy: float, qz: float, qw: float
-) -> NDArray[np.float64]:
-    """Return `[x, y, theta]` from x, y and the quaternion x, y, z, w, as `from_pose`."""
+) -> tuple[float, float, float]:
+    """Return `(x, y, theta)` from x, y and the quaternion x, y, z, w, as `from_pose`."""
     if not (abs(x) <= MAX_POSITION and abs(y) <= MAX_POSITION):
         raise MessageError(
             f'position must be finite and within {MAX_POSITION:g} m, got x {x:g}, y {y:g}'
@@ -128,7 +135,7 @@ def from_pose_values(
             f'got x {qx:g}, y {qy:g}, z {qz:g}, w {qw:g}'
         )
     sine, cosine = 2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2
-    return np.array([x, y, math.atan2(sine, cosine)])
+    return x, y, math.atan2(sine, cosine)
 
 
 def set_pose(message: Pose, pose: NDArray[np.float64]) -> None:

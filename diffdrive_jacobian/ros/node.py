@@ -77,7 +77,8 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
             self.destroy_node()
             raise
         guard_inputs(self)
-        self._read_time = time_reader(self.get_clock())
+        self.now: Callable[[], int] = time_reader(self.get_clock())
+        """Return the time of the node's clock (ns); 0: simulated time has not started."""
         self._event_limits: dict[str, RateLimit] = {}
         self.add_pre_set_parameters_callback(self._convert_parameters)
         self.add_on_set_parameters_callback(self._validate_parameters)
@@ -87,10 +88,6 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         self._faults: list[tuple[LastingFault, Callable[[], str | None]]] = []
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(WATCH_PERIOD, self._check_graph, clock=steady)
-
-    def now(self) -> int:
-        """Return the time of the node's clock (ns); 0: simulated time has not started."""
-        return self._read_time()
 
     def advertise(self, message: type, topic: str, *, latched: bool = False) -> Publisher:
         """Create a publisher with reliable QoS, keep last 10.

@@ -132,7 +132,8 @@ def time_reader(clock: Clock) -> Callable[[], int]:
     get_now = clock.handle.get_now
 
     def read() -> int:
-        return int(get_now().nanoseconds)
+        now: int = get_now().nanoseconds
+        return now
 
     return read
 

@@ -1,15 +1,15 @@
 """The uncertainty of a robot's pose along its path, computed when it is first needed.
 
 A robot gets a new state with every command, but its covariance is needed only where it is published.
-Each state keeps the arc that led to it and the state before. The covariance is evaluated along these
-arcs, in their order, so that it is the same to the last bit whenever it is evaluated.
+Each state keeps the arc that led to it and the state before. The moments of the error are evaluated
+along these arcs, in their order, so that they are the same to the last bit whenever that happens.
 """
 
 from __future__ import annotations
 
 from typing import TypeAlias
 
-from diffdrive_jacobian.simulation.odometry_noise import Entries, propagated_entries
+from diffdrive_jacobian.simulation.exact_moments import Moments, propagated_moments
 
 Arc: TypeAlias = tuple[float, tuple[float, float], float, float, float]
 """Heading at the start (rad), twist (m/s, rad/s), duration (s), wheel separation (m), k (m)."""
@@ -18,13 +18,13 @@ MAX_PENDING = 64
 
 
 class Uncertainty:
-    """Covariance of a pose, given or pending. An immutable value to its users."""
+    """Moments of the error of a pose, given or pending. An immutable value to its users."""
 
-    __slots__ = ('_entries', '_number', '_pending')
+    __slots__ = ('_moments', '_number', '_pending')
 
-    def __init__(self, entries: Entries) -> None:
-        """Start from the entries xx, xy, xt, yy, yt, tt of a covariance."""
-        self._entries: Entries | None = entries
+    def __init__(self, moments: Moments) -> None:
+        """Start from given moments."""
+        self._moments: Moments | None = moments
         self._pending: tuple[Uncertainty, Arc] | None = None
         self._number = 0
 
@@ -33,24 +33,24 @@ class Uncertainty:
         if self._number >= MAX_PENDING:
             self._evaluate()
         later = object.__new__(Uncertainty)
-        later._entries = None
+        later._moments = None
         later._pending = self, arc
         later._number = self._number + 1
         return later
 
-    def entries(self) -> Entries:
-        """Return the entries xx, xy, xt, yy, yt, tt.
+    def moments(self) -> Moments:
+        """Return the moments.
 
         Raises:
             ValueError: They overflow.
         """
-        entries = self._entries
-        if entries is None:
+        moments = self._moments
+        if moments is None:
             self._evaluate()
-            entries = self._entries
-            if entries is None:
+            moments = self._moments
+            if moments is None:
                 raise ValueError('twist and time must give a finite result, but it overflows')
-        return entries
+        return moments
 
     def _evaluate(self) -> None:
         """Evaluate the pending arcs in their order. Several threads may do so at once."""
@@ -61,9 +61,9 @@ class Uncertainty:
             here = pending[0]
             pending = here._pending
         for here, before, arc in reversed(waiting):
-            if before._entries is not None:
+            if before._moments is not None:
                 # After an overflow there is none.
-                here._entries = propagated_entries(before._entries, *arc)
+                here._moments = propagated_moments(before._moments, *arc)
             here._number = 0
-            # Last, because then the entries count.
+            # Last, because then the moments count.
             here._pending = None

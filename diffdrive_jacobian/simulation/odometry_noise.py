@@ -1,4 +1,7 @@
-"""Odometry covariance: the covariance of pose and twist, propagated with the Jacobians of the motion.
+"""Odometry covariance of first order: propagated with the Jacobians of the motion.
+
+The covariance of the pose is right while the standard deviation of the heading is small, and too small
+afterwards. It is here for comparison. The robot publishes the exact one of `exact_moments`.
 
 Model: the variance of the distance travelled by each wheel grows by `k |ds|` (m^2; k in m),
 independently of the other wheel. The covariance is the integral along the exact arc, not a sum over
@@ -13,7 +16,7 @@ Scaramuzza, *Introduction to Autonomous Mobile Robots*, 5.2.4.
 from __future__ import annotations
 
 import math
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,18 +30,12 @@ from diffdrive_jacobian.kinematics._elementary import (
     operand,
     sin,
     sinc,
+    sinc_defect,
     stack,
-    where,
 )
 
 ROUNDING = 1e-8
 """Tolerance on symmetry and semidefiniteness of a covariance, relative to its largest entry."""
-# Taylor coefficients of _sinc_defect in the square of its argument, (-1)^n / (2n + 3)!
-_DEFECT = [(-1.0) ** n / math.factorial(2 * n + 3) for n in range(9)]
-
-
-Entries: TypeAlias = tuple[float, float, float, float, float, float]
-"""Entries xx, xy, xt, yy, yt, tt of the covariance of a pose."""
 
 
 def twist_covariance(
@@ -127,31 +124,6 @@ def propagate_covariance(
     single = agree(covariance=entries[0], pose=theta, twist=v, dt=dt, L=L, wheel_travel_variance=k)
     names = 'covariance, pose, twist, dt, L and wheel_travel_variance'
     return _matrix(*evaluated(single, names, _propagated, *entries, theta, v, omega, dt, L, k))
-
-
-def propagated_entries(
-    entries: Entries,
-    theta: float,
-    twist: tuple[float, float],
-    dt: float,
-    L: float,
-    wheel_travel_variance: float,
-) -> Entries | None:
-    """Compute what `propagate_covariance` returns for one robot whose values were checked before.
-
-    Entries are xx, xy, xt, yy, yt, tt.
-
-    Returns:
-        The entries at the end. None: they overflow.
-    """
-    try:
-        xx, xy, xt, _, yy, yt, _, _, tt = _propagated(
-            *entries, theta, *twist, dt, L, wheel_travel_variance
-        )
-    except (OverflowError, ValueError, ZeroDivisionError):
-        return None
-    made = xx, xy, xt, yy, yt, tt
-    return made if all(map(math.isfinite, made)) else None
 
 
 def covariance_entries(name: str, covariance: ArrayLike) -> tuple[Any, ...]:
@@ -246,7 +218,7 @@ def _noise_at_end(v: Any, omega: Any, dt: Any, L: Any, wheel_travel_variance: An
 
     With the remaining turn phi = omega (T - s), the columns of g are `[cos phi, -sin phi, 0]` and
     `[v (1 - cos phi) / omega, v sin(phi) / omega, 1]`. The integrals over s are written so that no
-    digits cancel as omega goes to zero. Terms that would cancel are in `_sinc_defect`.
+    digits cancel as omega goes to zero. Terms that would cancel are in `sinc_defect`.
     """
     right, left = _wheel_variances(v, omega, L, wheel_travel_variance)
     # W = [[vv, vw], [vw, ww]], times the duration.
@@ -257,7 +229,7 @@ def _noise_at_end(v: Any, omega: Any, dt: Any, L: Any, wheel_travel_variance: An
     )
     turn, path = omega * dt, v * dt
     whole, half = sinc(turn), sinc(turn / 2.0)
-    once, twice = _sinc_defect(turn), _sinc_defect(2.0 * turn)
+    once, twice = sinc_defect(turn), sinc_defect(2.0 * turn)
     cosine = cos(turn)
     return (
         vv * (1.0 + whole * cosine) / 2.0
@@ -271,16 +243,6 @@ def _noise_at_end(v: Any, omega: Any, dt: Any, L: Any, wheel_travel_variance: An
         -vw * turn / 2.0 * half**2 + ww * path * half**2 / 2.0,
         ww,
     )
-
-
-def _sinc_defect(angle: Any) -> Any:
-    """Compute (1 - sin(x)/x) / x^2, which is 1/6 at zero, to full precision."""
-    square: Any = angle * angle
-    series: Any = 0.0
-    for coefficient in reversed(_DEFECT):
-        series = series * square + coefficient
-    far = where(square < 1.0, 1.0, angle)
-    return where(square < 1.0, series, (1.0 - sin(far) / far) / far**2)
 
 
 def _matrix(*entries: Any) -> NDArray[np.float64]:

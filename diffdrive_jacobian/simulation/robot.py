@@ -37,6 +37,7 @@ from diffdrive_jacobian.kinematics._checks import (
 from diffdrive_jacobian.kinematics._elementary import components, operand
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
 from diffdrive_jacobian.simulation._uncertainty import Uncertainty
+from diffdrive_jacobian.simulation.exact_moments import Moments, gaussian_moments
 from diffdrive_jacobian.simulation.odometry_noise import covariance_entries, twist_covariance_entries
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -111,8 +112,11 @@ class Robot:
     pose: NDArray[np.float64]
     """`[x, y, theta]`, shape (3,), read-only. `pose_tuple` has the same numbers without an array."""
     covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 3)))
-    """Covariance of the pose, shape (3, 3), read-only. Computed when it is first read, which raises
-    ValueError if it overflows."""
+    """Second moment of the error of `pose`, shape (3, 3), read-only: `E[(q - pose) (q - pose)^T]` of the
+    true pose q, in world coordinates, the heading unwrapped. It is exact under the noise model (see
+    `exact_moments`), and not the covariance about the mean, which is off the reported pose. Given to
+    the constructor, it is the covariance of a Gaussian error of mean zero. Computed when it is first
+    read, which raises ValueError if it overflows."""
     wheel_angles: tuple[float, float] = (0.0, 0.0)
     """`(right, left)`, unwrapped (rad)."""
     command: tuple[float, float] = STANDSTILL
@@ -143,7 +147,7 @@ class Robot:
             'pose': pose,
             'covariance': covariance,
             'pose_tuple': tuple(pose.tolist()),
-            '_uncertainty': Uncertainty(entries),
+            '_uncertainty': Uncertainty(gaussian_moments(entries)),
         }
         for name in ('wheel_angles', 'command', 'twist'):
             values[name] = _pair(name, getattr(self, name))
@@ -173,8 +177,17 @@ class Robot:
         Raises:
             ValueError: The covariance overflows.
         """
-        xx, xy, xt, yy, yt, tt = self._uncertainty.entries()
+        xx, xy, xt, yy, yt, tt, *_ = self._uncertainty.moments()
         return xx, xy, xt, xy, yy, yt, xt, yt, tt
+
+    @property
+    def moments(self) -> Moments:
+        """Moments of the error of the pose, from which its later uncertainty follows.
+
+        Raises:
+            ValueError: They overflow.
+        """
+        return self._uncertainty.moments()
 
     @property
     def expiry(self) -> int | None:
@@ -252,7 +265,7 @@ class Robot:
 
         Args:
             pose: `[x, y, theta]`, shape (3,) (m, m, rad).
-            covariance: Its covariance, shape (3, 3).
+            covariance: Its covariance, shape (3, 3). The error is taken for Gaussian.
             stamp: The time (ns).
 
         Raises:

@@ -1,4 +1,4 @@
-"""What one writes without the library: formulas of one robot in floats or small arrays, without checks."""
+"""What one writes without the library: formulas of one robot in floats or small arrays."""
 
 from __future__ import annotations
 

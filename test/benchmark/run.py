@@ -1,11 +1,10 @@
 """All benchmarks in one table: `python test/benchmark/run.py [--quick] [ROW ...]`.
 
 ROW is one or more of odometry, lockstep, identity, many_robots, start_up, closed_loops, jacobians,
-single_calls;
-without any all are measured (about half an hour; with --quick, to see whether it works, a minute and a
-half). Nothing else should run meanwhile. closed_loops also measures packages that pip installs, if they
-are there (pip install ir-sim roboticstoolbox-python). flood.py and inverse_kinematics.py in this folder
-are benchmarks of their own.
+single_calls; without any all are measured (about half an hour; with --quick, to see whether it works, a
+minute and a half). Nothing else should run meanwhile. closed_loops also measures packages that pip
+installs, if they are there (pip install ir-sim roboticstoolbox-python). flood.py and
+inverse_kinematics.py in this folder are benchmarks of their own.
 """
 
 from __future__ import annotations

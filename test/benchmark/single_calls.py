@@ -1,8 +1,8 @@
 """Single calls of kinematics and control: microseconds per call, beside the same formula by hand.
 
-By hand means what one writes without the library: the formula in floats or small NumPy arrays, without any
-check of its arguments (by_hand.py). Both sides give the same, which is looked at first. CPU time of the
-process counts, so that other processes disturb little.
+By hand means what one writes without the library: the formula in floats or small NumPy arrays, without
+any check of its arguments (by_hand.py). Both sides give the same, which is looked at first. CPU time of
+the process counts, so that other processes disturb little.
 
 As a program it prints for every function the least figures of all rounds: `single_calls.py [NAME ...]`.
 """
@@ -54,7 +54,7 @@ class Call(NamedTuple):
     def check(self) -> None:
         """Refuse to compare speeds of ways to different results."""
         ours, other = self.ours(), self.by_hand()
-        tolerance = 1e-5 if self.name in (SOLVER, 'manipulability_gradient') else 1e-9
+        tolerance = 1e-5 if self.name in (SOLVER, 'secondary_tasks.manipulability_gradient') else 1e-9
         for mine, theirs in zip(_parts(ours), _parts(other), strict=True):
             if not np.allclose(mine, theirs, rtol=tolerance, atol=tolerance):
                 raise RuntimeError(f'{self.name}: different results, {ours} and {other}')
@@ -66,6 +66,11 @@ class Call(NamedTuple):
         for _ in range(number):
             function()
         return (time.process_time() - begun) / number * 1e6
+
+
+def _name(function: Callable[..., Any]) -> str:
+    name = function.__qualname__
+    return f'{function.__module__.rpartition(".")[2]}.{name}' if '.' not in name else name
 
 
 def _parts(result: Any) -> Any:
@@ -153,7 +158,7 @@ def calls() -> list[Call]:
         (LINE.position, partial(by_hand.line_position, START, END, 0.1), (0.5,)),
     ]
     found = [
-        Call(ours.__qualname__, partial(ours, *arguments), partial(other, *arguments))
+        Call(_name(ours), partial(ours, *arguments), partial(other, *arguments))
         for ours, other, arguments in sides
     ]
     # Those whose arguments differ from what one passes by hand.
@@ -163,7 +168,7 @@ def calls() -> list[Call]:
     found += [
         *(
             Call(
-                f'saturate, {where} the limits',
+                f'saturation.saturate, {where} the limits',
                 partial(control.saturate, *twist, VELOCITY_LIMITS, *WHEELS),
                 partial(by_hand.saturate, *twist, LIMITS, *WHEELS),
             )
@@ -182,11 +187,17 @@ def calls() -> list[Call]:
         ),
         Call('one step: law, arrival, saturation', _one_step, _one_step_by_hand),
         Call(
-            'resolved_rate', partial(control.resolved_rate, *rate), partial(by_hand.resolved_rate, *rate)
+            'resolved_rate.resolved_rate',
+            partial(control.resolved_rate, *rate),
+            partial(by_hand.resolved_rate, *rate),
         ),
-        Call('prioritized', partial(iv.prioritized, pair[:1]), lambda: np.linalg.pinv(WIDE) @ X_DOT),
         Call(
-            'manipulability_gradient',
+            'task_priority.prioritized',
+            partial(iv.prioritized, pair[:1]),
+            lambda: np.linalg.pinv(WIDE) @ X_DOT,
+        ),
+        Call(
+            'secondary_tasks.manipulability_gradient',
             partial(iv.manipulability_gradient, ARM.jacobian, Q),
             lambda: by_hand.gradient(
                 lambda q: by_hand.manipulability(by_hand.two_links(ARM.lengths, q)), Q

@@ -1,0 +1,203 @@
+"""Exact moments of the error that the wheels' noise adds along one arc.
+
+Reported, a twist `[v, omega]` held for the time t moves the robot along an arc. Truly, v and omega are
+disturbed by white noise with the spectral densities vv, vw, ww, the entries of W. At the end let psi be
+the error of the heading, unwrapped, and gamma = gamma_x + i gamma_y the error of the position in the
+frame of the reported pose. psi is Gaussian with variance `ww t`, gamma is not.
+
+Notation: `x = i omega t`, `m = ww t / 2`, `alpha = v t`, `beta = vw t`, `h = exp(i psi)`. The moments
+obey a linear differential equation with constant coefficients. Its solution is written with divided
+differences of the exponential function: `[a, b] = (exp(a) - exp(b)) / (a - b)`, and so on. Where the
+points of those are close to each other, a power series is used, so that no digits cancel.
+
+Source: doc/mathematics.md, "Odometry covariance".
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from bisect import bisect_left
+from typing import NamedTuple
+
+SMALL_TURN = 0.05
+"""Turn below which the power series is used (rad)."""
+RADIUS = 1.0
+"""Largest argument of the power series, `2 |omega t| + 4 m`. Longer straight arcs are halved."""
+
+
+FIRST_ORDER, LAST_ORDER = 6, 21
+
+
+def _largest_argument(order: int) -> float:
+    """Return the argument up to which the terms after an order are negligible, 1e-16 of the leading
+    terms, which are of third order.
+    """
+    return float((1e-16 * math.factorial(order + 1) / 6.0) ** (1.0 / (order - 2)))
+
+
+_ORDERS = [_largest_argument(order) for order in range(FIRST_ORDER - 1, LAST_ORDER)]
+
+
+class NoiseMoments(NamedTuple):
+    """Expectations over the noise of one arc, in the frame of the reported pose at its end."""
+
+    x: float
+    """E[gamma_x] (m)."""
+    y: float
+    xx: float
+    """E[gamma_x^2] (m^2)."""
+    xy: float
+    yy: float
+    xt: float
+    """E[gamma_x psi] (m rad)."""
+    yt: float
+    xc: float
+    """E[gamma_x (cos psi - 1)] (m)."""
+    xs: float
+    """E[gamma_x sin psi] (m)."""
+    yc: float
+    ys: float
+
+
+def series(alpha: float, turn: float, nu: float, beta: float, m: float) -> NoiseMoments:
+    """Compute the moments by their power series in time, for a short arc or a nearly straight one.
+
+    Args:
+        alpha: v t (m).
+        turn: omega t (rad).
+        nu: vv t (m^2).
+        beta: vw t (m rad).
+        m: ww t / 2.
+    """
+    x, half = 1j * turn, 0.5j * beta
+    drift, ahead, back = alpha + half, alpha + 3.0 * half, x + m
+    back_b = x - m
+    # Coefficients of t^n, from n = 1 on: of exp(-m t) - 1 and exp(-4 m t) - 1, then of the moments
+    # E[gamma], E[gamma psi], E[gamma h], E[gamma* h], E[|gamma|^2] - nu, of E[gamma^2] less what vv
+    # contributes, and of nu less what vv contributes to it.
+    c, c4 = -m, -4.0 * m
+    first: complex = half
+    turned: complex = complex(beta)
+    a: complex = 3.0 * half
+    b: complex = half
+    square, unit = 0.0, nu
+    pseudo: complex = 0.0j
+    rest: complex = 0.0j
+    s_first, s_turned, s_a, s_b, s_square, s_pseudo, s_rest = first, turned, a, b, 0.0, 0.0j, 0.0j
+    for n in range(2, FIRST_ORDER + bisect_left(_ORDERS, 2.0 * abs(turn) + 4.0 * m)):
+        f = 1.0 / n
+        g = 2.0 * f
+        square = g * ((drift * b).real - alpha * first.real)
+        pseudo = g * (drift * a - alpha * first - x * pseudo)
+        rest = f * (2.0 * x * (unit - rest) - nu * c4)
+        turned = f * ((beta - 2j * (n - 1) * drift) * c - x * turned)
+        first = f * (drift * c - x * first)
+        a = f * (ahead * c4 - alpha * c - back * a)
+        b = f * (back_b * b - alpha * c)
+        c *= -m * f
+        c4 *= -4.0 * m * f
+        unit = 0.0
+        s_square += square
+        s_pseudo += pseudo
+        s_rest += rest
+        s_turned += turned
+        s_first += first
+        s_a += a
+        s_b += b
+    return _real(
+        s_first, s_turned, s_a - s_first, s_b - s_first.conjugate(), s_square, s_pseudo, nu, s_rest
+    )
+
+
+def closed_form(alpha: float, turn: float, nu: float, beta: float, m: float) -> NoiseMoments:
+    """Compute the moments by divided differences, for a turn of at least `SMALL_TURN`.
+
+    Arguments as for `series`.
+    """
+    x = 1j * turn
+    y, x2, z, w, u = x - m, 2.0 * x - m, 2.0 * x - 4.0 * m, x - 3.0 * m, x + m
+    e_x, e_m = cmath.exp(x), math.exp(-m)
+    e_y, e_2x, e_4m = e_x * e_m, e_x * e_x, e_m**4
+    # [0, -m], [0, 0, -m], [0, -3 m]
+    h1, h2, h3 = _mean_decay(m), _mean_defect(m), _mean_decay(3.0 * m)
+    p, r, q = (e_x - 1.0) / x, (e_y - 1.0) / y, e_m * (e_x - 1.0) / x  # [0, x], [0, y], [-m, y]
+    back, back_2, half = e_x.conjugate(), e_2x.conjugate(), 0.5j * beta
+    drift = alpha + half
+    x_y_0 = (e_x * h1 - r) / x  # [0, x, y]
+    first = half * r - alpha * m * x_y_0
+    turned = 2j * m * drift * (e_y - r) / y + beta * r
+    m_y_4 = (e_y * h3 - q) / w  # [-m, y, x - 4 m]
+    m_4 = (e_x * e_4m - e_m) / w  # [-m, x - 4 m]
+    a = alpha * m * (x_y_0 - 3.0 * m_y_4) + half * (3.0 * m_4 - r)
+    b_conjugate = alpha * m * ((e_x * h1 - q) / u + x_y_0) - half * ((e_x - e_m) / u + r)
+    y_0_m = ((q - h1) / y - h2) / y  # [0, 0, -m, y]
+    x_0_m = ((p - 1.0) / x - h2) / u  # [0, 0, -m, x]
+    y_0 = (r - 1.0) / y  # [0, 0, y]
+    square = (
+        2.0
+        * (
+            alpha * (alpha * m * (y_0_m + x_0_m) + half * (y_0 + (p - h1) / u + m * y_0_m))
+            + half * half * y_0
+        ).real
+    )
+    y_z = ((e_2x * e_4m - e_y) / w - r) / z  # [0, y, 2 x - 4 m]
+    y_2_z = ((e_2x * e_m * h3 - e_y * p) / w - (e_y * p - r) / x2) / z  # [0, y, 2 x - m, 2 x - 4 m]
+    x_2 = ((e_2x * e_m - e_x) / y - p) / x2  # [0, x, 2 x - m]
+    x_2_2 = ((e_2x * h1 - e_x * p) / y - 0.5 * p * p) / x2  # [0, x, 2 x, 2 x - m]
+    of_a = 3.0 * (half * y_z - alpha * m * y_2_z)
+    pseudo = 2.0 * (alpha * (of_a + alpha * m * x_2_2 - half * x_2) + half * of_a)
+    rest = nu * (1.0 - back_2 * (e_2x * e_4m - 1.0) / z)
+    return _real(
+        back * first,
+        back * turned,
+        back * a,
+        (back * b_conjugate).conjugate(),
+        square,
+        back_2 * pseudo,
+        nu,
+        rest,
+    )
+
+
+def _real(
+    first: complex,
+    turned: complex,
+    a: complex,
+    b: complex,
+    square: float,
+    pseudo: complex,
+    nu: float,
+    rest: complex,
+) -> NoiseMoments:
+    """Return the real moments of complex ones; `a` is E[gamma (h - 1)], `b` is E[gamma* (h - 1)]."""
+    return NoiseMoments(
+        first.real,
+        first.imag,
+        nu + 0.5 * (square + pseudo.real - rest.real),
+        0.5 * (pseudo.imag - rest.imag),
+        0.5 * (square - pseudo.real + rest.real),
+        turned.real,
+        turned.imag,
+        0.5 * (a.real + b.real),
+        0.5 * (a.imag + b.imag),
+        0.5 * (a.imag - b.imag),
+        0.5 * (b.real - a.real),
+    )
+
+
+def _mean_decay(m: float) -> float:
+    """Compute (1 - exp(-m)) / m, which is 1 at zero."""
+    return -math.expm1(-m) / m if m else 1.0
+
+
+def _mean_defect(m: float) -> float:
+    """Compute (1 - (1 - exp(-m)) / m) / m, which is 1/2 at zero."""
+    if m > 0.5:
+        return (1.0 - _mean_decay(m)) / m
+    total, term, n = 0.0, 0.5, 2
+    while abs(term) > 1e-17:
+        total += term
+        n += 1
+        term *= -m / n
+    return total

@@ -1,0 +1,249 @@
+"""Exact moments of the error of odometry about the reported pose.
+
+Model: as in `odometry_noise`, the travel of each wheel has a variance that grows by `k |ds|`. Where the
+covariance there is of first order in the error of the heading, the moments here are exact: they are the
+expectations over all paths that the robot may have driven.
+
+State: let delta be the error of the heading, unwrapped, and e the error of the position in the world
+frame, both relative to the reported pose. `Moments` has their second moments, and the moments with
+`C = cos(delta) - 1` and `S = sin(delta)` from which later second moments follow. No coordinate of the
+pose enters, so nothing cancels far from the origin.
+
+Source: doc/mathematics.md, "Odometry covariance".
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from diffdrive_jacobian.kinematics._checks import not_negative, number, positive
+from diffdrive_jacobian.kinematics._elementary import components
+from diffdrive_jacobian.simulation._noise_moments import (
+    RADIUS,
+    SMALL_TURN,
+    NoiseMoments,
+    closed_form,
+    series,
+)
+from diffdrive_jacobian.simulation.odometry_noise import covariance_entries
+
+
+class Moments(NamedTuple):
+    """Expectations of the error relative to the reported pose, in the world frame."""
+
+    xx: float
+    """E[e_x^2] (m^2)."""
+    xy: float
+    xt: float
+    """E[e_x delta] (m rad)."""
+    yy: float
+    yt: float
+    tt: float
+    """E[delta^2] (rad^2). The error of the heading is Gaussian with mean zero."""
+    x: float = 0.0
+    """E[e_x], the mean error (m)."""
+    y: float = 0.0
+    xc: float = 0.0
+    """E[e_x C] (m)."""
+    xs: float = 0.0
+    """E[e_x S] (m)."""
+    yc: float = 0.0
+    ys: float = 0.0
+
+    @property
+    def second_moment(self) -> NDArray[np.float64]:
+        """Second moment of `[e_x, e_y, delta]`, shape (3, 3): the covariance that is published."""
+        xx, xy, xt, yy, yt, tt = self[:6]
+        return np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
+
+    @property
+    def mean(self) -> NDArray[np.float64]:
+        """Mean of `[e_x, e_y, delta]`, shape (3,)."""
+        return np.array([self.x, self.y, 0.0])
+
+
+SURE = Moments(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""The moments of no error."""
+
+
+def gaussian(covariance: ArrayLike) -> Moments:
+    """Return the moments of a Gaussian error about the reported pose.
+
+    Args:
+        covariance: Covariance of `[x, y, theta]`, shape (3, 3).
+
+    Raises:
+        ValueError: It has another shape, is not finite, or is not symmetric and positive semidefinite.
+    """
+    entries = covariance_entries('covariance', covariance)
+    if type(entries[0]) is not float:
+        raise ValueError(f'covariance must have shape (3, 3), got {np.shape(covariance)}')
+    return gaussian_moments(entries)
+
+
+def gaussian_moments(entries: tuple[float, ...]) -> Moments:
+    """Compute what `gaussian` returns from the entries xx, xy, xt, yy, yt, tt, which were checked."""
+    xx, xy, xt, yy, yt, tt = entries
+    # Stein's lemma: E[e f(delta)] = E[e delta] E[f'(delta)].
+    decay = math.exp(-tt / 2.0)
+    return Moments(xx, xy, xt, yy, yt, tt, 0.0, 0.0, 0.0, xt * decay, 0.0, yt * decay)
+
+
+def propagate_moments(
+    moments: Moments,
+    pose: ArrayLike,
+    twist: ArrayLike,
+    dt: float,
+    L: float,
+    wheel_travel_variance: float,
+) -> Moments:
+    """Propagate the moments of the error along an arc, exactly.
+
+    Args:
+        moments: Moments at the start.
+        pose: Reported pose at the start, shape (3,) (m, m, rad).
+        twist: The constant twist as reported, `[v, omega]`, shape (2,) (m/s, rad/s).
+        dt: Duration, zero or positive (s).
+        L: Wheel separation, positive (m).
+        wheel_travel_variance: k, variance per distance travelled of each wheel, zero or positive (m).
+
+    Returns:
+        Moments of the error relative to the reported pose at the end. They do not depend on the number
+        of pieces in which the arc is propagated.
+
+    Raises:
+        ValueError: An argument has a wrong shape or sign, is not finite, or the result overflows.
+    """
+    _, _, theta = components('pose', pose, 3)
+    v, omega = components('twist', twist, 2)
+    if not type(theta) is type(v) is float:
+        raise ValueError(
+            f'pose and twist must have shapes (3,) and (2,), got {np.shape(pose)} and {np.shape(twist)}'
+        )
+    dt, L = number('dt', dt, not_negative), number('L', L, positive)
+    k = number('wheel_travel_variance', wheel_travel_variance, not_negative)
+    values = Moments(*components('moments', moments, 12))
+    propagated = propagated_moments(values, theta, (v, omega), dt, L, k)
+    if propagated is None:
+        raise ValueError(
+            'moments, pose, twist, dt, L and wheel_travel_variance must give a finite result, '
+            'but it overflows'
+        )
+    return propagated
+
+
+def propagated_moments(
+    moments: Moments,
+    theta: float,
+    twist: tuple[float, float],
+    dt: float,
+    L: float,
+    wheel_travel_variance: float,
+) -> Moments | None:
+    """Compute what `propagate_moments` returns for values that were checked before.
+
+    Returns:
+        The moments. None: they overflow.
+    """
+    v, omega = twist
+    half = omega * L / 2.0
+    try:
+        right = wheel_travel_variance * abs(v + half) * dt
+        left = wheel_travel_variance * abs(v - half) * dt
+        alpha, turn = v * dt, omega * dt
+        nu, beta, m = (right + left) / 4.0, (right - left) / (2.0 * L), (right + left) / (2.0 * L * L)
+        noise = _noise(alpha, turn, nu, beta, m) if m else None
+        end = _composed(moments, theta, alpha, turn, m, noise)
+    except (OverflowError, ValueError, ZeroDivisionError):
+        return None
+    return end if all(map(math.isfinite, end)) else None
+
+
+def _noise(alpha: float, turn: float, nu: float, beta: float, m: float) -> NoiseMoments:
+    """Compute the moments of the noise of one arc."""
+    if abs(turn) >= SMALL_TURN:
+        return closed_form(alpha, turn, nu, beta, m)
+    argument, halvings = 2.0 * abs(turn) + 4.0 * m, 0
+    if argument <= RADIUS:
+        return series(alpha, turn, nu, beta, m)
+    # A long and nearly straight arc: a short one, doubled again and again.
+    halvings = math.frexp(argument / RADIUS)[1]
+    share = 2.0**-halvings
+    alpha, turn, nu, beta, m = alpha * share, turn * share, nu * share, beta * share, m * share
+    noise = series(alpha, turn, nu, beta, m)
+    for _ in range(halvings):
+        first = _composed(SURE, -2.0 * turn, alpha, turn, m, noise)
+        xx, xy, xt, yy, yt, _, *others = _composed(first, -turn, alpha, turn, m, noise)
+        x, y, *trigonometric = others
+        noise = NoiseMoments(x, y, xx, xy, yy, xt, yt, *trigonometric)
+        alpha, turn, m = 2.0 * alpha, 2.0 * turn, 2.0 * m
+    return noise
+
+
+def _composed(
+    moments: Moments, theta: float, alpha: float, turn: float, m: float, noise: NoiseMoments | None
+) -> Moments:
+    """Compute the moments after an arc that starts with an error and adds its noise.
+
+    With the reported displacement g and the noise gamma, both in the world, and `u = exp(i delta)`,
+    the error becomes `e + (u - 1) g + u gamma`. The noise is independent of e and delta.
+    """
+    xx, xy, xt, yy, yt, tt, x, y, xc, xs, yc, ys = moments
+    # E[C], E[cos delta], E[C^2], E[S^2], E[cos delta C]; E[S], E[C S] are zero.
+    c = math.expm1(-tt / 2.0)
+    u = 1.0 + c
+    cc = c * c * (u * (u + 2.0) + 3.0) / 2.0
+    ss = -c * (1.0 + u) * (1.0 + u * u) / 2.0
+    uc = c + cc
+    # The displacement, as the noise, in the frame of the pose at the end, then in the world.
+    cosine, sine = math.cos(theta + turn), math.sin(theta + turn)
+    half = turn / 2.0
+    sinc = math.sin(half) / half if half else 1.0
+    along, across = alpha * (math.sin(turn) / turn if turn else 1.0), -alpha * sinc * math.sin(half)
+    gx, gy = cosine * along - sine * across, sine * along + cosine * across
+    decay, loss = math.exp(-m), math.expm1(-m)
+    cg, sg = cc * decay + c * loss, ss * decay
+    # E[(e + (u - 1) g) ...]
+    end_xx = xx + 2.0 * (xc * gx - xs * gy) + cc * gx * gx + ss * gy * gy
+    end_xy = xy + xc * gy + xs * gx + yc * gx - ys * gy + (cc - ss) * gx * gy
+    end_yy = yy + 2.0 * (yc * gy + ys * gx) + cc * gy * gy + ss * gx * gx
+    tu = tt * u
+    end_xt, end_yt = xt - tu * gy, yt + tu * gx
+    end_x, end_y = x + c * gx, y + c * gy
+    end_xc, end_xs = xc * decay + x * loss + cg * gx, xs * decay - sg * gy
+    end_yc, end_ys = yc * decay + y * loss + cg * gy, ys * decay + sg * gx
+    if noise is None:
+        return Moments(
+            *(end_xx, end_xy, end_xt, end_yy, end_yt, tt),
+            *(end_x, end_y, end_xc, end_xs, end_yc, end_ys),
+        )
+    nx, ny, nxx, nxy, nyy, nxt, nyt, nxc, nxs, nyc, nys = noise
+    px, py = cosine * nx - sine * ny, sine * nx + cosine * ny
+    pxt, pyt = cosine * nxt - sine * nyt, sine * nxt + cosine * nyt
+    pxc, pyc = cosine * nxc - sine * nyc, sine * nxc + cosine * nyc
+    pxs, pys = cosine * nxs - sine * nys, sine * nxs + cosine * nys
+    pxx = cosine * cosine * nxx - 2.0 * cosine * sine * nxy + sine * sine * nyy
+    pyy = sine * sine * nxx + 2.0 * cosine * sine * nxy + cosine * cosine * nyy
+    pxy = cosine * sine * (nxx - nyy) + (cosine * cosine - sine * sine) * nxy
+    # E[u gamma u gamma], and twice E[(e + (u - 1) g) u gamma].
+    spread = ss * (pxx - pyy)
+    qxx, qyy, qxy, qyx = uc * gx + x + xc, uc * gy + y + yc, ss * gy - xs, ss * gx + ys
+    ux, uy = 1.0 - ss, ss
+    return Moments(
+        end_xx + pxx - spread + 2.0 * (qxx * px + qxy * py),
+        end_xy + (1.0 - 2.0 * ss) * pxy + qxx * py - qxy * px + qyy * px - qyx * py,
+        end_xt + u * pxt - tu * py,
+        end_yy + pyy + spread + 2.0 * (qyy * py + qyx * px),
+        end_yt + u * pyt + tu * px,
+        tt + 2.0 * m,
+        end_x + u * px,
+        end_y + u * py,
+        end_xc + ux * pxc + uy * pys + uc * px,
+        end_xs + ux * pxs - uy * pyc - ss * py,
+        end_yc + ux * pyc - uy * pxs + uc * py,
+        end_ys + ux * pys + uy * pxc + ss * px,
+    )
