@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Any, Protocol
@@ -21,6 +22,7 @@ from diffdrive_jacobian.ros.goal_client import (
     duplicates,
     loss,
 )
+from diffdrive_jacobian.ros.heartbeats import fast_heartbeats
 from diffdrive_jacobian.ros.liveness import Liveness
 from diffdrive_jacobian.ros.node_runner import NodeRunner
 from diffdrive_jacobian.ros.runner import ros_context, running
@@ -147,6 +149,8 @@ def send_goal(
     """
     goals = np.asarray(goal, dtype=np.float64)[np.newaxis]
     with (
+        # The acknowledgement is what is waited for then.
+        nullcontext() if follow else fast_heartbeats(),
         ros_context([NAME, *ros_arguments]) as context,
         running(context, isolated=False) as runner,
     ):
