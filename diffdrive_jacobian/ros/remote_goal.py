@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Any, Protocol
@@ -22,6 +23,7 @@ from diffdrive_jacobian.ros.goal_client import (
     duplicates,
     loss,
 )
+from diffdrive_jacobian.ros.heartbeats import fast_heartbeats
 from diffdrive_jacobian.ros.liveness import Liveness
 from diffdrive_jacobian.ros.node_runner import NodeRunner
 from diffdrive_jacobian.ros.runner import ros_context, running
@@ -148,7 +150,8 @@ def send_goal(
     """
     goals = np.asarray(goal, dtype=np.float64)[np.newaxis]
     with (
-        fast_heartbeats(),  # A goal that is not followed ends with its acknowledgement.
+        # The acknowledgement is what is waited for then.
+        nullcontext() if follow else fast_heartbeats(),
         ros_context([NAME, *ros_arguments]) as context,
         running(context, isolated=False) as runner,
     ):
