@@ -1,0 +1,374 @@
+"""Maximum likelihood estimate of the multipliers from wheel angles and poses of a reference.
+
+The model is that of doc/mathematics.md, "Calibration": the pose of the body is a random walk about the
+motion that the wheels measure, and the reference observes it with white noise. All poses of the body and
+all parameters are estimated together by Gauss-Newton steps. The poses form a block-tridiagonal system,
+so that a step takes a time proportional to their number. The noise is estimated by restricted maximum
+likelihood.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffdrive_jacobian.calibration import _block_tridiagonal
+from diffdrive_jacobian.calibration.measurements import (
+    Array,
+    CalibrationError,
+    Given,
+    Noise,
+    Segment,
+    wrapped,
+)
+from diffdrive_jacobian.calibration.motion import (
+    Geometry,
+    adjoint,
+    composed,
+    increments,
+    inverted,
+    relative,
+)
+
+MULTIPLIERS, LEVER_ARM, YAW_OFFSET, TIME_OFFSETS = slice(0, 3), slice(3, 5), 5, 6
+"""Where the parameters are in their vector: logarithms of the multipliers (left, right, separation), the
+pose of the sensor in the body frame, and the time offset of each recording."""
+SCALES = (1.0, 1.0, 1.0, 1.0, 1.0, 3.0, 1.0)
+"""Standard deviations that bound a step where the data do not (-, m, rad, s)."""
+MAX_STEPS = 30
+MAX_NOISE_STEPS = 100
+CONVERGED = 1e-3
+"""Largest change of a parameter in the last step, relative to its standard deviation."""
+SMALLEST = Noise(wheel=1e-10, position=1e-6, heading=1e-6)
+"""Smallest noise that is estimated: with less, rounding errors dominate."""
+LARGEST = Noise(wheel=1.0, position=1e3, heading=1e2)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Estimate:
+    """Parameters of the model and the state of their estimation."""
+
+    parameters: Array
+    """As described at `MULTIPLIERS`, shape (6 + number of recordings,)."""
+    noise: Noise
+    free: NDArray[np.bool_]
+    """Which of the parameters are estimated, shape as `parameters`."""
+    states: tuple[Array, ...] = ()
+    """Most likely poses of the body at the times of each segment, shapes (n, 3)."""
+    information: Array
+    """Fisher information of the free parameters."""
+
+    def geometry(self, nominal: Geometry) -> Geometry:
+        """Return the dimensions of the robot with the estimated multipliers."""
+        left, right, separation = np.exp(self.parameters[MULTIPLIERS]).tolist()
+        return replace(nominal, multipliers=(left, right, separation))
+
+    @property
+    def sensor(self) -> Array:
+        """Pose of the sensor in the body frame, shape (3,)."""
+        return self.parameters[3:6]
+
+    def covariance(self) -> Array:
+        """Return the covariance of all parameters, zero for those that are not free.
+
+        Directions that the data do not determine have the variance of `SCALES`.
+        """
+        full = np.zeros((len(self.parameters),) * 2)
+        scales = _scales(len(self.parameters))[self.free]
+        inverse = np.linalg.inv(self.information + np.diag(scales**-2.0))
+        full[np.ix_(self.free, self.free)] = (inverse + inverse.T) / 2.0
+        return full
+
+
+def _scales(count: int) -> Array:
+    return np.array([*SCALES[:TIME_OFFSETS], *[SCALES[-1]] * (count - TIME_OFFSETS)])
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Group:
+    """Residuals of one kind with their Jacobians, as normal equations for unit weight."""
+
+    count: float
+    diagonal: Array
+    upper: Array
+    border: Array
+    """Blocks between the poses and the parameters, shape (n, 3, p)."""
+    corner: Array
+    gradient: Array
+    """With respect to the poses, shape (n, 3)."""
+    gradient_corner: Array
+    cost: float
+
+    def cost_after(self, step: Array, change: Array) -> float:
+        """Return the sum of the squared residuals after a step, to second order."""
+        linear = 2.0 * float(np.sum(self.gradient * step) + self.gradient_corner @ change)
+        along = np.einsum('nij,nj->ni', self.diagonal, step) + 2.0 * np.einsum(
+            'nip,p->ni', self.border, change
+        )
+        square = float(np.sum(step * along) + change @ self.corner @ change)
+        square += 2.0 * float(np.einsum('ni,nij,nj->', step[:-1], self.upper, step[1:]))
+        return max(0.0, self.cost + linear + square)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Solution:
+    step: Array
+    change: Array
+    information: Array
+    logarithm: float
+    """log det of the normal matrix."""
+
+
+def fit(segments: Sequence[Segment], nominal: Geometry, start: Estimate, given: Given) -> Estimate:
+    """Return the most likely parameters.
+
+    Args:
+        segments: Continuous motions, each with at least two poses.
+        nominal: Nominal dimensions of the robot.
+        start: Approximate parameters and noise.
+        given: What of the noise is known.
+
+    Raises:
+        CalibrationError: The estimate does not converge.
+    """
+    estimate = start
+    if not estimate.states:
+        sensor = inverted(estimate.sensor)
+        estimate = replace(estimate, states=tuple(composed(one.poses, sensor) for one in segments))
+    for _ in range(MAX_STEPS):
+        groups = _linearized(segments, nominal, estimate)
+        noise, solution = _with_noise(groups, estimate.noise, given, estimate.free)
+        size = np.abs(solution.change)
+        limit = 0.5 * _scales(len(estimate.parameters))[estimate.free]
+        shorten = float(min(1.0, np.min(limit / np.maximum(size, 1e-12), initial=1.0)))
+        parameters = estimate.parameters.copy()
+        parameters[estimate.free] += shorten * solution.change
+        estimate = replace(
+            estimate,
+            parameters=parameters,
+            noise=noise,
+            states=_moved(estimate.states, shorten * solution.step),
+            information=solution.information,
+        )
+        deviation = np.sqrt(np.diag(estimate.covariance())[estimate.free])
+        if shorten == 1.0 and (size <= CONVERGED * deviation).all():
+            return estimate
+    raise CalibrationError(
+        f'the estimate does not converge within {MAX_STEPS} steps: the poses of the reference do not '
+        'fit the motion of the wheels'
+    )
+
+
+def information(
+    segments: Sequence[Segment], nominal: Geometry, truth: Estimate
+) -> Array:
+    """Return the Fisher information of the free parameters of an estimate, at its states and noise.
+
+    Its inverse is the Cramer-Rao bound if these are the true ones.
+    """
+    groups = _linearized(segments, nominal, truth)
+    return _solved(groups, _weights(truth.noise), truth.free).information
+
+
+def _moved(states: Sequence[Array], step: Array) -> tuple[Array, ...]:
+    ends = np.cumsum([len(one) for one in states])[:-1]
+    return tuple(composed(one, part) for one, part in zip(states, np.split(step, ends), strict=True))
+
+
+def _linearized(
+    segments: Sequence[Segment], nominal: Geometry, estimate: Estimate
+) -> tuple[_Group, _Group, _Group]:
+    """Return the normal equations of the motion, the positions and the headings."""
+    count = len(estimate.parameters)
+    geometry, sensor = estimate.geometry(nominal), estimate.sensor
+    parts: tuple[list[_Group], ...] = ([], [], [])
+    for segment, states in zip(segments, estimate.states, strict=True):
+        offset = TIME_OFFSETS + segment.recording
+        at = segment.time + estimate.parameters[offset]
+        moved = increments(segment.wheel_time, segment.wheel_angles, at, geometry)
+        parts[0].append(_motion(moved, states, offset, count))
+        for kind, part in enumerate(_observation(segment, states, sensor, count), 1):
+            parts[kind].append(part)
+    motion, position, heading = (_joined(part) for part in parts)
+    return motion, position, heading
+
+
+def _motion(moved: object, states: Array, offset: int, count: int) -> _Group:
+    from diffdrive_jacobian.calibration.motion import Increments
+
+    assert isinstance(moved, Increments)
+    between = relative(states[:-1], states[1:])
+    residual = relative(moved.steps, between)
+    residual[:, 2] = wrapped(residual[:, 2])
+    weight = np.linalg.inv(moved.covariance)
+    back = -adjoint(inverted(between))
+    change = np.zeros((len(residual), 3, count))
+    change[:, :, MULTIPLIERS] = -moved.jacobian
+    # The time offset moves both ends of a step.
+    change[:, :, offset] = -(
+        moved.rates[1:] + np.einsum('nij,nj->ni', back, moved.rates[:-1])
+    )
+    n = len(states)
+    diagonal, border, gradient = np.zeros((n, 3, 3)), np.zeros((n, 3, count)), np.zeros((n, 3))
+    weighted_back = np.swapaxes(back, 1, 2) @ weight
+    weighted_change, weighted = weight @ change, np.einsum('nij,nj->ni', weight, residual)
+    diagonal[1:] += weight
+    diagonal[:-1] += weighted_back @ back
+    border[1:] += weighted_change
+    border[:-1] += weighted_back @ change
+    gradient[1:] += weighted
+    gradient[:-1] += np.einsum('nij,nj->ni', weighted_back, residual)
+    return _Group(
+        count=3.0 * (n - 1),
+        diagonal=diagonal,
+        upper=weighted_back,
+        border=border,
+        corner=np.einsum('nip,niq->pq', change, weighted_change),
+        gradient=gradient,
+        gradient_corner=np.einsum('nip,ni->p', change, weighted),
+        cost=float(np.sum(residual * weighted)),
+    )
+
+
+def _observation(
+    segment: Segment, states: Array, sensor: Array, count: int
+) -> tuple[_Group, _Group]:
+    """Return the normal equations of the positions and of the headings."""
+    residual = relative(composed(states, sensor), segment.poses)
+    # In the frame of the body, as the derivatives.
+    c, s = np.cos(sensor[2]), np.sin(sensor[2])
+    x, y = residual[:, 0].copy(), residual[:, 1].copy()
+    residual[:, 0], residual[:, 1] = c * x - s * y, s * x + c * y
+    residual[:, 2] = wrapped(residual[:, 2])
+    by_pose = -np.array([[1.0, 0.0, -sensor[1]], [0.0, 1.0, sensor[0]], [0.0, 0.0, 1.0]])
+    by_parameters = np.zeros((3, count))
+    by_parameters[:2, LEVER_ARM] = -np.eye(2)
+    by_parameters[2, YAW_OFFSET] = -1.0
+    groups = []
+    for rows in (slice(0, 2), slice(2, 3)):
+        J, M, e, w = by_pose[rows], by_parameters[rows], residual[:, rows], segment.weights
+        groups.append(
+            _Group(
+                count=float(e.size),
+                diagonal=w[:, None, None] * (J.T @ J),
+                upper=np.zeros((len(w) - 1, 3, 3)),
+                border=w[:, None, None] * (J.T @ M),
+                corner=w.sum() * (M.T @ M),
+                gradient=w[:, None] * (e @ J),
+                gradient_corner=(w @ e) @ M,
+                cost=float(np.sum(w[:, None] * e**2)),
+            )
+        )
+    return groups[0], groups[1]
+
+
+def _joined(parts: Sequence[_Group]) -> _Group:
+    """Return the equations of several segments, between which nothing is coupled."""
+    uncoupled = np.zeros((1, 3, 3))
+    uppers = [block for one in parts for block in (one.upper, uncoupled)][:-1]
+    return _Group(
+        count=sum(one.count for one in parts),
+        diagonal=np.concatenate([one.diagonal for one in parts]),
+        upper=np.concatenate(uppers),
+        border=np.concatenate([one.border for one in parts]),
+        corner=np.sum([one.corner for one in parts], axis=0),
+        gradient=np.concatenate([one.gradient for one in parts]),
+        gradient_corner=np.sum([one.gradient_corner for one in parts], axis=0),
+        cost=sum(one.cost for one in parts),
+    )
+
+
+def _weights(noise: Noise) -> Array:
+    return 1.0 / np.array([noise.wheel, noise.position**2, noise.heading**2])
+
+
+def _solved(
+    groups: tuple[_Group, _Group, _Group], weights: Array, free: NDArray[np.bool_]
+) -> _Solution:
+    """Return the Gauss-Newton step for given weights of the groups."""
+
+    def total(name: str) -> Array:
+        return np.asarray(
+            sum(w * getattr(one, name) for w, one in zip(weights, groups, strict=True))
+        )
+
+    border = total('border')[:, :, free]
+    right = np.concatenate([border, total('gradient')[:, :, None]], axis=2)
+    solved, logarithm = _block_tridiagonal.solve(total('diagonal'), total('upper'), right)
+    eliminated = np.einsum('nip,niq->pq', border, solved)
+    information = total('corner')[np.ix_(free, free)] - eliminated[:, :-1]
+    information = (information + information.T) / 2.0
+    damped = information + np.diag(_scales(len(free))[free] ** -2.0)
+    change = -np.linalg.solve(damped, total('gradient_corner')[free] - eliminated[:, -1])
+    step = -solved[:, :, -1] - solved[:, :, :-1] @ change
+    if not (np.isfinite(change).all() and np.isfinite(step).all()):
+        raise CalibrationError('the estimate diverges: the poses do not fit the motion of the wheels')
+    return _Solution(
+        step=step,
+        change=change,
+        information=information,
+        logarithm=logarithm + float(np.linalg.slogdet(damped)[1]),
+    )
+
+
+def _with_noise(
+    groups: tuple[_Group, _Group, _Group], noise: Noise, given: Given, free: NDArray[np.bool_]
+) -> tuple[Noise, _Solution]:
+    """Return the most likely noise at a linearization, and the step for it.
+
+    At the maximum of the restricted likelihood the weighted squares of each group equal its degrees of
+    freedom, which follow from the derivative of the log det of the normal matrix.
+    """
+    values = (given.wheel_noise, given.position_noise, given.heading_noise)
+    unknown = np.array([value is None for value in values])
+    weights = _weights(
+        Noise(
+            wheel=given.wheel_noise or noise.wheel,
+            position=given.position_noise or noise.position,
+            heading=given.heading_noise or noise.heading,
+        )
+    )
+    least, most = _weights(LARGEST), _weights(SMALLEST)
+    solution = _solved(groups, weights, free)
+    counts = np.array([one.count for one in groups])
+    for _ in range(MAX_NOISE_STEPS if unknown.any() else 0):
+        costs = np.array(_costs(groups, solution, free))
+        freedom = counts - _used(groups, weights, free, unknown)
+        proposed = np.clip(freedom / np.maximum(costs, 1e-300), least, most)
+        proposed = np.where(unknown, proposed, weights)
+        moved = np.abs(np.log(proposed / weights)).max()
+        weights = proposed
+        solution = _solved(groups, weights, free)
+        if moved < 2e-3:
+            break
+    wheel, position, heading = (1.0 / weights).tolist()
+    return Noise(wheel=wheel, position=position**0.5, heading=heading**0.5), solution
+
+
+def _costs(
+    groups: tuple[_Group, _Group, _Group], solution: _Solution, free: NDArray[np.bool_]
+) -> list[float]:
+    change = np.zeros(len(free))
+    change[free] = solution.change
+    return [one.cost_after(solution.step, change) for one in groups]
+
+
+def _used(
+    groups: tuple[_Group, _Group, _Group],
+    weights: Array,
+    free: NDArray[np.bool_],
+    unknown: NDArray[np.bool_],
+) -> Array:
+    """Return the degrees of freedom that the estimate takes from each group, shape (3,)."""
+    h = 0.05
+    used = np.zeros(3)
+    for kind in (1, 2):
+        shifted = [weights * np.where(np.arange(3) == kind, np.exp(sign * h), 1.0) for sign in (1, -1)]
+        more, less = (_solved(groups, one, free).logarithm for one in shifted)
+        used[kind] = (more - less) / (2.0 * h)
+    # The derivatives add up to the number of unknowns.
+    used[0] = groups[0].diagonal.shape[0] * 3 + int(free.sum()) - used[1] - used[2]
+    return used
