@@ -40,6 +40,8 @@ SCALES = (1.0, 1.0, 1.0, 1.0, 1.0, 3.0, 1.0)
 """Standard deviations that bound a step where the data do not (-, m, rad, s)."""
 MAX_STEPS = 30
 MAX_NOISE_STEPS = 100
+NOISE_CONVERGED = 2e-3
+"""Largest relative change of a variance in the last step."""
 CONVERGED = 1e-3
 """Largest change of a parameter in the last step, relative to its standard deviation."""
 SMALLEST = Noise(wheel=1e-10, position=1e-6, heading=1e-6)
@@ -334,15 +336,22 @@ def _with_noise(
     least, most = _weights(LARGEST), _weights(SMALLEST)
     solution = _solved(groups, weights, free)
     counts = np.array([one.count for one in groups])
+    before: tuple[Array, Array] | None = None
     for _ in range(MAX_NOISE_STEPS if unknown.any() else 0):
         costs = np.array(_costs(groups, solution, free))
-        freedom = counts - _used(groups, weights, free, unknown)
+        freedom = np.maximum(counts - _used(groups, weights, free), 1e-3 * counts)
         proposed = np.clip(freedom / np.maximum(costs, 1e-300), least, most)
-        proposed = np.where(unknown, proposed, weights)
-        moved = np.abs(np.log(proposed / weights)).max()
-        weights = proposed
+        now, change = np.log(weights), np.where(unknown, np.log(proposed / weights), 0.0)
+        target = now + change
+        if before is not None:
+            # Anderson acceleration with one step of memory: alone, the steps shrink slowly.
+            slope = change - before[1]
+            share = float(np.clip(slope @ change / max(float(slope @ slope), 1e-300), -5.0, 0.5))
+            target = target - share * (target - before[0] - before[1])
+        before = now, change
+        weights = np.clip(np.exp(target), least, most)
         solution = _solved(groups, weights, free)
-        if moved < 2e-3:
+        if np.abs(change).max() < NOISE_CONVERGED:
             break
     wheel, position, heading = (1.0 / weights).tolist()
     return Noise(wheel=wheel, position=position**0.5, heading=heading**0.5), solution
@@ -360,7 +369,6 @@ def _used(
     groups: tuple[_Group, _Group, _Group],
     weights: Array,
     free: NDArray[np.bool_],
-    unknown: NDArray[np.bool_],
 ) -> Array:
     """Return the degrees of freedom that the estimate takes from each group, shape (3,)."""
     h = 0.05
