@@ -188,7 +188,7 @@ def _estimated(
         motions = [one for one in motions if len(one.time) > 1]
         if not motions:
             raise CalibrationError('the wheels never turn while the reference is known')
-        estimate = fit(motions, nominal, replace(estimate, states=()), given)
+        estimate = fit(motions, nominal, replace(estimate, states=()), given, start.parameters)
         if np.abs(estimate.parameters[TIME_OFFSETS:] - before).max() < 1e-3:
             break
     return estimate

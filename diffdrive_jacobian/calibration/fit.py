@@ -26,6 +26,7 @@ from diffdrive_jacobian.calibration.measurements import (
 )
 from diffdrive_jacobian.calibration.motion import (
     Geometry,
+    Increments,
     adjoint,
     composed,
     increments,
@@ -36,13 +37,16 @@ from diffdrive_jacobian.calibration.motion import (
 MULTIPLIERS, LEVER_ARM, YAW_OFFSET, TIME_OFFSETS = slice(0, 3), slice(3, 5), 5, 6
 """Where the parameters are in their vector: logarithms of the multipliers (left, right, separation), the
 pose of the sensor in the body frame, and the time offset of each recording."""
-SCALES = (1.0, 1.0, 1.0, 1.0, 1.0, 3.0, 1.0)
-"""Standard deviations that bound a step where the data do not (-, m, rad, s)."""
-MAX_STEPS = 30
+SCALES = (0.2, 0.2, 0.2, 0.3, 0.3, 0.5, 0.3)
+"""Prior standard deviations about the approximate parameters (-, m, rad, s). They keep parameters that the
+data do not determine near these, and are without effect on the others."""
+MAX_STEPS = 40
+FULL_STEPS = 10
+"""Steps after which they are halved: the interpolated motion of the wheels has kinks."""
 MAX_NOISE_STEPS = 100
 NOISE_CONVERGED = 2e-3
 """Largest relative change of a variance in the last step."""
-CONVERGED = 1e-3
+CONVERGED = 0.02
 """Largest change of a parameter in the last step, relative to its standard deviation."""
 SMALLEST = Noise(wheel=1e-10, position=1e-6, heading=1e-6)
 """Smallest noise that is estimated: with less, rounding errors dominate."""
@@ -76,7 +80,7 @@ class Estimate:
     def covariance(self) -> Array:
         """Return the covariance of all parameters, zero for those that are not free.
 
-        Directions that the data do not determine have the variance of `SCALES`.
+        Directions that the data do not determine have about the variance of `SCALES`.
         """
         full = np.zeros((len(self.parameters),) * 2)
         scales = _scales(len(self.parameters))[self.free]
@@ -116,6 +120,14 @@ class _Group:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class _Prior:
+    """Which parameters are free, and the gradient of the prior."""
+
+    free: NDArray[np.bool_]
+    pull: Array
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class _Solution:
     step: Array
     change: Array
@@ -124,7 +136,13 @@ class _Solution:
     """log det of the normal matrix."""
 
 
-def fit(segments: Sequence[Segment], nominal: Geometry, start: Estimate, given: Given) -> Estimate:
+def fit(
+    segments: Sequence[Segment],
+    nominal: Geometry,
+    start: Estimate,
+    given: Given,
+    anchor: Array | None = None,
+) -> Estimate:
     """Return the most likely parameters.
 
     Args:
@@ -132,6 +150,7 @@ def fit(segments: Sequence[Segment], nominal: Geometry, start: Estimate, given: 
         nominal: Nominal dimensions of the robot.
         start: Approximate parameters and noise.
         given: What of the noise is known.
+        anchor: Parameters about which the prior lies (default: those of `start`).
 
     Raises:
         CalibrationError: The estimate does not converge.
@@ -140,12 +159,16 @@ def fit(segments: Sequence[Segment], nominal: Geometry, start: Estimate, given: 
     if not estimate.states:
         sensor = inverted(estimate.sensor)
         estimate = replace(estimate, states=tuple(composed(one.poses, sensor) for one in segments))
-    for _ in range(MAX_STEPS):
+    anchor = start.parameters if anchor is None else anchor
+    scales = _scales(len(anchor))
+    for count in range(MAX_STEPS):
         groups = _linearized(segments, nominal, estimate)
-        noise, solution = _with_noise(groups, estimate.noise, given, estimate.free)
+        prior = _Prior(free=estimate.free, pull=(estimate.parameters - anchor) / scales**2)
+        noise, solution = _with_noise(groups, estimate.noise, given, prior)
         size = np.abs(solution.change)
-        limit = 0.5 * _scales(len(estimate.parameters))[estimate.free]
+        limit = scales[estimate.free]
         shorten = float(min(1.0, np.min(limit / np.maximum(size, 1e-12), initial=1.0)))
+        shorten *= 1.0 if count < FULL_STEPS else 0.5
         parameters = estimate.parameters.copy()
         parameters[estimate.free] += shorten * solution.change
         estimate = replace(
@@ -156,7 +179,7 @@ def fit(segments: Sequence[Segment], nominal: Geometry, start: Estimate, given: 
             information=solution.information,
         )
         deviation = np.sqrt(np.diag(estimate.covariance())[estimate.free])
-        if shorten == 1.0 and (size <= CONVERGED * deviation).all():
+        if (size <= CONVERGED * deviation).all():
             return estimate
     raise CalibrationError(
         f'the estimate does not converge within {MAX_STEPS} steps: the poses of the reference do not '
@@ -172,7 +195,8 @@ def information(
     Its inverse is the Cramer-Rao bound if these are the true ones.
     """
     groups = _linearized(segments, nominal, truth)
-    return _solved(groups, _weights(truth.noise), truth.free).information
+    prior = _Prior(free=truth.free, pull=np.zeros(len(truth.parameters)))
+    return _solved(groups, _weights(truth.noise), prior).information
 
 
 def _moved(states: Sequence[Array], step: Array) -> tuple[Array, ...]:
@@ -198,10 +222,8 @@ def _linearized(
     return motion, position, heading
 
 
-def _motion(moved: object, states: Array, offset: int, count: int) -> _Group:
-    from diffdrive_jacobian.calibration.motion import Increments
-
-    assert isinstance(moved, Increments)
+def _motion(moved: Increments, states: Array, offset: int, count: int) -> _Group:
+    """Return the normal equations of the motion, for the wheel travel variance 1 m."""
     between = relative(states[:-1], states[1:])
     residual = relative(moved.steps, between)
     residual[:, 2] = wrapped(residual[:, 2])
@@ -288,9 +310,10 @@ def _weights(noise: Noise) -> Array:
 
 
 def _solved(
-    groups: tuple[_Group, _Group, _Group], weights: Array, free: NDArray[np.bool_]
+    groups: tuple[_Group, _Group, _Group], weights: Array, prior: _Prior
 ) -> _Solution:
     """Return the Gauss-Newton step for given weights of the groups."""
+    free = prior.free
 
     def total(name: str) -> Array:
         return np.asarray(
@@ -304,7 +327,7 @@ def _solved(
     information = total('corner')[np.ix_(free, free)] - eliminated[:, :-1]
     information = (information + information.T) / 2.0
     damped = information + np.diag(_scales(len(free))[free] ** -2.0)
-    change = -np.linalg.solve(damped, total('gradient_corner')[free] - eliminated[:, -1])
+    change = -np.linalg.solve(damped, total('gradient_corner')[free] + prior.pull[free] - eliminated[:, -1])
     step = -solved[:, :, -1] - solved[:, :, :-1] @ change
     if not (np.isfinite(change).all() and np.isfinite(step).all()):
         raise CalibrationError('the estimate diverges: the poses do not fit the motion of the wheels')
@@ -317,7 +340,7 @@ def _solved(
 
 
 def _with_noise(
-    groups: tuple[_Group, _Group, _Group], noise: Noise, given: Given, free: NDArray[np.bool_]
+    groups: tuple[_Group, _Group, _Group], noise: Noise, given: Given, prior: _Prior
 ) -> tuple[Noise, _Solution]:
     """Return the most likely noise at a linearization, and the step for it.
 
@@ -334,12 +357,12 @@ def _with_noise(
         )
     )
     least, most = _weights(LARGEST), _weights(SMALLEST)
-    solution = _solved(groups, weights, free)
+    solution = _solved(groups, weights, prior)
     counts = np.array([one.count for one in groups])
     before: tuple[Array, Array] | None = None
     for _ in range(MAX_NOISE_STEPS if unknown.any() else 0):
-        costs = np.array(_costs(groups, solution, free))
-        freedom = np.maximum(counts - _used(groups, weights, free), 1e-3 * counts)
+        costs = np.array(_costs(groups, solution, prior.free))
+        freedom = np.maximum(counts - _used(groups, weights, prior), 1e-3 * counts)
         proposed = np.clip(freedom / np.maximum(costs, 1e-300), least, most)
         now, change = np.log(weights), np.where(unknown, np.log(proposed / weights), 0.0)
         target = now + change
@@ -350,7 +373,7 @@ def _with_noise(
             target = target - share * (target - before[0] - before[1])
         before = now, change
         weights = np.clip(np.exp(target), least, most)
-        solution = _solved(groups, weights, free)
+        solution = _solved(groups, weights, prior)
         if np.abs(change).max() < NOISE_CONVERGED:
             break
     wheel, position, heading = (1.0 / weights).tolist()
@@ -368,15 +391,15 @@ def _costs(
 def _used(
     groups: tuple[_Group, _Group, _Group],
     weights: Array,
-    free: NDArray[np.bool_],
+    prior: _Prior,
 ) -> Array:
     """Return the degrees of freedom that the estimate takes from each group, shape (3,)."""
     h = 0.05
     used = np.zeros(3)
     for kind in (1, 2):
         shifted = [weights * np.where(np.arange(3) == kind, np.exp(sign * h), 1.0) for sign in (1, -1)]
-        more, less = (_solved(groups, one, free).logarithm for one in shifted)
+        more, less = (_solved(groups, one, prior).logarithm for one in shifted)
         used[kind] = (more - less) / (2.0 * h)
     # The derivatives add up to the number of unknowns.
-    used[0] = groups[0].diagonal.shape[0] * 3 + int(free.sum()) - used[1] - used[2]
+    used[0] = groups[0].diagonal.shape[0] * 3 + int(prior.free.sum()) - used[1] - used[2]
     return used

@@ -141,9 +141,11 @@ def _sinc_slope(h: Array) -> Array:
 
 
 def _rates(time: Array, rims: Array, at: Array, L: float) -> Array:
-    """Return the body twist `[v, 0, omega]` at given times, shape (n, 3)."""
-    here = np.clip(np.searchsorted(time, at, side='right') - 1, 0, len(time) - 2)
-    right, left = ((rims[here + 1] - rims[here]) / (time[here + 1] - time[here])[:, None]).T
+    """Return the body twist `[v, 0, omega]` at given times, shape (n, 3), over two samples of the wheels."""
+    half = float(np.median(np.diff(time)))
+    ends = np.clip(np.stack([at - half, at + half]), time[0], time[-1])
+    here = np.stack([np.interp(ends, time, rims[:, side]) for side in (0, 1)])
+    right, left = (here[:, 1] - here[:, 0]) / np.maximum(ends[1] - ends[0], 1e-9)
     return np.column_stack([(right + left) / 2.0, np.zeros_like(right), (right - left) / L])
 
 
