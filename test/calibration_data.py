@@ -1,4 +1,4 @@
-"""Simulated drives for the tests and the benchmark of the calibration: wheels, and a reference with noise."""
+"""Simulated drives for the calibration: angles of the wheels, and a reference with noise."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from diffdrive_jacobian.calibration.motion import Geometry, composed
 NOMINAL = Geometry(wheel_radius=0.033, wheel_separation=0.16)
 TRUE = (0.98, 1.015, 1.03)
 """Multipliers of the left radius, the right radius and the separation."""
+NOISE = Noise(wheel=1e-5, position=0.005, heading=0.01)
 STEP = 0.02
 """Period of the encoders (s)."""
 
@@ -60,7 +61,7 @@ class Simulation:
 
     drive: Drive
     multipliers: tuple = TRUE
-    noise: Noise = Noise(wheel=1e-5, position=0.005, heading=0.01)
+    noise: Noise = NOISE
     sensor: tuple = (0.0, 0.0, 0.0)
     start: tuple = (0.4, -0.3, 0.5)
     rate: int = 10

@@ -138,7 +138,8 @@ def calibrate(
     for one, offset in zip(recordings, result.time_offsets.tolist(), strict=True):
         if given.time_offset is None and abs(offset) > LONG_DELAY:
             notes.append(
-                f'{one.name}: the clock of the reference differs by {offset:.3f} s from that of the wheels'
+                f'{one.name}: the clock of the reference differs by {offset:.3f} s from that '
+                'of the wheels'
             )
     return replace(result, notes=tuple(notes))
 
@@ -150,8 +151,8 @@ def _gap_notes(one: Recording) -> list[str]:
         if found:
             begin, length = max(found, key=lambda gap: gap[1])
             lines.append(
-                f'{one.name}: {len(found)} gap{"" if len(found) == 1 else "s"} in the {what}, the longest '
-                f'of {length:.1f} s at {begin:.3f} s'
+                f'{one.name}: {len(found)} gap{"" if len(found) == 1 else "s"} in the {what}, '
+                f'the longest of {length:.1f} s at {begin:.3f} s'
             )
     return lines
 
@@ -187,7 +188,7 @@ def _estimated(
         motions = [merged(one, nominal, before[one.recording]) for one in segments]
         motions = [one for one in motions if len(one.time) > 1]
         if not motions:
-            raise CalibrationError('the wheels never turn while the reference is known')
+            raise CalibrationError('the wheels never turn')
         estimate = fit(motions, nominal, replace(estimate, states=()), given, start.parameters)
         if np.abs(estimate.parameters[TIME_OFFSETS:] - before).max() < 1e-3:
             break
@@ -205,8 +206,8 @@ def _check_result(result: Calibration) -> None:
     noise = result.estimate.noise
     if noise.wheel > LARGE_WHEEL_NOISE:
         raise CalibrationError(
-            f'the reference does not follow the wheels: after 1 m they differ by {noise.wheel**0.5:.2g} m; '
-            'is it of this robot, and do the wheels slip?'
+            f'the reference does not follow the wheels: after 1 m they differ by '
+            f'{noise.wheel**0.5:.2g} m; is it of this robot, and do the wheels slip?'
         )
 
 

@@ -17,7 +17,7 @@ from diffdrive_jacobian.calibration.motion import (
 )
 
 DISTANCE = 5.0
-"""Distance over which the odometry is compared with the reference, where the drive is long enough (m)."""
+"""Distance over which odometry and reference are compared, where the drive is long enough (m)."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -32,7 +32,7 @@ class Track:
     odometry: Array
     """Poses of the body by the wheels, aligned with the reference at the start, shape (n, 3)."""
     position_error: Array
-    """Distance between both after driving `distance` from where they agreed, shape (n,) (m); NaN before."""
+    """Distance between both after a given distance from where they agreed, shape (n,) (m)."""
     heading_error: Array
     """The same of the heading (rad)."""
 

@@ -38,8 +38,8 @@ MULTIPLIERS, LEVER_ARM, YAW_OFFSET, TIME_OFFSETS = slice(0, 3), slice(3, 5), 5, 
 """Where the parameters are in their vector: logarithms of the multipliers (left, right, separation), the
 pose of the sensor in the body frame, and the time offset of each recording."""
 SCALES = (0.2, 0.2, 0.2, 0.3, 0.3, 0.5, 0.3)
-"""Prior standard deviations about the approximate parameters (-, m, rad, s). They keep parameters that the
-data do not determine near these, and are without effect on the others."""
+"""Prior standard deviations about the approximate parameters (-, m, rad, s). They keep parameters that
+the data do not determine near these, and are without effect on the others."""
 MAX_STEPS = 40
 FULL_STEPS = 10
 """Steps after which they are halved: the interpolated motion of the wheels has kinks."""
@@ -187,9 +187,7 @@ def fit(
     )
 
 
-def information(
-    segments: Sequence[Segment], nominal: Geometry, truth: Estimate
-) -> Array:
+def information(segments: Sequence[Segment], nominal: Geometry, truth: Estimate) -> Array:
     """Return the Fisher information of the free parameters of an estimate, at its states and noise.
 
     Its inverse is the Cramer-Rao bound if these are the true ones.
@@ -232,9 +230,7 @@ def _motion(moved: Increments, states: Array, offset: int, count: int) -> _Group
     change = np.zeros((len(residual), 3, count))
     change[:, :, MULTIPLIERS] = -moved.jacobian
     # The time offset moves both ends of a step.
-    change[:, :, offset] = -(
-        moved.rates[1:] + np.einsum('nij,nj->ni', back, moved.rates[:-1])
-    )
+    change[:, :, offset] = -(moved.rates[1:] + np.einsum('nij,nj->ni', back, moved.rates[:-1]))
     n = len(states)
     diagonal, border, gradient = np.zeros((n, 3, 3)), np.zeros((n, 3, count)), np.zeros((n, 3))
     weighted_back = np.swapaxes(back, 1, 2) @ weight
@@ -257,9 +253,7 @@ def _motion(moved: Increments, states: Array, offset: int, count: int) -> _Group
     )
 
 
-def _observation(
-    segment: Segment, states: Array, sensor: Array, count: int
-) -> tuple[_Group, _Group]:
+def _observation(segment: Segment, states: Array, sensor: Array, count: int) -> tuple[_Group, _Group]:
     """Return the normal equations of the positions and of the headings."""
     residual = relative(composed(states, sensor), segment.poses)
     # In the frame of the body, as the derivatives.
@@ -309,16 +303,12 @@ def _weights(noise: Noise) -> Array:
     return 1.0 / np.array([noise.wheel, noise.position**2, noise.heading**2])
 
 
-def _solved(
-    groups: tuple[_Group, _Group, _Group], weights: Array, prior: _Prior
-) -> _Solution:
+def _solved(groups: tuple[_Group, _Group, _Group], weights: Array, prior: _Prior) -> _Solution:
     """Return the Gauss-Newton step for given weights of the groups."""
     free = prior.free
 
     def total(name: str) -> Array:
-        return np.asarray(
-            sum(w * getattr(one, name) for w, one in zip(weights, groups, strict=True))
-        )
+        return np.asarray(sum(w * getattr(one, name) for w, one in zip(weights, groups, strict=True)))
 
     border = total('border')[:, :, free]
     right = np.concatenate([border, total('gradient')[:, :, None]], axis=2)
@@ -327,7 +317,9 @@ def _solved(
     information = total('corner')[np.ix_(free, free)] - eliminated[:, :-1]
     information = (information + information.T) / 2.0
     damped = information + np.diag(_scales(len(free))[free] ** -2.0)
-    change = -np.linalg.solve(damped, total('gradient_corner')[free] + prior.pull[free] - eliminated[:, -1])
+    change = -np.linalg.solve(
+        damped, total('gradient_corner')[free] + prior.pull[free] - eliminated[:, -1]
+    )
     step = -solved[:, :, -1] - solved[:, :, :-1] @ change
     if not (np.isfinite(change).all() and np.isfinite(step).all()):
         raise CalibrationError('the estimate diverges: the poses do not fit the motion of the wheels')

@@ -141,7 +141,7 @@ def _sinc_slope(h: Array) -> Array:
 
 
 def _rates(time: Array, rims: Array, at: Array, L: float) -> Array:
-    """Return the body twist `[v, 0, omega]` at given times, shape (n, 3), over two samples of the wheels."""
+    """Return the mean body twist `[v, 0, omega]` about given times, shape (n, 3)."""
     half = float(np.median(np.diff(time)))
     ends = np.clip(np.stack([at - half, at + half]), time[0], time[-1])
     here = np.stack([np.interp(ends, time, rims[:, side]) for side in (0, 1)])
@@ -161,7 +161,8 @@ def composed(first: Array, second: Array) -> Array:
     first, second = np.broadcast_arrays(first, second)
     x, y, turn = np.moveaxis(second, -1, 0)
     c, s = np.cos(first[..., 2]), np.sin(first[..., 2])
-    return first + np.stack([c * x - s * y, s * x + c * y, turn], axis=-1)
+    moved: Array = first + np.stack([c * x - s * y, s * x + c * y, turn], axis=-1)
+    return moved
 
 
 def adjoint(pose: Array) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +54,7 @@ def overlapping(recording: Recording, index: int, offset: float, radius: float) 
     )
     found = []
     bounds = [0, *(np.flatnonzero(blind) + 1).tolist(), len(wheels)]
-    for first, last in zip(bounds[:-1], bounds[1:], strict=True):
+    for first, last in pairwise(bounds):
         if last - first < 2:
             continue
         here = inside & (at >= wheels[first]) & (at <= wheels[last - 1])
@@ -107,7 +108,7 @@ def without_jumps(
             size = float(np.hypot(*difference[start - 1, :2]))
             jumps.append((float(segment.time[start]), size, names[segment.recording]))
         bounds = [0, *starts, len(segment.time)]
-        for first, last in zip(bounds[:-1], bounds[1:], strict=True):
+        for first, last in pairwise(bounds):
             here = np.flatnonzero(use[first:last]) + first
             if len(here) >= FEWEST:
                 kept.append(
@@ -120,8 +121,8 @@ def without_jumps(
                 )
     if glitches + len(jumps) > MOST_JUMPS * poses:
         raise CalibrationError(
-            f'the poses of the reference do not follow the wheels: {glitches + len(jumps)} of {poses} are '
-            'off; are they of this robot, in one frame, and by the same clock?'
+            f'the poses of the reference do not follow the wheels: {glitches + len(jumps)} of {poses} '
+            'are off; are they of this robot, in one frame, and by the same clock?'
         )
     if sum(len(one.time) for one in kept) < FEWEST_IN_ALL:
         raise CalibrationError(

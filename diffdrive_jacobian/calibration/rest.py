@@ -16,7 +16,7 @@ MOST = 25
 
 
 def merged(segment: Segment, nominal: Geometry, time_offset: float) -> Segment:
-    """Return a segment in which poses between which the wheels are at rest are replaced by their mean."""
+    """Return a segment in which poses without motion of the wheels between them are averaged."""
     at = segment.time + time_offset
     steps = np.abs(np.diff(segment.wheel_angles, axis=0)).sum(axis=1) * nominal.wheel_radius
     travel = np.concatenate([[0.0], np.cumsum(steps)])

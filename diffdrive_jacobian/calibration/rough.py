@@ -10,9 +10,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from diffdrive_jacobian.calibration.measurements import Array, CalibrationError, Segment, wrapped
-from diffdrive_jacobian.calibration.motion import Geometry, composed, increments, inverted, relative
+from diffdrive_jacobian.calibration.motion import (
+    Geometry,
+    Increments,
+    composed,
+    increments,
+    inverted,
+    relative,
+)
 
 PARTS = 400
 """Largest number of parts into which the drives are divided."""
@@ -44,7 +52,7 @@ class Rough:
         return difference, moved.travel
 
 
-def _moved(segment: Segment, geometry: Geometry, offset: float):  # type: ignore[no-untyped-def]
+def _moved(segment: Segment, geometry: Geometry, offset: float) -> Increments:
     return increments(segment.wheel_time, segment.wheel_angles, segment.time + offset, geometry)
 
 
@@ -65,7 +73,7 @@ def rough(segments: Sequence[Segment], nominal: Geometry, offsets: Array) -> Rou
     rims = angles * radii
     if np.abs(angles).sum() < LEAST:
         raise CalibrationError(
-            f'the wheels never turn: by {np.abs(angles).sum():.3g} rad in all, while the reference is known'
+            f'the wheels never turn: they move by {np.abs(angles).sum():.3g} rad in all'
         )
     turns = np.concatenate([turn for _, turn in parts])
     gains, _ = _robust(
@@ -95,8 +103,8 @@ def rough(segments: Sequence[Segment], nominal: Geometry, offsets: Array) -> Rou
     scale = float(np.hypot(*found[:2]))
     if not 0.05 <= scale <= 20.0:
         raise CalibrationError(
-            f'the reference moves {scale:.2g} times as far as the wheels: its poses are not those of this '
-            'robot, or the nominal wheel radius is wrong'
+            f'the reference moves {scale:.2g} times as far as the wheels: its poses are not those of '
+            'this robot, or the nominal wheel radius is wrong'
         )
     yaw = float(np.arctan2(found[1], found[0]))
     c, s = np.cos(yaw), np.sin(yaw)
@@ -110,7 +118,7 @@ def rough(segments: Sequence[Segment], nominal: Geometry, offsets: Array) -> Rou
     return Rough(geometry=geometry, sensor=np.array([*lever, yaw]))
 
 
-def _ends(travel: Array, length: float) -> tuple[Array, Array]:
+def _ends(travel: Array, length: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the first and the last pose of each part."""
     place = np.concatenate([[0.0], np.cumsum(travel)])
     bounds = np.unique(np.searchsorted(place, np.arange(0.0, place[-1] + length, length)))
@@ -144,16 +152,14 @@ def _positions(segment: Segment, geometry: Geometry, offset: float) -> tuple[Arr
     found = relative(segment.poses[first], segment.poses[last])
     c, s = np.cos(step[:, 2]), np.sin(step[:, 2])
     x, y = step[:, 0], step[:, 1]
-    A = np.concatenate(
-        [np.column_stack([x, y, c - 1.0, -s]), np.column_stack([y, -x, s, c - 1.0])]
-    )
+    A = np.concatenate([np.column_stack([x, y, c - 1.0, -s]), np.column_stack([y, -x, s, c - 1.0])])
     return A, np.concatenate([found[:, 0], found[:, 1]])
 
 
 def _robust(
     A: Array, b: Array, prior: Sequence[float], deviations: Sequence[float], noise: float
 ) -> tuple[Array, float]:
-    """Return the least-squares solution in which outliers have no weight (Tukey), and the scale of errors.
+    """Return the least-squares solution without outliers (Tukey), and the scale of the errors.
 
     Args:
         A: Shape (n, m).
