@@ -17,6 +17,7 @@ COMMANDS = [
     'verify_run',
     'plot_run',
     'sweep_gains',
+    'calibrate_run',
 ]
 MESSAGES = '5.3.6'
 CORE_MESSAGES = '2.0.3'

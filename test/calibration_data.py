@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from geometry_msgs.msg import PoseStamped
+from ros_messages import pose_message, stamp
+from sensor_msgs.msg import JointState
 
 from diffdrive_jacobian.calibration.measurements import Noise, Recording
 from diffdrive_jacobian.calibration.motion import Geometry, composed
@@ -101,3 +104,41 @@ class Simulation:
             pose_time=self.drive.time[here] - self.delay,
             poses=poses,
         )
+
+
+JOINTS = ['left_wheel_joint', 'right_wheel_joint']
+
+
+def bag_messages(
+    recording, *, kind=PoseStamped, topic='/mocap/pose', position=True, begin=100.0, clock=0.0
+):
+    """Return the messages of a recording as (seconds, topic, message), as `write_bag` takes them.
+
+    Args:
+        recording: The recording.
+        kind: Type of the reference.
+        topic: Topic of the reference.
+        position: Whether the joint states have positions beside their velocities.
+        begin: When it was recorded (s).
+        clock: Added to the stamps of the reference (s).
+    """
+    sent = []
+    speeds = np.gradient(recording.wheel_angles, recording.wheel_time, axis=0)
+    for time, angles, speed in zip(
+        recording.wheel_time.tolist(), recording.wheel_angles, speeds, strict=True
+    ):
+        message = JointState(name=JOINTS, velocity=[*map(float, speed[::-1])])
+        if position:
+            message.position = [*map(float, angles[::-1])]
+        message.header.stamp = stamp(round((begin + time) * 1e9))
+        sent.append((begin + time, '/joint_states', message))
+    for time, pose in zip(recording.pose_time.tolist(), recording.poses, strict=True):
+        message = kind()
+        message.header.frame_id = 'mocap'
+        message.header.stamp = stamp(round((begin + clock + time) * 1e9))
+        if kind is PoseStamped:
+            message.pose = pose_message(pose)
+        else:
+            message.pose.pose = pose_message(pose)
+        sent.append((begin + time, topic, message))
+    return sorted(sent, key=lambda one: one[0])

@@ -16,8 +16,9 @@ from diffdrive_jacobian.calibration.measurements import (
     Noise,
     Recording,
     Segment,
+    wrapped,
 )
-from diffdrive_jacobian.calibration.motion import Geometry
+from diffdrive_jacobian.calibration.motion import Geometry, composed
 from diffdrive_jacobian.calibration.observability import undetermined
 from diffdrive_jacobian.calibration.preparation import gaps, overlapping, without_jumps
 from diffdrive_jacobian.calibration.rest import merged
@@ -53,6 +54,8 @@ class Calibration:
     recordings: tuple[Recording, ...]
     segments: tuple[Segment, ...]
     """Continuous motions; poses at rest are not merged."""
+    motions: tuple[Segment, ...]
+    """Continuous motions, poses at rest merged; `estimate.states` are their poses."""
     notes: tuple[str, ...] = ()
 
     @property
@@ -75,6 +78,29 @@ class Calibration:
     def time_offsets(self) -> Array:
         """What is added to the times of the poses of each recording (s)."""
         return self.estimate.parameters[TIME_OFFSETS:]
+
+    def residuals(self) -> list[Array]:
+        """Return what remains between the reference and the most likely poses of the sensor.
+
+        Returns:
+            For each continuous motion the time since the first pose of all (s) and the residual in x, y
+            (m) and heading (rad), shape (n, 4). Poses at rest are merged.
+        """
+        parts: list[Array] = []
+        begin = before = 0.0
+        recording = 0
+        for motion, states in zip(self.motions, self.estimate.states, strict=True):
+            if not parts:
+                begin = -float(motion.time[0])
+            elif motion.recording != recording:
+                # Recordings follow each other, whenever they were made.
+                begin = before - float(motion.time[0])
+            recording = motion.recording
+            difference = motion.poses - composed(states, self.estimate.sensor)
+            difference[:, 2] = wrapped(difference[:, 2])
+            parts.append(np.column_stack([begin + motion.time, difference]))
+            before = float(parts[-1][-1, 0])
+        return parts
 
     @property
     def undetermined(self) -> list[tuple[str, str]]:
@@ -128,9 +154,13 @@ def calibrate(
         free=_free(given, len(recordings)),
         information=np.zeros((0, 0)),
     )
-    estimate = _estimated(segments, nominal, start, given)
+    estimate, motions = _estimated(segments, nominal, start, given)
     result = Calibration(
-        nominal=nominal, estimate=estimate, recordings=recordings, segments=tuple(segments)
+        nominal=nominal,
+        estimate=estimate,
+        recordings=recordings,
+        segments=tuple(segments),
+        motions=tuple(motions),
     )
     _check_result(result)
     if len(recordings) > 1:
@@ -180,9 +210,12 @@ def _free(given: Given, count: int) -> np.typing.NDArray[np.bool_]:
 
 def _estimated(
     segments: Sequence[Segment], nominal: Geometry, start: Estimate, given: Given
-) -> Estimate:
-    """Return the estimate; which poses are at rest depends on the time offset, so it is repeated."""
-    estimate = start
+) -> tuple[Estimate, list[Segment]]:
+    """Return the estimate and the motions with merged poses.
+
+    Which poses are at rest depends on the time offset, so it is repeated.
+    """
+    estimate, motions = start, list(segments)
     for _ in range(ROUNDS):
         before = estimate.parameters[TIME_OFFSETS:]
         motions = [merged(one, nominal, before[one.recording]) for one in segments]
@@ -192,7 +225,7 @@ def _estimated(
         estimate = fit(motions, nominal, replace(estimate, states=()), given, start.parameters)
         if np.abs(estimate.parameters[TIME_OFFSETS:] - before).max() < 1e-3:
             break
-    return estimate
+    return estimate, motions
 
 
 def _check_result(result: Calibration) -> None:
@@ -231,7 +264,7 @@ def _check_agreement(result: Calibration, given: Given) -> None:
             parameters=result.estimate.parameters[here],
             free=result.estimate.free[here],
         )
-        alone = _estimated(own, result.nominal, start, known)
+        alone, _ = _estimated(own, result.nominal, start, known)
         covariance = alone.covariance()[:3, :3]
         off = alone.parameters[:3] - together
         distance = float(off @ np.linalg.solve(covariance, off))
