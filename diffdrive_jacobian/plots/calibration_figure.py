@@ -65,7 +65,8 @@ def figure(result: Calibration) -> Figure:
         grid = drawing.add_gridspec(3, 2, width_ratios=[1.2, 1.0])
         plane = drawing.add_subplot(grid[:, 0])
         _draw_plane(plane, before, after)
-        panels = [drawing.add_subplot(grid[row, 1]) for row in range(3)]
+        panels = [drawing.add_subplot(grid[0, 1])]
+        panels += [drawing.add_subplot(grid[row, 1], sharex=panels[0]) for row in (1, 2)]
         for panel, name, unit in zip(panels, ('position', 'heading'), ('m', 'rad'), strict=False):
             for drawn, label, color in ((before, 'before', BEFORE), (after, 'after', AFTER)):
                 values = [getattr(one, f'{name}_error') for one in drawn]
