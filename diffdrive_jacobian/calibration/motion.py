@@ -94,8 +94,6 @@ def increments(time: Array, angles: Array, at: Array, geometry: Geometry) -> Inc
     chords = (s * shrink)[:, None] * np.column_stack([np.cos(middle), np.sin(middle)])
     places = np.concatenate([np.zeros((1, 2)), np.cumsum(chords, axis=0)])
     poses = np.column_stack([places, theta])[marks]
-    # Sub-steps before the first mark do not exist: the first knot is `at[0]`.
-    starts = marks[:-1]
     ends = np.repeat(marks[1:], np.diff(marks))
     cosine, sine = np.cos(theta[ends]), np.sin(theta[ends])
     # A turn acts about the centroid of the arc, which lies off the middle of its chord.
@@ -106,31 +104,34 @@ def increments(time: Array, angles: Array, at: Array, geometry: Geometry) -> Inc
     lever_x, lever_y = cosine * dx + sine * dy, cosine * dy - sine * dx
     heading = middle - theta[ends]
     c, n = np.cos(heading), np.sin(heading)
-    forward = np.stack([c * shrink, n * shrink, np.zeros_like(c)], axis=1)
-    turn = np.stack([-lever_y, lever_x, np.ones_like(c)], axis=1)
-    side = np.stack([-n, c, np.zeros_like(c)], axis=1)
-    # Derivatives of s and a with respect to the logarithms: left, right, separation.
-    ds = np.stack([left / 2.0, right / 2.0, np.zeros_like(s)], axis=1)
-    da = np.stack([-left / L, right / L, -a], axis=1)
-    jacobian = forward[:, :, None] * ds[:, None, :] + turn[:, :, None] * da[:, None, :]
+    # Of each sub-step: the twists at the end of the step for a unit of s, of a, and to the side.
+    fx, fy, tx, ty = c * shrink, n * shrink, -lever_y, lever_x
+    by_left = [fx * left / 2.0 - tx * left / L, fy * left / 2.0 - ty * left / L, -left / L]
+    by_right = [fx * right / 2.0 + tx * right / L, fy * right / 2.0 + ty * right / L, right / L]
+    by_separation = [-tx * a, -ty * a, -a]
     vr, vl = np.abs(right), np.abs(left)
     vv, vw, ww = (vr + vl) / 4.0, (vr - vl) / (2.0 * L), (vr + vl) / L**2
-    lateral = ww * (s * shrink) ** 2 / 12.0 + LATERAL * vv
-    covariance = _outer(forward, forward, vv) + _outer(turn, turn, ww) + _outer(side, side, lateral)
-    mixed = _outer(forward, turn, vw)
-    covariance += mixed + np.swapaxes(mixed, 1, 2)
+    side = ww * (s * shrink) ** 2 / 12.0 + LATERAL * vv
+    variances = [
+        fx * fx * vv + 2.0 * fx * tx * vw + tx * tx * ww + n * n * side,
+        fx * fy * vv + (fx * ty + fy * tx) * vw + tx * ty * ww - n * c * side,
+        fx * vw + tx * ww,
+        fy * fy * vv + 2.0 * fy * ty * vw + ty * ty * ww + c * c * side,
+        fy * vw + ty * ww,
+        ww,
+    ]
+    rows = np.stack([*by_left, *by_right, *by_separation, *variances, vr + vl])
+    sums = np.add.reduceat(rows, marks[:-1], axis=1)
+    symmetric = sums[[9, 10, 11, 10, 12, 13, 11, 13, 14]].reshape(3, 3, -1)
+    least = np.diag([1.0, 1.0, 4.0 / L**2]) * REST
     return Increments(
         poses=poses,
         steps=relative(poses[:-1], poses[1:]),
-        jacobian=np.add.reduceat(jacobian, starts),
-        covariance=np.add.reduceat(covariance, starts) + np.diag([1.0, 1.0, 4.0 / L**2]) * REST,
+        jacobian=np.moveaxis(sums[:9].reshape(3, 3, -1), (0, 1, 2), (2, 1, 0)),
+        covariance=np.moveaxis(symmetric, 2, 0) + least,
         rates=_rates(time, angles * radius, at, L),
-        travel=np.add.reduceat(vr + vl, starts),
+        travel=sums[15],
     )
-
-
-def _outer(first: Array, second: Array, weight: Array) -> Array:
-    return np.asarray(first[:, :, None] * (weight[:, None] * second)[:, None, :])
 
 
 def _sinc_slope(h: Array) -> Array:

@@ -2,10 +2,10 @@
 
     python test/benchmark/calibration.py [--robots 500]
 
-Each robot has other wheels (multipliers within 3 %), slips by the documented noise model (1e-5 m) and is
-observed at 2 Hz with 5 mm and 0.01 rad. Noise, place of the sensor and time offset are unknown to the
-calibration. Prints a table: rms error over the bound, bias, and the mean of the normalized squared errors
-(NEES), each with the standard deviation that chance gives it.
+Each robot has other wheels (multipliers within 3 %), slips by the documented noise model (1e-5 m) and
+is observed at 2 Hz with 5 mm and 0.01 rad. Noise, place of the sensor and time offset are unknown to
+the calibration. Prints a table: rms error over the bound, bias, and the mean of the normalized squared
+errors (NEES), each with the standard deviation that chance gives it.
 """
 
 from __future__ import annotations
