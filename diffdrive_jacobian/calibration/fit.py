@@ -50,6 +50,10 @@ CONVERGED = 0.02
 """Largest change of a parameter in the last step, relative to its standard deviation."""
 SMALLEST = Noise(wheel=1e-10, position=1e-6, heading=1e-6)
 """Smallest noise that is estimated: with less, rounding errors dominate."""
+PRIOR_WHEEL_NOISE, PRIOR_FREEDOM = 1e-5, 2.0
+"""Wheel travel variance that is assumed in advance (m), and how many squares it counts as. In
+short drives with a coarse reference the likelihood alone is largest at zero, where the stated covariance
+would be far too small."""
 LARGEST = Noise(wheel=1.0, position=1e3, heading=1e2)
 
 
@@ -355,6 +359,8 @@ def _with_noise(
     for _ in range(MAX_NOISE_STEPS if unknown.any() else 0):
         costs = np.array(_costs(groups, solution, prior.free))
         freedom = np.maximum(counts - _used(groups, weights, prior), 1e-3 * counts)
+        freedom[0] += PRIOR_FREEDOM
+        costs[0] += PRIOR_FREEDOM * PRIOR_WHEEL_NOISE
         proposed = np.clip(freedom / np.maximum(costs, 1e-300), least, most)
         now, change = np.log(weights), np.where(unknown, np.log(proposed / weights), 0.0)
         target = now + change
