@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,8 +19,10 @@ from diffdrive_jacobian.calibration import PARAMETERS, calibrate
 from diffdrive_jacobian.parameters.nodes import WheelBridgeParameters
 from diffdrive_jacobian.plots import calibration_figure
 from diffdrive_jacobian.plots.calibration_figure import figure
+from diffdrive_jacobian.reading.calibration_data import read_wheels_and_reference
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import calibrate_run as _calibrate_run
+from diffdrive_jacobian.tools import drive_to
 from diffdrive_jacobian.tools.calibrate_run import main
 
 ROBOT = Simulation(drive=Drive.of(umbmark(side=0.6, runs=1)))
@@ -353,3 +357,21 @@ def test_too_short_and_no_bag(folder, capsys):
 def test_the_figure_needs_no_display(monkeypatch):
     monkeypatch.delenv('DISPLAY', raising=False)
     assert calibration_figure.draw(calibrate([RECORDING], NOMINAL), 'svg').startswith(b'<?xml')
+
+
+def test_the_recipe_of_the_page_determines_all_parameters(folder):
+    """The goals that doc/calibration.md gives, driven by drive_to."""
+    page = (Path(__file__).parents[1] / 'doc' / 'calibration.md').read_text()
+    goals = re.search(r'^drive_to ([-\d ]+?) --lockstep', page, re.MULTILINE).group(1).split()
+    quick = ['--ros-args', '-p', 'kp:=12.0', '-p', 'kv:=3.0']
+    assert drive_to.main([*goals, '--lockstep', '--no-plot', '-o', 'umbmark', *quick], Signals()) == 0
+    read = read_wheels_and_reference('umbmark', reference='odom')
+    assert read.dimensions == (0.033, 0.16)
+    np.testing.assert_allclose(calibrate([read.recording], NOMINAL).multipliers, 1.0, atol=1e-6)
+    # The same commands, driven by a robot with other wheels.
+    time = read.recording.wheel_time
+    robot = Simulation(drive=Drive(time=time, angles=read.recording.wheel_angles), rate=5)
+    result = calibrate([robot.recording(np.random.default_rng(1))], NOMINAL)
+    assert result.undetermined == []
+    assert (np.sqrt(np.diag(result.covariance)) < 0.006).all()
+    np.testing.assert_allclose(result.multipliers, TRUE, atol=0.018)

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from diffdrive_jacobian.calibration.clock import time_offset
-from diffdrive_jacobian.calibration.fit import TIME_OFFSETS, YAW_OFFSET, Estimate, fit
+from diffdrive_jacobian.calibration.estimate import TIME_OFFSETS, YAW_OFFSET, Estimate
+from diffdrive_jacobian.calibration.fit import fit
 from diffdrive_jacobian.calibration.measurements import (
     Array,
     CalibrationError,

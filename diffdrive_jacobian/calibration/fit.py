@@ -16,30 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.calibration import _block_tridiagonal
+from diffdrive_jacobian.calibration._normal_equations import Group, linearized
+from diffdrive_jacobian.calibration.estimate import Estimate, prior_deviations
 from diffdrive_jacobian.calibration.measurements import (
     Array,
     CalibrationError,
     Given,
     Noise,
     Segment,
-    wrapped,
 )
-from diffdrive_jacobian.calibration.motion import (
-    Geometry,
-    Increments,
-    adjoint,
-    composed,
-    increments,
-    inverted,
-    relative,
-)
+from diffdrive_jacobian.calibration.motion import Geometry, composed, inverted
 
-MULTIPLIERS, LEVER_ARM, YAW_OFFSET, TIME_OFFSETS = slice(0, 3), slice(3, 5), 5, 6
-"""Where the parameters are in their vector: logarithms of the multipliers (left, right, separation), the
-pose of the sensor in the body frame, and the time offset of each recording."""
-SCALES = (0.2, 0.2, 0.2, 0.3, 0.3, 0.5, 0.3)
-"""Prior standard deviations about the approximate parameters (-, m, rad, s). They keep parameters that
-the data do not determine near these, and are without effect on the others."""
 MAX_STEPS = 40
 FULL_STEPS = 10
 """Steps after which they are halved: the interpolated motion of the wheels has kinks."""
@@ -55,72 +42,6 @@ PRIOR_WHEEL_NOISE, PRIOR_FREEDOM = 1e-5, 2.0
 short drives with a coarse reference the likelihood alone is largest at zero, where the stated covariance
 would be far too small."""
 LARGEST = Noise(wheel=1.0, position=1e3, heading=1e2)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Estimate:
-    """Parameters of the model and the state of their estimation."""
-
-    parameters: Array
-    """As described at `MULTIPLIERS`, shape (6 + number of recordings,)."""
-    noise: Noise
-    free: NDArray[np.bool_]
-    """Which of the parameters are estimated, shape as `parameters`."""
-    states: tuple[Array, ...] = ()
-    """Most likely poses of the body at the times of each segment, shapes (n, 3)."""
-    information: Array
-    """Fisher information of the free parameters."""
-
-    def geometry(self, nominal: Geometry) -> Geometry:
-        """Return the dimensions of the robot with the estimated multipliers."""
-        left, right, separation = np.exp(self.parameters[MULTIPLIERS]).tolist()
-        return replace(nominal, multipliers=(left, right, separation))
-
-    @property
-    def sensor(self) -> Array:
-        """Pose of the sensor in the body frame, shape (3,)."""
-        return self.parameters[3:6]
-
-    def covariance(self) -> Array:
-        """Return the covariance of all parameters, zero for those that are not free.
-
-        Directions that the data do not determine have about the variance of `SCALES`.
-        """
-        full = np.zeros((len(self.parameters),) * 2)
-        scales = _scales(len(self.parameters))[self.free]
-        inverse = np.linalg.inv(self.information + np.diag(scales**-2.0))
-        full[np.ix_(self.free, self.free)] = (inverse + inverse.T) / 2.0
-        return full
-
-
-def _scales(count: int) -> Array:
-    return np.array([*SCALES[:TIME_OFFSETS], *[SCALES[-1]] * (count - TIME_OFFSETS)])
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Group:
-    """Residuals of one kind with their Jacobians, as normal equations for unit weight."""
-
-    count: float
-    diagonal: Array
-    upper: Array
-    border: Array
-    """Blocks between the poses and the parameters, shape (n, 3, p)."""
-    corner: Array
-    gradient: Array
-    """With respect to the poses, shape (n, 3)."""
-    gradient_corner: Array
-    cost: float
-
-    def cost_after(self, step: Array, change: Array) -> float:
-        """Return the sum of the squared residuals after a step, to second order."""
-        linear = 2.0 * float(np.sum(self.gradient * step) + self.gradient_corner @ change)
-        along = np.einsum('nij,nj->ni', self.diagonal, step) + 2.0 * np.einsum(
-            'nip,p->ni', self.border, change
-        )
-        square = float(np.sum(step * along) + change @ self.corner @ change)
-        square += 2.0 * float(np.einsum('ni,nij,nj->', step[:-1], self.upper, step[1:]))
-        return max(0.0, self.cost + linear + square)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -164,9 +85,9 @@ def fit(
         sensor = inverted(estimate.sensor)
         estimate = replace(estimate, states=tuple(composed(one.poses, sensor) for one in segments))
     anchor = start.parameters if anchor is None else anchor
-    scales = _scales(len(anchor))
+    scales = prior_deviations(len(anchor))
     for count in range(MAX_STEPS):
-        groups = _linearized(segments, nominal, estimate)
+        groups = linearized(segments, nominal, estimate)
         prior = _Prior(free=estimate.free, pull=(estimate.parameters - anchor) / scales**2)
         noise, solution = _with_noise(groups, estimate.noise, given, prior)
         size = np.abs(solution.change)
@@ -196,7 +117,7 @@ def information(segments: Sequence[Segment], nominal: Geometry, truth: Estimate)
 
     Its inverse is the Cramer-Rao bound if these are the true ones.
     """
-    groups = _linearized(segments, nominal, truth)
+    groups = linearized(segments, nominal, truth)
     prior = _Prior(free=truth.free, pull=np.zeros(len(truth.parameters)))
     return _solved(groups, _weights(truth.noise), prior).information
 
@@ -206,108 +127,11 @@ def _moved(states: Sequence[Array], step: Array) -> tuple[Array, ...]:
     return tuple(composed(one, part) for one, part in zip(states, np.split(step, ends), strict=True))
 
 
-def _linearized(
-    segments: Sequence[Segment], nominal: Geometry, estimate: Estimate
-) -> tuple[_Group, _Group, _Group]:
-    """Return the normal equations of the motion, the positions and the headings."""
-    count = len(estimate.parameters)
-    geometry, sensor = estimate.geometry(nominal), estimate.sensor
-    parts: tuple[list[_Group], ...] = ([], [], [])
-    for segment, states in zip(segments, estimate.states, strict=True):
-        offset = TIME_OFFSETS + segment.recording
-        at = segment.time + estimate.parameters[offset]
-        moved = increments(segment.wheel_time, segment.wheel_angles, at, geometry)
-        parts[0].append(_motion(moved, states, offset, count))
-        for kind, part in enumerate(_observation(segment, states, sensor, count), 1):
-            parts[kind].append(part)
-    motion, position, heading = (_joined(part) for part in parts)
-    return motion, position, heading
-
-
-def _motion(moved: Increments, states: Array, offset: int, count: int) -> _Group:
-    """Return the normal equations of the motion, for the wheel travel variance 1 m."""
-    between = relative(states[:-1], states[1:])
-    residual = relative(moved.steps, between)
-    residual[:, 2] = wrapped(residual[:, 2])
-    weight = np.linalg.inv(moved.covariance)
-    back = -adjoint(inverted(between))
-    change = np.zeros((len(residual), 3, count))
-    change[:, :, MULTIPLIERS] = -moved.jacobian
-    # The time offset moves both ends of a step.
-    change[:, :, offset] = -(moved.rates[1:] + np.einsum('nij,nj->ni', back, moved.rates[:-1]))
-    n = len(states)
-    diagonal, border, gradient = np.zeros((n, 3, 3)), np.zeros((n, 3, count)), np.zeros((n, 3))
-    weighted_back = np.swapaxes(back, 1, 2) @ weight
-    weighted_change, weighted = weight @ change, np.einsum('nij,nj->ni', weight, residual)
-    diagonal[1:] += weight
-    diagonal[:-1] += weighted_back @ back
-    border[1:] += weighted_change
-    border[:-1] += weighted_back @ change
-    gradient[1:] += weighted
-    gradient[:-1] += np.einsum('nij,nj->ni', weighted_back, residual)
-    return _Group(
-        count=3.0 * (n - 1),
-        diagonal=diagonal,
-        upper=weighted_back,
-        border=border,
-        corner=np.einsum('nip,niq->pq', change, weighted_change),
-        gradient=gradient,
-        gradient_corner=np.einsum('nip,ni->p', change, weighted),
-        cost=float(np.sum(residual * weighted)),
-    )
-
-
-def _observation(segment: Segment, states: Array, sensor: Array, count: int) -> tuple[_Group, _Group]:
-    """Return the normal equations of the positions and of the headings."""
-    residual = relative(composed(states, sensor), segment.poses)
-    # In the frame of the body, as the derivatives.
-    c, s = np.cos(sensor[2]), np.sin(sensor[2])
-    x, y = residual[:, 0].copy(), residual[:, 1].copy()
-    residual[:, 0], residual[:, 1] = c * x - s * y, s * x + c * y
-    residual[:, 2] = wrapped(residual[:, 2])
-    by_pose = -np.array([[1.0, 0.0, -sensor[1]], [0.0, 1.0, sensor[0]], [0.0, 0.0, 1.0]])
-    by_parameters = np.zeros((3, count))
-    by_parameters[:2, LEVER_ARM] = -np.eye(2)
-    by_parameters[2, YAW_OFFSET] = -1.0
-    groups = []
-    for rows in (slice(0, 2), slice(2, 3)):
-        J, M, e, w = by_pose[rows], by_parameters[rows], residual[:, rows], segment.weights
-        groups.append(
-            _Group(
-                count=float(e.size),
-                diagonal=w[:, None, None] * (J.T @ J),
-                upper=np.zeros((len(w) - 1, 3, 3)),
-                border=w[:, None, None] * (J.T @ M),
-                corner=w.sum() * (M.T @ M),
-                gradient=w[:, None] * (e @ J),
-                gradient_corner=(w @ e) @ M,
-                cost=float(np.sum(w[:, None] * e**2)),
-            )
-        )
-    return groups[0], groups[1]
-
-
-def _joined(parts: Sequence[_Group]) -> _Group:
-    """Return the equations of several segments, between which nothing is coupled."""
-    uncoupled = np.zeros((1, 3, 3))
-    uppers = [block for one in parts for block in (one.upper, uncoupled)][:-1]
-    return _Group(
-        count=sum(one.count for one in parts),
-        diagonal=np.concatenate([one.diagonal for one in parts]),
-        upper=np.concatenate(uppers),
-        border=np.concatenate([one.border for one in parts]),
-        corner=np.sum([one.corner for one in parts], axis=0),
-        gradient=np.concatenate([one.gradient for one in parts]),
-        gradient_corner=np.sum([one.gradient_corner for one in parts], axis=0),
-        cost=sum(one.cost for one in parts),
-    )
-
-
 def _weights(noise: Noise) -> Array:
     return 1.0 / np.array([noise.wheel, noise.position**2, noise.heading**2])
 
 
-def _solved(groups: tuple[_Group, _Group, _Group], weights: Array, prior: _Prior) -> _Solution:
+def _solved(groups: tuple[Group, Group, Group], weights: Array, prior: _Prior) -> _Solution:
     """Return the Gauss-Newton step for given weights of the groups."""
     free = prior.free
 
@@ -320,7 +144,7 @@ def _solved(groups: tuple[_Group, _Group, _Group], weights: Array, prior: _Prior
     eliminated = np.einsum('nip,niq->pq', border, solved)
     information = total('corner')[np.ix_(free, free)] - eliminated[:, :-1]
     information = (information + information.T) / 2.0
-    damped = information + np.diag(_scales(len(free))[free] ** -2.0)
+    damped = information + np.diag(prior_deviations(len(free))[free] ** -2.0)
     change = -np.linalg.solve(
         damped, total('gradient_corner')[free] + prior.pull[free] - eliminated[:, -1]
     )
@@ -336,7 +160,7 @@ def _solved(groups: tuple[_Group, _Group, _Group], weights: Array, prior: _Prior
 
 
 def _with_noise(
-    groups: tuple[_Group, _Group, _Group], noise: Noise, given: Given, prior: _Prior
+    groups: tuple[Group, Group, Group], noise: Noise, given: Given, prior: _Prior
 ) -> tuple[Noise, _Solution]:
     """Return the most likely noise at a linearization, and the step for it.
 
@@ -379,7 +203,7 @@ def _with_noise(
 
 
 def _costs(
-    groups: tuple[_Group, _Group, _Group], solution: _Solution, free: NDArray[np.bool_]
+    groups: tuple[Group, Group, Group], solution: _Solution, free: NDArray[np.bool_]
 ) -> list[float]:
     change = np.zeros(len(free))
     change[free] = solution.change
@@ -387,7 +211,7 @@ def _costs(
 
 
 def _used(
-    groups: tuple[_Group, _Group, _Group],
+    groups: tuple[Group, Group, Group],
     weights: Array,
     prior: _Prior,
 ) -> Array:

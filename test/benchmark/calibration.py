@@ -23,7 +23,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from calibration_data import NOISE, NOMINAL, Drive, Simulation, umbmark
 
 from diffdrive_jacobian.calibration import PARAMETERS, calibrate
-from diffdrive_jacobian.calibration.fit import Estimate, information
+from diffdrive_jacobian.calibration.estimate import Estimate
+from diffdrive_jacobian.calibration.fit import information
 
 SPREAD = 0.03
 """Multipliers are drawn from 1 plus and minus this."""
