@@ -23,7 +23,6 @@ from diffdrive_jacobian.ros.goal_client import (
     duplicates,
     loss,
 )
-from diffdrive_jacobian.ros.heartbeats import fast_heartbeats
 from diffdrive_jacobian.ros.liveness import Liveness
 from diffdrive_jacobian.ros.node_runner import NodeRunner
 from diffdrive_jacobian.ros.runner import ros_context, running
