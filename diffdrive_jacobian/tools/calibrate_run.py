@@ -245,7 +245,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--yaw-offset',
         metavar='RAD',
-        type=_cli.heading,
+        type=_cli.angle,
         help='heading of the sensor in the body frame (rad) (default: estimated)',
     )
     parser.add_argument(
