@@ -6,9 +6,7 @@ If a test fails with a new release of rclpy, the function that it names must cha
 from __future__ import annotations
 
 import ast
-import faulthandler
 import math
-import os
 import sys
 from pathlib import Path
 
@@ -399,16 +397,6 @@ def test_tasks_that_are_not_done_are_detected(ros):
 def test_rclpy_without_the_events_executor_is_detected(ros, monkeypatch):
     monkeypatch.setitem(sys.modules, 'rclpy.experimental.events_executor', None)
     assert internals.events_executor(ros.context) is None
-
-
-def test_events_executor_is_created_in_a_process_without_stderr(ros, monkeypatch):
-    # The entry point has replaced it.
-    monkeypatch.setattr(sys, '__stderr__', None)
-    with open(os.devnull, 'w') as replacement:
-        monkeypatch.setattr(sys, 'stderr', replacement)
-        internals.events_executor(ros.context).shutdown()
-        monkeypatch.undo()
-        faulthandler.enable(sys.__stderr__)
 
 
 def test_new_task_runs_a_function_when_it_is_called(ros):

@@ -256,9 +256,8 @@ def events_executor(context: Context) -> Executor | None:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:
         return None
-    # It enables the faulthandler, for which sys.stderr must be a file. In some tests it is not. A process
-    # that was started without has only the replacement of its entry point.
-    with redirect_stderr(sys.__stderr__ or sys.stderr):
+    # It enables the faulthandler, for which sys.stderr must be a file. In some tests it is not.
+    with redirect_stderr(sys.__stderr__):
         return EventsExecutor(context=context)
 
 
