@@ -69,7 +69,12 @@ def test_the_configurations_of_an_installation_are_found(tmp_path, monkeypatch):
     (folder / 'rover.yaml').write_text('')
     # As if the package was not in a clone.
     monkeypatch.setattr(module, '__file__', str(tmp_path / 'lib' / 'a' / 'b' / 'c.py'))
+    monkeypatch.setenv('AMENT_PREFIX_PATH', '/nowhere')
+    assert 'rover' not in configurations()
     monkeypatch.setenv('AMENT_PREFIX_PATH', os.pathsep.join(['/nowhere', str(tmp_path)]))
+    assert configurations()['rover'] == folder / 'rover.yaml'
+    monkeypatch.delenv('AMENT_PREFIX_PATH')
+    monkeypatch.setattr(module, '__file__', str(tmp_path / 'a' / 'b' / 'c.py'))
     assert configurations()['rover'] == folder / 'rover.yaml'
 
 
