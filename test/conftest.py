@@ -28,7 +28,7 @@ LONGEST_FIRST = (
     *('test_record_run', 'test_live_browser', 'test_secondary_tracking', 'test_fixtures', 'test_flood'),
     *('test_own_controllers', 'test_se2', 'test_recording', 'test_calibrate_run', 'test_calibration'),
 )
-"""Files with tests that take seconds. They start first, so that no worker is left with them at the end."""
+"""Files with tests that take seconds. They start first, so that none is left for the end."""
 CHUNK = 4
 """Most tests that a worker of pytest-xdist gets at once."""
 PATIENCE = 20.0

@@ -376,8 +376,9 @@ def queue_depth(node: Node) -> float:
 def requires_wait_set(node: Node) -> bool:
     """Return whether a node has callbacks that the EventsExecutor of Jazzy does not support.
 
-    It passes a message and its info as one argument, unless `with_message_info` made the callback, does not await coroutines of subscriptions and
-    services, and raises an exception for guard conditions.
+    It passes a message and its info as one argument, which only callbacks of `with_message_info` take,
+    does not await coroutines of subscriptions and services, and raises an exception for guard
+    conditions.
     Relies on `Subscription._callback_type`.
     """
     with_info = any(
