@@ -19,7 +19,8 @@ HOUSE = Path(diffdrive_jacobian.__file__).parent
 LAYERS = (
     *('kinematics', 'control', 'simulation', 'sweeps', 'messages', 'parameters', 'bags'),
     *('recovery', 'reading'),
-    *('plots', 'ros', 'nodes', 'recording', 'replay', 'lockstep', 'drives', 'testing', 'tools'),
+    *('plots', 'ros', 'nodes', 'recording', 'replay', 'lockstep', 'drives'),
+    *('live', 'testing', 'tools'),
 )
 PURE = LAYERS[:3]
 # These may load rosbags and what it needs, but nothing of ROS, and matplotlib only when they draw.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.nodes import CONTROLLERS
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools import _cli, _live
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.drives import Outcome
@@ -32,7 +32,14 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         parser.error(f'coordinates must be pairs X Y, got {len(options.coordinates)} of them')
     if options.lockstep and options.open:
         parser.error('--lockstep and --open exclude each other: other processes have another clock')
+    if not options.live:
+        if not options.coordinates:
+            parser.error('the following arguments are required: X Y (only --live needs no goal)')
+        if options.port or options.no_browser:
+            parser.error('--port and --no-browser are options of --live')
     ros = ['--ros-args', '--log-level', 'warn', '--', *_cli.with_params_file(ros, options)]
+    if options.live:
+        return _drive_live(options, ros, signals)
     # Not above: --help needs no ROS.
     from diffdrive_jacobian.drives import DriveError, drive, waypoints_through
     from diffdrive_jacobian.recording.record import open_recording, saved_on_error
@@ -75,6 +82,51 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     return code if code == _cli.INTERRUPTED else saved or code
 
 
+def _drive_live(options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> int:
+    """Drive with the page until Ctrl-C; return the exit code."""
+    from diffdrive_jacobian.drives import DriveError, waypoints_through
+    from diffdrive_jacobian.recording.record import open_recording, saved_on_error
+
+    recording = None
+    try:
+        from diffdrive_jacobian.live.running import drive_live
+
+        goals = np.empty((0, 3))
+        if options.coordinates:
+            places = np.reshape(options.coordinates, (-1, 2))
+            goals = waypoints_through(places, options.heading or 0.0)
+        if not options.no_record:
+            recording = open_recording('drive', options.output, 'mcap', lossless=options.lockstep)
+        with saved_on_error(recording):
+            drive_live(
+                goals,
+                lockstep=options.lockstep,
+                isolated=not options.open,
+                parameters=_parameters(options),
+                recording=recording,
+                ros_arguments=ros,
+                port=options.port,
+                signals=signals,
+                ready=_live.announcing(options),
+                nodes_created=lambda names: _warn_of_unused_files(ros, names),
+            )
+    except ModuleNotFoundError as error:
+        if (error.name or '').split('.')[0] != 'websockets':
+            raise
+        return _cli.complain(PROGRAM, _live.MISSING, _cli.FAILED)
+    except (UserError, DriveError, OSError) as error:
+        message = _live.port_message(error, options.port) if isinstance(error, OSError) else None
+        code = _cli.USER_ERROR if isinstance(error, UserError) else _cli.FAILED
+        return _cli.complain(PROGRAM, message or error, code)
+    return _cli.DONE if recording is None else _save(recording, plot=False)
+
+
+def _warn_of_unused_files(ros: Sequence[str], names: Sequence[str]) -> None:
+    from diffdrive_jacobian.tools._unused_files import warn_of_unused_files
+
+    warn_of_unused_files(PROGRAM, ros, names)
+
+
 class _Progress:
     """Prints the progress of a drive."""
 
@@ -96,9 +148,7 @@ class _Progress:
         self._bar.__exit__()
 
     def nodes_created(self, names: Sequence[str]) -> None:
-        from diffdrive_jacobian.tools._unused_files import warn_of_unused_files
-
-        warn_of_unused_files(PROGRAM, self._ros, names)
+        _warn_of_unused_files(self._ros, names)
 
     def driving(self, seconds: float, index: int, distance: float, wheels: tuple[float, float]) -> None:
         self._seconds = seconds
@@ -196,7 +246,7 @@ def _parser() -> argparse.ArgumentParser:
         'or the recording is not complete; 2: wrong arguments; 130: interrupted.',
     )
     parser.add_argument(
-        'coordinates', metavar='X Y', nargs='+', type=_cli.coordinate, help='x and y of each goal (m)'
+        'coordinates', metavar='X Y', nargs='*', type=_cli.coordinate, help='x and y of each goal (m)'
     )
     parser.add_argument(
         '--timeout',
@@ -245,4 +295,11 @@ def _parser() -> argparse.ArgumentParser:
         help='let other processes (RViz, ros2 topic) communicate with the nodes (default: isolated, so '
         'that no real robot on the network can be moved by mistake)',
     )
+    parser.add_argument(
+        '--live',
+        action='store_true',
+        help='show the drive on a page in the browser and steer the robot there, until Ctrl-C; without '
+        'X Y the robot waits for goals; the bag is recorded, no picture is drawn',
+    )
+    _live.add_options(parser)
     return parser
