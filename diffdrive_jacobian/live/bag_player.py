@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.live import settings
 from diffdrive_jacobian.live.commands import Command, Pause, Seek, SetSpeed, Step
 from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.live.recorded_runs import RecordedRobot
@@ -52,6 +53,7 @@ class BagPlayer:
         self._fixed = {
             'bag': path.name,
             'strips': {film.robot.name: film.strips() for film in self._films},
+            'settings': {film.robot.name: film.settings() for film in self._films},
             'notes': [note for film in self._films for note in film.robot.run.notes][:5],
         }
 
@@ -158,6 +160,11 @@ class _Film:
         goal.index = int(np.searchsorted(route, number))
         reached = bool(np.isnan(trace.heading_error[index]))
         goal.state = GoalState.SUCCEEDED if reached else GoalState.EXECUTING
+
+    def settings(self) -> list[dict[str, Any]]:
+        """Return the recorded parameters that the page shows."""
+        state = self._state
+        return settings.shown({'controller': state.controller_values, 'robot': state.robot_values})
 
     def strips(self) -> Mapping[str, Any]:
         """Return the curves over the whole bag."""

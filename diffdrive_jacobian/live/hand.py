@@ -6,6 +6,7 @@ it and begins when that is confirmed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from enum import Enum, auto
 
@@ -33,8 +34,13 @@ class Act(Enum):
 class HandDriving:
     """Driving of one robot by hand."""
 
-    def __init__(self) -> None:
-        """Start at rest."""
+    def __init__(self, period: float = PERIOD) -> None:
+        """Start at rest.
+
+        Args:
+            period: Shortest time between two commands (s).
+        """
+        self._period = period
         self.page: int | None = None
         """The page that drives. None: none does."""
         self.twist = STANDSTILL
@@ -55,7 +61,7 @@ class HandDriving:
     def release(self, page: int) -> None:
         """Take the end of driving by a page."""
         if self.page == page:
-            self._commanded = -DEAD_MAN - 1.0
+            self._commanded = -math.inf
             self.twist = STANDSTILL
 
     def update(self, now: float, is_open: Callable[[int], bool], goal_active: bool) -> Act:
@@ -68,7 +74,7 @@ class HandDriving:
         """
         if self.page is None:
             return Act.NOTHING
-        if now - self._commanded > DEAD_MAN or not is_open(self.page):
+        if self._commanded == -math.inf or now - self._commanded > DEAD_MAN or not is_open(self.page):
             self.page = None
             return Act.STOP if self._moved else Act.NOTHING
         if goal_active:
@@ -80,7 +86,7 @@ class HandDriving:
                 return Act.GIVE_UP
             return Act.NOTHING
         self._canceling = None
-        if now - self._published < PERIOD:
+        if now - self._published < self._period:
             return Act.NOTHING
         self._published, self._moved = now, True
         return Act.PUBLISH

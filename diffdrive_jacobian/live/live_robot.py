@@ -11,7 +11,6 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Goals
 from numpy.typing import NDArray
 from rclpy.node import Node
-from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.live import settings
 from diffdrive_jacobian.live.commands import (
@@ -25,20 +24,25 @@ from diffdrive_jacobian.live.commands import (
     SendGoal,
     SetParameter,
 )
-from diffdrive_jacobian.live.hand import STANDSTILL, Act, HandDriving
+from diffdrive_jacobian.live.hand import PERIOD, STANDSTILL, Act, HandDriving
 from diffdrive_jacobian.live.parameter_link import ParameterLink
 from diffdrive_jacobian.live.robot_state import RobotState
 from diffdrive_jacobian.live.robot_topics import RobotTopics
 from diffdrive_jacobian.live.session import Session
 from diffdrive_jacobian.live.trail import Trail
+from diffdrive_jacobian.live.trigger_link import TriggerLink
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
 from diffdrive_jacobian.messages.goal_status import GoalState
-from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import seconds
 
 COMMAND_LIFE = 0.5
 """Time for which a cmd_vel is shown after it was received (s)."""
+SERVICES = {
+    'cancel_goal': 'the goal cannot be canceled',
+    'reset_odometry': 'the odometry cannot be reset',
+}
+"""Services of a robot, and what it means if they fail."""
 
 
 class LiveRobot:
@@ -68,8 +72,10 @@ class LiveRobot:
         self.topics.prepare()
         self.links: dict[str, ParameterLink] = {}
         """Parameters by role."""
-        self.hand = HandDriving()
-        self._services: dict[str, Any] = {}
+        # Simulated time may be fast: then with each of its steps.
+        self.hand = HandDriving(PERIOD if polled else 0.0)
+        # Before they are needed, so that they are discovered by then.
+        self._services = {name: TriggerLink(node, self.topics.full(name)) for name in SERVICES}
         self._frame = ''
         self._seen = self._commanded = time.monotonic()
 
@@ -152,15 +158,17 @@ class LiveRobot:
         elif isinstance(command, Release):
             self.hand.release(page)
         elif isinstance(command, CancelGoal):
-            self._call('cancel_goal', 'the goal cannot be canceled')
+            self._call('cancel_goal')
         elif isinstance(command, Reset):
-            self._call('reset_odometry', 'the odometry cannot be reset')
+            self._call('reset_odometry')
+            self.state.interrupt()
         elif isinstance(command, Place):
             if not self.topics.readers('initialpose'):
                 self._warn(f'nobody is subscribed to {self.topics.full("initialpose")}: not placed')
             else:
                 pose = np.array([command.x, command.y, command.theta])
                 self.topics.publish_pose(pose, self._frame, self._now())
+                self.state.interrupt()
         elif isinstance(command, ClearPath):
             self.state.trail = Trail()
         elif isinstance(command, SetParameter):
@@ -205,23 +213,8 @@ class LiveRobot:
 
         link.set(setting.name, value, answer)
 
-    def _call(self, service: str, failure: str) -> None:
-        name = self.topics.full(service)
-        if name not in self._services:
-            self._services[name] = self._node.create_client(Trigger, name)
-        client = self._services[name]
-        if not client.service_is_ready() and name not in dict(self._node.get_service_names_and_types()):
-            self._warn(f'{failure}: there is no service {name}')
-            return
-        client.call_async(Trigger.Request()).add_done_callback(
-            lambda done: self._on_answer(done, failure)
-        )
-
-    def _on_answer(self, done: Any, failure: str) -> None:
-        if done.cancelled() or done.exception() is not None:
-            self._warn(failure)
-        elif not done.result().success:
-            self._warn(f'{failure}: {printable(done.result().message)}')
+    def _call(self, service: str) -> None:
+        self._services[service].call(lambda reason: self._warn(f'{SERVICES[service]}: {reason}'))
 
     def _warn(self, text: str) -> None:
         self._session.notify(text, 'warning')
@@ -240,7 +233,7 @@ class LiveRobot:
             self.topics.publish_twist(STANDSTILL, self._now())
         elif act is Act.CANCEL_GOAL:
             self._session.notify('driving by hand: the goal is canceled')
-            self._call('cancel_goal', 'the goal cannot be canceled')
+            self._call('cancel_goal')
         elif act is Act.GIVE_UP:
             self._warn('the controller did not cancel its goal: the robot is not driven by hand')
 
@@ -262,6 +255,8 @@ class LiveRobot:
 
     def advance(self) -> None:
         """Advance queries of parameters."""
+        for service in self._services.values():
+            service.advance()
         for role, link in self.links.items():
             link.advance()
             if role == 'robot':
@@ -280,8 +275,8 @@ class LiveRobot:
     def destroy(self) -> None:
         """Destroy all entities."""
         self.topics.destroy()
-        for client in self._services.values():
-            self._node.destroy_client(client)
+        for service in self._services.values():
+            service.destroy()
 
     def use_nodes(self, found: dict[str, str]) -> None:
         """Take the nodes that have the parameters, by role."""

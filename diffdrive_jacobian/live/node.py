@@ -83,7 +83,7 @@ class LivePage(Node):  # type: ignore[misc]
             robot.stop()
 
     def _snapshot(self) -> Snapshot:
-        shown = {name: robot.shown() for name, robot in self.robots.items()}
+        shown = {name: robot.shown() for name, robot in sorted(self.robots.items())}
         return Snapshot(
             robots=[one for one in shown.values() if one is not None],
             trails={name: robot.state.trail for name, robot in self.robots.items()},

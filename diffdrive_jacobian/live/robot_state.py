@@ -107,6 +107,10 @@ class RobotState:
             self.covariance = covariance
         self.goal.moved(pose, self.arrival)
 
+    def interrupt(self) -> None:
+        """Interrupt the path: the robot is placed elsewhere."""
+        self.trail.points.append(None)
+
     def shown(self, *, age: float, by_hand: bool, **more: Any) -> dict[str, Any] | None:
         """Return the JSON object for the page. None: there was no odometry.
 

@@ -66,8 +66,8 @@ SETTINGS = (
             hint='Gain on the distance: how fast it drives. Above Kp the robot spirals in'),
     Setting(role='controller', name='controller', label='Control law', kind='choice',
             hint='How goal and pose become v and ω'),
-    Setting(role='controller', name='use_goal_heading', label='Turn to the goal’s heading', kind='flag',
-            hint='Turn in place at the last goal'),
+    Setting(role='controller', name='use_goal_heading', label='Goal heading', kind='flag',
+            hint='Turn in place to the heading of the last goal'),
     Setting(role='controller', name='xy_goal_tolerance', label='Tolerance', unit='m', low=0.005,
             high=0.5, hint='Distance that counts as arrived: the circle around the goal'),
     Setting(role='controller', name='offset', label='Offset d', unit='m', low=0.02, high=0.4,
@@ -76,9 +76,9 @@ SETTINGS = (
             high=2.0, kind='limit', hint='Both speeds are scaled alike, so the path stays the same'),
     Setting(role='controller', name='angular.z.max_velocity', label='Limit of ω', unit='rad/s', low=0.1,
             high=6.0, kind='limit', hint='Both speeds are scaled alike, so the path stays the same'),
-    Setting(role='robot', name='max_wheel_velocity', label='Limit of the wheels', unit='rad/s', low=1.0,
+    Setting(role='robot', name='max_wheel_velocity', label='Wheel limit', unit='rad/s', low=1.0,
             high=40.0, kind='limit', hint='Both wheels are scaled alike'),
-    Setting(role='robot', name='wheel_travel_variance', label='Noise of the wheels', unit='m', low=0.0,
+    Setting(role='robot', name='wheel_travel_variance', label='Wheel noise', unit='m', low=0.0,
             high=0.002, hint='Variance per distance: how fast the uncertainty region grows'),
 )  # fmt: skip
 """What the page offers. A node is asked for those that it has."""

@@ -80,8 +80,8 @@ def _parser() -> argparse.ArgumentParser:
         prog=PROGRAM,
         usage=f'{PROGRAM} [BAG] [options] [--ros-args ...]',
         description='Show running robots on a page in the browser: path, goal, wheels and the numbers '
-        'of the Jacobian chain. The page also steers them. With BAG the page plays a recorded run. Ctrl-C '
-        'ends. Exit code 0: ended by Ctrl-C; 1: the page cannot be served; 2: wrong arguments.',
+        'of the Jacobian chain. The page also steers them. With BAG the page plays a recorded run. '
+        'Ctrl-C ends. Exit code 0: ended by Ctrl-C; 1: the page cannot be served; 2: wrong arguments.',
     )
     parser.add_argument(
         'bag', metavar='BAG', nargs='?', help='bag to play (default: show running robots)'

@@ -21,11 +21,18 @@ class Matrix {
   }
 }
 
-function link(title, equation, source, ...numbers) {
+/** A matrix of symbols. */
+function symbols(name, columns, ...cells) {
+  const matrix = element('span', { class: columns === 2 ? 'matrix two' : 'matrix' }, ...cells.map((cell) => element('span', {}, ...math(cell))));
+  return element('span', { class: 'symbols numbers' }, element('span', {}, ...math(`${name} =`)), matrix);
+}
+
+function link(title, equation, source, symbolic, ...numbers) {
   const heading = element('h3', {}, element('span', {}, ...math(title)), element('span', { class: 'source', title: 'Document and equation: see doc/mathematics.md' }, source));
   const formula = element('p', { class: 'equation' });
   setMath(formula, equation);
-  return { node: element('div', { class: 'link' }, heading, formula, element('div', { class: 'numbers' }, ...numbers)), heading, formula };
+  return { node: element('div', { class: 'link' }, heading,
+    element('div', { class: 'formula' }, formula, symbolic), element('div', { class: 'numbers' }, ...numbers)), heading, formula };
 }
 
 const unit = (text) => element('span', { class: 'unit' }, text);
@@ -46,11 +53,14 @@ export class Chain {
     this.twistAgain = new Matrix(2, 1, pair);
     this.world = new Matrix(3, 1);
     this.links = {
-      goal: link('Goal', 'd = |p_{goal} − p|,  e = ∠(p_{goal} − p) − θ', 'A (9)', this.goal),
-      law: link('Control law', LAWS.go_to_goal[0], LAWS.go_to_goal[1], '[v, ω] =', this.command.node, unit('m/s, rad/s'), this.law),
-      inverse: link('To the wheels', '[ω_R, ω_L] = J_w⁻¹ [v, ω]', 'A (8), E', this.wanted.node, '=', this.inverse.node, this.commandAgain.node, unit('rad/s')),
-      forward: link('From the wheels to the body', '[v, ω] = J_w [ω_R, ω_L]', 'A (8), E', this.twist.node, '=', this.forward.node, this.wheels.node),
-      world: link('From the body to the world', 'q̇ = [ẋ, ẏ, θ̇] = S(θ) [v, ω]', 'A (4)–(7)', this.world.node, '=', this.unicycle.node, this.twistAgain.node),
+      goal: link('Goal', 'd = |p_{goal} − p|,  e = ∠(p_{goal} − p) − θ', 'A (9)', '', this.goal),
+      law: link('Control law', LAWS.go_to_goal[0], LAWS.go_to_goal[1], '', '[v, ω] =', this.command.node, unit('m/s, rad/s'), this.law),
+      inverse: link('To the wheels', '[ω_R, ω_L] = J_w⁻¹ [v, ω]', 'A (8), E',
+        symbols('J_w⁻¹', 2, '1/r', 'L/2r', '1/r', '−L/2r'), this.wanted.node, '=', this.inverse.node, this.commandAgain.node, unit('rad/s')),
+      forward: link('From the wheels to the body', '[v, ω] = J_w [ω_R, ω_L]', 'A (8), E',
+        symbols('J_w', 2, 'r/2', 'r/2', 'r/L', '−r/L'), this.twist.node, '=', this.forward.node, this.wheels.node),
+      world: link('From the body to the world', 'q̇ = [ẋ, ẏ, θ̇] = S(θ) [v, ω]', 'A (4)–(7)',
+        symbols('S', 2, 'cos θ', '0', 'sin θ', '0', '0', '1'), this.world.node, '=', this.unicycle.node, this.twistAgain.node),
     };
     this.note = element('p', { class: 'small' });
     section.append(element('h2', {}, 'From the goal to motion'), ...Object.values(this.links).map((one) => one.node), this.note);
@@ -79,16 +89,17 @@ export class Chain {
     this.unicycle.set(chain.unicycle);
     this.world.set(chain.world);
     const [r, L] = robot.geometry;
-    setText(this.note, `r = ${format(r)} m, L = ${format(L)} m, θ = ${format(robot.pose[2])} rad. `
+    setText(this.note, `q = (${format(robot.pose[0])} m, ${format(robot.pose[1])} m, ${format(robot.pose[2])} rad), r = ${format(r)} m, L = ${format(L)} m. `
       + (chain.measured ? 'From J_w on with the wheel speeds of joint_states.' : 'No joint_states: the wheels are taken to do as told.'));
   }
 
-  /** Return what the law computes where the command differs, or with which gains. */
+  /** Return the gains, and the factor by which limits scale what the law computes. */
   describe(robot) {
     const { law, chain } = robot;
-    if (robot.by_hand || !robot.commanded || law.twist === null) return '';
-    const limited = law.twist && law.twist.some((value, k) => Math.abs(value - chain.command[k]) > 0.02 + 0.05 * Math.abs(value));
-    if (limited) return `limited, the law says ${format(law.twist[0], 2)}, ${format(law.twist[1], 2)}`;
-    return law.kp === null ? '' : `K_p = ${law.kp}, K_v = ${law.kv}`;
+    if (robot.by_hand || !robot.commanded || !law.twist) return '';
+    const gains = law.kp === null ? '' : `K_p = ${law.kp}, K_v = ${law.kv}`;
+    const factors = law.twist.map((value, k) => chain.command[k] / value).filter((_, k) => Math.abs(law.twist[k]) > 0.02);
+    const limited = factors.length > 0 && Math.max(...factors) < 0.97 && Math.max(...factors) - Math.min(...factors) < 0.02;
+    return limited ? `${gains}; the limits scale both by ${format(factors[0], 2)}` : gains;
   }
 }

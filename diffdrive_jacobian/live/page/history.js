@@ -1,7 +1,7 @@
 // Quantities of one robot over time, for the strips.
 
 export const CURVES = ['v', 'omega', 'command_v', 'command_omega', 'right', 'left', 'distance', 'heading_error'];
-const KEPT = 30;
+const KEPT = 20;
 
 export class History {
   constructor() {
@@ -53,6 +53,7 @@ export class History {
   /** Return the interval of time to show. */
   window(now) {
     if (this.whole) return [this.time[0] ?? 0, this.time.at(-1) ?? 1];
-    return [now - KEPT, now];
+    const from = Math.max(this.time[0] ?? now, now - KEPT);
+    return [from, from + KEPT];
   }
 }

@@ -16,12 +16,13 @@ import { Transport } from './transport.js';
 import { View } from './view.js';
 
 const HINTS = {
-  goal: 'click: goal · drag: with heading · shift-click: waypoint · drag the robot: place it · arrow keys or WASD: drive',
+  goal: 'click: goal · drag: with heading · shift-click: waypoint · drag the robot: place it · WASD or arrow keys: drive',
   waypoint: 'click: a further place after the present goal · drag: with heading',
   move: 'drag: move the map · wheel or pinch: zoom',
   bag: 'drag: move the map · wheel or pinch: zoom · click a curve: go to that time · space: pause',
 };
 
+let changed = true;
 const model = new Model(), view = new View(), notices = new Notices(byId('notices'));
 const drawing = new MapDrawing(byId('map'), view, model);
 const send = (command) => {
@@ -34,9 +35,8 @@ const pointer = new MapPointer(byId('map'), view, drawing, model, send, showFoll
 const hand = new HandDriving(model, send), chain = new Chain(byId('chain'));
 const settings = new Settings(model, send), transport = new Transport(model, send);
 const strips = new Strips(byId('strips'), model, (time) => transport.seek(time));
-followTheme(byId('theme'), () => { drawing.colors = themeColors(); });
+followTheme(byId('theme'), () => { drawing.colors = themeColors(); changed = true; });
 
-let changed = true;
 const connection = new Connection((frame) => {
   model.take(frame);
   for (const notice of frame.notices ?? []) {
@@ -94,15 +94,18 @@ const onSelected = (id, command) => byId(id).addEventListener('click', () => {
 onSelected('cancel', 'cancel');
 onSelected('reset', 'reset');
 onSelected('clear', 'clear_path');
-byId('follow').addEventListener('click', () => { view.follow = !view.follow; showFollow(); byId('follow').blur(); });
+byId('follow').addEventListener('click', () => { view.follow = !view.follow; changed = true; showFollow(); byId('follow').blur(); });
 byId('fit').addEventListener('click', () => {
   const points = [...model.paths.values()].flat().filter((point) => point !== null);
   for (const robot of model.robots.values()) points.push(robot.pose, ...(robot.goal.goals ?? []));
   view.fit(points.map(([x, y]) => [x, y]));
   showFollow();
+  changed = true;
 });
-byId('in').addEventListener('click', () => view.zoom(1.3));
-byId('out').addEventListener('click', () => view.zoom(1 / 1.3));
+byId('in').addEventListener('click', () => { view.zoom(1.3); changed = true; });
+byId('out').addEventListener('click', () => { view.zoom(1 / 1.3); changed = true; });
+byId('map').addEventListener('wheel', () => { changed = true; }, { passive: true });
+byId('map').addEventListener('pointerup', () => { changed = true; });
 byId('goto').addEventListener('submit', (event) => {
   event.preventDefault();
   const [x, y, theta] = ['x', 'y', 'theta'].map((name) => parseNumber(byId(`goto-${name}`).value));
@@ -113,17 +116,24 @@ addEventListener('keydown', (event) => {
   if (event.code === 'Escape' && model.selected && !model.recorded) send({ do: 'cancel', robot: model.selected.name });
 });
 
-let before = performance.now(), fitted = false;
+const STRIP_PERIOD = 80;
+let before = performance.now(), stripped = 0, moving = false, fitted = false;
 function draw(now) {
-  if (changed) {
+  requestAnimationFrame(draw);
+  const fresh = changed, [x, y, scale] = [view.x, view.y, view.scale];
+  if (fresh) {
     changed = false;
     showPanels();
+  }
+  if (fresh && now - stripped > STRIP_PERIOD) {
+    stripped = now;
     strips.draw(drawing.colors);
   }
   if (model.recorded && !fitted && model.paths.size) { fitted = true; drawing.draw(0); byId('fit').click(); }
-  drawing.draw((now - before) / 1000);
+  // Without news there is nothing to draw.
+  if (fresh || pointer.action || moving) drawing.draw((now - before) / 1000);
   before = now;
-  requestAnimationFrame(draw);
+  moving = Math.hypot(view.x - x, view.y - y) * view.scale > 0.2 || view.scale !== scale;
 }
 addEventListener('resize', () => { changed = true; });
 requestAnimationFrame(draw);

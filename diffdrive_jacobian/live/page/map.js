@@ -33,9 +33,10 @@ export class MapDrawing {
     for (const robot of model.robots.values()) this.drawPath(context, robot);
     for (const robot of model.robots.values()) this.drawGoals(context, robot, robot === selected);
     for (const robot of model.robots.values()) drawRegion(context, view, robot, colors);
-    for (const robot of model.robots.values()) this.drawRobot(context, robot, robot === selected, seconds);
+    const last = [...model.robots.values()].sort((a, b) => Number(a === selected) - Number(b === selected));
+    for (const robot of last) this.drawRobot(context, robot, robot === selected, seconds);
     if (this.preview) this.drawPreview(context, selected);
-    this.drawScale(context, height);
+    this.drawScale(context, width, height);
   }
 
   drawGrid(context, width, height) {
@@ -54,8 +55,8 @@ export class MapDrawing {
         context.stroke();
         context.fillStyle = colors.muted;
         const label = `${(k * step).toFixed(digits).replace('-', '−')}`;
-        if (vertical) context.fillText(label, px + 3, height - 30);
-        else if (py < height - 44 && py > 56) context.fillText(label, 5, py - 3);
+        if (vertical) context.fillText(label, px + 3, height - 7);
+        else if (py < height - 20 && py > 56) context.fillText(label, 5, py - 3);
       }
     }
   }
@@ -180,15 +181,18 @@ export class MapDrawing {
     this.drawGoal(context, pose, { tolerance: robot?.tolerance ?? 0.02, heading, done: false, label: '' });
   }
 
-  drawScale(context, height) {
+  drawScale(context, width, height) {
     const { view, colors } = this, step = niceStep(50 / view.scale), length = step * view.scale;
     context.strokeStyle = context.fillStyle = colors.muted;
     context.lineWidth = 2;
     context.beginPath();
-    context.moveTo(12.5, height - 14); context.lineTo(12.5, height - 10);
-    context.lineTo(12.5 + length, height - 10); context.lineTo(12.5 + length, height - 14);
+    const right = width - 14.5, bottom = height - 24;
+    context.moveTo(right - length, bottom - 4); context.lineTo(right - length, bottom);
+    context.lineTo(right, bottom); context.lineTo(right, bottom - 4);
     context.stroke();
     context.font = '11px system-ui, sans-serif';
-    context.fillText(step < 1 ? `${Math.round(step * 100)} cm` : `${step} m`, 18 + length, height - 9);
+    context.textAlign = 'center';
+    context.fillText(step < 1 ? `${Math.round(step * 100)} cm` : `${step} m`, right - length / 2, bottom - 6);
+    context.textAlign = 'left';
   }
 }

@@ -1,9 +1,15 @@
 // Sliders for the parameters of the nodes. A value that a node refuses goes back.
 
-import { byId, element, parseNumber } from './dom.js';
+import { byId, element, parseNumber, setText } from './dom.js';
 
 const PERIOD = 120;
 const REST = 900;
+
+/** Return a number as a person would type it. */
+function plain(value) {
+  const small = value !== 0 && Math.abs(value) < 1e-3;
+  return small ? value.toExponential(2).replace(/\.?0+e/, 'e') : String(Number(value.toPrecision(4)));
+}
 
 export class Settings {
   constructor(model, send) {
@@ -18,6 +24,7 @@ export class Settings {
   show(force = false) {
     const robot = this.model.selected, rows = (robot && this.model.settings[robot.name]) ?? [];
     byId('settings').hidden = !rows.length;
+    setText(byId('settings').firstElementChild, this.model.recorded ? 'Parameters, as recorded' : 'Parameters');
     const layout = `${robot?.name} ${rows.map((row) => `${row.key} ${row.choices ?? ''}`).join(';')}`;
     if (layout !== this.shown) {
       this.shown = layout;
@@ -35,6 +42,7 @@ export class Settings {
     const label = element('label', { htmlFor: id, title: row.hint }, row.label);
     const controls = { choice: this.choice, flag: this.flag }[row.kind] ?? this.number;
     const { nodes, set } = controls.call(this, row, id);
+    for (const node of nodes) node.disabled = this.model.recorded;
     this.rows.set(row.key, set);
     return element('div', { class: 'setting', 'data-key': row.key, title: row.hint }, label, ...nodes);
   }
@@ -56,7 +64,7 @@ export class Settings {
     const slider = element('input', { id, type: 'range', min: row.low, max: row.high, step, 'aria-description': row.hint });
     const field = element('input', { type: 'text', inputMode: 'decimal', 'aria-label': `${row.label}, exact value${limit ? ', empty for none' : ''}`,
       placeholder: limit ? 'none' : '' });
-    const write = (value) => { field.value = value === null ? '' : String(Number(value.toPrecision(4))); };
+    const write = (value) => { field.value = value === null ? '' : plain(value); };
     slider.addEventListener('input', () => { write(Number(slider.value)); this.change(row, Number(slider.value), true); });
     slider.addEventListener('change', () => this.change(row, Number(slider.value)));
     slider.addEventListener('pointerup', () => slider.blur());

@@ -5,10 +5,13 @@ import { element, format, niceStep, prepared, setText } from './dom.js';
 const STRIPS = [
   { name: 'v', unit: 'm/s', curves: [['command_v', 'muted', 'set', true], ['v', 'v', 'v']] },
   { name: 'ω', unit: 'rad/s', curves: [['command_omega', 'muted', 'set', true], ['omega', 'omega', 'ω']] },
-  { name: 'wheels', unit: 'rad/s', curves: [['left', 'left', 'L'], ['right', 'right', 'R']] },
+  { name: 'wheels', unit: 'rad/s', digits: 1, curves: [['left', 'left', 'L'], ['right', 'right', 'R']] },
   { name: 'distance', unit: 'm', curves: [['distance', 'v', 'd']], zero: true },
   { name: 'heading error', unit: 'rad', curves: [['heading_error', 'omega', 'e']] },
 ];
+
+/** Room for the labels (px). */
+const GUTTER = 30;
 
 export class Strips {
   constructor(section, model, onSeek) {
@@ -28,7 +31,7 @@ export class Strips {
     if (!this.model.recorded || !this.model.selected) return;
     const [from, to] = this.model.histories.get(this.model.selected.name).window(0);
     const box = canvas.getBoundingClientRect();
-    onSeek(from + ((event.clientX - box.left) / box.width) * (to - from));
+    onSeek(from + ((event.clientX - box.left - GUTTER) / (box.width - GUTTER)) * (to - from));
   }
 
   draw(colors) {
@@ -40,7 +43,7 @@ export class Strips {
 
   drawStrip(strip, history, now, colors) {
     const { context, width, height } = prepared(strip.canvas);
-    const [from, to] = history.window(now), toX = (time) => ((time - from) / Math.max(to - from, 1e-9)) * width;
+    const [from, to] = history.window(now), toX = (time) => GUTTER + ((time - from) / Math.max(to - from, 1e-9)) * (width - GUTTER);
     let low = 0, high = 0;
     for (const [name] of strip.curves) {
       const curve = history.curves[name];
@@ -61,14 +64,15 @@ export class Strips {
       context.strokeStyle = zero ? colors['grid-strong'] : colors.grid;
       context.lineWidth = 1;
       context.beginPath();
-      context.moveTo(0, toY(value)); context.lineTo(width, toY(value));
+      context.moveTo(GUTTER, toY(value)); context.lineTo(width, toY(value));
       context.stroke();
       context.fillStyle = colors.muted;
-      context.fillText(format(value, digits), 1, toY(value) - 1.5 + (value >= high - step / 2 ? 10 : 0));
+      context.textAlign = 'right';
+      context.fillText(format(value, digits), GUTTER - 4, toY(value) + 3.5);
     }
     strip.curves.forEach(([name, color, label, dashed], number) => {
       const last = this.drawCurve(context, history, name, colors[color], dashed, { from, now, toX, toY });
-      setText(strip.values[number], `${label} ${format(last, 2)}`);
+      setText(strip.values[number], `${label} ${format(last, strip.digits ?? 2)}`);
     });
     if (history.whole) {
       context.strokeStyle = colors.text;

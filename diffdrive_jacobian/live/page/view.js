@@ -1,12 +1,13 @@
 // The view of the map: which part of the world is where on the screen.
 
 const MIN_SCALE = 0.5, MAX_SCALE = 4000;
+const ABOVE = 70, BELOW = 110;
 
 export class View {
   constructor() {
     this.x = 0;
     this.y = 0;
-    this.scale = 220;
+    this.scale = 280;
     this.follow = true;
     this.width = 1;
     this.height = 1;
@@ -49,8 +50,11 @@ export class View {
     this.follow = false;
     this.x = (left + right) / 2;
     this.y = (bottom + top) / 2;
-    const width = Math.max(right - left, 0.5) * 1.35, height = Math.max(top - bottom, 0.5) * 1.5;
-    this.scale = Math.min(MAX_SCALE, Math.max(MIN_SCALE, Math.min(this.width / width, this.height / height)));
+    // The bars above and below take their share.
+    const width = Math.max(right - left, 0.5) * 1.3, height = Math.max(top - bottom, 0.5) * 1.15;
+    const scale = Math.min(this.width / width, (this.height - ABOVE - BELOW) / height);
+    this.scale = Math.min(MAX_SCALE, Math.max(MIN_SCALE, scale));
+    this.y += (ABOVE - BELOW) / 2 / this.scale;
   }
 
   /** Keep a robot in the middle, gently. */
