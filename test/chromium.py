@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 NAMES = ('chromium', 'chromium-browser', 'google-chrome')
@@ -52,7 +53,11 @@ class Browser:
         port_file = Path(self._profile, 'DevToolsActivePort')
         until(lambda: port_file.exists() and len(port_file.read_text().split()) == 2, 'chromium starts')
         port, path = port_file.read_text().split()
-        self._socket = connect(f'ws://127.0.0.1:{port}{path}', max_size=1 << 26, proxy=None)
+        # Without compression, and for as long as the browser lives.
+        self._closing = ExitStack()
+        self._socket = self._closing.enter_context(
+            connect(f'ws://127.0.0.1:{port}{path}', max_size=1 << 26, compression=None, proxy=None)
+        )
         self._session = None
         target = self.call('Target.createTarget', url='about:blank')['targetId']
         attached = self.call('Target.attachToTarget', targetId=target, flatten=True)
@@ -182,7 +187,7 @@ class Browser:
             self.call('Browser.close')
         except Exception:
             self._process.kill()
-        self._socket.close()
+        self._closing.close()
         self._process.wait(PATIENCE)
         shutil.rmtree(self._profile, ignore_errors=True)
 

@@ -93,9 +93,9 @@ JSON = st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_siz
     st.dictionaries(st.sampled_from(KEYS), JSON, max_size=5),
 )
 def test_nothing_else_than_a_command_or_an_error(name, values):
+    said = ''
     try:
-        command = parse(json.dumps({'do': name, **values}))
+        parse(json.dumps({'do': name, **values}))
     except CommandError as error:
-        assert str(error).isprintable()
-    else:
-        assert command is not None
+        said = str(error)
+    assert said.isprintable()

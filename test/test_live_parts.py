@@ -51,7 +51,8 @@ def test_driving_ends_at_once_with_the_page_or_its_release():
             hand.release(2)
             assert hand.update(10.05, is_open, goal_active=False) is Act.PUBLISH
             hand.release(1)
-        assert hand.update(10.06, lambda page: end != 'closed', goal_active=False) is Act.STOP
+        gone = end == 'closed'
+        assert hand.update(10.06, lambda page, gone=gone: not gone, goal_active=False) is Act.STOP
 
 
 def test_one_page_drives_at_a_time():

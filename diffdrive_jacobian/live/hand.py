@@ -6,7 +6,6 @@ it and begins when that is confirmed.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from enum import Enum, auto
 
@@ -47,7 +46,7 @@ class HandDriving:
         """`(v, omega)` that is to be published (m/s, rad/s)."""
         self._commanded = self._published = -1.0
         self._canceling: float | None = None
-        self._moved = False
+        self._moved = self._released = False
 
     def command(self, page: int, twist: tuple[float, float], now: float) -> bool:
         """Take a command of a page. Return False if another page drives."""
@@ -55,14 +54,13 @@ class HandDriving:
             return False
         if self.page is None:
             self._canceling, self._moved, self._published = None, False, -1.0
-        self.page, self.twist, self._commanded = page, twist, now
+        self.page, self.twist, self._commanded, self._released = page, twist, now, False
         return True
 
     def release(self, page: int) -> None:
         """Take the end of driving by a page."""
         if self.page == page:
-            self._commanded = -math.inf
-            self.twist = STANDSTILL
+            self._released = True
 
     def update(self, now: float, is_open: Callable[[int], bool], goal_active: bool) -> Act:
         """Return what must be done now; to be called often.
@@ -74,7 +72,7 @@ class HandDriving:
         """
         if self.page is None:
             return Act.NOTHING
-        if self._commanded == -math.inf or now - self._commanded > DEAD_MAN or not is_open(self.page):
+        if self._released or now - self._commanded > DEAD_MAN or not is_open(self.page):
             self.page = None
             return Act.STOP if self._moved else Act.NOTHING
         if goal_active:

@@ -17,6 +17,7 @@ from diffdrive_jacobian.bags.bag_reader import (
     DamagedBagError,
     base_name,
     messages,
+    namespace_of,
     open_bag,
     recorded_parameters,
     stored_connections,
@@ -48,7 +49,9 @@ WHEELS = ('left_wheel_joint', 'right_wheel_joint')
 """Names of the left and the right wheel joint where no parameters give them."""
 
 
-def read_run(path: str | Path, topics: Mapping[str, str] | None = None) -> Run:
+def read_run(
+    path: str | Path, topics: Mapping[str, str] | None = None, *, namespace: str | None = None
+) -> Run:
     """Read a bag that `record_run` or `ros2 bag record` has written.
 
     Messages that cannot be decoded, and those that the nodes drop, are skipped. `Run.skipped` counts
@@ -58,17 +61,24 @@ def read_run(path: str | Path, topics: Mapping[str, str] | None = None) -> Run:
         path: The bag's directory, or an MCAP or SQLite file.
         topics: Topics with another name in the bag: from the usual name, such as `odom`, to the name in
             the bag, such as `/robot1/odom`. By default topics are found by their name without namespace.
+        namespace: Namespace of the robot, such as `/robot1`, in a bag of several. Only its topics and
+            nodes are read, and topics that are given. None: that of the only robot.
 
     Raises:
-        BagError: It is not a bag, is damaged, or has several topics of the same name.
+        BagError: It is not a bag, is damaged, has several topics of the same name, or none in the
+            namespace.
     """
     path = Path(path)
     rows: dict[str, list[tuple[int, int, list[float]]]] = defaultdict(list)
     events: list[tuple[int, str, dict[str, Any]]] = []
     with open_bag(path) as reader:
-        parameters = recorded_parameters(reader)
+        parameters = {
+            node: values
+            for node, values in recorded_parameters(reader).items()
+            if namespace in (None, namespace_of(node))
+        }
         names = _wheel_names(parameters)
-        chosen = _choose(reader, dict(topics or {}))
+        chosen = _choose(reader, dict(topics or {}), namespace)
         connections = [one for one in reader.connections if one.id in chosen]
         tally = _Tally()
         stored = stored_connections(reader)
@@ -86,7 +96,8 @@ def read_run(path: str | Path, topics: Mapping[str, str] | None = None) -> Run:
             try:
                 message = decode(data, kind)
                 if topic == PARAMETER_EVENTS[0]:
-                    events.append((received, message.node, changed_parameters(message)))
+                    if namespace in (None, namespace_of(message.node)):
+                        events.append((received, message.node, changed_parameters(message)))
                     continue
                 read = list(ROW_READERS[topic, kind](message, names))
             except UndecodableError:
@@ -152,23 +163,27 @@ class _Tally:
         return tuple(lines)
 
 
-def _choose(reader: Reader, given: dict[str, str]) -> dict[int, str]:
+def _choose(reader: Reader, given: dict[str, str], namespace: str | None) -> dict[int, str]:
     """Return which connections are which topics of a run: id of the connection to usual name.
 
     Raises:
-        BagError: A given topic is missing or has another type, or a name has several topics.
+        BagError: A given topic is missing or has another type, a name has several topics, or the
+            namespace has none.
     """
     chosen: dict[int, str] = {}
     usual = {name for name, _ in ROW_READERS} | {PARAMETER_EVENTS[0]}
     if unknown := sorted(set(given) - usual):
         raise BagError(f'topics must be among {", ".join(sorted(usual))}, got {unknown[0]!r}')
-    for name in usual:
+    for name in sorted(usual):
         types = {kind for topic, kind in (*ROW_READERS, PARAMETER_EVENTS) if topic == name}
         candidates = [
             connection
             for connection in reader.connections
             if (
-                connection.topic == given[name] if name in given else base_name(connection.topic) == name
+                connection.topic == given[name]
+                if name in given
+                else base_name(connection.topic) == name
+                and (name == PARAMETER_EVENTS[0] or namespace in (None, namespace_of(connection.topic)))
             )
         ]
         matching = [connection for connection in candidates if connection.msgtype in types]
@@ -180,9 +195,17 @@ def _choose(reader: Reader, given: dict[str, str]) -> dict[int, str]:
         if len({connection.topic for connection in matching}) > 1:
             raise BagError(
                 f'{reader.path} has several topics {name}: '
-                f'{", ".join(sorted({one.topic for one in matching}))}; choose one of them'
+                f'{", ".join(sorted({one.topic for one in matching}))}; choose one of them, or one '
+                'namespace (--namespace)'
             )
         chosen.update((connection.id, name) for connection in matching)
+    if namespace is not None and not set(chosen.values()) - {PARAMETER_EVENTS[0]}:
+        topics = (one.topic for one in reader.connections)
+        there = {namespace_of(one) for one in topics if base_name(one) in usual - {PARAMETER_EVENTS[0]}}
+        raise BagError(
+            f'{reader.path} has no topics of a run in the namespace {namespace}; it has them in '
+            f'{", ".join(sorted(there)) or "none"}'
+        )
     return chosen
 
 

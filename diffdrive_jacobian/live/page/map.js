@@ -29,6 +29,8 @@ export class MapDrawing {
     Object.assign(view, { width, height });
     const selected = model.selected;
     view.track(selected?.pose, seconds);
+    // Where the robot is on the canvas, for tests of the page.
+    if (selected) this.canvas.dataset.robot = view.toScreen(selected.pose[0], selected.pose[1]).map(Math.round).join(' ');
     this.drawGrid(context, width, height);
     for (const robot of model.robots.values()) this.drawPath(context, robot);
     for (const robot of model.robots.values()) this.drawGoals(context, robot, robot === selected);
