@@ -95,6 +95,7 @@ def test_drive_to_live_waits_for_the_page_records_and_ends_by_a_signal(world, tm
         (drive_to, ['1', '1', '--no-browser'], 'are options of --live'),
         (drive_to, ['1', '1', '--port', '8000'], 'are options of --live'),
         (drive_to, ['1', '1', '--live', '--lockstep', '--open'], 'exclude each other'),
+        (drive_to, ['--live', '--timeout', '5'], '--timeout has no effect with --live'),
     ],
 )
 def test_wrong_arguments(capsys, tool, arguments, message):
@@ -109,9 +110,11 @@ def test_a_port_in_use_a_bag_that_is_none_and_a_missing_library(capsys, tmp_path
         port = str(taken.getsockname()[1])
         assert watch_run.main(['--port', port, '--no-browser'], Signals()) == 1
         assert f'--port {port} is in use' in capsys.readouterr().err
-        arguments = ['--live', '--no-record', '--no-browser', '--port', port]
+        monkeypatch.chdir(tmp_path)
+        arguments = ['--live', '--no-browser', '--port', port]
         assert drive_to.main(arguments, Signals()) == 1
         assert f'drive_to: error: --port {port} is in use' in capsys.readouterr().err
+        assert list(tmp_path.iterdir()) == []
     assert watch_run.main([str(tmp_path / 'none')], Signals()) == 2
     assert 'watch_run: error: ' in capsys.readouterr().err
     for name in [name for name in sys.modules if name.startswith('diffdrive_jacobian.live')]:

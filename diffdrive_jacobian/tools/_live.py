@@ -7,8 +7,11 @@ import errno
 import os
 import threading
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
+
+from diffdrive_jacobian.errors import UserError
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.live.server import LiveServer
@@ -53,7 +56,23 @@ def announcing(options: argparse.Namespace) -> Callable[[LiveServer], None]:
     return announce
 
 
-def port_message(error: OSError, port: int) -> str | None:
+class PortError(UserError):
+    """The port that the user gave cannot be used."""
+
+
+@contextmanager
+def explaining_port(port: int) -> Iterator[None]:
+    """Raise PortError where the given port cannot be used."""
+    try:
+        yield
+    except OSError as error:
+        message = _port_message(error, port)
+        if message is None:
+            raise
+        raise PortError(message) from error
+
+
+def _port_message(error: OSError, port: int) -> str | None:
     """Return what to print if a port cannot be used. None: the error is another one."""
     reasons = {
         errno.EADDRINUSE: 'is in use: choose another one, or none for any free one',

@@ -37,9 +37,13 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             parser.error('the following arguments are required: X Y (only --live needs no goal)')
         if options.port or options.no_browser:
             parser.error('--port and --no-browser are options of --live')
+    elif options.timeout != parser.get_default('timeout'):
+        parser.error('--timeout has no effect with --live, which ends by Ctrl-C')
     ros = ['--ros-args', '--log-level', 'warn', '--', *_cli.with_params_file(ros, options)]
     if options.live:
-        return _drive_live(options, ros, signals)
+        from diffdrive_jacobian.tools._live_drive import drive_with_page
+
+        return drive_with_page(options, ros, signals)
     # Not above: --help needs no ROS.
     from diffdrive_jacobian.drives import DriveError, drive, waypoints_through
     from diffdrive_jacobian.recording.record import open_recording, saved_on_error
@@ -63,7 +67,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                     lockstep=options.lockstep,
                     isolated=not options.open,
                     timeout=options.timeout,
-                    parameters=_parameters(options),
+                    parameters=controller_parameters(options),
                     recording=recording,
                     ros_arguments=ros,
                     signals=signals,
@@ -77,48 +81,9 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     code = _cli.FAILED if outcome is None else _report(outcome, options)
     if recording is None:
         return code
-    saved = _save(recording, plot=not options.no_plot)
+    saved = save(recording, plot=not options.no_plot)
     # An interruption remains one.
     return code if code == _cli.INTERRUPTED else saved or code
-
-
-def _drive_live(options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> int:
-    """Drive with the page until Ctrl-C; return the exit code."""
-    from diffdrive_jacobian.drives import DriveError, waypoints_through
-    from diffdrive_jacobian.recording.record import open_recording, saved_on_error
-
-    recording = None
-    try:
-        from diffdrive_jacobian.live.running import drive_live
-
-        goals = np.empty((0, 3))
-        if options.coordinates:
-            places = np.reshape(options.coordinates, (-1, 2))
-            goals = waypoints_through(places, options.heading or 0.0)
-        if not options.no_record:
-            recording = open_recording('drive', options.output, 'mcap', lossless=options.lockstep)
-        with saved_on_error(recording):
-            drive_live(
-                goals,
-                lockstep=options.lockstep,
-                isolated=not options.open,
-                parameters=_parameters(options),
-                recording=recording,
-                ros_arguments=ros,
-                port=options.port,
-                signals=signals,
-                ready=_live.announcing(options),
-                nodes_created=lambda names: _warn_of_unused_files(ros, names),
-            )
-    except ModuleNotFoundError as error:
-        if (error.name or '').split('.')[0] != 'websockets':
-            raise
-        return _cli.complain(PROGRAM, _live.MISSING, _cli.FAILED)
-    except (UserError, DriveError, OSError) as error:
-        message = _live.port_message(error, options.port) if isinstance(error, OSError) else None
-        code = _cli.USER_ERROR if isinstance(error, UserError) else _cli.FAILED
-        return _cli.complain(PROGRAM, message or error, code)
-    return _cli.DONE if recording is None else _save(recording, plot=False)
 
 
 def _warn_of_unused_files(ros: Sequence[str], names: Sequence[str]) -> None:
@@ -159,7 +124,7 @@ class _Progress:
         self._bar.show(f'goal {index + 1}/{len(self._goals)} ({x:g}, {y:g})', distance, wheels)
 
 
-def _parameters(options: argparse.Namespace) -> dict[str, Any]:
+def controller_parameters(options: argparse.Namespace) -> dict[str, Any]:
     """Return the controller's parameters that were given by an option of their own."""
     given = {'xy_goal_tolerance': options.tolerance, 'controller': options.controller}
     if options.heading is not None:
@@ -171,7 +136,7 @@ def _picture(recording: Recording) -> Path:
     return recording.bag.with_name(recording.bag.name + '.png')
 
 
-def _save(recording: Recording, *, plot: bool) -> int:
+def save(recording: Recording, *, plot: bool) -> int:
     """Write the bag and its picture, and print their names; return the exit code."""
     from diffdrive_jacobian.plots.run_figure import draw
     from diffdrive_jacobian.reading.reader import BagError, read_run

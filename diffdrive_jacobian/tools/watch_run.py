@@ -23,16 +23,14 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     if options.bag is not None and ros:
         parser.error('a BAG needs no ROS arguments')
     try:
-        return _bag(options, signals) if options.bag is not None else _nodes(options, ros, signals)
+        with _live.explaining_port(options.port):
+            return _bag(options, signals) if options.bag is not None else _nodes(options, ros, signals)
     except ModuleNotFoundError as error:
         if (error.name or '').split('.')[0] != 'websockets':
             raise
         return _cli.complain(PROGRAM, _live.MISSING, _cli.FAILED)
-    except OSError as error:
-        message = _live.port_message(error, options.port)
-        if message is None:
-            raise
-        return _cli.complain(PROGRAM, message, _cli.FAILED)
+    except _live.PortError as error:
+        return _cli.complain(PROGRAM, error, _cli.FAILED)
 
 
 def _bag(options: argparse.Namespace, signals: Signals) -> int:
