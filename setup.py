@@ -64,7 +64,7 @@ setup(
             'ros-unique-identifier-msgs==2.5.0',
         ],
         'doc': ['pdoc>=15'],
-        'live': ['websockets>=14'],
+        'live': ['websockets>=15'],
         'plot': ['matplotlib>=3.5'],
         'test': [
             'mcap>=1.2',
@@ -73,7 +73,7 @@ setup(
             'pytest>=7',
             'pytest-xdist>=3',
             'pyyaml>=5',
-            'websockets>=14',
+            'websockets>=15',
         ],
     },
     zip_safe=False,

@@ -7,6 +7,9 @@ import math
 import os
 import re
 import signal
+import threading
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import processes
 import pytest
@@ -31,10 +34,11 @@ def live(tmp_path_factory):
         try:
             child.until_says(r'page: http://\S+\n')
             browser.size(1280, 800)
-            browser.open(re.search(r'page: (\S+)', child.stdout)[1])
+            url = re.search(r'page: (\S+)', child.stdout)[1]
+            browser.open(url)
             browser.until('document.getElementById("state").innerText === "no goal"')
             browser.until('document.querySelector("#sliders input") !== null')
-            yield Live(browser, child)
+            yield Live(browser, child, url)
         finally:
             browser.close()
 
@@ -42,8 +46,8 @@ def live(tmp_path_factory):
 class Live:
     """The page as its user sees it."""
 
-    def __init__(self, browser, child):
-        self.browser, self.child = browser, child
+    def __init__(self, browser, child, url):
+        self.browser, self.child, self.url = browser, child, url
 
     def state(self, name):
         self.browser.until(f'document.getElementById("state").innerText === {json.dumps(name)}')
@@ -71,7 +75,7 @@ def test_a_click_sends_a_goal_and_the_robot_arrives(live):
     x, y, _ = live.pose()
     assert math.dist((x, y), (0.5, 0.25)) < 0.03
     assert live.browser.errors == []
-    own = re.search(r'http://([^/]+)/', live.child.stdout)[1]
+    own = re.search(r'http://([^/]+)/', live.url)[1]
     assert all(re.match(rf'(http|ws)://{own}/', url) for url in live.browser.requests)
 
 
@@ -163,6 +167,49 @@ def test_other_widths_and_colours(live):
     assert browser.evaluate('document.getElementById("map").clientWidth') > 300
     browser.size(1280, 800)
     browser.scheme('light')
+
+
+@contextmanager
+def other_site():
+    """Serve an empty page of another origin, in this browser."""
+
+    class Empty(BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(b'<title>another site</title>')
+
+        def log_message(self, *_):
+            pass
+
+    with ThreadingHTTPServer(('127.0.0.1', 0), Empty) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f'http://127.0.0.1:{server.server_port}/'
+        server.shutdown()
+        thread.join()
+
+
+def test_a_page_of_another_site_cannot_use_the_page(live):
+    """Even if it knew the address: neither connect nor read, load or frame."""
+    browser, url = live.browser, live.url
+    ways = {
+        'connect': f'const s = new WebSocket("{url.replace("http", "ws")}socket");'
+        's.onopen = () => done("open"); s.onerror = () => done("refused");',
+        'read': f'fetch("{url}").then(() => done("open"), () => done("refused"));',
+        'script': f'const s = document.createElement("script"); s.src = "{url}main.js";'
+        's.onload = () => done("open"); s.onerror = () => done("refused"); document.head.append(s);',
+        'frame': f'const f = document.createElement("iframe"); f.src = "{url}";'
+        'f.onload = () => done(f.contentDocument === null ? "refused" : "open");'
+        'document.documentElement.append(f);',
+    }
+    with other_site() as site:
+        browser.open(site)
+        browser.until('document.title === "another site"')
+        for way, script in ways.items():
+            assert browser.evaluate(f'new Promise((done) => {{ {script} }})') == 'refused', way
+    browser.open(url)
+    browser.until('document.getElementById("connection").innerText === "connected"')
 
 
 def test_the_page_says_when_the_connection_is_lost(live):

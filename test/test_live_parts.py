@@ -335,3 +335,14 @@ def test_every_control_has_a_name():
 def test_the_front_end_is_installed():
     setup = (Path(__file__).parents[1] / 'setup.py').read_text()
     assert "f'{PACKAGE}.live': ['page/*']" in setup
+
+
+def test_installed_controllers_are_looked_for_once(monkeypatch):
+    """It takes many milliseconds, and the page is served 30 times a second."""
+    looked = []
+    monkeypatch.setattr(settings, 'controller_names', lambda: looked.append(1) or ['a'])
+    settings._controllers.cache_clear()
+    for _ in range(5):
+        settings.shown({'controller': {'controller': 'a'}})
+    settings._controllers.cache_clear()
+    assert len(looked) == 1

@@ -16,6 +16,8 @@ from websockets.sync.client import connect
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _live, drive_to, watch_run
 
+QUICK = ('--ros-args', '-p', 'go_to_goal:kp:=8.0', '-p', 'go_to_goal:kv:=4.0')
+
 
 @pytest.fixture
 def world(tmp_path):
@@ -60,8 +62,9 @@ def test_watch_run_beside_nodes_and_the_robot_stops_with_the_page(world):
 
 
 def test_drive_to_live_waits_for_the_page_records_and_ends_by_a_signal(world, tmp_path):
+    bag = str(tmp_path / 'bag')
     drive = world.start(
-        'drive_to', '0.2', '0.1', '--live', '--lockstep', '--no-browser', '-o', str(tmp_path / 'bag')
+        'drive_to', '0.2', '0.1', '--live', '--lockstep', '--no-browser', '-o', bag, *QUICK
     )
     with opened(drive) as page:
         page.send(json.dumps({'do': 'speed', 'speed': 50}))
@@ -77,6 +80,15 @@ def test_drive_to_live_waits_for_the_page_records_and_ends_by_a_signal(world, tm
         assert len(frame['paths']['/']['points']) > 10
     watch.signal(signal.SIGINT)
     assert watch.exit() == 0
+
+
+def test_drive_to_live_in_real_time(world):
+    drive = world.start('drive_to', '0.1', '0', '--live', '--no-record', '--no-browser', *QUICK)
+    with opened(drive) as page:
+        until(lambda: robots(page).get('/', {}).get('goal', {}).get('state') == 'succeeded', 'arrives')
+    drive.signal(signal.SIGINT)
+    assert drive.exit() == 0
+    assert drive.stderr == ''
 
 
 # --- Arguments

@@ -139,9 +139,12 @@ class LiveRobot:
         stamp = message.goal_info.stamp
         if message.status not in set(GoalState):
             return
-        before = self.state.goal.state
-        self.state.goal.reported(GoalState(message.status), (stamp.sec, stamp.nanosec))
-        if self.state.goal.state is GoalState.ABORTED and before is not GoalState.ABORTED:
+        goal = self.state.goal
+        before = goal.state
+        goal.reported(GoalState(message.status), (stamp.sec, stamp.nanosec))
+        # The latched status of a goal that was sent before is no news.
+        known = goal.goals is not None
+        if known and goal.state is GoalState.ABORTED and before is not GoalState.ABORTED:
             self._session.notify(
                 'the controller refused or aborted the goal: its log says why', 'warning'
             )

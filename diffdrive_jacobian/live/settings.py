@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal
 
 from diffdrive_jacobian.control import controller_names
@@ -128,5 +129,11 @@ def shown(values: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
-def _choices(value: str, names: Iterable[str] = ()) -> list[str]:
-    return list(dict.fromkeys([*controller_names(), *names, value]))[:MAX_CHOICES]
+@lru_cache(maxsize=1)
+def _controllers() -> tuple[str, ...]:
+    # To find the installed ones takes many milliseconds.
+    return tuple(controller_names())
+
+
+def _choices(value: str) -> list[str]:
+    return list(dict.fromkeys([*_controllers()[:MAX_CHOICES], value]))

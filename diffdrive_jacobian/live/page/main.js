@@ -73,7 +73,8 @@ function showPanels() {
   settings.show();
   byId('hand').hidden = recorded || !robot;
   byId('tools').hidden = byId('actions').hidden = byId('goto').hidden = recorded;
-  byId('chain').hidden = !robot;
+  byId('chain').hidden = byId('legend').hidden = !robot;
+  setText(byId('title'), model.bag || 'diffdrive_jacobian');
   setText(byId('hint'), HINTS[recorded ? 'bag' : pointer.tool]);
   byId('map').classList.toggle('grab', recorded || pointer.tool === 'move');
   if (robot) chain.show(robot);

@@ -37,6 +37,6 @@ export function showStatus(model, open) {
   const [badge, kind, sentence] = described(robot);
   setText(byId('state'), badge);
   byId('state').className = `badge ${kind}`;
-  setText(byId('summary'), model.recorded && !robot.goal.active ? `${model.bag}  ${sentence === 'click on the map to send one' ? '' : sentence}` : sentence);
+  setText(byId('summary'), model.recorded && !robot.goal.active ? '' : sentence);
   byId('cancel').disabled = !robot.goal.active;
 }
