@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ from diffdrive_jacobian.reading import read_run
 from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.recording.selection import Selection
+from diffdrive_jacobian.tools.entry_points import ROS_MODULES
 
 
 @pytest.fixture(scope='module')
@@ -150,3 +153,11 @@ def test_several_robots(lockstep, tmp_path):
 def test_what_is_no_run(tmp_path):
     with pytest.raises(BagError):
         read_robots(tmp_path / 'none')
+
+
+def test_a_bag_is_watched_without_ros():
+    """In an interpreter of its own."""
+    program = 'import sys, diffdrive_jacobian.live.serving, diffdrive_jacobian.tools.watch_run\n'
+    program += 'print(*{name.split(".")[0] for name in sys.modules})'
+    run = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True)
+    assert not set(run.stdout.split()) & {*ROS_MODULES, 'rpyutils', 'matplotlib'}

@@ -8,8 +8,8 @@ from typing import Any
 
 from diffdrive_jacobian.live.commands import Pause, SetSpeed, Step
 
-NAP, BRIEF_NAP = 0.02, 0.002
-"""Time for which `pace` waits before it looks again, while time stands and while it passes (s)."""
+NAP = 0.02
+"""Longest time for which `pace` waits before it looks at commands again (s)."""
 MAX_LAG = 0.1
 """Time that is made up for at most (s). A machine that is too slow shows time as it comes."""
 
@@ -21,7 +21,7 @@ class Pacing:
         """Start at a speed relative to the clock on the wall."""
         self.speed, self.paused = speed, paused
         self._steps = 0
-        self._simulated = 0.0
+        self._simulated = self._wait = 0.0
         self._anchor: tuple[float, float] | None = None
 
     def obey(self, command: Pause | Step | SetSpeed) -> None:
@@ -54,6 +54,7 @@ class Pacing:
         lag = (now - self._anchor[1]) * self.speed - (simulated - self._anchor[0])
         if lag > MAX_LAG * self.speed:
             self._anchor = simulated, now
+        self._wait = -lag / self.speed
         return lag >= 0.0
 
     def pace(self, simulated: float, meanwhile: Callable[[], bool]) -> bool:
@@ -66,7 +67,7 @@ class Pacing:
         while not self.may_advance(simulated, time.monotonic()):
             if meanwhile():
                 return True
-            time.sleep(NAP if self.paused else BRIEF_NAP)
+            time.sleep(NAP if self.paused else min(NAP, max(0.0, self._wait)))
         return False
 
     def shown(self) -> dict[str, Any]:

@@ -57,12 +57,12 @@ function showRobots() {
   if (bar.dataset.names !== names.join(' ')) {
     bar.dataset.names = names.join(' ');
     bar.replaceChildren(...names.map((name) => {
-      const tab = element('button', { type: 'button', role: 'tab' }, name);
+      const tab = element('button', { type: 'button' }, name);
       tab.addEventListener('click', () => { hand.stop(); model.selectedName = name; changed = true; });
       return tab;
     }));
   }
-  for (const tab of bar.children) tab.setAttribute('aria-selected', String(tab.textContent === model.selected?.name));
+  for (const tab of bar.children) tab.setAttribute('aria-pressed', String(tab.textContent === model.selected?.name));
 }
 
 function showPanels() {
@@ -83,7 +83,7 @@ function showPanels() {
 for (const button of byId('tools').children) {
   button.addEventListener('click', () => {
     pointer.tool = button.dataset.tool;
-    for (const other of byId('tools').children) other.setAttribute('aria-checked', String(other === button));
+    for (const other of byId('tools').children) other.setAttribute('aria-pressed', String(other === button));
     button.blur();
     changed = true;
   });
