@@ -210,6 +210,7 @@ def test_a_page_of_another_site_cannot_use_the_page(live):
             assert browser.evaluate(f'new Promise((done) => {{ {script} }})') == 'refused', way
     browser.open(url)
     browser.until('document.getElementById("connection").innerText === "connected"')
+    browser.until('document.querySelector("#sliders input") !== null')
 
 
 def test_the_page_says_when_the_connection_is_lost(live):

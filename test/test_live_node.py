@@ -136,6 +136,17 @@ def test_waypoints_are_appended_and_a_goal_is_canceled(driven):
     driven.until(lambda: any('no goal is active' in text for text in driven.texts))
 
 
+def test_a_waypoint_is_appended_to_a_goal_that_was_sent_just_now(driven):
+    driven.send(goal(0.3, 0.0), goal(0.3, 0.3, append=True), goal(0.0, 0.3, append=True))
+    driven.until(lambda: driven.state() == 'executing')
+    places = [one[:2] for one in driven.robot()['goal']['goals']]
+    assert places == [[0.3, 0.0], [0.3, 0.3], [0.0, 0.3]]
+    driven.until(lambda: driven.state() == 'succeeded')
+    driven.send(goal(0.5, 0.5, append=True))
+    driven.until(lambda: driven.state() == 'executing')
+    assert len(driven.robot()['goal']['goals']) == 1
+
+
 def test_without_a_heading_the_goal_is_approached_straight(driven):
     driven.send(goal(0.3, 0.3))
     driven.until(lambda: driven.robot()['goal']['goals'])

@@ -29,6 +29,7 @@ class GoalProgress:
         self.state = GoalState.UNKNOWN
         """State of the last goal that has a status."""
         self._stamp: tuple[int, int] | None = None
+        self._answered = False
         self._early: tuple[tuple[int, int], GoalState] | None = None
         self._known: dict[tuple[int, int], NDArray[np.float64]] = {}
 
@@ -42,23 +43,28 @@ class GoalProgress:
         """The goal that is driven to, shape (3,). None: none or unknown."""
         return None if self.goals is None or not self.active else self.goals[self.index]
 
-    def remaining(self) -> NDArray[np.float64]:
-        """Return the goals that are not reached yet, shape (n, 3)."""
-        if self.goals is None or not self.active:
+    def remaining(self, *, fresh: bool = False) -> NDArray[np.float64]:
+        """Return the goals that are not reached yet, shape (n, 3).
+
+        Args:
+            fresh: Whether they were sent just now: they count although no status is known yet.
+        """
+        if self.goals is None or not (self.active or (fresh and not self._answered)):
             return np.empty((0, 3))
         return self.goals[self.index :]
 
     def sent(self, goals: NDArray[np.float64], stamp: tuple[int, int]) -> None:
         """Take goals that somebody has sent, with their stamp."""
-        if not len(goals):
+        if not len(goals) or (stamp == self._stamp and any(stamp)):
+            # Those that this program has sent come back by their topic.
             return
-        self.goals, self.index, self._stamp = goals, 0, stamp
+        self.goals, self.index, self._stamp, self._answered = goals, 0, stamp, False
         self._known[stamp] = goals
         while len(self._known) > MAX_KNOWN:
             del self._known[next(iter(self._known))]
         if self._early is not None and self._early[0] == stamp:
             # The status overtook the goal.
-            self.state = self._early[1]
+            self.state, self._answered = self._early[1], True
 
     def reported(self, state: GoalState, stamp: tuple[int, int]) -> None:
         """Take a status of a controller, with the stamp of its goal."""
@@ -70,7 +76,7 @@ class GoalProgress:
             elif self.active:
                 # The end of goals that were replaced by the present ones.
                 return
-        self.state = state
+        self.state, self._answered = state, True
 
     def moved(self, pose: NDArray[np.float64], arrival: Arrival) -> None:
         """Take a pose of the robot, `[x, y, theta]`: a waypoint may be reached."""

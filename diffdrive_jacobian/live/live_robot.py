@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
@@ -34,10 +35,12 @@ from diffdrive_jacobian.live.trigger_link import TriggerLink
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
 from diffdrive_jacobian.messages.goal_status import GoalState
-from diffdrive_jacobian.time_units import seconds
+from diffdrive_jacobian.time_units import NANOSECONDS, seconds
 
 COMMAND_LIFE = 0.5
 """Time for which a cmd_vel is shown after it was received (s)."""
+ANSWER_PATIENCE = 1.0
+"""Time within which a controller reports the status of a goal (s)."""
 SERVICES = {
     'cancel_goal': 'the goal cannot be canceled',
     'reset_odometry': 'the odometry cannot be reset',
@@ -78,6 +81,7 @@ class LiveRobot:
         self._services = {name: TriggerLink(node, self.topics.full(name)) for name in SERVICES}
         self._frame = ''
         self._seen = self._commanded = time.monotonic()
+        self._sent, self._stamp = -math.inf, 0
 
     @property
     def silence(self) -> float:
@@ -182,7 +186,8 @@ class LiveRobot:
             self._warn('the robot is driven by hand: release the keys before you send a goal')
             return
         state = self.state
-        remaining = state.goal.remaining() if command.append else np.empty((0, 3))
+        fresh = time.monotonic() - self._sent < ANSWER_PATIENCE
+        remaining = state.goal.remaining(fresh=fresh) if command.append else np.empty((0, 3))
         x, y = command.x, command.y
         before = remaining[-1] if len(remaining) else state.pose
         theta = command.theta
@@ -196,7 +201,7 @@ class LiveRobot:
         elif not self.topics.readers(topic):
             self._warn(f'nobody is subscribed to {self.topics.full(topic)}: is go_to_goal running?')
         else:
-            self.topics.publish_goals(goals, self._now(), together=together)
+            self.send(goals, together=together)
 
     def _set(self, command: SetParameter) -> None:
         try:
@@ -252,9 +257,14 @@ class LiveRobot:
         """Whether a controller can receive goals, and the robot has odometry."""
         return self.state.pose is not None and self.topics.readers('goals') > 0
 
-    def send(self, goals: NDArray[np.float64]) -> None:
-        """Send goals, `[x, y, theta]` each, shape (n, 3)."""
-        self.topics.publish_goals(goals, self._now(), together=True)
+    def send(self, goals: NDArray[np.float64], *, together: bool = True) -> None:
+        """Send goals, `[x, y, theta]` each, shape (n, 3), on the topic goals or, one, on goal_pose."""
+        # The stamp distinguishes goals, also while simulated time stands.
+        now = self._stamp = max(self._now(), self._stamp + 1)
+        self.topics.publish_goals(goals, now, together=together)
+        # At once: the next command may append a waypoint.
+        self.state.goal.sent(goals, divmod(now, NANOSECONDS))
+        self._sent = time.monotonic()
 
     def advance(self) -> None:
         """Advance queries of parameters."""
