@@ -158,6 +158,15 @@ def add(lockstep):
     )
 
 
+def pytest_terminal_summary(terminalreporter):
+    """Report loudly what a missing browser left untested."""
+    for report in terminalreporter.stats.get('skipped', []):
+        if 'chromium is not installed' in str(report.longrepr):
+            text = 'NOT TESTED: the live page in a browser. Install chromium (apt install chromium).'
+            terminalreporter.write_line(f'\n{text}\n', red=True, bold=True)
+            break
+
+
 @pytest.fixture
 def team(lockstep):
     """The topics of a robot with bridge and quick controller, and the nodes."""
