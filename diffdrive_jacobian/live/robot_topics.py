@@ -148,10 +148,8 @@ class RobotTopics:
 
     def publish_twist(self, twist: tuple[float, float], now: int) -> None:
         """Publish a command, at a time (ns)."""
-        if self.twist_type is TwistStamped:
-            data = _twist_stamped(twist, now)
-        else:
-            data = _twist(*twist)
+        stamped = self.twist_type is TwistStamped
+        data = _twist_stamped(twist, now) if stamped else _twist(*twist)
         self._publisher(self.twist_type, 'cmd_vel').publish(data)
 
     def publish_goals(self, goals: NDArray[np.float64], now: int, *, together: bool) -> None:
