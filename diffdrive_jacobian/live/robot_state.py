@@ -18,15 +18,18 @@ from diffdrive_jacobian.live.goal_progress import GoalProgress
 from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.live.trail import JUMP, Trail
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters, VirtualRobotParameters
+from diffdrive_jacobian.reading.run import number
 
 ROBOT_DEFAULTS = VirtualRobotParameters()
 CONTROLLER_DEFAULTS = GoToGoalParameters()
 Values = Mapping[str, Any]
+MIN_LENGTH = 1e-4
+"""Smallest wheel radius and separation that count (m). Parameters of any node may be anything."""
 
 
 def _number(values: Values, name: str, default: float) -> float:
-    value = values.get(name)
-    return value if isinstance(value, float) and math.isfinite(value) else default
+    value = number(values.get(name))
+    return value if math.isfinite(value) else default
 
 
 class RobotState:
@@ -60,7 +63,7 @@ class RobotState:
         values = self.robot_values
         r = _number(values, 'wheel_radius', ROBOT_DEFAULTS.wheel_radius)
         L = _number(values, 'wheel_separation', ROBOT_DEFAULTS.wheel_separation)
-        if r <= 0.0 or L <= 0.0:
+        if min(r, L) < MIN_LENGTH:
             return ROBOT_DEFAULTS.wheel_radius, ROBOT_DEFAULTS.wheel_separation
         return r, L
 

@@ -40,7 +40,7 @@ def drive_with_page(options: argparse.Namespace, ros: Sequence[str], signals: Si
                 ros_arguments=ros,
                 port=options.port,
                 signals=signals,
-                ready=_live.announcing(options),
+                ready=_live.announcing(options, waiting='the drive starts' if len(goals) else ''),
                 nodes_created=lambda names: warn_of_unused_files(PROGRAM, ros, names),
             )
     except ModuleNotFoundError as error:
