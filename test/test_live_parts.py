@@ -366,3 +366,22 @@ def test_parameters_of_any_node_may_be_anything():
             shown = state.shown(age=0.0, by_hand=False)
             json.dumps(shown, allow_nan=False)
             assert shown['geometry'] == usual['geometry']
+
+
+def test_the_path_is_interrupted_where_a_robot_is_placed():
+    state = RobotState('/')
+    for x in (0.0, 0.02, 0.04):
+        state.moved(x, np.array([x, 0.0, 0.0]), (1.0, 0.0), None)
+    state.interrupt()
+    # One message more is from before.
+    for time, x in ((0.06, 0.06), (0.08, 0.2), (0.1, 0.22)):
+        state.moved(time, np.array([x, 0.0, 0.0]), (1.0, 0.0), None)
+    assert state.trail.points == [
+        (0.0, 0.0),
+        (0.02, 0.0),
+        (0.04, 0.0),
+        (0.06, 0.0),
+        None,
+        (0.2, 0.0),
+        (0.22, 0.0),
+    ]
