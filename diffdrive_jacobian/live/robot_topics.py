@@ -149,10 +149,11 @@ class RobotTopics:
     def publish_twist(self, twist: tuple[float, float], now: int) -> None:
         """Publish a command, at a time (ns)."""
         message = self.twist_type()
+        command = message
         if isinstance(message, TwistStamped):
-            messages.set_twist_stamped(message, twist, now)
-        else:
-            messages.set_twist(message, twist)
+            messages.set_time(message.header.stamp, now)
+            command = message.twist
+        command.linear.x, command.angular.z = twist
         self._publisher(self.twist_type, 'cmd_vel').publish(message)
 
     def publish_goals(self, goals: NDArray[np.float64], now: int, *, together: bool) -> None:
