@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import islice
 from typing import Any, TypeVar
 
 import numpy as np
@@ -80,7 +81,8 @@ class Latest:
     def take(self) -> Any | None:
         """Return the message that was received since the last call. None: none, or it is damaged."""
         if self._polled:
-            for data, _ in waiting_messages(self._subscription):
+            # The queue has one place; more than that is a flood, which must not hold up the page.
+            for data, _ in islice(waiting_messages(self._subscription), 2):
                 self._data = data
         latest, self._data = self._data, None
         if latest is None:
