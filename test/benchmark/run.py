@@ -1,8 +1,9 @@
 """All benchmarks in one table: `python test/benchmark/run.py [--quick] [ROW ...]`.
 
-ROW is one or more of odometry, lockstep, identity, many_robots, start_up, closed_loops, jacobians,
-single_calls; without any all are measured (about half an hour; with --quick, to see whether it works, a
-minute and a half). Nothing else should run meanwhile. closed_loops also measures packages that pip
+ROW is one or more of odometry, three_processes, lockstep, identity, many_robots, start_up, discovery,
+closed_loops, jacobians, single_calls; without any all are measured (about forty minutes; with --quick,
+to see whether it works, two). Nothing else should run meanwhile. --page writes the rows into
+doc/performance.md. closed_loops also measures packages that pip
 installs, if they are there (pip install ir-sim roboticstoolbox-python). flood.py and
 inverse_kinematics.py in this folder are benchmarks of their own.
 """
@@ -14,16 +15,21 @@ import importlib
 import os
 import platform
 import time
+from pathlib import Path
 
 from rich.console import Console
-from table import WIDTH, show
+from table import WIDTH, Row, markdown, show
 
+PAGE = Path(__file__).parents[2] / 'doc' / 'performance.md'
+BEGIN, END = '<!-- measured -->', '<!-- end -->'
 ROWS = (
     'lockstep',
     'identity',
     'start_up',
     'many_robots',
     'odometry',
+    'three_processes',
+    'discovery',
     'closed_loops',
     'jacobians',
     'single_calls',
@@ -37,6 +43,7 @@ def main() -> None:
     parser.add_argument(
         '--quick', action='store_true', help='short and noisy, to try it; judges nothing'
     )
+    parser.add_argument('--page', action='store_true', help='write the table into doc/performance.md')
     parser.add_argument('rows', metavar='ROW', nargs='*', help=', '.join(ROWS))
     options = parser.parse_args()
     if unknown := set(options.rows) - set(ROWS):
@@ -50,10 +57,21 @@ def main() -> None:
         found += importlib.import_module(name).rows(options.quick)
         console.print(f'{name}: measured in {time.monotonic() - begun:.0f} s', style='dim')
     show(found, console, judged=not options.quick)
-    console.print(
+    machine = (
         f'Python {platform.python_version()}, {os.cpu_count()} cores, '
         f'load of the last five minutes {os.getloadavg()[1]:.2f}'
     )
+    console.print(machine)
+    if options.page:
+        write(found, machine)
+
+
+def write(rows: list[Row], machine: str) -> None:
+    """Write rows and machine into the page, in the place of those before."""
+    before, _, rest = PAGE.read_text().partition(BEGIN)
+    _, _, after = rest.partition(END)
+    lines = '\n'.join([f'Measured on {time.strftime("%Y-%m-%d")}: {machine}.', *markdown(rows)])
+    PAGE.write_text(f'{before}{BEGIN}\n{lines.rstrip()}\n\n{END}{after}')
 
 
 if __name__ == '__main__':

@@ -100,6 +100,27 @@ def show(rows: Sequence[Row], console: Console, *, judged: bool) -> None:
         console.print(f'- {note}', highlight=False)
 
 
+def markdown(rows: Sequence[Row]) -> list[str]:
+    """Return the lines of the table for a page."""
+    lines = []
+    group = None
+    for row in rows:
+        if row.group != group:
+            group = row.group
+            lines += [
+                '',
+                f'### {group[:1].upper()}{group[1:]}',
+                '',
+                '| | what | ours | reference | ratio | goal |',
+                '|---|---|---:|---:|---:|---|',
+            ]
+        cells = [cell.replace('[dim]', '').replace('[/dim]', '') for cell in row.cells(judged=True)]
+        cells[4] = cells[4].removeprefix('[bold]').removesuffix('[/bold]')
+        lines.append(f'| {" | ".join(cell.replace(chr(10), " ") for cell in cells)} |')
+    notes = dict.fromkeys(note for row in rows for note in row.notes)
+    return [*lines, '', *(f'- {note}' for note in notes)]
+
+
 def interleave(sides: Iterable[Any], rounds: int, measure: Callable[[Any], Any]) -> dict[Any, list[Any]]:
     """Measure every side once in each round, one after the other; gives the figures of each side."""
     figures: dict[Any, list[Any]] = {side: [] for side in sides}
