@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from importlib import metadata
 from pathlib import Path
 
 PACKAGE = 'diffdrive_jacobian'
@@ -31,6 +30,9 @@ def _files() -> Iterator[Path]:
     for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
         if prefix:
             yield from (Path(prefix) / SHARE).glob('*.yaml')
+    # Not above: it is slow to import, and nodes seldom need it.
+    from importlib import metadata
+
     try:
         files = metadata.distribution(PACKAGE).files or ()
     except metadata.PackageNotFoundError:
