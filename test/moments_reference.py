@@ -4,6 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
+from diffdrive_jacobian.kinematics.se2 import integrate
+
+DRIVES = {
+    'straight': lambda duration: [((0.22, 0.0), duration)],
+    'arc': lambda duration: [((0.22, 0.5), duration)],
+    'in place': lambda duration: [((0.0, 1.0), duration)],
+    'stop and go': lambda duration: (
+        [
+            *(((0.22, 0.3), duration / 12.0), ((0.0, 0.0), duration / 12.0)),
+            ((0.22, -0.3), duration / 12.0),
+        ]
+        * 4
+    ),
+}
+"""Twists and how long each is held, for a given duration of the drive (s)."""
 REAL, COMPLEX = np.longdouble, np.clongdouble
 I = COMPLEX(1j)  # noqa: E741
 NAMES = ('one', 'U', 'U2', 's', 'W', 'm', 'm*', 'A', 'A*', 'B', 'B*', 'D', 'D*', 'N', 'Q', 'Q*')
@@ -91,7 +106,20 @@ def reference(moments, theta, twist, duration, L, k):
     )
 
 
-def noisy_runs(rng, drive, covariance, count, L, k, step=0.1):
+def reported_path(drive, L, k, start=(0.0, 0.0, 0.0)):
+    """The reported poses in small pieces, shape (n, 3), and the noise between them, shape (n - 1, 3)."""
+    poses, noise = [np.array(start)], []
+    for (v, omega), duration in drive:
+        pieces = max(20, int(abs(omega) * duration / 0.2) + 1)
+        dt = duration / pieces
+        right, left = (k * abs(v + sign * omega * L / 2.0) * dt for sign in (1.0, -1.0))
+        for _ in range(pieces):
+            poses.append(integrate(poses[-1], (v, omega), dt))
+            noise.append([(right + left) / 4.0, (right - left) / (2.0 * L), (right + left) / L**2])
+    return np.array(poses), np.array(noise)
+
+
+def noisy_runs(rng, drive, covariance, count, L, k, step=0.2):
     """Drive with noisy wheels. Returns the errors about the reported pose, shape (count, 3).
 
     Each wheel's travel has an independent Gaussian error of variance k times its distance in every step,

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from moments_reference import noisy_runs, reference
+from moments_reference import DRIVES, noisy_runs, reference
 
 from diffdrive_jacobian.kinematics.se2 import integrate
 from diffdrive_jacobian.simulation import Robot, RobotModel
@@ -159,16 +159,9 @@ def test_what_overflows_raises_an_error():
 
 # --- Monte Carlo
 
-DRIVES = {
-    'straight': [((0.22, 0.0), 60.0)],
-    'arc': [((0.22, 0.5), 60.0)],
-    'in place': [((0.0, 1.0), 60.0)],
-    'stop and go': [((0.22, 0.3), 5.0), ((0.0, 0.0), 5.0), ((0.22, -0.3), 5.0)] * 4,
-}
-
 
 @pytest.mark.parametrize('start', [NONE, COVARIANCE], ids=['sure', 'unsure'])
-@pytest.mark.parametrize('drive', DRIVES.values(), ids=DRIVES)
+@pytest.mark.parametrize('drive', [drive(60.0) for drive in DRIVES.values()], ids=DRIVES)
 def test_the_moments_are_those_of_four_thousand_noisy_runs(drive, start):
     count = 4000
     moments, pose = gaussian(start), np.zeros(3)
@@ -195,7 +188,7 @@ def test_the_moments_are_those_of_four_thousand_noisy_runs(drive, start):
 
 def test_the_first_order_form_is_too_small_after_a_minute():
     """What the exact moments are for: 5 times too small, NEES 45 instead of 3."""
-    count, drive = 4000, DRIVES['straight']
+    count, drive = 4000, DRIVES['straight'](60.0)
     errors = noisy_runs(np.random.default_rng(8), drive, NONE, count, L, K)
     first = propagate_covariance(NONE, np.zeros(3), *drive[0], L, K)
     assert errors[:, 0].std() > 4.0 * math.sqrt(first[0, 0])

@@ -14,12 +14,14 @@ from recorded import recorded
 from ros_messages import goal, goals, twist, twist_stamped
 from std_srvs.srv import Trigger
 
+from diffdrive_jacobian.kinematics.se2 import integrate
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.reading import BagError, read_run
 from diffdrive_jacobian.reading.run import COLUMNS, Run, Series
 from diffdrive_jacobian.reading.verification import verify
+from diffdrive_jacobian.simulation.odometry_noise import propagate_covariance
 from diffdrive_jacobian.simulation.robot import Robot
 
 EXACT = 1e-9
@@ -331,3 +333,72 @@ def test_odometry_that_was_not_compared_is_counted():
     assert verification.notes == (
         '39 of 100 odometry messages precede the start of the simulated robot and were not compared',
     )
+
+
+# --- The covariance
+
+
+def test_the_covariances_are_those_of_the_node_to_the_last_bit(lockstep, robot_at, tmp_path):
+    robot_at(cmd_vel_timeout=0.3)
+    with recorded(lockstep, tmp_path / 'run') as made:
+        made.look()
+        lockstep.publish('cmd_vel', twist(0.2, 1.0))
+        lockstep.run_for(1.0)
+        placed = PoseWithCovarianceStamped()
+        placed.pose.covariance[0] = placed.pose.covariance[7] = placed.pose.covariance[35] = 0.04
+        lockstep.publish('initialpose', placed)
+        for turn in range(40):
+            lockstep.publish('cmd_vel', twist(-0.2, 0.1 * turn))
+            lockstep.run_for(0.1)
+    run = made.run
+    verification = held(run)
+    assert (verification.covariance, verification.covariance_difference) == ('exact moments', 0.0)
+    # The heading of the start is exactly zero, so that no digit is lost in the quaternion.
+    assert run.odometry_covariances[-1, 5] > 0.04
+
+    forged = run.odometry_covariances.copy()
+    forged[100, 3] *= 1.0 + 1e-6
+    verification = verify(replace(run, odometry_covariances=forged))
+    assert verification.covariance == 'neither'
+    assert not verification.holds(EXACT, EXACT)
+
+
+def test_a_bag_with_covariances_of_first_order_still_verifies(lockstep, robot_at, tmp_path):
+    """The covariances are replaced by those that earlier versions published."""
+    robot_at()
+    with recorded(lockstep, tmp_path / 'run') as made:
+        made.look()
+        lockstep.publish('cmd_vel', twist(0.2, 1.0))
+        lockstep.run_for(1.0)
+        lockstep.publish('cmd_vel', twist(0.2, -0.7))
+        lockstep.run_for(2.0)
+    run = made.run
+    separation, variance = (
+        run.of_node('virtual_robot')[name] for name in ('wheel_separation', 'wheel_travel_variance')
+    )
+    commands = zip(run.cmd_vel_out.stamps.tolist(), run.cmd_vel_out.values, strict=True)
+    events = [(int(run.start_pose.stamps[0]), (0.0, 0.0), run.start_pose.values[0], np.zeros((3, 3)))]
+    for stamp, (v, omega) in commands:
+        begin, twist_before, pose, covariance = events[-1]
+        arc = twist_before, (stamp - begin) / 1e9
+        end = propagate_covariance(covariance, pose, *arc, separation, variance)
+        events.append((stamp, (v, omega), integrate(pose, *arc), end))
+    covariances = run.odometry_covariances.copy()
+    for row, stamp in zip(covariances, run.odometry.stamps.tolist(), strict=True):
+        # A command at the stamp of a message was received after it.
+        begin, held_twist, pose, covariance = [
+            one for one in events if one[0] < stamp or one is events[0]
+        ][-1]
+        arc = held_twist, (stamp - begin) / 1e9
+        row[:6] = propagate_covariance(covariance, pose, *arc, separation, variance)[np.triu_indices(3)]
+    old = replace(run, odometry_covariances=covariances)
+    assert held(run).covariance == 'exact moments'
+    assert held(old).covariance == 'first order'
+
+
+@pytest.mark.parametrize('missing', ['parameters', 'start_pose'])
+def test_without_the_robot_or_its_start_the_covariances_are_not_compared(drive, missing):
+    run = drive()
+    without = {} if missing == 'parameters' else rows(run.start_pose, slice(0, 0))
+    verification = held(replace(run, **{missing: without}))
+    assert verification.covariance is None

@@ -18,6 +18,7 @@ import numpy as np
 
 from diffdrive_jacobian.plots.output_files import FORMATS, create
 from diffdrive_jacobian.plots.style import DPI, styled
+from diffdrive_jacobian.plots.uncertainty import draw_uncertainty, uncertainty_marks
 from diffdrive_jacobian.reading.run import Run
 from diffdrive_jacobian.reading.time_series import commanded, limits, line, measured
 from diffdrive_jacobian.reading.trace import Array, Trace, tolerance, trace
@@ -103,7 +104,8 @@ def names(paths: Sequence[Path]) -> list[str]:
 def figure(runs: Sequence[Run]) -> Figure:
     """Return a figure of runs in one set of axes. The plane is the first of its axes.
 
-    A single run is drawn with its commands and the changes of its goals.
+    A single run is drawn with its commands, the changes of its goals, and the uncertainty along its
+    path, see `uncertainty`.
 
     Raises:
         BagError: A run has no odometry.
@@ -129,6 +131,7 @@ def figure(runs: Sequence[Run]) -> Figure:
             height_ratios=[*[1.0] * rows, 0.03 * rows],
         )
         plane, panels = drawing.add_subplot(grid[:-1, 0]), _panels(drawing, grid, quantities, columns)
+        uncertain = len(runs) == 1 and draw_uncertainty(plane, traces[0])
         for one, label, color, style in zip(traces, labels, cycle(COLORS), cycle(STYLES), strict=False):
             _draw_path(plane, one, label, color, style)
             for quantity, panel in panels.items():
@@ -137,7 +140,8 @@ def figure(runs: Sequence[Run]) -> Figure:
         _finish(plane, traces)
         below = drawing.add_subplot(grid[-1, :])
         below.axis('off')
-        below.legend(handles=_marks(traces), loc='center', ncol=6, borderaxespad=0.0)
+        marks = [*_marks(traces), *(uncertainty_marks() if uncertain else [])]
+        below.legend(handles=marks, loc='center', ncol=4 if uncertain else 6, borderaxespad=0.0)
         if notes := _notes(runs, labels):
             drawing.supxlabel(notes, fontsize=8.0, color=GREY)
     return drawing

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from diffdrive_jacobian.bags.decoding import (
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.parameter_values import changed_parameters
 from diffdrive_jacobian.reading.rows import PARAMETER_EVENTS, ROW_READERS, SERIES_TOPICS
-from diffdrive_jacobian.reading.run import COLUMNS, Run, Series
+from diffdrive_jacobian.reading.run import COLUMNS, COVARIANCES, Run, Series
 from diffdrive_jacobian.text import printable
 
 __all__ = [
@@ -108,11 +108,18 @@ def read_run(
             else:
                 rows[topic].extend((received, stamp or received, values) for stamp, values in read)
         notes = tally.notes(connections)
-    series = {
-        name: _series(_in_order(rows, SERIES_TOPICS[name]), columns) for name, columns in COLUMNS.items()
-    }
+    beside = {'odometry': COVARIANCES, 'start_pose': COVARIANCES[:6]}
+    series, covariances = {}, {}
+    for name, columns in COLUMNS.items():
+        more = beside.get(name, ())
+        one = _series(_in_order(rows, SERIES_TOPICS[name]), columns + more)
+        count = len(columns)
+        covariances[name] = one.values[:, count:].copy()
+        series[name] = replace(one, values=one.values[:, :count].copy(), columns=columns)
     return Run(
         path=path,
+        odometry_covariances=covariances['odometry'],
+        start_covariances=covariances['start_pose'],
         parameters=parameters,
         parameter_events=tuple(events),
         skipped=dict(tally.skipped),

@@ -28,7 +28,9 @@ def _twist_stamped(message: Any, _: tuple[str, str]) -> Rows:
 
 def _odometry(message: Any, _: tuple[str, str]) -> Rows:
     pose, twist = from_pose(message.pose.pose), from_twist(message.twist.twist)
-    yield from_time(message.header.stamp), [*pose.tolist(), *twist]
+    of_twist = message.twist.covariance
+    covariances = [*_planar(message.pose.covariance), of_twist[0], of_twist[5], of_twist[35]]
+    yield from_time(message.header.stamp), [*pose.tolist(), *twist, *covariances]
 
 
 def _pose(message: Any, _: tuple[str, str]) -> Rows:
@@ -36,7 +38,13 @@ def _pose(message: Any, _: tuple[str, str]) -> Rows:
 
 
 def _pose_with_covariance(message: Any, _: tuple[str, str]) -> Rows:
-    yield from_time(message.header.stamp), from_pose(message.pose.pose).tolist()
+    pose = from_pose(message.pose.pose).tolist()
+    yield from_time(message.header.stamp), [*pose, *_planar(message.pose.covariance)]
+
+
+def _planar(covariance: Any) -> list[float]:
+    """Return the entries xx, xy, xt, yy, yt, tt of the covariance of a pose."""
+    return [covariance[index] for index in (0, 1, 5, 7, 11, 35)]
 
 
 def _goals(message: Any, _: tuple[str, str]) -> Rows:

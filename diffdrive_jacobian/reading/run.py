@@ -29,6 +29,8 @@ COLUMNS = {
     'goal_status': ('status',),
 }
 """Columns of the values of each series of a `Run`."""
+COVARIANCES = ('xx', 'xy', 'xt', 'yy', 'yt', 'tt', 'vv', 'vw', 'ww')
+"""Columns of `Run.odometry_covariances`; the first six are those of `Run.start_covariances`."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, repr=False)
@@ -82,6 +84,11 @@ class Run:
     """`[x, y, theta]` of each goal and waypoint (m, m, rad)."""
     goal_status: Series
     """`[status]`, the numbers of action_msgs/GoalStatus, stamped as the goal."""
+    odometry_covariances: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 9)))
+    """Covariances in each message of odom as recorded, unchecked, shape (n, 9): the entries xx, xy, xt,
+    yy, yt, tt of the pose's and vv, vw, ww of the twist's."""
+    start_covariances: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 6)))
+    """The entries xx, xy, xt, yy, yt, tt of the covariance in each start_pose, shape (n, 6)."""
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     """By the full name of the node, as of the beginning of the run."""
     parameter_events: tuple[tuple[int, str, dict[str, Any]], ...] = ()

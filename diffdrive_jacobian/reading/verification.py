@@ -22,6 +22,7 @@ from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
 from diffdrive_jacobian.messages.conversion import MessageError, plausible_twist
 from diffdrive_jacobian.parameters.declaration import from_ros
 from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
+from diffdrive_jacobian.reading.covariance_rule import NEITHER, recorded_model, rule, start_covariances
 from diffdrive_jacobian.reading.reader import BagError
 from diffdrive_jacobian.reading.run import Run, Series
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
@@ -54,6 +55,12 @@ class Verification:
     notes: tuple[str, ...] = ()
     """Faults of the bag that did not prevent reading it, such as messages that were skipped, and how
     many odometry messages were not compared."""
+    covariance: str | None = None
+    """The rule that the covariances of the pose follow: `exact moments`, `first order` (as published by
+    earlier versions), or `neither`. None: they were not compared, because the parameters of the robot or
+    its start were not recorded."""
+    covariance_difference: float = 0.0
+    """Largest difference of a covariance from the rule, relative to the standard deviations."""
 
     @property
     def allowed(self) -> float:
@@ -61,8 +68,11 @@ class Verification:
         return EXACT if self.source == 'cmd_vel_out' else BY_RECORDING_TIME
 
     def holds(self, tolerance: float, yaw_tolerance: float) -> bool:
-        """Return whether no difference exceeds the tolerances (m, rad)."""
-        return bool(np.all(self.distances <= tolerance) and np.all(self.headings <= yaw_tolerance))
+        """Return whether no difference exceeds the tolerances (m, rad), and the covariances follow a
+        rule if they were compared.
+        """
+        near = np.all(self.distances <= tolerance) and np.all(self.headings <= yaw_tolerance)
+        return bool(near) and self.covariance != NEITHER
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +111,8 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
         source, start, anchors = _commanded(run, parameters)
     stamps, values = run.odometry.stamps, run.odometry.values
     seconds, poses = [], []
+    messages: list[tuple[int, Robot]] = []
+    covariances: list[int] = []
     measured = []
     followed = False
     epochs = _epochs(run.odometry)
@@ -114,8 +126,12 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
         next((anchor.robot.stamp for anchor in epoch if anchor.is_command), _NEVER) for epoch in anchors
     ]
     for index, epoch in enumerate(epochs):
-        robot = _nearest(anchors[epoch], run.odometry, index)
-        if robot is not None:
+        found = _nearest(anchors[epoch], run.odometry, index)
+        if found is not None:
+            last, robot = found
+            if epoch == 0:
+                messages.append((last, robot))
+                covariances.append(index)
             followed |= int(stamps[index]) > first_commands[epoch]
             seconds.append((stamps[index] - stamps[0]) / NANOSECONDS)
             poses.append(robot.pose)
@@ -132,6 +148,10 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
             f'{omitted} of {len(stamps)} odometry messages precede the start of the simulated robot and '
             'were not compared',
         )
+    covariance: tuple[str | None, float] = (None, 0.0)
+    if start == 'start_pose' and recorded_model(run) and len(run.odometry_covariances) == len(stamps):
+        events = [(anchor.robot, not anchor.is_command) for anchor in anchors[0]]
+        covariance = rule(events, messages, run.odometry_covariances[covariances, :6])
     difference: NDArray[np.float64] = np.array(measured) - np.array(poses)
     return Verification(
         source=source,
@@ -140,6 +160,8 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
         distances=np.hypot(difference[:, 0], difference[:, 1]),
         headings=np.abs(wrapped(difference[:, 2])),
         notes=notes,
+        covariance=covariance[0],
+        covariance_difference=covariance[1],
     )
 
 
@@ -149,8 +171,8 @@ def _epochs(series: Series) -> list[int]:
     return [0, *np.cumsum(back).astype(int).tolist()]
 
 
-def _nearest(anchors: list[_Anchor], odometry: Series, index: int) -> Robot | None:
-    """Return the robot at the stamp of an odometry message; None: it starts later.
+def _nearest(anchors: list[_Anchor], odometry: Series, index: int) -> tuple[int, Robot] | None:
+    """Return the last event before an odometry message, and the robot then; None: it starts later.
 
     A command that took effect before that stamp, but was recorded no sooner than the message, may have
     reached the robot after it sent the message, or only the recorder late. Which was published first is
@@ -161,16 +183,16 @@ def _nearest(anchors: list[_Anchor], odometry: Series, index: int) -> Robot | No
     last = bisect_right(anchors, stamp, key=lambda anchor: anchor.robot.stamp) - 1
     if last < 0:
         return None
-    robot = anchors[last].robot.at(stamp)
+    robot = last, anchors[last].robot.at(stamp)
     # The first one is the start of the robot, the others are in the order of their recording.
     known = bisect_left(anchors, received, 1, last + 1, key=lambda anchor: anchor.received) - 1
     if known == last:
         return robot
     earlier = range(max(known, last + 1 - _MAX_CANDIDATES), last)
-    candidates = [robot, *(anchors[one].robot.at(stamp) for one in earlier)]
+    candidates = [robot, *((one, anchors[one].robot.at(stamp)) for one in earlier)]
 
-    def apart(candidate: Robot) -> float:
-        dx, dy, turn = (odometry.values[index, :3] - candidate.pose).tolist()
+    def apart(candidate: tuple[int, Robot]) -> float:
+        dx, dy, turn = (odometry.values[index, :3] - candidate[1].pose).tolist()
         return math.hypot(dx, dy) + abs(float(wrapped(turn)))
 
     return min(candidates, key=apart)
@@ -183,12 +205,15 @@ def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
     whole = len(starts) > 0 and int(starts.stamps[0]) >= first.stamp - _period(run)
     # Otherwise the first one is latched, from before the recording.
     skipped = 0 if whole else 1
+    placed = start_covariances(run)
     events: list[tuple[int, int, bool, NDArray[np.float64]]] = []
     for is_start, series, begin in ((True, starts, skipped), (False, run.cmd_vel_out, 0)):
-        rows = zip(series.received.tolist(), series.stamps.tolist(), series.values, strict=True)
+        values = np.hstack([series.values, placed]) if is_start else series.values
+        rows = zip(series.received.tolist(), series.stamps.tolist(), values, strict=True)
         events += [(received, stamp, is_start, row) for received, stamp, row in list(rows)[begin:]]
     events.sort(key=lambda event: event[0])
     begun = int(run.odometry.received[0])
+    model = recorded_model(run) or RobotModel()
     # The command that was recorded before the odometry is in effect in its first message.
     driven = (run.cmd_vel_out.stamps <= first.stamp) & (
         run.cmd_vel_out.received <= begun + _MAX_DELAY * NANOSECONDS
@@ -201,12 +226,12 @@ def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
         if is_start and (latest is None or stamp < latest.stamp):
             if latest is not None:
                 epochs.append([])
-            robot = Robot(model=RobotModel(), stamp=stamp, pose=row)
+            robot = Robot(model=model, stamp=stamp, pose=row[:3], covariance=row[3:].reshape(3, 3))
         elif latest is None or stamp < latest.stamp:
             # From before the recording, or from before time went back.
             continue
         elif is_start:
-            robot = latest.placed(row, latest.covariance, stamp)
+            robot = latest.placed(row[:3], row[3:].reshape(3, 3), stamp)
         else:
             robot = latest.commanded((float(row[0]), float(row[1])), stamp)
         epochs[-1].append(_Anchor(robot, received, is_command=not is_start))

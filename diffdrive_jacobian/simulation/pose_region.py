@@ -1,13 +1,14 @@
 """The region that holds the position of a robot with a given probability, in exponential coordinates.
 
 After a long drive the positions that a robot may have form a banana, not an ellipse. In exponential
-coordinates `xi = log(pose^-1 q)` of SE(2) about the reported pose, the distribution of the true pose q is
-nearly Gaussian. Here it is taken for the Gaussian of mean zero whose second moments about the reported
-pose are the given ones: exact to all orders of the exponential map, where the sources propagate to first
-(Long et al.) and to fourth order (Barfoot and Furgale).
+coordinates `xi = log(pose^-1 q)` of SE(2) about the reported pose the distribution of the true pose q
+is nearly Gaussian. Its covariance is propagated to first order by Long et al., and to fourth order by
+Barfoot and Furgale. Driving straight for a minute, the first order is already too thin along the path.
+Here it is taken to all orders, from runs of the noise model along the reported path that are drawn at
+random with a fixed seed.
 
-The region of positions is the projection of the ellipsoid `xi^T covariance^-1 xi <= quantile` onto the
-plane, with the quantile of two degrees of freedom.
+The region of positions is the projection of the ellipsoid `xi^T covariance^-1 xi <= level` onto the
+plane. The level is that at which the region holds 95 % of the drawn runs: 5.99 for a Gaussian.
 
 Sources: Long, Wolfe, Mashner and Chirikjian, "The banana distribution is Gaussian", 2012; Barfoot and
 Furgale, "Associating uncertainty with three-dimensional poses for use in estimation problems", 2014.
@@ -16,84 +17,124 @@ Furgale, "Associating uncertainty with three-dimensional poses for use in estima
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._checks import array
+from diffdrive_jacobian.kinematics.se2 import compose, inverse, log
 from diffdrive_jacobian.simulation.odometry_noise import covariance_entries
 
 Array = NDArray[np.float64]
-QUANTILE = -2.0 * math.log(0.05)
-"""95 % quantile of chi-squared with two degrees of freedom."""
-_THINNEST = 1e-3
-"""Least ratio of the axes of the position's spread at a given heading."""
+PROBABILITY = 0.95
+ELLIPSE_LEVEL = -2.0 * math.log(1.0 - PROBABILITY)
+"""Level of the ellipse that holds 95 % of a Gaussian in the plane: a quantile of chi-squared."""
+RUNS = 10_000
+"""Number of runs that are drawn."""
+_THINNEST = 1e-4
+"""Least ratio of the standard deviations of the position at a given heading."""
 _STEPS = 0.25
 """Step of the headings that are tried, in their standard deviations at a given position."""
 _MOST_HEADINGS = 4001
+_STRAIGHTEST = 1e-9
+"""Least ratio of chord and arc, so that a full turn divides by no zero."""
 
 
-class ExponentialGaussian(NamedTuple):
-    """A Gaussian of poses in exponential coordinates about a reported pose."""
+class Region(NamedTuple):
+    """A region of positions about a reported pose."""
 
     pose: Array
-    """`[x, y, theta]`, shape (3,)."""
+    """The reported pose, `[x, y, theta]`, shape (3,)."""
     covariance: Array
-    """Covariance of `xi = [along, across, turn]`, shape (3, 3) (m, m, rad)."""
+    """Second moment of `xi = [along, across, turn]`, shape (3, 3) (m, m, rad)."""
+    level: float
+    """Largest distance, as `region_distance` returns it, within the region."""
 
 
-def exponential_gaussian(pose: ArrayLike, second_moment: ArrayLike) -> ExponentialGaussian:
-    """Find the Gaussian in exponential coordinates whose second moment about the pose is a given one.
+def sampled_errors(
+    poses: ArrayLike, noise: ArrayLike, covariance: ArrayLike, *, seed: int = 0, count: int = RUNS
+) -> Iterator[Array]:
+    """Draw runs of the noise model along a reported path. Yield their errors at each of its poses.
+
+    Args:
+        poses: Reported poses, shape (n, 3).
+        noise: Variances that the noise adds between the poses: those of the distance travelled, of
+            distance and turn, and of the turn, shape (n - 1, 3) (m^2, m rad, rad^2).
+        covariance: Covariance of the error of the first pose, which is Gaussian, shape (3, 3).
+        seed: Seed of the random numbers.
+        count: Number of runs.
+
+    Yields:
+        The errors `[x, y, theta]` relative to the reported pose, heading unwrapped, shape (count, 3).
+
+    Raises:
+        ValueError: A shape is wrong, an entry is not finite, or a variance is negative.
+    """
+    poses, noise = array('poses', poses, 3), array('noise', noise, 3)
+    if poses.ndim != 2 or noise.shape != (len(poses) - 1, 3):
+        raise ValueError(
+            f'poses and noise must have shapes (n, 3) and (n - 1, 3), got {poses.shape}, {noise.shape}'
+        )
+    if np.any(noise[:, [0, 2]] < 0.0):
+        raise ValueError('noise must have variances that are zero or positive')
+    covariance_entries('covariance', covariance)
+    rng = np.random.default_rng(seed)
+    errors = rng.normal(size=(count, 3)) @ _root(np.asarray(covariance, dtype=np.float64))
+    yield errors
+    x, y, turned = errors.T
+    for (before, after), (vv, vw, ww) in zip(pairwise(poses), noise.tolist(), strict=True):
+        along, across, turn = log(compose(inverse(before), after)).tolist()
+        draws = rng.normal(size=(count, 2)) @ _root(np.array([[vv, vw], [vw, ww]]))
+        bent = turn + draws[:, 1]
+        # The arc of the disturbed twist from the true heading, in complex numbers.
+        heading = np.exp(1j * (before[2] + turned + bent / 2.0)) * np.sinc(bent / (2.0 * np.pi))
+        moved = (along + draws[:, 0] + 1j * across) * heading
+        dx, dy = (after[:2] - before[:2]).tolist()
+        x, y, turned = x + moved.real - dx, y + moved.imag - dy, turned + draws[:, 1]
+        yield np.column_stack([x, y, turned])
+
+
+def region_of(pose: ArrayLike, errors: ArrayLike) -> Region:
+    """Return the region that holds 95 % of the positions of some runs.
 
     Args:
         pose: The reported pose, shape (3,).
-        second_moment: `E[(q - pose) (q - pose)^T]` as published in odometry, shape (3, 3).
-
-    Returns:
-        The Gaussian. A covariance that no such Gaussian has is replaced by the nearest one.
+        errors: Errors of the runs relative to it, as `sampled_errors` yields them, shape (n, 3).
 
     Raises:
-        ValueError: A shape is wrong, an entry not finite, or the second moment is not symmetric and
-            positive semidefinite.
+        ValueError: A shape is wrong, or an entry is not finite.
     """
-    place = array('pose', pose, 3)
-    moment = array('second_moment', second_moment, 3, 3)
-    if place.ndim != 1 or moment.ndim != 2:
+    place, errors = array('pose', pose, 3), array('errors', errors, 3)
+    if place.ndim != 1 or errors.ndim != 2 or not len(errors):
         raise ValueError(
-            f'pose and second_moment must have shapes (3,) and (3, 3), got {place.shape}, {moment.shape}'
+            f'pose and errors must have shapes (3,) and (n, 3), got {place.shape} and {errors.shape}'
         )
-    xx, xy, xt, yy, yt, s = covariance_entries('second_moment', moment)
-    back = complex(math.cos(place[2]), -math.sin(place[2]))
-    mixed, pseudo = complex(xt, yt) * back, complex(xx - yy, 2.0 * xy) * back * back
-    # With V = (exp(i t) - 1) / (i t) the position is V rho: rho = slope t + rest, the rest independent.
-    decay = math.exp(-s / 2.0)
-    slope = mixed / (s * decay) if s * decay > 0.0 else 0.0j
-    size, square = _mean_squares(s)
-    # E[|V t|^2] and E[(V t)^2].
-    drop = math.expm1(-s / 2.0)
-    turned, turned_2 = -2.0 * drop, -(math.expm1(-2.0 * s) - 2.0 * drop)
-    trace = (xx + yy - abs(slope) ** 2 * turned) / size
-    pseudo = (pseudo - slope * slope * turned_2) / square
-    rest = np.array([[trace + pseudo.real, pseudo.imag], [pseudo.imag, trace - pseudo.real]]) / 2.0
-    values, vectors = np.linalg.eigh(rest)
-    floor = _THINNEST**2 * max(float(values[1]), _THINNEST**2 * (xx + yy))
-    rest = vectors * np.maximum(values, floor) @ vectors.T
-    covariance = np.empty((3, 3))
-    line = np.array([slope.real, slope.imag])
-    covariance[:2, :2] = rest + s * np.outer(line, line)
-    covariance[:2, 2] = covariance[2, :2] = s * line
-    covariance[2, 2] = s
-    return ExponentialGaussian(place, covariance)
+    xi = log_about(place, errors)
+    region = Region(place, xi.T @ xi / len(xi), ELLIPSE_LEVEL)
+    distances = region_distance(region, place[:2] + errors[:, :2])
+    level = float(np.quantile(distances, PROBABILITY))
+    return region._replace(level=level if math.isfinite(level) and level > 0.0 else ELLIPSE_LEVEL)
 
 
-def region_distance(gaussian: ExponentialGaussian, positions: ArrayLike) -> Array:
-    """Compute the squared distance of positions, normalized: at most `QUANTILE` within the 95 % region.
+def log_about(pose: ArrayLike, errors: ArrayLike) -> Array:
+    """Return errors of x, y and heading (unwrapped) in exponential coordinates, shape (n, 3)."""
+    theta = float(np.asarray(pose, dtype=np.float64)[2])
+    x, y, turned = array('errors', errors, 3).T
+    bend = np.exp(1j * (theta + turned / 2.0)) * np.sinc(turned / (2.0 * np.pi))
+    rho = (x + 1j * y) / np.where(np.abs(bend) > _STRAIGHTEST, bend, _STRAIGHTEST)
+    return np.column_stack([rho.real, rho.imag, turned])
+
+
+def region_distance(region: Region, positions: ArrayLike) -> Array:
+    """Compute the normalized squared distance of positions: at most the level within the region.
 
     It is the least `xi^T covariance^-1 xi` over all headings, found among a grid of headings.
 
     Args:
-        gaussian: The distribution of poses.
+        region: The region.
         positions: `[x, y]`, shape (..., 2) (m).
 
     Returns:
@@ -103,25 +144,28 @@ def region_distance(gaussian: ExponentialGaussian, positions: ArrayLike) -> Arra
         ValueError: The positions have another shape, or are not finite.
     """
     points = array('positions', positions, 2)
-    covariance, (x, y, theta) = gaussian.covariance, gaussian.pose.tolist()
+    covariance, (x, y, theta) = region.covariance, region.pose.tolist()
     offsets = (points[..., 0] - x + 1j * (points[..., 1] - y)) * complex(
         math.cos(theta), -math.sin(theta)
     )
     s = float(covariance[2, 2])
     line = covariance[:2, 2] / s if s > 0.0 else np.zeros(2)
     rest = covariance[:2, :2] - s * np.outer(line, line)
-    determinant = rest[0, 0] * rest[1, 1] - rest[0, 1] ** 2
-    if not determinant > 0.0:
+    values, vectors = np.linalg.eigh(rest)
+    if not values[1] > 0.0:
         return np.where(offsets == 0.0, 0.0, np.inf)
-    a, b, c = rest[1, 1] / determinant, -rest[0, 1] / determinant, rest[0, 0] / determinant
-    reach = math.sqrt(1.5 * QUANTILE * s)
-    precision = (a * line[0] ** 2 + 2.0 * b * line[0] * line[1] + c * line[1] ** 2) + 1.0 / max(s, 1e-300)
+    inverted = vectors / np.maximum(values, values[1] * _THINNEST**2) @ vectors.T
+    a, b, c = inverted[0, 0], inverted[0, 1], inverted[1, 1]
+    reach = math.sqrt(2.0 * max(region.level, ELLIPSE_LEVEL) * s)
+    precision = (a * line[0] ** 2 + 2.0 * b * line[0] * line[1] + c * line[1] ** 2) + 1.0 / max(
+        s, 1e-300
+    )
     half = min(math.ceil(reach * math.sqrt(precision) / _STEPS), _MOST_HEADINGS // 2)
     least = np.full(offsets.shape, np.inf)
     previous, before = least, least
     for turn in np.linspace(-reach, reach, 2 * half + 1).tolist() if half else [0.0]:
         bend = np.exp(0.5j * turn) * np.sinc(turn / (2.0 * np.pi))
-        rho = offsets / bend if abs(bend) > 1e-9 else np.full_like(offsets, np.inf)
+        rho = offsets / (bend if abs(bend) > _STRAIGHTEST else _STRAIGHTEST)
         along, across = rho.real - line[0] * turn, rho.imag - line[1] * turn
         distance = a * along**2 + 2.0 * b * along * across + c * across**2
         distance += turn * turn / s if s > 0.0 else 0.0
@@ -136,16 +180,8 @@ def region_distance(gaussian: ExponentialGaussian, positions: ArrayLike) -> Arra
     return np.maximum(least, 0.0)
 
 
-def _mean_squares(s: float) -> tuple[float, float]:
-    """Compute E[|V|^2] and E[V^2], `V = (exp(i t) - 1) / (i t)`, of a Gaussian t with variance s."""
-    if s < 1e-8:
-        return 1.0 - s / 12.0, 1.0 - 7.0 * s / 12.0
-    root = math.sqrt(s / 2.0)
-
-    def even(reach: float) -> float:
-        return math.sqrt(math.pi) / (2.0 * root) * math.erf(reach * root)
-
-    def odd(reach: float) -> float:
-        return -math.expm1(-reach * reach * s / 2.0) / s
-
-    return 2.0 * (even(1.0) - odd(1.0)), 2.0 * (odd(1.0) + even(2.0) - even(1.0)) - odd(2.0)
+def _root(covariance: Array) -> Array:
+    """Return a symmetric square root of a positive semidefinite matrix."""
+    values, vectors = np.linalg.eigh(covariance)
+    root: Array = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return root

@@ -12,6 +12,7 @@ from diffdrive_jacobian.bags.bag_reader import BagError
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.file import robot_parameters
+from diffdrive_jacobian.reading.covariance_rule import EXACT_MOMENTS, FIRST_ORDER, NEITHER
 from diffdrive_jacobian.reading.reader import read_run
 from diffdrive_jacobian.reading.verification import BY_RECORDING_TIME, EXACT, Verification, verify
 from diffdrive_jacobian.signals import Signals
@@ -20,6 +21,13 @@ from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._waiting import busy
 
 PROGRAM = 'verify_run'
+
+
+_RULES = {
+    EXACT_MOMENTS: 'the exact moments of the noise model',
+    FIRST_ORDER: 'of first order, as published by earlier versions',
+    NEITHER: 'neither the exact moments of the noise model nor their first order',
+}
 
 
 def report(verification: Verification, tolerance: float, yaw_tolerance: float) -> str:
@@ -49,6 +57,11 @@ def report(verification: Verification, tolerance: float, yaw_tolerance: float) -
         if len(beyond):
             first = verification.seconds[beyond[0]]
             lines.append(f'{name}: exceeded in {len(beyond)} messages, first at {first:.3f} s')
+    if verification.covariance is not None:
+        lines.append(
+            f'covariance: {_RULES[verification.covariance]}; '
+            f'maximum relative difference {verification.covariance_difference:.3g}'
+        )
     verdict = 'as recorded' if verification.holds(tolerance, yaw_tolerance) else 'NOT as recorded'
     return '\n'.join([*lines, f'the robot moves {verdict}'])
 

@@ -1,0 +1,133 @@
+"""The uncertainty that odometry reports, beside noisy runs: `python test/benchmark/uncertainty.py`.
+
+For each drive and time: the standard deviations about the reported pose as published, as of first
+order, and of 4,000 Monte Carlo runs of the documented noise model, the mean normalized error squared
+(3 is right), and how many of the runs are in the 95 % region that plot_run draws, and in the ellipse.
+Then the CPU time of a covariance compared with that of first order, interleaved. Half a minute.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from moments_reference import DRIVES, noisy_runs, reported_path
+
+from diffdrive_jacobian.simulation.exact_moments import (
+    gaussian,
+    propagate_moments,
+    propagated_moments,
+)
+from diffdrive_jacobian.simulation.odometry_noise import (
+    _propagated,
+    propagate_covariance,
+)
+from diffdrive_jacobian.simulation.pose_region import (
+    ELLIPSE_LEVEL,
+    region_distance,
+    region_of,
+    sampled_errors,
+)
+
+L, K = 0.16, 1e-5
+SURE = np.zeros((3, 3))
+ARCS = {
+    'straight, 20 ms': ((0.22, 0.0), 0.02),
+    'arc, 20 ms': ((0.22, 0.5), 0.02),
+    'arc, 1 s': ((0.22, 0.5), 1.0),
+    'arc, 300 s': ((0.22, 0.5), 300.0),
+    'straight, 300 s': ((0.22, 0.0), 300.0),
+}
+
+
+def nees(errors, moment):
+    """Return the mean normalized error squared."""
+    return float(np.einsum('ni,ij,nj->n', errors, np.linalg.inv(moment), errors).mean())
+
+
+def accuracy(count: int) -> Table:
+    """Return the table of standard deviations, errors and coverage."""
+    table = Table(title=f'Uncertainty about the reported pose, {count} runs', show_lines=False)
+    for name in (
+        *('drive', 'time (s)', 'sigma x (m)', 'of first order', 'Monte Carlo'),
+        *('sigma y (m)', 'Monte Carlo', 'NEES', 'of first order', 'region (%)', 'ellipse (%)'),
+    ):
+        table.add_column(name, justify='right')
+    for name, drive_for in DRIVES.items():
+        for duration in (10.0, 60.0, 300.0):
+            drive = drive_for(duration)
+            poses, noise = reported_path(drive, L, K)
+            pose, moments, first = np.zeros(3), gaussian(SURE), SURE
+            for twist, held in drive:
+                moments = propagate_moments(moments, pose, twist, held, L, K)
+                first = propagate_covariance(first, pose, twist, held, L, K)
+                pose, _ = reported_path([(twist, held)], L, K, start=pose)
+                pose = pose[-1]
+            errors = noisy_runs(np.random.default_rng(1), drive, SURE, count, L, K)
+            second = moments.second_moment
+            *_, drawn = sampled_errors(poses, noise, SURE)
+            region = region_of(pose, drawn)
+            within = region_distance(region, pose[:2] + errors[:, :2]) <= region.level
+            inverted = np.linalg.inv(second[:2, :2])
+            ellipse = np.einsum('ni,ij,nj->n', errors[:, :2], inverted, errors[:, :2])
+            sampled = np.sqrt(np.mean(errors**2, axis=0))
+            table.add_row(
+                *(name, f'{duration:.0f}', f'{second[0, 0] ** 0.5:.4f}', f'{first[0, 0] ** 0.5:.4f}'),
+                *(f'{sampled[0]:.4f}', f'{second[1, 1] ** 0.5:.4f}', f'{sampled[1]:.4f}'),
+                *(f'{nees(errors, second):.2f}', f'{nees(errors, first):.1f}'),
+                *(f'{100.0 * within.mean():.1f}', f'{100.0 * np.mean(ellipse <= ELLIPSE_LEVEL):.1f}'),
+            )
+    return table
+
+
+def cost(rounds: int) -> Table:
+    """Return the table of CPU times, both sides in turn."""
+    table = Table(title='CPU time of one covariance (us)')
+    for name in ('arc', 'exact', 'first order', 'ratio'):
+        table.add_column(name, justify='right')
+    moments = gaussian(1e-4 * np.diag([1.0, 2.0, 3.0]))
+    entries = tuple(moments[:6])
+    for name, (twist, held) in ARCS.items():
+
+        def exact(twist=twist, held=held):
+            propagated_moments(moments, 0.3, twist, held, L, K)
+
+        def of_first_order(twist=twist, held=held):
+            _propagated(*entries, 0.3, *twist, held, L, K)
+
+        sides: list[tuple[float, float]] = []
+        for _ in range(rounds):
+            pair = []
+            for side in (exact, of_first_order):
+                begin = time.process_time()
+                for _ in range(1000):
+                    side()
+                pair.append((time.process_time() - begin) * 1e3)
+            sides.append((pair[0], pair[1]))
+        ours, others = (statistics.median(side) for side in zip(*sides, strict=True))
+        ratio = statistics.median(one / other for one, other in sides)
+        table.add_row(name, f'{ours:.1f}', f'{others:.1f}', f'{ratio:.2f}')
+    return table
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--quick', action='store_true', help='fewer runs, to try it')
+    options = parser.parse_args()
+    console = Console()
+    if not console.is_terminal:
+        console.width = 150
+    console.print(accuracy(500 if options.quick else 4000))
+    console.print(cost(3 if options.quick else 15))
+
+
+if __name__ == '__main__':
+    main()
