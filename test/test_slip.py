@@ -174,7 +174,7 @@ def test_the_slip_in_a_cell_has_the_variance_of_its_distance_whatever_the_comman
     slipped = slips(start, driven(start, commands, end))
     for distance_slipped, xi in zip(slipped, normals(4, 0, cell), strict=True):
         # The path is so short that the slip adds up along x.
-        assert distance_slipped / xi == pytest.approx(math.sqrt(k * distance), rel=1e-5)
+        assert distance_slipped / xi == pytest.approx(math.sqrt(k * distance), rel=1e-4)
 
 
 def test_a_stop_within_a_cell_leaves_no_slip_for_later():
