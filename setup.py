@@ -18,6 +18,7 @@ COMMANDS = [
     'plot_run',
     'sweep_gains',
     'doctor',
+    'calibrate_run',
 ]
 MESSAGES = '5.3.6'
 CORE_MESSAGES = '2.0.3'

@@ -33,6 +33,34 @@ sys.exit(getattr(entry_points, {tool!r})())
 """
 
 
+WITHOUT_STDERR = """
+import faulthandler, os, sys
+os.close(2)
+sys.stderr = sys.__stderr__ = None
+
+import types
+
+def run(*arguments):
+    # As rclpy does.
+    sys.stderr = sys.__stderr__
+    faulthandler.enable()
+    print('enabled')
+
+module = types.ModuleType('run_node')
+module.run_node = run
+sys.modules['diffdrive_jacobian.tools.run_node'] = module
+from diffdrive_jacobian.tools.entry_points import virtual_robot
+virtual_robot()
+"""
+
+
+def test_a_process_that_was_started_without_stderr_gets_one():
+    ended = subprocess.run(
+        [sys.executable, '-c', WITHOUT_STDERR], capture_output=True, text=True, timeout=60
+    )
+    assert ended.stdout == 'enabled\n'
+
+
 @pytest.mark.parametrize('tool', TOOLS)
 def test_an_error_of_the_system_names_the_tool(tool):
     ended = subprocess.run(

@@ -195,6 +195,28 @@ def test_a_node_on_wall_time_is_named_when_it_changes_within_a_run(lockstep):
         lockstep.run_for(1.0)
 
 
+def test_what_a_condition_creates_or_changes_takes_effect_at_once(lockstep):
+    server = lockstep.add(Node('server'))
+    answered, ticks = [], []
+    server.create_service(
+        Trigger, 'ask', lambda _, response: answered.append(lockstep.elapsed) or response
+    )
+    client = lockstep.node.create_client(Trigger, 'ask')
+    slow = lockstep.node.create_timer(0.5, lambda: ticks.append(lockstep.elapsed))
+
+    def condition():
+        if lockstep.elapsed == 0.5:
+            client.call_async(Trigger.Request())
+            lockstep.node.create_timer(0.2, lambda: ticks.append(('new', lockstep.elapsed)))
+        if lockstep.elapsed == 0.7:
+            slow.reset()
+        return lockstep.elapsed >= 1.2
+
+    lockstep.run_until(condition, timeout=2.0)
+    assert answered == [0.5]
+    assert ticks == [0.5, ('new', 0.7), ('new', 0.9), ('new', 1.1), 1.2]
+
+
 # --- Last messages
 
 

@@ -69,7 +69,12 @@ def test_the_configurations_of_an_installation_are_found(tmp_path, monkeypatch):
     (folder / 'rover.yaml').write_text('')
     # As if the package was not in a clone.
     monkeypatch.setattr(module, '__file__', str(tmp_path / 'lib' / 'a' / 'b' / 'c.py'))
+    monkeypatch.setenv('AMENT_PREFIX_PATH', '/nowhere')
+    assert 'rover' not in configurations()
     monkeypatch.setenv('AMENT_PREFIX_PATH', os.pathsep.join(['/nowhere', str(tmp_path)]))
+    assert configurations()['rover'] == folder / 'rover.yaml'
+    monkeypatch.delenv('AMENT_PREFIX_PATH')
+    monkeypatch.setattr(module, '__file__', str(tmp_path / 'a' / 'b' / 'c.py'))
     assert configurations()['rover'] == folder / 'rover.yaml'
 
 
@@ -385,12 +390,13 @@ class Progress:
 
     def __init__(self):
         self.ignored = []
+        self.reasons = set()
 
     def heading_ignored(self, controller):
         self.ignored.append(controller)
 
     def waiting(self, reason):
-        pass
+        self.reasons.add(reason)
 
     def driving(self, distance):
         pass
@@ -427,3 +433,30 @@ def test_a_controller_that_ignores_the_heading_is_reported(follow, matters, para
         session = _Session(client, runner, signals, progress)
         session.run(10.0, 0.0, follow=follow, heading_matters=matters)
     assert progress.ignored == expected
+    waited = {'no answer on /goal_status', 'no odometry on /odom'} if follow else set()
+    assert waited <= progress.reasons
+
+
+def test_a_replay_says_which_subscriptions_it_waits_for(robots, capfd):
+    from diffdrive_jacobian.replay import Playback, replay
+
+    class Reasons(Progress):
+        def started(self, seconds):
+            pass
+
+        def playing(self, seconds, *, paused):
+            pass
+
+        def toggled(self):
+            return False
+
+        def ended(self):
+            pass
+
+    progress = Reasons()
+    playback = Playback(namespace='/one', rate=100.0)
+    assert replay(robots, playback, patience=0.1, progress=progress).played
+    assert progress.reasons == {
+        'no subscription to /one/cmd_vel (starting after 0.1 s without it)',
+    }
+    assert 'no node is subscribed to /one/cmd_vel' in capfd.readouterr().err

@@ -123,9 +123,10 @@ def library():
     names = set()
     for module in (
         *(importlib.import_module(f'diffdrive_jacobian.{layer}') for layer in ('control', 'simulation')),
-        *vars(kinematics).values(),
+        *(getattr(kinematics, name) for name in kinematics.__all__),
     ):
-        for name, value in getattr(module, '__dict__', {}).items():
+        for name in dir(module):
+            value = getattr(module, name)
             names.add(name)
             if inspect.isclass(value):
                 names.update(vars(value))

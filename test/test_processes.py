@@ -104,7 +104,7 @@ def test_no_wait_leaves_the_goal_and_timeout_cancels_it(world):
     assert lines[-2].startswith('not arrived within --timeout 0.5 s')
     assert lines[-1] == 'canceled: the robot was stopped'
     drive.until_canceled()
-    assert (left.exit(), left.stdout) == (0, 'sent: goal (50, 0) on /goal_pose\n')
+    assert (left.exit(), left.last_line) == (0, 'sent: goal (50, 0) on /goal_pose')
 
 
 def test_ctrl_c_cancels_the_goal(world):

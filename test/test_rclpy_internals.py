@@ -14,6 +14,7 @@ import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.clock import Clock
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import HistoryPolicy, QoSProfile
@@ -321,6 +322,31 @@ def test_waiting_messages_are_taken_serialized_with_their_info(ros):
     assert numbers == [1, 2, 3]
     assert all(info['received_timestamp'] > 0 and info['source_timestamp'] > 0 for _, info in taken)
     assert list(internals.waiting_messages(subscription)) == []
+
+
+# --- Log
+
+
+def test_a_line_is_logged_with_the_place_of_the_caller(ros, monkeypatch, capfd):
+    logged = []
+    monkeypatch.setattr(
+        internals.rclpy_implementation, 'rclpy_logging_rcutils_log', lambda *given: logged.append(given)
+    )
+    node = ros.add(Node, node_name='logging')
+    internals.log_info(node, 'a line')
+    [(severity, name, text, function, file, line)] = logged
+    assert (int(severity), name, text) == (20, 'logging', 'a line')
+    assert function == 'test_a_line_is_logged_with_the_place_of_the_caller'
+    assert Path(file) == Path(__file__)
+    assert Path(file).read_text().splitlines()[line - 1].strip() == "internals.log_info(node, 'a line')"
+    node.get_logger().set_level(LoggingSeverity.ERROR)
+    internals.log_info(node, 'another')
+    assert len(logged) == 1
+    monkeypatch.undo()
+    node.get_logger().set_level(LoggingSeverity.INFO)
+    internals.log_info(node, 'written {name} %s')
+    assert '[INFO]' in (said := capfd.readouterr().err)
+    assert said.rstrip().endswith('[logging]: written {name} %s')
 
 
 # --- Executors

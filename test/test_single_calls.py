@@ -193,7 +193,7 @@ def test_integers_and_booleans_are_numbers(call, valid):
 
 def invalid():
     for call, valid in CALLS:
-        for name in valid.keys() - OPTIONS:
+        for name in (name for name in valid if name not in OPTIONS):
             yield pytest.param(call, valid, name, id=f'{name_of(call)}-{name}')
 
 

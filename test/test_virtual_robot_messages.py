@@ -195,10 +195,12 @@ def test_initialpose_while_driving_carries_its_covariance(lockstep, robot_at, fr
     assert from_pose(topics.starts[-1].pose.pose) == pytest.approx([2.0, 3.0, math.pi / 2])
     lockstep.run_for(1.0)
     assert pose_of(topics.odom[-1]) == pytest.approx([2.0, 3.125, math.pi / 2], abs=1e-15)
-    # Of the way driven only the uncertain heading makes the pose more uncertain: sideways.
-    lever = 0.125
-    expected = np.diag([0.25 + lever**2 * 0.07, 0.5, 0.07])
-    expected[0, 2] = expected[2, 0] = -lever * 0.07
+    # Only the uncertain heading makes the pose more uncertain: the path ends on a circle, at an angle
+    # that is Gaussian with variance 0.07.
+    lever, mean, double = 0.125, math.exp(-0.07 / 2.0), math.exp(-2.0 * 0.07)
+    sideways, ahead = (1.0 - double) / 2.0, (1.0 + double) / 2.0 - 2.0 * mean + 1.0
+    expected = np.diag([0.25 + lever**2 * sideways, 0.5 + lever**2 * ahead, 0.07])
+    expected[0, 2] = expected[2, 0] = -lever * 0.07 * mean
     assert covariance_of(topics.odom[-1]) == pytest.approx(expected, abs=1e-15)
 
 

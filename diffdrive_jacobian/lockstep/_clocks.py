@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
+from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.ros.rclpy_internals import SimulatedClock
 
 
@@ -24,6 +26,7 @@ class Clocks:
         self.publisher: Publisher | None = None
         """Publisher of /clock."""
         self._clocks: list[SimulatedClock] = []
+        self._message = Clock()
 
     def find(self, nodes: Iterable[Node]) -> set[Subscription]:
         """Find the clocks of nodes. Return the subscriptions to /clock that are replaced.
@@ -40,10 +43,11 @@ class Clocks:
                 replaced.add(clock.subscription)
         return replaced
 
-    def set(self, message: Clock) -> None:
-        """Set the time, and publish the message if somebody else receives it."""
-        now = Time.from_msg(message.clock)
+    def set(self, now: int) -> None:
+        """Set the time (ns), and publish it if somebody else receives it."""
+        time = Time(nanoseconds=now, clock_type=ClockType.ROS_TIME)
         for clock in self._clocks:
-            clock.set(now)
+            clock.set(time)
         if self.publisher is not None and self.publisher.get_subscription_count() > len(self._clocks):
-            self.publisher.publish(message)
+            set_time(self._message.clock, now)
+            self.publisher.publish(self._message)

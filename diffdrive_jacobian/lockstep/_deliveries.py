@@ -81,7 +81,11 @@ class Deliveries:
         """
         found = False
         for reader in self._polled:
-            found |= reader.deliver()
+            # As `deliver`, without a call for each.
+            taken = reader.take(reader.message_type, reader.raw)
+            if taken is not None:
+                reader.call(taken)
+                found = True
         return found
 
     def close(self) -> None:
@@ -95,11 +99,11 @@ class Reader:
     __slots__ = (
         '_close',
         '_create_task',
-        '_message_type',
-        '_raw',
         '_subscription',
-        '_take',
         'latched',
+        'message_type',
+        'raw',
+        'take',
         'topic',
     )
 
@@ -109,25 +113,29 @@ class Reader:
         self.latched = is_latched(subscription)
         self._subscription = subscription
         self._create_task = create_task
-        self._message_type, self._raw = subscription.msg_type, subscription.raw
-        self._take, self._close = message_taker(subscription)
+        self.message_type, self.raw = subscription.msg_type, subscription.raw
+        self.take, self._close = message_taker(subscription)
 
     def deliver(self) -> bool:
         """Take a message and call the callback. Return False if there is none."""
-        taken = self._take(self._message_type, self._raw)
+        taken = self.take(self.message_type, self.raw)
         if taken is None:
             return False
+        self.call(taken)
+        return True
+
+    def call(self, taken: tuple[Any, dict[str, Any]]) -> None:
+        """Call the callback with a message that was taken, and its info."""
         # The callback is looked up for each message, because it may be replaced.
         subscription = self._subscription
         callback = subscription.callback
         result = callback(*taken) if receives_info(subscription) else callback(taken[0])
         if result is not None and inspect.iscoroutine(result):
             self._create_task(result)
-        return True
 
     def close(self) -> None:
         """Let the subscription be destroyed. No message can be taken afterwards."""
-        self._take = _nothing
+        self.take = _nothing
         self._close()
 
 

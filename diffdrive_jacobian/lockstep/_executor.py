@@ -20,7 +20,6 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.task import Task
 from rclpy.timer import Timer
-from rosgraph_msgs.msg import Clock
 
 from diffdrive_jacobian.lockstep._clocks import Clocks
 from diffdrive_jacobian.lockstep._deliveries import Deliveries, is_latched
@@ -144,9 +143,9 @@ class QuiescentExecutor:
                 return until_next
         return self.settle()
 
-    def advance(self, message: Clock) -> int | None:
-        """Set the clocks of the nodes, and settle."""
-        self.clocks.set(message)
+    def advance(self, now: int) -> int | None:
+        """Set the clocks of the nodes to a time (ns), and settle."""
+        self.clocks.set(now)
         if not self._has_work():
             called, until_next = self._call_timers()
             if called:

@@ -8,13 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rclpy.executors import ExternalShutdownException
-from rosgraph_msgs.msg import Clock
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
 from diffdrive_jacobian.lockstep._guard import Guard, Stuck
 from diffdrive_jacobian.lockstep._report import Traffic
-from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 MAX_SECONDS = 2**31 - 1
@@ -30,7 +28,6 @@ class SimulatedTime:
     def __init__(self, start: int) -> None:
         """Start at a time (ns)."""
         self._now = self._start = start
-        self._clock = Clock()
         self._until_next: int | None = None
         self._busy = False
         self._traffic = Traffic(lambda: self._now)
@@ -140,9 +137,8 @@ class SimulatedTime:
         self._publish_clock()
 
     def _publish_clock(self) -> None:
-        set_time(self._clock.clock, self._now)
         with self._watched():
-            self._until_next = self._executor.advance(self._clock)
+            self._until_next = self._executor.advance(self._now)
 
     @contextmanager
     def _watched(self) -> Iterator[None]:

@@ -39,7 +39,7 @@ from diffdrive_jacobian.ros.graph_faults import (
     unpublished,
 )
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
-from diffdrive_jacobian.ros.rclpy_internals import change_timer_period
+from diffdrive_jacobian.ros.rclpy_internals import change_timer_period, log_info
 from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import nanoseconds, seconds
@@ -296,7 +296,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         try:
             from tf2_ros import TransformBroadcaster
         except ImportError:
-            self.get_logger().info('tf2_ros is not installed: no transform is published')
+            log_info(self, 'tf2_ros is not installed: no transform is published')
             return None
         return TransformBroadcaster(self)
 

@@ -23,9 +23,11 @@ def configurations() -> dict[str, Path]:
 def _files() -> Iterator[Path]:
     """Yield the files of the clone, of the ROS installation and of the Python installation."""
     # An editable installation has no copy of them.
-    clone = Path(__file__).parents[2]
-    if (clone / 'setup.py').is_file():
-        yield from (clone / 'config').glob('*.yaml')
+    above = Path(__file__).parents[2]
+    if (above / 'setup.py').is_file():
+        yield from (above / 'config').glob('*.yaml')
+    # As `pip install --target` lays it out.
+    yield from (above / SHARE).glob('*.yaml')
     for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
         if prefix:
             yield from (Path(prefix) / SHARE).glob('*.yaml')

@@ -73,7 +73,11 @@ def _use(profile: str) -> bool:
     if present is None and _user_has_chosen():
         return False
     names = sorted({profile, *(present or [])})
-    os.environ[VARIABLE] = os.path.join(_FOLDER, f'{"_".join(names)}.xml')
+    file = os.path.join(_FOLDER, f'{"_".join(names)}.xml')
+    if not os.access(file, os.R_OK):
+        # Packed without its data files. Fast DDS would report that as an error.
+        return False
+    os.environ[VARIABLE] = file
     return True
 
 

@@ -31,7 +31,7 @@ from diffdrive_jacobian.ros import parameters as ros_parameters
 from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.rate_limit import RateLimit
-from diffdrive_jacobian.ros.rclpy_internals import time_reader
+from diffdrive_jacobian.ros.rclpy_internals import log_info, time_reader
 from diffdrive_jacobian.ros.serialization import decoding
 from diffdrive_jacobian.ros.topic_errors import explaining_failure, type_name
 from diffdrive_jacobian.ros.type_mismatches import TypeMismatches
@@ -219,7 +219,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
             ', '.join(self.resolve_topic_name(topic) for topic in topics)
             for topics in (subscribed, publishing)
         )
-        self.get_logger().info(f'subscribed to {received}, publishing {sent}')
+        log_info(self, f'subscribed to {received}, publishing {sent}')
 
     @staticmethod
     def flush(publisher: Publisher) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar
 
@@ -117,6 +116,11 @@ def report_unknown(nodes: Sequence[Node]) -> None:
     for node in nodes:
         for name in parameter_overrides(node).keys() - declared:
             unknown.setdefault(name, node)
+    if not unknown:
+        return
+    # Slow to import.
+    import difflib
+
     known = sorted(name for name in declared if not name.startswith(PARAMETERS_OF_RCLPY))
     for name, node in sorted(unknown.items()):
         close = difflib.get_close_matches(name, known, n=1)

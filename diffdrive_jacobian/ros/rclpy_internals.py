@@ -21,6 +21,7 @@ from rclpy.clock import Clock
 from rclpy.context import Context
 from rclpy.executors import Executor, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -47,6 +48,21 @@ def reason(error: Exception) -> str:
     rcl writes "message, at /path/file.c:line".
     """
     return str(error).split(', at /')[0].strip()
+
+
+def log_info(node: Node, text: str) -> None:
+    """Log a line at level info, with the function, file and line of the caller.
+
+    For the first lines of a process: `RcutilsLogger.info` searches all modules for the caller, which
+    takes more CPU time than to create a node. It also has filters, which this has not.
+    Relies on `rclpy_logging_rcutils_log`.
+    """
+    logger, frame = node.get_logger(), sys._getframe(1)
+    if logger.is_enabled_for(LoggingSeverity.INFO):
+        code = frame.f_code
+        rclpy_implementation.rclpy_logging_rcutils_log(
+            LoggingSeverity.INFO, logger.name, text, code.co_name, code.co_filename, frame.f_lineno
+        )
 
 
 # --- Parameters

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Any, Protocol
@@ -148,7 +149,8 @@ def send_goal(
     """
     goals = np.asarray(goal, dtype=np.float64)[np.newaxis]
     with (
-        fast_heartbeats(),  # A goal that is not followed ends with its acknowledgement.
+        # The acknowledgement is what is waited for then.
+        nullcontext() if follow else fast_heartbeats(),
         ros_context([NAME, *ros_arguments]) as context,
         running(context, isolated=False) as runner,
     ):

@@ -30,10 +30,10 @@ FIRST_ORDER, LAST_ORDER = 6, 21
 
 
 def _largest_argument(order: int) -> float:
-    """Return the argument up to which the terms after an order are negligible, 1e-16 of the leading
+    """Return the argument up to which the terms after an order are negligible, 1e-13 of the leading
     terms, which are of third order.
     """
-    return float((1e-16 * math.factorial(order + 1) / 6.0) ** (1.0 / (order - 2)))
+    return float((1e-13 * math.factorial(order + 1) / 6.0) ** (1.0 / (order - 2)))
 
 
 _ORDERS = [_largest_argument(order) for order in range(FIRST_ORDER - 1, LAST_ORDER)]
@@ -70,44 +70,38 @@ def series(alpha: float, turn: float, nu: float, beta: float, m: float) -> Noise
         beta: vw t (m rad).
         m: ww t / 2.
     """
-    x, half = 1j * turn, 0.5j * beta
-    drift, ahead, back = alpha + half, alpha + 3.0 * half, x + m
-    back_b = x - m
+    # Straight on everything but E[gamma psi] is real, and floats are faster.
+    x: complex = 1j * turn if turn else 0.0
+    half: complex = 0.5j * beta if beta else 0.0
+    drift, ahead, back, back_b, twice = alpha + half, alpha + 3.0 * half, x + m, x - m, 2.0 * x
+    bent, by_m, by_4m = 2j * drift, -m, -4.0 * m
     # Coefficients of t^n, from n = 1 on: of exp(-m t) - 1 and exp(-4 m t) - 1, then of the moments
-    # E[gamma], E[gamma psi], E[gamma h], E[gamma* h], E[|gamma|^2] - nu, of E[gamma^2] less what vv
-    # contributes, and of nu less what vv contributes to it.
-    c, c4 = -m, -4.0 * m
-    first: complex = half
+    # E[gamma], E[gamma psi], E[gamma h], E[gamma* h], E[|gamma|^2] - nu, and of nu - E[gamma^2].
+    c, c4 = by_m, by_4m
+    first, a, b = half, 3.0 * half, half
     turned: complex = complex(beta)
-    a: complex = 3.0 * half
-    b: complex = half
-    square, unit = 0.0, nu
-    pseudo: complex = 0.0j
-    rest: complex = 0.0j
-    s_first, s_turned, s_a, s_b, s_square, s_pseudo, s_rest = first, turned, a, b, 0.0, 0.0j, 0.0j
+    rest: complex = 0.0
+    straight: complex = twice * nu
+    s_first, s_turned, s_a, s_b, s_square, s_rest = first, turned, a, b, 0.0, rest
     for n in range(2, FIRST_ORDER + bisect_left(_ORDERS, 2.0 * abs(turn) + 4.0 * m)):
         f = 1.0 / n
-        g = 2.0 * f
-        square = g * ((drift * b).real - alpha * first.real)
-        pseudo = g * (drift * a - alpha * first - x * pseudo)
-        rest = f * (2.0 * x * (unit - rest) - nu * c4)
-        turned = f * ((beta - 2j * (n - 1) * drift) * c - x * turned)
+        short = alpha * first
+        s_square += 2.0 * f * ((drift * b).real - short.real)
+        rest = f * (straight - twice * rest - nu * c4 - 2.0 * (drift * a - short))
+        turned = f * ((beta - (n - 1) * bent) * c - x * turned)
         first = f * (drift * c - x * first)
-        a = f * (ahead * c4 - alpha * c - back * a)
-        b = f * (back_b * b - alpha * c)
-        c *= -m * f
-        c4 *= -4.0 * m * f
-        unit = 0.0
-        s_square += square
-        s_pseudo += pseudo
+        behind = alpha * c
+        a = f * (ahead * c4 - behind - back * a)
+        b = f * (back_b * b - behind)
+        c *= by_m * f
+        c4 *= by_4m * f
+        straight = 0.0
         s_rest += rest
         s_turned += turned
         s_first += first
         s_a += a
         s_b += b
-    return _real(
-        s_first, s_turned, s_a - s_first, s_b - s_first.conjugate(), s_square, s_pseudo, nu, s_rest
-    )
+    return _real(s_first, s_turned, s_a - s_first, s_b - s_first.conjugate(), s_square, nu, s_rest)
 
 
 def closed_form(alpha: float, turn: float, nu: float, beta: float, m: float) -> NoiseMoments:
@@ -154,9 +148,8 @@ def closed_form(alpha: float, turn: float, nu: float, beta: float, m: float) -> 
         back * a,
         (back * b_conjugate).conjugate(),
         square,
-        back_2 * pseudo,
         nu,
-        rest,
+        rest - back_2 * pseudo,
     )
 
 
@@ -166,7 +159,6 @@ def _real(
     a: complex,
     b: complex,
     square: float,
-    pseudo: complex,
     nu: float,
     rest: complex,
 ) -> NoiseMoments:
@@ -174,9 +166,9 @@ def _real(
     return NoiseMoments(
         first.real,
         first.imag,
-        nu + 0.5 * (square + pseudo.real - rest.real),
-        0.5 * (pseudo.imag - rest.imag),
-        0.5 * (square - pseudo.real + rest.real),
+        nu + 0.5 * (square - rest.real),
+        -0.5 * rest.imag,
+        0.5 * (square + rest.real),
         turned.real,
         turned.imag,
         0.5 * (a.real + b.real),

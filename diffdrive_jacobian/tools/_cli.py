@@ -96,6 +96,17 @@ def number(text: str) -> float:
     return float(text)
 
 
+def angle(text: str) -> float:
+    """Parse an angle (rad). More than one turn is rejected: it is probably in degrees."""
+    value = number(text)
+    if abs(value) > math.tau:
+        raise argparse.ArgumentTypeError(
+            f'must be in radians, from -2 pi to 2 pi, got {text.strip()!r} '
+            f'({value:g} degrees are {math.radians(value):.6g} rad)'
+        )
+    return value
+
+
 def add_heading(parser: argparse.ArgumentParser, text: str) -> None:
     """Add the options for a heading, which `given_heading` evaluates."""
     parser.add_argument('--heading', metavar='RAD', type=number, help=text)

@@ -73,7 +73,8 @@ def _run(module: str, function: str, *arguments: str, watched: bool = False) -> 
     for name in ('stdout', 'stderr'):
         if getattr(sys, name) is None:
             # Started without it, as by cron. Imported modules write to it.
-            setattr(sys, name, open(os.devnull, 'w'))  # noqa: SIM115
+            for replaced in (name, f'__{name}__'):
+                setattr(sys, replaced, open(os.devnull, 'w'))  # noqa: SIM115
     announce_frequently()
     try:
         run = getattr(importlib.import_module(f'diffdrive_jacobian.tools.{module}'), function)

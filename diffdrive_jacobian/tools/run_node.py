@@ -71,7 +71,9 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
     """
     program = NODES[name]
     own, ros = _cli.split_arguments(arguments)
-    ros = _cli.with_params_file(ros, _cli.parse(_parser(name, program), own))
+    if own:
+        # Not otherwise: to create the parser describes all parameters, which takes time.
+        ros = _cli.with_params_file(ros, _cli.parse(_parser(name, program), own))
     # Not above: --help needs no ROS. Only the node that runs: each takes time to import.
     from diffdrive_jacobian.ros.runner import ros_context, running
 
@@ -90,9 +92,22 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
 
 
 def _parser(name: str, program: Program) -> argparse.ArgumentParser:
-    parameters = program.parameters
+    parser = _cli.Parser(
+        prog=name,
+        usage=f'{name} [-h] [--params-file FILE | --robot NAME] '
+        '[--ros-args -p PARAMETER:=VALUE -r NAME:=NAME ...]',
+        description=textwrap.fill(program.description, 90),
+        epilog=_description(program.parameters),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    _cli.add_params_file(parser)
+    return parser
+
+
+def _description(parameters: type[NodeParameters]) -> str:
+    """Return the description of all parameters."""
     defaults = {field.name: field.default for field in fields(parameters)}
-    lines = []
+    lines = ['parameters:']
     for ros_name, (field, specification) in specifications(parameters).items():
         text = specification.description
         text += f' Must be {specification.allowed}.' if specification.allowed else ''
@@ -101,13 +116,4 @@ def _parser(name: str, program: Program) -> argparse.ArgumentParser:
             f'  {ros_name}',
             *textwrap.wrap(text, 90, initial_indent='      ', subsequent_indent='      '),
         ]
-    parser = _cli.Parser(
-        prog=name,
-        usage=f'{name} [-h] [--params-file FILE | --robot NAME] '
-        '[--ros-args -p PARAMETER:=VALUE -r NAME:=NAME ...]',
-        description=textwrap.fill(program.description, 90),
-        epilog='\n'.join(['parameters:', *lines]),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    _cli.add_params_file(parser)
-    return parser
+    return '\n'.join(lines)

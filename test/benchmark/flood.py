@@ -256,6 +256,7 @@ def measure(case: Case, executor: str, seconds: float, processes: int) -> str:
             observer.spin(20.0, observer.client.service_is_ready)
             observer.spin(2.0)
             observer.response()
+            observer.goal.publish(message('goal_pose'))
             before = resident(node)
             command = [sys.executable, __file__, '--flood', case.node, case.flooded, str(seconds)]
             floods += [

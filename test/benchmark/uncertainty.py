@@ -9,6 +9,7 @@ Then the CPU time of a covariance compared with that of first order, interleaved
 from __future__ import annotations
 
 import argparse
+import itertools
 import statistics
 import sys
 import time
@@ -21,6 +22,7 @@ from rich.table import Table
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from moments_reference import DRIVES, noisy_runs, reported_path
 
+from diffdrive_jacobian.simulation import Robot, RobotModel
 from diffdrive_jacobian.simulation.exact_moments import (
     gaussian,
     propagate_moments,
@@ -89,13 +91,22 @@ def accuracy(count: int) -> Table:
 
 
 def cost(rounds: int) -> Table:
-    """Return the table of CPU times, both sides in turn."""
-    table = Table(title='CPU time of one covariance (us)')
-    for name in ('arc', 'exact', 'first order', 'ratio'):
+    """Return the table of CPU times, both sides in turn.
+
+    A message is the state at its stamp, with both covariances.
+    """
+    table = Table(title='CPU time (us)')
+    for name in (
+        *('arc', 'covariance: exact', 'first order', 'ratio'),
+        *('message: exact', 'first order', 'ratio'),
+    ):
         table.add_column(name, justify='right')
     moments = gaussian(1e-4 * np.diag([1.0, 2.0, 3.0]))
     entries = tuple(moments[:6])
+    model = RobotModel(wheel_separation=L, wheel_travel_variance=K)
     for name, (twist, held) in ARCS.items():
+        start = Robot(model=model, stamp=0, pose=np.zeros(3), covariance=moments.second_moment)
+        robot, stamps = start.commanded(twist, 0), itertools.count(round(held * 1e9))
 
         def exact(twist=twist, held=held):
             propagated_moments(moments, 0.3, twist, held, L, K)
@@ -103,18 +114,27 @@ def cost(rounds: int) -> Table:
         def of_first_order(twist=twist, held=held):
             _propagated(*entries, 0.3, *twist, held, L, K)
 
-        sides: list[tuple[float, float]] = []
-        for _ in range(rounds):
-            pair = []
-            for side in (exact, of_first_order):
-                begin = time.process_time()
-                for _ in range(1000):
-                    side()
-                pair.append((time.process_time() - begin) * 1e3)
-            sides.append((pair[0], pair[1]))
-        ours, others = (statistics.median(side) for side in zip(*sides, strict=True))
-        ratio = statistics.median(one / other for one, other in sides)
-        table.add_row(name, f'{ours:.1f}', f'{others:.1f}', f'{ratio:.2f}')
+        def exact_message(robot=robot, stamps=stamps):
+            state = robot.at(next(stamps))
+            return state.pose_tuple, state.covariance_tuple, state.twist_covariance_tuple(0.02)
+
+        def first_order_message(robot=robot, stamps=stamps, twist=twist, held=held):
+            state = robot.at(next(stamps))
+            covariance = _propagated(*entries, 0.3, *twist, held, L, K)
+            return state.pose_tuple, covariance, state.twist_covariance_tuple(0.02)
+
+        cells = [name]
+        for pair in ((exact, of_first_order), (exact_message, first_order_message)):
+            times: list[list[float]] = [[], []]
+            for _ in range(rounds):
+                for side, found in zip(pair, times, strict=True):
+                    begin = time.process_time()
+                    for _ in range(1000):
+                        side()
+                    found.append((time.process_time() - begin) * 1e3)
+            ratio = statistics.median(one / other for one, other in zip(*times, strict=True))
+            cells += [*(f'{statistics.median(found):.1f}' for found in times), f'{ratio:.2f}']
+        table.add_row(*cells)
     return table
 
 

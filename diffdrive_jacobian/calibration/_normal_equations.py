@@ -1,0 +1,149 @@
+"""Residuals of the calibration and their Jacobians, as normal equations of poses and parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffdrive_jacobian.calibration.estimate import (
+    LEVER_ARM,
+    MULTIPLIERS,
+    TIME_OFFSETS,
+    YAW_OFFSET,
+    Estimate,
+)
+from diffdrive_jacobian.calibration.measurements import Array, Segment, wrapped
+from diffdrive_jacobian.calibration.motion import (
+    Geometry,
+    Increments,
+    adjoint,
+    composed,
+    increments,
+    inverted,
+    relative,
+)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Group:
+    """Residuals of one kind with their Jacobians, as normal equations for unit weight."""
+
+    count: float
+    diagonal: Array
+    upper: Array
+    border: Array
+    """Blocks between the poses and the parameters, shape (n, 3, p)."""
+    corner: Array
+    gradient: Array
+    """With respect to the poses, shape (n, 3)."""
+    gradient_corner: Array
+    cost: float
+
+    def cost_after(self, step: Array, change: Array) -> float:
+        """Return the sum of the squared residuals after a step, to second order."""
+        linear = 2.0 * float(np.sum(self.gradient * step) + self.gradient_corner @ change)
+        along = np.einsum('nij,nj->ni', self.diagonal, step) + 2.0 * np.einsum(
+            'nip,p->ni', self.border, change
+        )
+        square = float(np.sum(step * along) + change @ self.corner @ change)
+        square += 2.0 * float(np.einsum('ni,nij,nj->', step[:-1], self.upper, step[1:]))
+        return max(0.0, self.cost + linear + square)
+
+
+def linearized(
+    segments: Sequence[Segment], nominal: Geometry, estimate: Estimate
+) -> tuple[Group, Group, Group]:
+    """Return the normal equations of the motion, the positions and the headings."""
+    count = len(estimate.parameters)
+    geometry, sensor = estimate.geometry(nominal), estimate.sensor
+    parts: tuple[list[Group], ...] = ([], [], [])
+    for segment, states in zip(segments, estimate.states, strict=True):
+        offset = TIME_OFFSETS + segment.recording
+        at = segment.time + estimate.parameters[offset]
+        moved = increments(segment.wheel_time, segment.wheel_angles, at, geometry)
+        parts[0].append(_motion(moved, states, offset, count))
+        for kind, part in enumerate(_observation(segment, states, sensor, count), 1):
+            parts[kind].append(part)
+    motion, position, heading = (_joined(part) for part in parts)
+    return motion, position, heading
+
+
+def _motion(moved: Increments, states: Array, offset: int, count: int) -> Group:
+    """Return the normal equations of the motion, for the wheel travel variance 1 m."""
+    between = relative(states[:-1], states[1:])
+    residual = relative(moved.steps, between)
+    residual[:, 2] = wrapped(residual[:, 2])
+    weight = np.linalg.inv(moved.covariance)
+    back = -adjoint(inverted(between))
+    change = np.zeros((len(residual), 3, count))
+    change[:, :, MULTIPLIERS] = -moved.jacobian
+    # The time offset moves both ends of a step.
+    change[:, :, offset] = -(moved.rates[1:] + np.einsum('nij,nj->ni', back, moved.rates[:-1]))
+    n = len(states)
+    diagonal, border, gradient = np.zeros((n, 3, 3)), np.zeros((n, 3, count)), np.zeros((n, 3))
+    weighted_back = np.swapaxes(back, 1, 2) @ weight
+    weighted_change, weighted = weight @ change, np.einsum('nij,nj->ni', weight, residual)
+    diagonal[1:] += weight
+    diagonal[:-1] += weighted_back @ back
+    border[1:] += weighted_change
+    border[:-1] += weighted_back @ change
+    gradient[1:] += weighted
+    gradient[:-1] += np.einsum('nij,nj->ni', weighted_back, residual)
+    return Group(
+        count=3.0 * (n - 1),
+        diagonal=diagonal,
+        upper=weighted_back,
+        border=border,
+        corner=np.einsum('nip,niq->pq', change, weighted_change),
+        gradient=gradient,
+        gradient_corner=np.einsum('nip,ni->p', change, weighted),
+        cost=float(np.sum(residual * weighted)),
+    )
+
+
+def _observation(segment: Segment, states: Array, sensor: Array, count: int) -> tuple[Group, Group]:
+    """Return the normal equations of the positions and of the headings."""
+    residual = relative(composed(states, sensor), segment.poses)
+    # In the frame of the body, as the derivatives.
+    c, s = np.cos(sensor[2]), np.sin(sensor[2])
+    x, y = residual[:, 0].copy(), residual[:, 1].copy()
+    residual[:, 0], residual[:, 1] = c * x - s * y, s * x + c * y
+    residual[:, 2] = wrapped(residual[:, 2])
+    by_pose = -np.array([[1.0, 0.0, -sensor[1]], [0.0, 1.0, sensor[0]], [0.0, 0.0, 1.0]])
+    by_parameters = np.zeros((3, count))
+    by_parameters[:2, LEVER_ARM] = -np.eye(2)
+    by_parameters[2, YAW_OFFSET] = -1.0
+    groups = []
+    for rows in (slice(0, 2), slice(2, 3)):
+        J, M, e, w = by_pose[rows], by_parameters[rows], residual[:, rows], segment.weights
+        groups.append(
+            Group(
+                count=float(e.size),
+                diagonal=w[:, None, None] * (J.T @ J),
+                upper=np.zeros((len(w) - 1, 3, 3)),
+                border=w[:, None, None] * (J.T @ M),
+                corner=w.sum() * (M.T @ M),
+                gradient=w[:, None] * (e @ J),
+                gradient_corner=(w @ e) @ M,
+                cost=float(np.sum(w[:, None] * e**2)),
+            )
+        )
+    return groups[0], groups[1]
+
+
+def _joined(parts: Sequence[Group]) -> Group:
+    """Return the equations of several segments, between which nothing is coupled."""
+    uncoupled = np.zeros((1, 3, 3))
+    uppers = [block for one in parts for block in (one.upper, uncoupled)][:-1]
+    return Group(
+        count=sum(one.count for one in parts),
+        diagonal=np.concatenate([one.diagonal for one in parts]),
+        upper=np.concatenate(uppers),
+        border=np.concatenate([one.border for one in parts]),
+        corner=np.sum([one.corner for one in parts], axis=0),
+        gradient=np.concatenate([one.gradient for one in parts]),
+        gradient_corner=np.sum([one.gradient_corner for one in parts], axis=0),
+        cost=sum(one.cost for one in parts),
+    )

@@ -1,0 +1,280 @@
+"""Calibration of wheel radii and wheel separation from recordings of the wheels and a reference."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from diffdrive_jacobian.calibration.clock import time_offset
+from diffdrive_jacobian.calibration.estimate import TIME_OFFSETS, YAW_OFFSET, Estimate
+from diffdrive_jacobian.calibration.fit import fit
+from diffdrive_jacobian.calibration.measurements import (
+    Array,
+    CalibrationError,
+    Given,
+    Noise,
+    Recording,
+    Segment,
+    wrapped,
+)
+from diffdrive_jacobian.calibration.motion import Geometry, composed
+from diffdrive_jacobian.calibration.observability import undetermined
+from diffdrive_jacobian.calibration.preparation import gaps, overlapping, without_jumps
+from diffdrive_jacobian.calibration.rest import merged
+from diffdrive_jacobian.calibration.rough import rough
+
+PARAMETERS = (
+    'left_wheel_radius_multiplier',
+    'right_wheel_radius_multiplier',
+    'wheel_separation_multiplier',
+)
+"""Names of the multipliers in their order, as wheel_bridge and diff_drive_controller have them."""
+BOUNDS = (0.1, 10.0)
+"""Multipliers that `wheel_bridge` accepts."""
+START = Noise(wheel=1e-5, position=0.01, heading=0.02)
+LARGE_WHEEL_NOISE = 1e-2
+"""Wheel travel variance beyond which the reference does not follow the wheels (m)."""
+DISAGREEMENT = 30.0
+"""Largest squared distance of a recording's own estimate from that of all, in units of its covariance;
+a sum of three squares exceeds it once in a million."""
+SAME = 0.005
+"""Multipliers that differ by less agree in any case [-]."""
+ROUNDS = 3
+LONG_DELAY = 0.2
+"""Time offset that is worth a note (s)."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Calibration:
+    """The result of a calibration."""
+
+    nominal: Geometry
+    estimate: Estimate
+    recordings: tuple[Recording, ...]
+    segments: tuple[Segment, ...]
+    """Continuous motions; poses at rest are not merged."""
+    motions: tuple[Segment, ...]
+    """Continuous motions, poses at rest merged; `estimate.states` are their poses."""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def geometry(self) -> Geometry:
+        """The calibrated dimensions."""
+        return self.estimate.geometry(self.nominal)
+
+    @property
+    def multipliers(self) -> Array:
+        """Multipliers of the left radius, the right radius and the separation, shape (3,)."""
+        return np.array(self.geometry.multipliers)
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the multipliers, shape (3, 3)."""
+        scale = self.multipliers
+        return np.asarray(self.estimate.covariance()[:3, :3] * scale[:, None] * scale)
+
+    @property
+    def time_offsets(self) -> Array:
+        """What is added to the times of the poses of each recording (s)."""
+        return self.estimate.parameters[TIME_OFFSETS:]
+
+    def residuals(self) -> list[Array]:
+        """Return what remains between the reference and the most likely poses of the sensor.
+
+        Returns:
+            For each continuous motion the time since the first pose of all (s) and the residual in x, y
+            (m) and heading (rad), shape (n, 4). Poses at rest are merged.
+        """
+        parts: list[Array] = []
+        begin = before = 0.0
+        recording = 0
+        for motion, states in zip(self.motions, self.estimate.states, strict=True):
+            if not parts:
+                begin = -float(motion.time[0])
+            elif motion.recording != recording:
+                # Recordings follow each other, whenever they were made.
+                begin = before - float(motion.time[0])
+            recording = motion.recording
+            difference = motion.poses - composed(states, self.estimate.sensor)
+            difference[:, 2] = wrapped(difference[:, 2])
+            parts.append(np.column_stack([begin + motion.time, difference]))
+            before = float(parts[-1][-1, 0])
+        return parts
+
+    @property
+    def undetermined(self) -> list[tuple[str, str]]:
+        """Combinations of the multipliers that the drives do not determine, and what determines them."""
+        return undetermined(self.estimate.covariance()[:3, :3])
+
+
+def calibrate(
+    recordings: Sequence[Recording], nominal: Geometry, given: Given | None = None
+) -> Calibration:
+    """Estimate the multipliers of the wheel radii and of the wheel separation.
+
+    Args:
+        recordings: At least one. The sensor has the same place on the robot in all of them.
+        nominal: Nominal dimensions of the robot.
+        given: Quantities that are known.
+
+    Raises:
+        CalibrationError: The recordings contradict the model, or each other.
+    """
+    given = given or Given()
+    recordings = tuple(recordings)
+    notes = [note for one in recordings for note in _gap_notes(one)]
+    offsets = np.zeros(len(recordings))
+    for index, one in enumerate(recordings):
+        _check(one)
+        found = given.time_offset if given.time_offset is not None else time_offset(one, nominal)
+        offsets[index] = 0.0 if found is None else found
+    segments = [
+        segment
+        for index, one in enumerate(recordings)
+        for segment in overlapping(one, index, offsets[index], nominal.wheel_radius)
+    ]
+    if not segments:
+        raise CalibrationError(
+            'too short: the wheels and the reference have less than 5 poses in common without a gap'
+        )
+    names = [one.name for one in recordings]
+    first = rough(segments, nominal, offsets)
+    segments, found_notes = without_jumps(segments, first, offsets, names)
+    notes += found_notes
+    first = rough(segments, nominal, offsets)
+    sensor = first.sensor.copy()
+    if given.lever_arm is not None:
+        sensor[:2] = given.lever_arm
+    if given.yaw_offset is not None:
+        sensor[2] = given.yaw_offset
+    start = Estimate(
+        parameters=np.concatenate([np.log(first.geometry.multipliers), sensor, offsets]),
+        noise=START,
+        free=_free(given, len(recordings)),
+        information=np.zeros((0, 0)),
+    )
+    estimate, motions = _estimated(segments, nominal, start, given)
+    result = Calibration(
+        nominal=nominal,
+        estimate=estimate,
+        recordings=recordings,
+        segments=tuple(segments),
+        motions=tuple(motions),
+    )
+    _check_result(result)
+    if len(recordings) > 1:
+        _check_agreement(result, given)
+    for one, offset in zip(recordings, result.time_offsets.tolist(), strict=True):
+        if given.time_offset is None and abs(offset) > LONG_DELAY:
+            notes.append(
+                f'{one.name}: the clock of the reference differs by {offset:.3f} s from that '
+                'of the wheels'
+            )
+    return replace(result, notes=tuple(notes))
+
+
+def _gap_notes(one: Recording) -> list[str]:
+    lines = []
+    for what, time in (('reference', one.pose_time), ('wheels', one.wheel_time)):
+        found = gaps(time)
+        if found:
+            begin, length = max(found, key=lambda gap: gap[1])
+            lines.append(
+                f'{one.name}: {len(found)} gap{"" if len(found) == 1 else "s"} in the {what}, '
+                f'the longest of {length:.1f} s at {begin:.3f} s'
+            )
+    return lines
+
+
+def _check(one: Recording) -> None:
+    for what, time, values in (
+        ('the wheels', one.wheel_time, one.wheel_angles),
+        ('the reference', one.pose_time, one.poses),
+    ):
+        if len(time) < 2:
+            raise CalibrationError(f'{one.name}: too short: {what} have {len(time)} samples')
+        if not (np.isfinite(time).all() and np.isfinite(values).all()):
+            raise CalibrationError(f'{one.name}: {what} must be finite')
+        if (np.diff(time) <= 0.0).any():
+            raise CalibrationError(f'{one.name}: the times of {what} must increase')
+
+
+def _free(given: Given, count: int) -> np.typing.NDArray[np.bool_]:
+    free = np.ones(TIME_OFFSETS + count, dtype=bool)
+    free[3:5] = given.lever_arm is None
+    free[YAW_OFFSET] = given.yaw_offset is None
+    free[TIME_OFFSETS:] = given.time_offset is None
+    return free
+
+
+def _estimated(
+    segments: Sequence[Segment], nominal: Geometry, start: Estimate, given: Given
+) -> tuple[Estimate, list[Segment]]:
+    """Return the estimate and the motions with merged poses.
+
+    Which poses are at rest depends on the time offset, so it is repeated.
+    """
+    estimate, motions = start, list(segments)
+    for _ in range(ROUNDS):
+        before = estimate.parameters[TIME_OFFSETS:]
+        motions = [merged(one, nominal, before[one.recording]) for one in segments]
+        motions = [one for one in motions if len(one.time) > 1]
+        if not motions:
+            raise CalibrationError('the wheels never turn')
+        estimate = fit(motions, nominal, replace(estimate, states=()), given, start.parameters)
+        if np.abs(estimate.parameters[TIME_OFFSETS:] - before).max() < 1e-3:
+            break
+    return estimate, motions
+
+
+def _check_result(result: Calibration) -> None:
+    values = result.multipliers
+    if (values < BOUNDS[0]).any() or (values > BOUNDS[1]).any():
+        found = ', '.join(f'{value:.3g}' for value in values.tolist())
+        raise CalibrationError(
+            f'multipliers must be from {BOUNDS[0]:g} to {BOUNDS[1]:g}, got {found} (left, right, '
+            'separation): are the nominal dimensions right, and is the reference of this robot?'
+        )
+    noise = result.estimate.noise
+    if noise.wheel > LARGE_WHEEL_NOISE:
+        raise CalibrationError(
+            f'the reference does not follow the wheels: after 1 m they differ by '
+            f'{noise.wheel**0.5:.2g} m; is it of this robot, and do the wheels slip?'
+        )
+
+
+def _check_agreement(result: Calibration, given: Given) -> None:
+    """Raise CalibrationError if the recordings, each alone, have different multipliers."""
+    known = replace(
+        given,
+        wheel_noise=result.estimate.noise.wheel,
+        position_noise=result.estimate.noise.position,
+        heading_noise=result.estimate.noise.heading,
+    )
+    together = result.estimate.parameters[:3]
+    lines, disagree = [], False
+    for index, one in enumerate(result.recordings):
+        own = [replace(part, recording=0) for part in result.segments if part.recording == index]
+        if not own:
+            continue
+        here = np.r_[0:TIME_OFFSETS, TIME_OFFSETS + index]
+        start = replace(
+            result.estimate,
+            parameters=result.estimate.parameters[here],
+            free=result.estimate.free[here],
+        )
+        alone, _ = _estimated(own, result.nominal, start, known)
+        covariance = alone.covariance()[:3, :3]
+        off = alone.parameters[:3] - together
+        distance = float(off @ np.linalg.solve(covariance, off))
+        deviation = np.sqrt(np.diag(covariance))
+        values = zip(np.exp(alone.parameters[:3]).tolist(), deviation.tolist(), strict=True)
+        lines.append(f'{one.name}: ' + ', '.join(f'{value:.4f} ± {std:.4f}' for value, std in values))
+        disagree |= distance > DISAGREEMENT and bool((np.abs(off) > SAME).any())
+    if disagree:
+        raise CalibrationError(
+            'the recordings disagree about the multipliers (left radius, right radius, separation), '
+            f'each alone: {"; ".join(lines)}'
+        )

@@ -1,0 +1,232 @@
+"""Maximum likelihood estimate of the multipliers from wheel angles and poses of a reference.
+
+The model is that of doc/mathematics.md, "Calibration": the pose of the body is a random walk about the
+motion that the wheels measure, and the reference observes it with white noise. All poses of the body and
+all parameters are estimated together by Gauss-Newton steps. The poses form a block-tridiagonal system,
+so that a step takes a time proportional to their number. The noise is estimated by restricted maximum
+likelihood.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffdrive_jacobian.calibration import _block_tridiagonal
+from diffdrive_jacobian.calibration._normal_equations import Group, linearized
+from diffdrive_jacobian.calibration.estimate import Estimate, prior_deviations
+from diffdrive_jacobian.calibration.measurements import (
+    Array,
+    CalibrationError,
+    Given,
+    Noise,
+    Segment,
+)
+from diffdrive_jacobian.calibration.motion import Geometry, composed, inverted
+
+MAX_STEPS = 25
+FULL_STEPS = 10
+"""Steps after which they are halved: the interpolated motion of the wheels has kinks."""
+MAX_NOISE_STEPS = 40
+NOISE_CONVERGED = 2e-3
+"""Largest relative change of a variance in the last step."""
+CONVERGED = 0.02
+"""Largest change of a parameter in the last step, relative to its standard deviation."""
+NEGLIGIBLE = 1e-7
+"""Change of a parameter that is negligible in any case (-, m, rad, s)."""
+SMALLEST = Noise(wheel=1e-9, position=1e-5, heading=1e-5)
+"""Smallest noise that is estimated: with less, rounding errors dominate."""
+PRIOR_WHEEL_NOISE, PRIOR_FREEDOM = 1e-5, 2.0
+"""Wheel travel variance that is assumed in advance (m), and how many squares it counts as. In
+short drives with a coarse reference the likelihood alone is largest at zero, where the stated covariance
+would be far too small."""
+LARGEST = Noise(wheel=1.0, position=1e3, heading=1e2)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Prior:
+    """Which parameters are free, and the gradient of the prior."""
+
+    free: NDArray[np.bool_]
+    pull: Array
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Solution:
+    step: Array
+    change: Array
+    information: Array
+    logarithm: float
+    """log det of the normal matrix."""
+
+
+def fit(
+    segments: Sequence[Segment],
+    nominal: Geometry,
+    start: Estimate,
+    given: Given,
+    anchor: Array | None = None,
+) -> Estimate:
+    """Return the most likely parameters.
+
+    Args:
+        segments: Continuous motions, each with at least two poses.
+        nominal: Nominal dimensions of the robot.
+        start: Approximate parameters and noise.
+        given: What of the noise is known.
+        anchor: Parameters about which the prior lies (default: those of `start`).
+
+    Raises:
+        CalibrationError: The estimate does not converge.
+    """
+    estimate = start
+    if not estimate.states:
+        sensor = inverted(estimate.sensor)
+        estimate = replace(estimate, states=tuple(composed(one.poses, sensor) for one in segments))
+    anchor = start.parameters if anchor is None else anchor
+    scales = prior_deviations(len(anchor))
+    for count in range(MAX_STEPS):
+        groups = linearized(segments, nominal, estimate)
+        prior = _Prior(free=estimate.free, pull=(estimate.parameters - anchor) / scales**2)
+        noise, solution = _with_noise(groups, estimate.noise, given, prior)
+        size = np.abs(solution.change)
+        limit = scales[estimate.free]
+        shorten = float(min(1.0, np.min(limit / np.maximum(size, 1e-12), initial=1.0)))
+        shorten *= 1.0 if count < FULL_STEPS else 0.5
+        parameters = estimate.parameters.copy()
+        parameters[estimate.free] += shorten * solution.change
+        estimate = replace(
+            estimate,
+            parameters=parameters,
+            noise=noise,
+            states=_moved(estimate.states, shorten * solution.step),
+            information=solution.information,
+        )
+        deviation = np.sqrt(np.diag(estimate.covariance())[estimate.free])
+        if (size <= np.maximum(CONVERGED * deviation, NEGLIGIBLE)).all():
+            return estimate
+    if (size[:3] <= deviation[:3] / 5.0).all():
+        # The time offset may alternate between two sides of a kink in the motion of the wheels.
+        return estimate
+    raise CalibrationError(
+        f'the estimate does not converge within {MAX_STEPS} steps: the poses of the reference do not '
+        'fit the motion of the wheels'
+    )
+
+
+def information(segments: Sequence[Segment], nominal: Geometry, truth: Estimate) -> Array:
+    """Return the Fisher information of the free parameters of an estimate, at its states and noise.
+
+    Its inverse is the Cramer-Rao bound if these are the true ones.
+    """
+    groups = linearized(segments, nominal, truth)
+    prior = _Prior(free=truth.free, pull=np.zeros(len(truth.parameters)))
+    return _solved(groups, _weights(truth.noise), prior).information
+
+
+def _moved(states: Sequence[Array], step: Array) -> tuple[Array, ...]:
+    ends = np.cumsum([len(one) for one in states])[:-1]
+    return tuple(composed(one, part) for one, part in zip(states, np.split(step, ends), strict=True))
+
+
+def _weights(noise: Noise) -> Array:
+    return 1.0 / np.array([noise.wheel, noise.position**2, noise.heading**2])
+
+
+def _solved(groups: tuple[Group, Group, Group], weights: Array, prior: _Prior) -> _Solution:
+    """Return the Gauss-Newton step for given weights of the groups."""
+    free = prior.free
+
+    def total(name: str) -> Array:
+        return np.asarray(sum(w * getattr(one, name) for w, one in zip(weights, groups, strict=True)))
+
+    border = total('border')[:, :, free]
+    right = np.concatenate([border, total('gradient')[:, :, None]], axis=2)
+    solved, logarithm = _block_tridiagonal.solve(total('diagonal'), total('upper'), right)
+    eliminated = np.einsum('nip,niq->pq', border, solved)
+    information = total('corner')[np.ix_(free, free)] - eliminated[:, :-1]
+    information = (information + information.T) / 2.0
+    damped = information + np.diag(prior_deviations(len(free))[free] ** -2.0)
+    change = -np.linalg.solve(
+        damped, total('gradient_corner')[free] + prior.pull[free] - eliminated[:, -1]
+    )
+    step = -solved[:, :, -1] - solved[:, :, :-1] @ change
+    if not (np.isfinite(change).all() and np.isfinite(step).all()):
+        raise CalibrationError('the estimate diverges: the poses do not fit the motion of the wheels')
+    return _Solution(
+        step=step,
+        change=change,
+        information=information,
+        logarithm=logarithm + float(np.linalg.slogdet(damped)[1]),
+    )
+
+
+def _with_noise(
+    groups: tuple[Group, Group, Group], noise: Noise, given: Given, prior: _Prior
+) -> tuple[Noise, _Solution]:
+    """Return the most likely noise at a linearization, and the step for it.
+
+    At the maximum of the restricted likelihood the weighted squares of each group equal its degrees of
+    freedom, which follow from the derivative of the log det of the normal matrix.
+    """
+    values = (given.wheel_noise, given.position_noise, given.heading_noise)
+    unknown = np.array([value is None for value in values])
+    weights = _weights(
+        Noise(
+            wheel=given.wheel_noise or noise.wheel,
+            position=given.position_noise or noise.position,
+            heading=given.heading_noise or noise.heading,
+        )
+    )
+    least, most = _weights(LARGEST), _weights(SMALLEST)
+    solution = _solved(groups, weights, prior)
+    counts = np.array([one.count for one in groups])
+    before: tuple[Array, Array] | None = None
+    for _ in range(MAX_NOISE_STEPS if unknown.any() else 0):
+        costs = np.array(_costs(groups, solution, prior.free))
+        freedom = np.maximum(counts - _used(groups, weights, prior), 1e-3 * counts)
+        freedom[0] += PRIOR_FREEDOM
+        costs[0] += PRIOR_FREEDOM * PRIOR_WHEEL_NOISE
+        proposed = np.clip(freedom / np.maximum(costs, 1e-300), least, most)
+        now, change = np.log(weights), np.where(unknown, np.log(proposed / weights), 0.0)
+        target = now + change
+        if before is not None:
+            # Anderson acceleration with one step of memory: alone, the steps shrink slowly.
+            slope = change - before[1]
+            share = float(np.clip(slope @ change / max(float(slope @ slope), 1e-300), -5.0, 0.5))
+            target = target - share * (target - before[0] - before[1])
+        before = now, change
+        weights = np.clip(np.exp(target), least, most)
+        solution = _solved(groups, weights, prior)
+        if np.abs(change).max() < NOISE_CONVERGED:
+            break
+    wheel, position, heading = (1.0 / weights).tolist()
+    return Noise(wheel=wheel, position=position**0.5, heading=heading**0.5), solution
+
+
+def _costs(
+    groups: tuple[Group, Group, Group], solution: _Solution, free: NDArray[np.bool_]
+) -> list[float]:
+    change = np.zeros(len(free))
+    change[free] = solution.change
+    return [one.cost_after(solution.step, change) for one in groups]
+
+
+def _used(
+    groups: tuple[Group, Group, Group],
+    weights: Array,
+    prior: _Prior,
+) -> Array:
+    """Return the degrees of freedom that the estimate takes from each group, shape (3,)."""
+    h = 0.05
+    used = np.zeros(3)
+    for kind in (1, 2):
+        shifted = [weights * np.where(np.arange(3) == kind, np.exp(sign * h), 1.0) for sign in (1, -1)]
+        more, less = (_solved(groups, one, prior).logarithm for one in shifted)
+        used[kind] = (more - less) / (2.0 * h)
+    # The derivatives add up to the number of unknowns.
+    used[0] = groups[0].diagonal.shape[0] * 3 + int(prior.free.sum()) - used[1] - used[2]
+    return used

@@ -1,0 +1,61 @@
+"""Which combinations of the multipliers a drive does not determine, in words."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from diffdrive_jacobian.calibration.measurements import Array
+
+UNDETERMINED = 0.02
+"""Standard deviation of a combination of multipliers beyond which it counts as not determined [-]."""
+_WITHIN = 0.98
+"""Part of a combination that must lie in the undetermined space."""
+_TURN = 'turn in place or drive arcs, in both directions'
+_STRAIGHT = 'drive straight'
+COMBINATIONS: tuple[tuple[str, tuple[float, float, float], str], ...] = (
+    ('the wheel separation', (0.0, 0.0, 1.0), _TURN),
+    (
+        'the common scale of radii and separation (only their ratio is determined)',
+        (1.0, 1.0, 1.0),
+        _STRAIGHT,
+    ),
+    ('the mean of the wheel radii', (1.0, 1.0, 0.0), _STRAIGHT),
+    ('the difference of the wheel radii', (1.0, -1.0, 0.0), f'{_STRAIGHT}, further'),
+    ('the radius of the left wheel', (1.0, 0.0, 0.0), f'{_STRAIGHT}, with both wheels turning'),
+    ('the radius of the right wheel', (0.0, 1.0, 0.0), f'{_STRAIGHT}, with both wheels turning'),
+)
+"""Name, direction in the space of the logarithms of the multipliers (left, right, separation), and what
+drive determines it."""
+
+
+def undetermined(covariance: Array) -> list[tuple[str, str]]:
+    """Return the combinations of multipliers that are not determined, and what drive determines them.
+
+    Args:
+        covariance: Of the logarithms of the multipliers (left, right, separation), shape (3, 3).
+    """
+    variances, directions = np.linalg.eigh(covariance)
+    space = directions[:, variances > UNDETERMINED**2]
+    dimension = space.shape[1]
+    if dimension == 3:
+        return [('none of the multipliers', f'{_STRAIGHT}, and {_TURN}')]
+    found: list[tuple[str, str]] = []
+    spanned = np.zeros((3, 0))
+    for name, direction, remedy in COMBINATIONS:
+        unit = np.array(direction) / np.linalg.norm(direction)
+        if np.linalg.norm(space.T @ unit) < _WITHIN or spanned.shape[1] == dimension:
+            continue
+        rest = unit - spanned @ (spanned.T @ unit)
+        if np.linalg.norm(rest) > 0.5:
+            spanned = np.column_stack([spanned, rest / np.linalg.norm(rest)])
+            found.append((name, remedy))
+    if spanned.shape[1] < dimension:
+        for direction in space.T:
+            rest = direction - spanned @ (spanned.T @ direction)
+            if np.linalg.norm(rest) > 0.5:
+                weights = rest / np.linalg.norm(rest)
+                parts = zip(weights.tolist(), ('left radius', 'right radius', 'separation'), strict=True)
+                text = ', '.join(f'{weight:+.2f} {name}' for weight, name in parts)
+                found.append((f'the combination {text}', f'{_STRAIGHT}, and {_TURN}'))
+                spanned = np.column_stack([spanned, weights])
+    return found

@@ -1,0 +1,171 @@
+"""From recordings to continuous motions: overlap in time, gaps, glitches and jumps of the reference."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffdrive_jacobian.calibration.measurements import (
+    Array,
+    CalibrationError,
+    Recording,
+    Segment,
+)
+from diffdrive_jacobian.calibration.rough import Rough
+
+GAP = 0.5
+"""A shorter pause between samples is not a gap (s)."""
+BLIND = 0.02
+"""Distance that a wheel may travel between two of its samples around a gap (m)."""
+FEWEST = 5
+"""Fewest poses of a continuous motion that is used."""
+FEWEST_IN_ALL = 10
+FLOORS = np.array([0.03, 0.03, 0.06])
+"""Differences that are never taken for a jump (m, m, rad)."""
+SIGMAS = 8.0
+SHARES = np.array([0.1, 0.1, 0.5])
+"""Allowed difference relative to the distance that the wheels travel (m/m, m/m, rad/m)."""
+GLITCH = 3
+"""Number of poses after which a pose that is off is no glitch but a jump."""
+MOST_JUMPS = 0.05
+"""Share of poses at jumps beyond which the reference is refused."""
+
+
+def overlapping(recording: Recording, index: int, offset: float, radius: float) -> list[Segment]:
+    """Return the continuous motions of a recording: its times in common, split at gaps of the wheels.
+
+    Raises:
+        CalibrationError: There is no time in common.
+    """
+    wheels, at = recording.wheel_time, recording.pose_time + offset
+    inside = (at >= wheels[0]) & (at <= wheels[-1])
+    if not inside.any():
+        raise CalibrationError(
+            f'{recording.name}: the wheels and the reference have no time in common: wheels from '
+            f'{wheels[0]:.3f} to {wheels[-1]:.3f} s, reference from {at[0]:.3f} to {at[-1]:.3f} s'
+        )
+    steps = np.diff(wheels)
+    blind = (steps > max(GAP, 10.0 * float(np.median(steps)))) & (
+        np.abs(np.diff(recording.wheel_angles, axis=0)).max(axis=1) * radius > BLIND
+    )
+    found = []
+    bounds = [0, *(np.flatnonzero(blind) + 1).tolist(), len(wheels)]
+    for first, last in pairwise(bounds):
+        if last - first < 2:
+            continue
+        here = inside & (at >= wheels[first]) & (at <= wheels[last - 1])
+        if np.count_nonzero(here) >= FEWEST:
+            found.append(
+                Segment(
+                    recording=index,
+                    wheel_time=wheels[first:last],
+                    wheel_angles=recording.wheel_angles[first:last],
+                    time=recording.pose_time[here],
+                    poses=recording.poses[here],
+                    weights=np.ones(int(np.count_nonzero(here))),
+                )
+            )
+    return found
+
+
+def gaps(time: Array) -> list[tuple[float, float]]:
+    """Return pauses between samples that are much longer than usual: their beginning and length (s)."""
+    steps = np.diff(time)
+    if not len(steps):
+        return []
+    long = np.flatnonzero(steps > max(2.0 * GAP, 10.0 * float(np.median(steps))))
+    return [(float(time[i]), float(steps[i])) for i in long]
+
+
+def without_jumps(
+    segments: Sequence[Segment], found: Rough, offsets: Array, names: Sequence[str]
+) -> tuple[list[Segment], list[str]]:
+    """Remove glitches of the reference, and split motions at its jumps.
+
+    Returns:
+        The motions, and descriptions of what was found.
+
+    Raises:
+        CalibrationError: There are too many of them, or too few poses remain.
+    """
+    kept: list[Segment] = []
+    notes: list[str] = []
+    poses = glitches = 0
+    jumps: list[tuple[float, float, str]] = []
+    differences = [found.differences(one, offsets[one.recording]) for one in segments]
+    everything = np.concatenate([difference for difference, _ in differences])
+    allowed = FLOORS + SIGMAS * 1.4826 * np.median(np.abs(everything), axis=0)
+    for segment, (difference, travel) in zip(segments, differences, strict=True):
+        poses += len(segment.time)
+        off = (np.abs(difference) > allowed + travel[:, None] * SHARES).any(axis=1)
+        use, starts = _followed(segment, found, offsets[segment.recording], off, allowed)
+        glitches += int(np.count_nonzero(~use))
+        for start in starts:
+            size = float(np.hypot(*difference[start - 1, :2]))
+            jumps.append((float(segment.time[start]), size, names[segment.recording]))
+        bounds = [0, *starts, len(segment.time)]
+        for first, last in pairwise(bounds):
+            here = np.flatnonzero(use[first:last]) + first
+            if len(here) >= FEWEST:
+                kept.append(
+                    replace(
+                        segment,
+                        time=segment.time[here],
+                        poses=segment.poses[here],
+                        weights=segment.weights[here],
+                    )
+                )
+    if glitches + len(jumps) > MOST_JUMPS * poses:
+        raise CalibrationError(
+            f'the poses of the reference do not follow the wheels: {glitches + len(jumps)} of {poses} '
+            'are off; are they of this robot, in one frame, and by the same clock?'
+        )
+    if sum(len(one.time) for one in kept) < FEWEST_IN_ALL:
+        raise CalibrationError(
+            f'too short: the wheels and the reference have {poses} poses in common, at least '
+            f'{FEWEST_IN_ALL} are needed'
+        )
+    if glitches:
+        notes.append(f'{glitches} poses of the reference are glitches and were left out')
+    notes += [
+        f'{name}: the reference jumps by {size:.3f} m at {time:.3f} s; what follows is aligned anew'
+        for time, size, name in jumps[:4]
+    ]
+    if len(jumps) > 4:
+        notes.append(f'{len(jumps) - 4} further jumps of the reference')
+    return kept, notes
+
+
+def _followed(
+    segment: Segment, found: Rough, offset: float, off: NDArray[np.bool_], allowed: Array
+) -> tuple[NDArray[np.bool_], list[int]]:
+    """Return which poses are no glitches, and where the reference continues elsewhere after a jump."""
+    use = np.ones(len(segment.time), dtype=bool)
+    starts: list[int] = []
+    index = 0
+    marked = np.flatnonzero(off) + 1
+    for mark in marked.tolist():
+        if mark <= index:
+            continue
+        # Does one of the next poses continue the one before?
+        last = mark - 1
+        for back in range(mark + 1, min(mark + 1 + GLITCH, len(use))):
+            pair = replace(
+                segment,
+                time=segment.time[[last, back]],
+                poses=segment.poses[[last, back]],
+                weights=segment.weights[[last, back]],
+            )
+            difference, travel = found.differences(pair, offset)
+            if (np.abs(difference) <= allowed + travel[:, None] * SHARES).all():
+                use[mark:back] = False
+                index = back
+                break
+        else:
+            starts.append(mark)
+            index = mark
+    return use, starts

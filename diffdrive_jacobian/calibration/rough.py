@@ -1,0 +1,182 @@
+"""Approximate parameters by linear least squares over short parts of the drives.
+
+They are where the estimate starts, and what jumps of the reference are compared with. Robust: parts that
+do not fit have no weight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffdrive_jacobian.calibration.measurements import Array, CalibrationError, Segment, wrapped
+from diffdrive_jacobian.calibration.motion import (
+    Geometry,
+    Increments,
+    composed,
+    increments,
+    inverted,
+    relative,
+)
+
+PARTS = 400
+"""Largest number of parts into which the drives are divided."""
+ROUNDS = 6
+LEAST = 0.05
+"""Wheel angle below which the wheels count as never turning (rad)."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Rough:
+    """Approximate parameters."""
+
+    geometry: Geometry
+    sensor: Array
+    """Pose of the sensor in the body frame, shape (3,)."""
+
+    def differences(self, segment: Segment, time_offset: float) -> tuple[Array, Array]:
+        """Return what differs between poses of the reference and the wheels.
+
+        Returns:
+            The poses in the frames of the poses before, relative to those that the wheels measure,
+            shape (n - 1, 3), and the distance that both wheels travel between them, shape (n - 1,).
+        """
+        moved = _moved(segment, self.geometry, time_offset)
+        expected = composed(composed(inverted(self.sensor), moved.steps), self.sensor)
+        found = relative(segment.poses[:-1], segment.poses[1:])
+        difference = relative(expected, found)
+        difference[:, 2] = wrapped(difference[:, 2])
+        return difference, moved.travel
+
+
+def _moved(segment: Segment, geometry: Geometry, offset: float) -> Increments:
+    return increments(segment.wheel_time, segment.wheel_angles, segment.time + offset, geometry)
+
+
+def rough(segments: Sequence[Segment], nominal: Geometry, offsets: Array) -> Rough:
+    """Return approximate parameters.
+
+    Args:
+        segments: Continuous motions.
+        nominal: Nominal dimensions.
+        offsets: Time offset of each recording (s).
+
+    Raises:
+        CalibrationError: The wheels or the reference do not move, or turn in opposite senses.
+    """
+    parts = [_parts(one, nominal, offsets[one.recording]) for one in segments]
+    radii, separation = np.array(nominal.radii), nominal.separation
+    angles = np.concatenate([angle for angle, _ in parts])
+    rims = angles * radii
+    if np.abs(angles).sum() < LEAST:
+        raise CalibrationError(
+            f'the wheels never turn: they move by {np.abs(angles).sum():.3g} rad in all'
+        )
+    turns = np.concatenate([turn for _, turn in parts])
+    gains, _ = _robust(
+        np.column_stack([rims[:, 0], -rims[:, 1]]) / separation, turns, [1.0, 1.0], [0.7, 0.7], 0.02
+    )
+    if gains.sum() < 0.0:
+        raise CalibrationError(
+            'the headings of the reference turn against those of the wheels: the left and the right '
+            'wheel are swapped, an angle has the wrong sign, or the frame of the reference is mirrored '
+            'or upside down'
+        )
+    # From here on the turns of the wheels agree with those of the reference.
+    gains = np.clip(gains, 0.05, 20.0)
+    turning = Geometry(
+        wheel_radius=nominal.wheel_radius,
+        wheel_separation=nominal.wheel_separation,
+        multipliers=(float(gains[1]), float(gains[0]), 1.0),
+    )
+    rows, values = [], []
+    for one in segments:
+        A, b = _positions(one, turning, offsets[one.recording])
+        rows.append(A)
+        values.append(b)
+    found, _ = _robust(
+        np.concatenate(rows), np.concatenate(values), [1.0, 0.0, 0.0, 0.0], [10.0, 10.0, 1.0, 1.0], 0.01
+    )
+    scale = float(np.hypot(*found[:2]))
+    if not 0.05 <= scale <= 20.0:
+        raise CalibrationError(
+            f'the reference moves {scale:.2g} times as far as the wheels: its poses are not those of '
+            'this robot, or the nominal wheel radius is wrong'
+        )
+    yaw = float(np.arctan2(found[1], found[0]))
+    c, s = np.cos(yaw), np.sin(yaw)
+    lever = np.array([[c, -s], [s, c]]) @ found[2:]
+    left, right = (float(np.clip(gain * scale, 0.05, 20.0)) for gain in (gains[1], gains[0]))
+    geometry = Geometry(
+        wheel_radius=nominal.wheel_radius,
+        wheel_separation=nominal.wheel_separation,
+        multipliers=(left, right, float(np.clip(scale, 0.05, 20.0))),
+    )
+    return Rough(geometry=geometry, sensor=np.array([*lever, yaw]))
+
+
+def _ends(travel: Array, length: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the first and the last pose of each part."""
+    place = np.concatenate([[0.0], np.cumsum(travel)])
+    bounds = np.unique(np.searchsorted(place, np.arange(0.0, place[-1] + length, length)))
+    bounds = np.unique(np.minimum(bounds, len(place) - 1))
+    return bounds[:-1], bounds[1:]
+
+
+def _length(segment: Segment, travel: Array, separation: float) -> float:
+    return max(2.0 * separation, float(travel.sum()) / PARTS)
+
+
+def _parts(segment: Segment, nominal: Geometry, offset: float) -> tuple[Array, Array]:
+    """Return the turns of both wheels and of the sensor in each part, shapes (n, 2) and (n,) (rad)."""
+    moved = _moved(segment, nominal, offset)
+    first, last = _ends(moved.travel, _length(segment, moved.travel, nominal.separation))
+    at = segment.time + offset
+    angles = np.column_stack(
+        [np.interp(at, segment.wheel_time, segment.wheel_angles[:, side]) for side in (0, 1)]
+    )
+    # Relative to the wheels the heading changes too little between two poses to be ambiguous.
+    heading = segment.poses[:, 2] - moved.poses[:, 2]
+    heading = moved.poses[:, 2] + np.unwrap(heading)
+    return angles[last] - angles[first], heading[last] - heading[first]
+
+
+def _positions(segment: Segment, geometry: Geometry, offset: float) -> tuple[Array, Array]:
+    """Return equations for the scale, the yaw offset and the lever arm: `A x = b`."""
+    moved = _moved(segment, geometry, offset)
+    first, last = _ends(moved.travel, _length(segment, moved.travel, geometry.separation))
+    step = relative(moved.poses[first], moved.poses[last])
+    found = relative(segment.poses[first], segment.poses[last])
+    c, s = np.cos(step[:, 2]), np.sin(step[:, 2])
+    x, y = step[:, 0], step[:, 1]
+    A = np.concatenate([np.column_stack([x, y, c - 1.0, -s]), np.column_stack([y, -x, s, c - 1.0])])
+    return A, np.concatenate([found[:, 0], found[:, 1]])
+
+
+def _robust(
+    A: Array, b: Array, prior: Sequence[float], deviations: Sequence[float], noise: float
+) -> tuple[Array, float]:
+    """Return the least-squares solution without outliers (Tukey), and the scale of the errors.
+
+    Args:
+        A: Shape (n, m).
+        b: Shape (n,).
+        prior: Solution where the equations do not determine it.
+        deviations: How far it may be from that.
+        noise: Standard deviation of the equations for the weight of the prior, and the least scale.
+    """
+    ridge = np.diag(noise**2 / np.square(deviations))
+    target = ridge @ np.asarray(prior)
+    weights = np.ones(len(b))
+    scale = noise
+    x = np.asarray(prior, dtype=np.float64)
+    for _ in range(ROUNDS):
+        weighted = A * weights[:, None]
+        x = np.linalg.solve(weighted.T @ A + ridge, weighted.T @ b + target)
+        error = np.abs(b - A @ x)
+        scale = max(noise, 1.4826 * float(np.median(error)))
+        weights = np.maximum(0.0, 1.0 - (error / (6.0 * scale)) ** 2) ** 2
+    return x, scale

@@ -1,0 +1,210 @@
+"""Messages of wheels and of a reference as samples over time."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffdrive_jacobian.bags.bag_reader import BagError
+from diffdrive_jacobian.messages.conversion import MessageError, from_pose, from_time, quoted
+from diffdrive_jacobian.time_units import NANOSECONDS
+
+Array = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+JOINTS = 'sensor_msgs/msg/JointState'
+POSES: dict[str, Callable[[Any], Any]] = {
+    'nav_msgs/msg/Odometry': lambda message: message.pose.pose,
+    'geometry_msgs/msg/PoseStamped': lambda message: message.pose,
+    'geometry_msgs/msg/PoseWithCovarianceStamped': lambda message: message.pose.pose,
+}
+"""Types of a reference, and where they have the pose."""
+MOST_TILT = 0.5
+"""Median tilt of the sensor beyond which its frame is not that of a floor (rad)."""
+FASTEST = 300.0
+"""Wheel speed beyond which angles jump (rad/s)."""
+BACK = 0.5
+"""A clock that goes back further was reset (s)."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Samples:
+    """Values over time, in the order of their recording."""
+
+    received: Times
+    """Times of recording, shape (n,) (ns)."""
+    stamps: Times
+    """Stamps, shape (n,) (ns)."""
+    values: Array
+    """Shape (n, k)."""
+
+    @classmethod
+    def of(cls, times: Sequence[tuple[int, int]], values: Sequence[Sequence[float]]) -> Samples:
+        """Return samples of times of recording with stamps, and of values."""
+        received, stamps = np.array(times, dtype=np.int64).T
+        return cls(received=received, stamps=stamps, values=np.array(values, dtype=np.float64))
+
+
+@dataclass(slots=True)
+class JointRows:
+    """Messages of the joints: time of recording, stamp, positions and speeds by name."""
+
+    rows: list[tuple[int, int, dict[str, float], dict[str, float]]] = field(default_factory=list)
+    names: Counter[str] = field(default_factory=Counter)
+
+    def add(self, received: int, message: Any, kind: str) -> None:
+        """Add a message.
+
+        Raises:
+            MessageError: It is invalid.
+        """
+        names = list(message.name)
+        found: list[dict[str, float]] = []
+        for values in (message.position, message.velocity):
+            if len(values) not in (0, len(names)):
+                raise MessageError('joint state must have as many values as names')
+            found.append(dict(zip(names, values if len(values) else (), strict=False)))
+        stamp = from_time(message.header.stamp) or received
+        self.rows.append((received, stamp, found[0], found[1]))
+        self.names.update(names)
+
+    def of(self, wheels: tuple[str, str], where: object, topic: str) -> tuple[Samples, bool]:
+        """Return the angles of the right and the left wheel, or their speeds if there are none.
+
+        Args:
+            wheels: Joints of the left and the right wheel.
+            where: The bag, for messages.
+            topic: The topic, for messages.
+
+        Returns:
+            The samples, and whether these are speeds.
+
+        Raises:
+            BagError: There are fewer than two.
+        """
+        left, right = wheels
+        for are_speeds in (False, True):
+            times, values = [], []
+            for received, stamp, *both in self.rows:
+                joints = both[are_speeds]
+                pair = joints.get(right, math.nan), joints.get(left, math.nan)
+                if all(map(math.isfinite, pair)):
+                    times.append((received, stamp))
+                    values.append(pair)
+            if len(values) > 1:
+                return Samples.of(times, values), are_speeds
+        raise BagError(
+            f'{where}: {topic} has less than two messages with finite positions or velocities of '
+            f'{quoted(wheels)}'
+        )
+
+
+@dataclass(slots=True)
+class PoseRows:
+    """Messages of the reference: time of recording, stamp, x, y, theta, z, tilt."""
+
+    rows: list[tuple[int, int, float, float, float, float, float]] = field(default_factory=list)
+    frames: Counter[str] = field(default_factory=Counter)
+
+    def add(self, received: int, message: Any, kind: str) -> None:
+        """Add a message.
+
+        Raises:
+            MessageError: It is invalid.
+        """
+        pose = POSES[kind](message)
+        x, y, theta = from_pose(pose).tolist()
+        q = pose.orientation
+        tilt = math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (q.x**2 + q.y**2))))
+        stamp = from_time(message.header.stamp) or received
+        self.rows.append((received, stamp, x, y, theta, float(pose.position.z), tilt))
+        self.frames[str(message.header.frame_id)] += 1
+
+    def samples(self) -> Samples:
+        """Return `[x, y, theta]` over time."""
+        return Samples.of([row[:2] for row in self.rows], [row[2:5] for row in self.rows])
+
+    def check(self, where: object, topic: str) -> None:
+        """Raise BagError if the poses are in several frames, or not in one of the floor."""
+        if len(self.frames) > 1:
+            raise BagError(
+                f'{where}: the poses on {topic} are in several frames, '
+                f'{quoted(sorted(self.frames))}: one is needed'
+            )
+        values = np.array([row[2:] for row in self.rows])
+        x, y, z = (float(np.ptp(values[:, column])) for column in (0, 1, 3))
+        tilt = float(np.median(values[:, 4]))
+        if tilt > MOST_TILT or (np.isfinite(z) and z > 0.2 and z > 0.5 * max(x, y)):
+            raise BagError(
+                f'{where}: the frame of {topic} is not that of a floor with z up: the sensor is tilted '
+                f'by {tilt:.2g} rad and moves by {z:.2g} m in z, {x:.2g} m in x and {y:.2g} m in y'
+            )
+
+
+def common_clock(
+    wheels: Samples, poses: Samples, wheels_topic: str, poses_topic: str
+) -> tuple[Times, Times, str]:
+    """Return the times of the wheels and of the poses, and a note.
+
+    These are the stamps. If the stamps have no time in common, the clocks differ, and the times of
+    recording are returned.
+    """
+    begin = max(wheels.stamps.min(), poses.stamps.min())
+    end = min(wheels.stamps.max(), poses.stamps.max())
+    if begin < end:
+        return wheels.stamps, poses.stamps, ''
+    apart = (int(poses.stamps[0]) - int(wheels.stamps[0])) / NANOSECONDS
+    note = (
+        f'the stamps on {poses_topic} and {wheels_topic} are {apart:.1f} s apart: they are of different '
+        'clocks, so the times of recording are used'
+    )
+    return wheels.received, poses.received, note
+
+
+def increasing(times: Times, values: Array, what: str) -> tuple[Array, Array]:
+    """Return times in s, sorted, each once, with their values.
+
+    Raises:
+        BagError: The clock was reset.
+    """
+    steps = np.diff(times)
+    if len(steps) and steps.min() < -BACK * NANOSECONDS:
+        at = int(np.argmin(steps))
+        raise BagError(
+            f'{what} goes back in time by {-steps[at] / NANOSECONDS:.3f} s after '
+            f'{(times[at] - times.min()) / NANOSECONDS:.3f} s: its clock was reset; split the bag there'
+        )
+    unique, first = np.unique(times, return_index=True)
+    return np.asarray(unique / NANOSECONDS), values[first]
+
+
+def integrated(time: Array, speeds: Array) -> Array:
+    """Return angles from speeds, by trapezoids, shape (n, 2) (rad)."""
+    means = (speeds[1:] + speeds[:-1]) / 2.0
+    steps = means * np.diff(time)[:, None]
+    return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+
+
+def unwrapped(time: Array, angles: Array, what: str) -> Array:
+    """Return angles that are continuous, shape (n, 2) (rad). Those within one turn are unwrapped.
+
+    Raises:
+        BagError: An angle jumps.
+    """
+    if len(angles) > 1 and np.ptp(angles) <= 2.0 * math.pi + 1e-3:
+        angles = np.unwrap(angles, axis=0)
+    speeds = np.abs(np.diff(angles, axis=0)).max(axis=1) / np.maximum(np.diff(time), 1e-3)
+    if len(speeds) and speeds.max() > FASTEST:
+        at = int(np.argmax(speeds))
+        step = float(np.abs(angles[at + 1] - angles[at]).max())
+        raise BagError(
+            f'{what}: an angle of a wheel jumps by {step:.3g} rad after {time[at]:.3f} s: its counter '
+            'was reset; split the bag there'
+        )
+    return angles

@@ -1,0 +1,268 @@
+"""Estimate wheel radii and wheel separation from recorded drives with a reference of the pose."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from diffdrive_jacobian.bags.bag_reader import BagError
+from diffdrive_jacobian.calibration import Calibration, CalibrationError, Geometry, Given, calibrate
+from diffdrive_jacobian.calibration.description import (
+    describe,
+    explain_undetermined,
+    parameter_file,
+)
+from diffdrive_jacobian.plots.calibration_figure import draw
+from diffdrive_jacobian.plots.output_files import create, new_file
+from diffdrive_jacobian.reading.calibration_data import (
+    WheelsAndReference,
+    read_wheels_and_reference,
+)
+from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.text import PATH_LIMIT, printable
+from diffdrive_jacobian.tools import _cli
+
+PROGRAM = 'calibrate_run'
+ENDINGS = ('yaml', 'yml')
+RADIUS_BOUNDS, SEPARATION_BOUNDS = (1e-3, 10.0), (1e-3, 100.0)
+"""Nominal dimensions that the nodes accept (m)."""
+
+
+class UsageError(Exception):
+    """An argument is invalid; the message names it."""
+
+
+def main(arguments: Sequence[str], signals: Signals) -> int:
+    """Run the tool and return its exit code."""
+    own, ros = _cli.split_arguments(arguments)
+    parser = _parser()
+    options = _cli.parse(parser, [*own, *ros], ros=False)
+    try:
+        bags = [Path(bag) for bag in options.bags]
+        if len({bag.resolve() for bag in bags}) < len(bags):
+            raise UsageError(f'each bag can be given once, got {" ".join(map(str, bags))}')
+        output, picture = _outputs(options, bags)
+        read: list[WheelsAndReference] = []
+        for bag in bags:
+            read.append(
+                read_wheels_and_reference(
+                    bag,
+                    wheels=options.wheels_topic,
+                    reference=options.reference,
+                    names=None if options.wheels is None else tuple(options.wheels),
+                )
+            )
+            for note in read[-1].notes:
+                _note(f'{printable(bag, PATH_LIMIT)}: {note}')
+            if signals.count:
+                return _interrupted()
+        nominal = _nominal(options, read)
+    except (BagError, UsageError, ValueError, OSError) as error:
+        return _cli.complain(PROGRAM, printable(error, PATH_LIMIT))
+    try:
+        result = calibrate([one.recording for one in read], nominal, _given(options))
+    except CalibrationError as error:
+        return _cli.complain(PROGRAM, printable(error, PATH_LIMIT), _cli.FAILED)
+    for note in result.notes:
+        _note(note)
+    if signals.count:
+        return _interrupted()
+    _print_summary(result, read)
+    if missing := explain_undetermined(result):
+        return _cli.complain(PROGRAM, f'{missing}. Nothing was written', _cli.FAILED)
+    return _write(result, read, output, picture)
+
+
+def _note(text: str) -> None:
+    print(f'{PROGRAM}: {text}', file=sys.stderr)
+
+
+def _print_summary(result: Calibration, read: Sequence[WheelsAndReference]) -> None:
+    for one in read:
+        recording = one.recording
+        begin = max(recording.wheel_time[0], recording.pose_time[0])
+        end = min(recording.wheel_time[-1], recording.pose_time[-1])
+        left, right = map(printable, one.wheel_names)
+        print(
+            f'{recording.name}: {end - begin:.1f} s, {len(recording.pose_time)} poses on '
+            f'{printable(one.reference_topic)}, {len(recording.wheel_time)} samples of {left} and '
+            f'{right} on {printable(one.wheels_topic)}'
+        )
+    for line in describe(result):
+        print(line)
+
+
+def _write(
+    result: Calibration, read: Sequence[WheelsAndReference], output: Path, picture: Path | None
+) -> int:
+    """Write the parameter file and the picture, and return the exit code."""
+    names = ', '.join(printable(Path(one.recording.name).name) for one in read)
+    files: list[tuple[Path, bytes]] = [(output, parameter_file(result, names).encode())]
+    if picture is not None:
+        try:
+            files.append((picture, draw(result, 'png')))
+        except ModuleNotFoundError as error:
+            if (error.name or '').split('.')[0] != 'matplotlib':
+                raise
+            _note("not drawn: matplotlib is not installed: pip install 'diffdrive_jacobian[plot]'")
+    done: list[Path] = []
+    for path, data in files:
+        try:
+            create(path, data)
+        except OSError as error:
+            for one in done:
+                one.unlink(missing_ok=True)
+            message = f'{path} cannot be written: {error.strerror or error}; nothing was written'
+            return _cli.complain(PROGRAM, printable(message, PATH_LIMIT), _cli.FAILED)
+        done.append(path)
+    for path in done:
+        print(printable(path, PATH_LIMIT))
+    return _cli.DONE
+
+
+def _interrupted() -> int:
+    print(f'{PROGRAM}: interrupted: nothing was written', file=sys.stderr)
+    return _cli.INTERRUPTED
+
+
+def _outputs(options: argparse.Namespace, bags: Sequence[Path]) -> tuple[Path, Path | None]:
+    """Return the paths of the parameter file and of the picture.
+
+    Raises:
+        FileExistsError: One of them exists.
+        OSError: One of them cannot be written.
+        ValueError: The parameter file has another ending.
+    """
+    name = options.output
+    if name is None:
+        stem = '_and_'.join(bag.resolve().name for bag in bags)
+        name = str(bags[0].resolve().parent / f'{stem}_calibration.yaml')
+    output = new_file(name, ENDINGS, 'parameter file')
+    picture = None
+    if not options.no_plot:
+        picture = new_file(os.path.splitext(name)[0] + '.png', ('png',), 'picture')
+    return output, picture
+
+
+def _nominal(options: argparse.Namespace, read: Sequence[WheelsAndReference]) -> Geometry:
+    """Return the nominal dimensions, of the options or of the parameters in the bags.
+
+    Raises:
+        UsageError: They are unknown, or differ between the bags.
+    """
+    radius, separation = options.wheel_radius, options.wheel_separation
+    if radius is None or separation is None:
+        recorded = {one.dimensions for one in read if one.dimensions is not None}
+        if len(recorded) > 1:
+            listed = ', '.join(f'{r:g} and {s:g} m' for r, s in sorted(recorded))
+            raise UsageError(
+                f'the bags have several wheel radii and separations, {listed}: choose with '
+                '--wheel-radius and --wheel-separation'
+            )
+        if not recorded:
+            raise UsageError(
+                'the bag has no parameters wheel_radius and wheel_separation of a node: both must be '
+                'given with --wheel-radius and --wheel-separation'
+            )
+        known = recorded.pop()
+        radius = known[0] if radius is None else radius
+        separation = known[1] if separation is None else separation
+    for name, value, (low, high) in (
+        ('wheel radius', radius, RADIUS_BOUNDS),
+        ('wheel separation', separation, SEPARATION_BOUNDS),
+    ):
+        if not low <= value <= high:
+            raise UsageError(f'the {name} must be from {low:g} to {high:g} m, got {value:g}')
+    return Geometry(wheel_radius=radius, wheel_separation=separation)
+
+
+def _given(options: argparse.Namespace) -> Given:
+    return Given(
+        lever_arm=None if options.lever_arm is None else tuple(options.lever_arm),
+        yaw_offset=options.yaw_offset,
+        time_offset=options.time_offset,
+        wheel_noise=options.wheel_noise,
+        position_noise=options.position_noise,
+        heading_noise=options.heading_noise,
+    )
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM,
+        description='Estimate the wheel radii and the wheel separation of a robot from recorded drives '
+        'with a reference of its pose, such as motion capture or SLAM. Writes the multipliers of '
+        'wheel_bridge and diff_drive_controller as a parameter file, and a picture. Existing files are '
+        'not overwritten. Exit code 0: calibrated; 1: the drives do not determine the parameters, '
+        'contradict each other, or a file cannot be written; 2: wrong arguments, or a bag cannot be '
+        'read; 130: interrupted.',
+    )
+    parser.add_argument('bags', metavar='BAG', nargs='+', help='directory of a bag')
+    parser.add_argument(
+        '-o',
+        '--output',
+        metavar='FILE',
+        help='parameter file to write, .yaml; the picture is FILE.png (default: BAG_calibration.yaml '
+        'beside the first bag)',
+    )
+    parser.add_argument('--no-plot', action='store_true', help='do not draw')
+    parser.add_argument(
+        '--reference',
+        metavar='TOPIC',
+        help='topic of the reference: Odometry, PoseStamped or PoseWithCovarianceStamped (default: '
+        'ground_truth, or the only topic of poses)',
+    )
+    parser.add_argument(
+        '--wheels-topic',
+        metavar='TOPIC',
+        help='topic of the wheels, JointState; positions are preferred to velocities (default: '
+        'joint_states)',
+    )
+    parser.add_argument(
+        '--wheels',
+        metavar=('LEFT', 'RIGHT'),
+        nargs=2,
+        help='joints of the left and the right wheel (default: from the parameters in the bag, or the '
+        'joints with left and right in their names)',
+    )
+    for name, what in (('radius', 'wheel radius'), ('separation', 'wheel separation')):
+        parser.add_argument(
+            f'--wheel-{name}',
+            metavar='M',
+            type=_cli.positive,
+            help=f'nominal {what} (m) (default: from the parameters in the bag)',
+        )
+    parser.add_argument(
+        '--lever-arm',
+        metavar=('X', 'Y'),
+        nargs=2,
+        type=_cli.coordinate,
+        help='position of the sensor in the body frame (m) (default: estimated)',
+    )
+    parser.add_argument(
+        '--yaw-offset',
+        metavar='RAD',
+        type=_cli.angle,
+        help='heading of the sensor in the body frame (rad) (default: estimated)',
+    )
+    parser.add_argument(
+        '--time-offset',
+        metavar='SECONDS',
+        type=_cli.number,
+        help='added to the times of the reference (s) (default: estimated)',
+    )
+    for name, unit, what in (
+        ('wheel', 'm', 'variance of the distance travelled by a wheel, per distance'),
+        ('position', 'm', 'standard deviation of the positions of the reference'),
+        ('heading', 'rad', 'standard deviation of the headings of the reference'),
+    ):
+        parser.add_argument(
+            f'--{name}-noise',
+            metavar='M' if unit == 'm' else 'RAD',
+            type=_cli.positive,
+            help=f'{what} ({unit}) (default: estimated)',
+        )
+    return parser
