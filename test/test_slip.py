@@ -187,12 +187,31 @@ def test_a_stop_within_a_cell_leaves_no_slip_for_later():
     assert again.true_twist == fresh.true_twist
 
 
-def test_the_same_command_again_changes_nothing_but_rounding():
+@pytest.mark.parametrize('hold', [HOLD, SECOND // 2], ids='wide cells after {} ns'.format)
+def test_the_same_command_again_changes_nothing_but_rounding(monkeypatch, hold):
+    monkeypatch.setattr('diffdrive_jacobian.simulation.slip.HOLD', hold)
     begin = 123_456_789
-    once = driven(robot(seed=8), [((0.2, 0.4), begin)], 3 * SECOND)
-    often = [((0.2, 0.4), stamp) for stamp in range(begin, 3 * SECOND, 7_777_777)]
-    repeated = driven(robot(seed=8), often, 3 * SECOND)
+    once = driven(robot(seed=8), [((0.2, 0.4), begin)], 5 * SECOND)
+    often = [((0.2, 0.4), stamp) for stamp in range(begin, 5 * SECOND, 7_777_777)]
+    repeated = driven(robot(seed=8), often, 5 * SECOND)
     np.testing.assert_allclose(repeated.true_pose, once.true_pose, rtol=0.0, atol=1e-13)
+
+
+def test_the_true_pose_is_the_integral_of_the_true_twist(monkeypatch):
+    """Within a cell, also after some commands in it, and in the wide cells of a long time."""
+    monkeypatch.setattr('diffdrive_jacobian.simulation.slip.HOLD', SECOND)
+    start = robot(seed=6, variance=1e-3, left_wheel_radius_multiplier=0.97)
+    held = start.commanded((0.2, 0.3), 5)
+    states = [held.at(stamp) for stamp in np.geomspace(10, 50 * SECOND, 20).astype(int).tolist()]
+    states += [driven(start, irregular(7, count), irregular(7, count)[-1][1]) for count in range(1, 20)]
+    for state in states:
+        end = state.at(state.stamp + 1)
+        turned = math.remainder(end.true_pose[2] - state.true_pose[2], math.tau)
+        v, omega = state.true_twist
+        moved = np.linalg.norm(end.true_pose[:2] - state.true_pose[:2])
+        # A nanosecond crosses no boundary of cells here.
+        assert moved == pytest.approx(abs(v) * 1e-9, abs=2e-14)
+        assert turned == pytest.approx(omega * 1e-9, abs=2e-14)
 
 
 @pytest.mark.parametrize('commands', ['straight', 'arc', 'in place', 'irregular'])

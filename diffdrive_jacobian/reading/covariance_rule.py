@@ -28,11 +28,14 @@ _PARAMETERS = ('wheel_separation', 'wheel_travel_variance')
 
 def recorded_model(run: Run) -> RobotModel | None:
     """Return the model of the robot; None: it was not recorded, or it changed."""
+    recorded = run.of_node(NODE)
+    # A robot that starts later than the recorder reports its first values as changes.
     changed = {
         name
         for _, node, values in run.parameter_events
         if node.split('/')[-1] == NODE
-        for name in values
+        for name, value in values.items()
+        if value != recorded.get(name)
     }
     separation, variance = (run.number_of_node(NODE, name, math.nan) for name in _PARAMETERS)
     if changed & set(_PARAMETERS) or not (separation > 0.0 and variance >= 0.0):

@@ -108,19 +108,27 @@ class Truth:
     nominal wheel separation L (m) and k (m). All values were checked before.
     """
 
-    __slots__ = ('_ahead', '_drift', '_slipped', 'pose')
+    __slots__ = ('_ahead', '_drift', '_held', '_slipped', 'pose')
 
-    def __init__(self, drift: Drift, pose: Pose, slipped: _Slipped = _NOT_SLIPPED) -> None:
+    def __init__(
+        self,
+        drift: Drift,
+        pose: Pose,
+        slipped: _Slipped = _NOT_SLIPPED,
+        held: tuple[tuple[float, float], int] | None = None,
+    ) -> None:
         """Place the robot.
 
         Args:
             drift: In what its motion differs from its odometry.
             pose: `(x, y, theta)` (m, m, rad).
             slipped: What its wheels slipped in the present cell.
+            held: The twist that led here, and since when it is held (ns); None: the robot rested.
         """
         self.pose = pose
         self._drift = drift
         self._slipped = slipped
+        self._held = held
         # The last boundary of cells that was reached from here, and the motion that led to it.
         self._ahead: tuple[Any, int, Pose] | None = None
 
@@ -130,7 +138,7 @@ class Truth:
 
     def at_rest(self) -> Truth:
         """Return the same pose of a robot that rests."""
-        return self if self._slipped is _NOT_SLIPPED else Truth(self._drift, self.pose)
+        return self if self._held is None else Truth(self._drift, self.pose)
 
     def after(self, start: int, stamp: int, twist: tuple[float, float], L: float, k: float) -> Truth:
         """Return the truth after a motion.
@@ -152,20 +160,20 @@ class Truth:
             v, omega = (right + left) / 2.0, (right - left) / separation
             return Truth(drift, arc_end(*self.pose, v, omega, dt))
         motion = start, twist, L, k
-        time, pose, slipped = start, self.pose, self._slipped
+        since = self._since(start, twist)
+        time, pose, slipped = start, self.pose, self._present(start, twist)
         if self._ahead is not None and self._ahead[1] <= stamp and self._ahead[0] == motion:
             _, time, pose = self._ahead
             slipped = _NOT_SLIPPED
         growth_R, growth_L = k * abs(right), k * abs(left)
         while True:
-            level = ((time - start) // HOLD).bit_length()
-            width = CELL << level
-            cell = time // width
-            end = (cell + 1) * width
+            begun = slipped is not _NOT_SLIPPED
+            level = slipped[0] if begun else ((time - since) // HOLD).bit_length()
+            cell = time // (CELL << level)
+            end = (cell + 1) * (CELL << level)
             xi_R, xi_L = normals(drift.seed, level, cell)
             rest = (end - time) / NANOSECONDS
-            if slipped is _NOT_SLIPPED or slipped[:2] != (level, cell):
-                slipped = _NOT_SLIPPED
+            if not begun:
                 # sqrt(k |v| rest) / rest
                 gain_R, gain_L = math.sqrt(growth_R / rest), math.sqrt(growth_L / rest)
             else:
@@ -180,11 +188,12 @@ class Truth:
         if time > start:
             self._ahead = motion, time, pose
         if time == stamp:
-            return Truth(drift, pose, slipped)
+            return Truth(drift, pose, slipped, (twist, since))
         dt = (stamp - time) / NANOSECONDS
         a_R, V_R = (slipped[2] + gain_R * dt, slipped[3] + growth_R * dt) if right else (0.0, 0.0)
         a_L, V_L = (slipped[4] + gain_L * dt, slipped[5] + growth_L * dt) if left else (0.0, 0.0)
-        return Truth(drift, arc_end(*pose, v, omega, dt), (level, cell, a_R, V_R, a_L, V_L))
+        slipped = level, cell, a_R, V_R, a_L, V_L
+        return Truth(drift, arc_end(*pose, v, omega, dt), slipped, (twist, since))
 
     def twist(self, stamp: int, twist: tuple[float, float], L: float, k: float) -> tuple[float, float]:
         """Return the true twist from a time on, the slip included (m/s, rad/s).
@@ -198,15 +207,28 @@ class Truth:
         right, left, separation = self._wheels(twist, L)
         seed = self._drift.seed
         if seed is not None and k:
-            level, cell, a_R, V_R, a_L, V_L = self._slipped
-            if level < 0 or cell != stamp // (CELL << level):
-                level, a_R, V_R, a_L, V_L = 0, 0.0, 0.0, 0.0, 0.0
-            cell, since = divmod(stamp, CELL << level)
-            rest = ((CELL << level) - since) / NANOSECONDS
+            level, _, a_R, V_R, a_L, V_L = self._present(stamp, twist)
+            if level < 0:
+                level = ((stamp - self._since(stamp, twist)) // HOLD).bit_length()
+            cell, passed = divmod(stamp, CELL << level)
+            rest = ((CELL << level) - passed) / NANOSECONDS
             xi_R, xi_L = normals(seed, level, cell)
             right += xi_R * _gain(a_R, V_R, k * abs(right), rest)
             left += xi_L * _gain(a_L, V_L, k * abs(left), rest)
         return (right + left) / 2.0, (right - left) / separation
+
+    def _since(self, start: int, twist: tuple[float, float]) -> int:
+        """Return since when a twist from a time on is held (ns)."""
+        return self._held[1] if self._held is not None and self._held[0] == twist else start
+
+    def _present(self, start: int, twist: tuple[float, float]) -> _Slipped:
+        """Return what was slipped so far in the cell of a time, from which on a twist is held.
+
+        A wide cell ends with the twist that was held.
+        """
+        level, cell, *_ = slipped = self._slipped
+        valid = level == 0 or (level > 0 and self._since(start, twist) < start)
+        return slipped if valid and cell == start // (CELL << level) else _NOT_SLIPPED
 
     def _wheels(self, twist: tuple[float, float], L: float) -> tuple[float, float, float]:
         """Return the true rim speeds of right and left wheel without slip, and the true separation."""
