@@ -38,10 +38,10 @@ def bag(tmp_path_factory):
 class Player:
     """A player with a page."""
 
-    def __init__(self, bag):
+    def __init__(self, bag, robots):
         self.session = Session()
         self.page = self.session.enter()
-        self.player = BagPlayer(self.session, bag, read_robots(bag))
+        self.player = BagPlayer(self.session, bag, robots)
         self.player.advance(0.0)
 
     def send(self, *commands):
@@ -59,9 +59,14 @@ class Player:
         return self.session.latest()[1].world
 
 
+@pytest.fixture(scope='module')
+def robots(bag):
+    return read_robots(bag)
+
+
 @pytest.fixture
-def player(bag):
-    return Player(bag)
+def player(bag, robots):
+    return Player(bag, robots)
 
 
 def test_the_robot_is_where_it_was(bag, player):
@@ -142,7 +147,7 @@ def test_several_robots(lockstep, tmp_path):
     lockstep.publish('/one/cmd_vel', twist(0.5, 0.0))
     lockstep.run_for(0.4)
     recording.finish()
-    player = Player(tmp_path / 'two')
+    player = Player(tmp_path / 'two', read_robots(tmp_path / 'two'))
     player.send(Seek(0.4))
     one, two = player.session.latest()[1].robots
     assert (one['name'], two['name']) == ('/one', '/two')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from pathlib import Path
@@ -18,6 +19,7 @@ from diffdrive_jacobian.live.hand import CANCEL_PATIENCE, DEAD_MAN, Act, HandDri
 from diffdrive_jacobian.live.pacing import Pacing
 from diffdrive_jacobian.live.quantities import chain, errors, region, rounded
 from diffdrive_jacobian.live.rate import TokenBucket
+from diffdrive_jacobian.live.robot_state import RobotState
 from diffdrive_jacobian.live.session import MAX_COMMANDS, MAX_NOTICES, Session, Snapshot
 from diffdrive_jacobian.live.trail import MAX_POINTS, SPACING, Trail
 from diffdrive_jacobian.messages.goal_status import GoalState
@@ -346,3 +348,40 @@ def test_installed_controllers_are_looked_for_once(monkeypatch):
         settings.shown({'controller': {'controller': 'a'}})
     settings._controllers.cache_clear()
     assert len(looked) == 1
+
+
+def test_parameters_of_any_node_may_be_anything():
+    state = RobotState('/')
+    state.moved(1.0, np.array([1.0, 2.0, 0.5]), (0.3, 0.1), None)
+    state.goal.sent(np.array([[2.0, 2.0, 0.0]]), (1, 0))
+    state.goal.reported(GoalState.EXECUTING, (1, 0))
+    usual = state.shown(age=0.0, by_hand=False)
+    for value in (math.nan, math.inf, -1.0, 0.0, 1e-300, 1e300, 'x', None, True, [1.0]):
+        state.robot_values = dict.fromkeys(
+            ('wheel_radius', 'wheel_separation', 'left_wheel_name'), value
+        )
+        names = ('kp', 'kv', 'offset', 'xy_goal_tolerance', 'use_goal_heading')
+        for controller in ('go_to_goal', 'pose', 'offset_point', value):
+            state.controller_values = {**dict.fromkeys(names, value), 'controller': controller}
+            shown = state.shown(age=0.0, by_hand=False)
+            json.dumps(shown, allow_nan=False)
+            assert shown['geometry'] == usual['geometry']
+
+
+def test_the_path_is_interrupted_where_a_robot_is_placed():
+    state = RobotState('/')
+    for x in (0.0, 0.02, 0.04):
+        state.moved(x, np.array([x, 0.0, 0.0]), (1.0, 0.0), None)
+    state.interrupt()
+    # One message more is from before.
+    for time, x in ((0.06, 0.06), (0.08, 0.2), (0.1, 0.22)):
+        state.moved(time, np.array([x, 0.0, 0.0]), (1.0, 0.0), None)
+    assert state.trail.points == [
+        (0.0, 0.0),
+        (0.02, 0.0),
+        (0.04, 0.0),
+        (0.06, 0.0),
+        None,
+        (0.2, 0.0),
+        (0.22, 0.0),
+    ]

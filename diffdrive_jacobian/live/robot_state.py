@@ -18,15 +18,22 @@ from diffdrive_jacobian.live.goal_progress import GoalProgress
 from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.live.trail import JUMP, Trail
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters, VirtualRobotParameters
+from diffdrive_jacobian.reading.run import number
 
 ROBOT_DEFAULTS = VirtualRobotParameters()
 CONTROLLER_DEFAULTS = GoToGoalParameters()
 Values = Mapping[str, Any]
+PLACED_JUMP = 0.03
+"""Step from which the path of a robot is interrupted that is being placed (m)."""
+PLACED_LIFE = 15
+"""Number of odometry messages within which that counts."""
+MIN_LENGTH = 1e-4
+"""Smallest wheel radius and separation that count (m). Parameters of any node may be anything."""
 
 
 def _number(values: Values, name: str, default: float) -> float:
-    value = values.get(name)
-    return value if isinstance(value, float) and math.isfinite(value) else default
+    value = number(values.get(name))
+    return value if math.isfinite(value) else default
 
 
 class RobotState:
@@ -49,6 +56,7 @@ class RobotState:
         """Latest cmd_vel. None: none was received lately."""
         self.goal = GoalProgress()
         self.trail = Trail()
+        self._placed = 0
         self.robot_values: Values = {}
         """Parameters of the node that publishes odom."""
         self.controller_values: Values = {}
@@ -60,7 +68,7 @@ class RobotState:
         values = self.robot_values
         r = _number(values, 'wheel_radius', ROBOT_DEFAULTS.wheel_radius)
         L = _number(values, 'wheel_separation', ROBOT_DEFAULTS.wheel_separation)
-        if r <= 0.0 or L <= 0.0:
+        if min(r, L) < MIN_LENGTH:
             return ROBOT_DEFAULTS.wheel_radius, ROBOT_DEFAULTS.wheel_separation
         return r, L
 
@@ -101,15 +109,18 @@ class RobotState:
         """Take an odometry."""
         # A motion is at most three times as long as speed and time say.
         far = 3.0 * max(abs(twist[0]), abs(self.twist[0])) * abs(time - self.time)
-        self.trail = self.trail.extended(float(pose[0]), float(pose[1]), max(JUMP, far))
+        jump = JUMP
+        if self._placed:
+            self._placed, jump = self._placed - 1, PLACED_JUMP
+        self.trail = self.trail.extended(float(pose[0]), float(pose[1]), max(jump, far))
         self.time, self.pose, self.twist = time, pose, twist
         if covariance is not None:
             self.covariance = covariance
         self.goal.moved(pose, self.arrival)
 
     def interrupt(self) -> None:
-        """Interrupt the path: the robot is placed elsewhere."""
-        self.trail.points.append(None)
+        """Expect a jump of the path: the robot is placed elsewhere."""
+        self._placed = PLACED_LIFE
 
     def shown(self, *, age: float, by_hand: bool, **more: Any) -> dict[str, Any] | None:
         """Return the JSON object for the page. None: there was no odometry.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import islice
 from typing import Any, TypeVar
 
 import numpy as np
@@ -80,7 +81,8 @@ class Latest:
     def take(self) -> Any | None:
         """Return the message that was received since the last call. None: none, or it is damaged."""
         if self._polled:
-            for data, _ in waiting_messages(self._subscription):
+            # The queue has one place; more than that is a flood, which must not hold up the page.
+            for data, _ in islice(waiting_messages(self._subscription), 2):
                 self._data = data
         latest, self._data = self._data, None
         if latest is None:
@@ -148,10 +150,8 @@ class RobotTopics:
 
     def publish_twist(self, twist: tuple[float, float], now: int) -> None:
         """Publish a command, at a time (ns)."""
-        if self.twist_type is TwistStamped:
-            data = _twist_stamped(twist, now)
-        else:
-            data = _twist(*twist)
+        stamped = self.twist_type is TwistStamped
+        data = _twist_stamped(twist, now) if stamped else _twist(*twist)
         self._publisher(self.twist_type, 'cmd_vel').publish(data)
 
     def publish_goals(self, goals: NDArray[np.float64], now: int, *, together: bool) -> None:

@@ -17,10 +17,12 @@ _MODULES = {'closed_loops': 'closed_loop', 'trajectories': 'closed_loop', 'track
 
 
 def __getattr__(name: str) -> Any:
-    """Return a function. Nodes, which need none of them, start faster without."""
-    if name not in _MODULES:
-        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    return getattr(import_module(f'{__name__}.{_MODULES[name]}'), name)
+    """Return a function or its module. Nodes, which need none of them, start faster without."""
+    if name in _MODULES:
+        return getattr(import_module(f'{__name__}.{_MODULES[name]}'), name)
+    if name in _MODULES.values():
+        return import_module(f'{__name__}.{name}')
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
 
 
 def __dir__() -> list[str]:

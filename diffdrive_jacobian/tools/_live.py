@@ -42,11 +42,18 @@ def _port(text: str) -> int:
     return int(text)
 
 
-def announcing(options: argparse.Namespace) -> Callable[[LiveServer], None]:
-    """Return a function that prints the address of a server, and opens it in a browser."""
+def announcing(options: argparse.Namespace, waiting: str = '') -> Callable[[LiveServer], None]:
+    """Return a function that prints the address of a server, and opens it in a browser.
+
+    Args:
+        options: The options of the page.
+        waiting: What happens when the page is open. Empty: nothing in particular.
+    """
 
     def announce(server: LiveServer) -> None:
         print(f'page: {server.url}')
+        if waiting:
+            print(f'{waiting} when the page is open')
         print('whoever knows this address can steer the robot; Ctrl-C ends', flush=True)
         if not options.no_browser and any(map(os.environ.get, DISPLAYS)):
             # Starting a browser may take seconds.

@@ -55,7 +55,7 @@ def drive_with_page(
                 ros_arguments=ros,
                 port=options.port,
                 signals=signals,
-                ready=_live.announcing(options),
+                ready=_live.announcing(options, waiting='the drive starts' if len(goals) else ''),
                 nodes_created=lambda names: warn_of_unused_files(PROGRAM, ros, names),
             )
     except ModuleNotFoundError as error:

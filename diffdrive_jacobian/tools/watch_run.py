@@ -37,6 +37,7 @@ def _bag(options: argparse.Namespace, signals: Signals) -> int:
     from diffdrive_jacobian.bags.bag_reader import BagError
     from diffdrive_jacobian.live.serving import watch_bag
 
+    print(f'reading {options.bag}', flush=True)
     try:
         watch_bag(
             Path(options.bag),

@@ -89,8 +89,8 @@ export class Chain {
     this.unicycle.set(chain.unicycle);
     this.world.set(chain.world);
     const [r, L] = robot.geometry;
-    setMath(this.note, `q = (${format(robot.pose[0])} m, ${format(robot.pose[1])} m, ${format(robot.pose[2])} rad), r = ${format(r)} m, L = ${format(L)} m. `
-      + (chain.measured ? 'From J_w on with the wheel speeds of joint_states.' : 'No joint_states: the wheels are taken to do as told.'));
+    setText(this.note, `q = (${format(robot.pose[0])} m, ${format(robot.pose[1])} m, ${format(robot.pose[2])} rad), r = ${format(r)} m, L = ${format(L)} m. `
+      + (chain.measured ? 'The wheel speeds that move the body are those of joint_states.' : 'No joint_states: the wheels are taken to do as told.'));
   }
 
   /** Return the gains, and the factor by which limits scale what the law computes. */
