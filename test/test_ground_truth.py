@@ -77,11 +77,12 @@ def test_ground_truth_is_that_of_the_library_and_odometry_that_of_a_perfect_robo
     assert (message.header.frame_id, message.child_frame_id) == ('map', 'base_link')
 
 
-def test_ground_truth_has_a_frame_of_its_own_that_can_change(lockstep, robot_at):
+def test_ground_truth_has_a_frame_of_its_own_that_can_change(lockstep, robot_at, capfd):
     truths = lockstep.listen(Odometry, 'ground_truth')
     robot = robot_at(ground_truth_frame_id='world', base_frame_id='body', **SLIPPING)
     lockstep.run_for(0.02)
     assert (truths[-1].header.frame_id, truths[-1].child_frame_id) == ('world', 'body')
+    assert 'publishing /odom, /ground_truth' in capfd.readouterr().err
     assert change(robot, ground_truth_frame_id='earth').successful
     lockstep.run_for(0.02)
     assert truths[-1].header.frame_id == 'earth'

@@ -92,7 +92,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self._timer = self.create_timer(1.0 / self.parameters.publish_rate, self._on_tick)
         self._jumps = self._watch_jumps()
         self._advance()
-        self.announce(subscribed=[source], publishing=['odom'])
+        self.announce(subscribed=[source], publishing=['odom', *['ground_truth'] * drifts])
 
     # --- Time
 
