@@ -6,12 +6,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
+from diffdrive_jacobian.simulation.slip import Drift
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.simulation.closed_loop import closed_loops, trajectories
     from diffdrive_jacobian.simulation.tracking import track_line
 
-__all__ = ['Robot', 'RobotModel', 'closed_loops', 'track_line', 'trajectories']
+__all__ = ['Drift', 'Robot', 'RobotModel', 'closed_loops', 'track_line', 'trajectories']
 _MODULES = {'closed_loops': 'closed_loop', 'trajectories': 'closed_loop', 'track_line': 'tracking'}
 
 
