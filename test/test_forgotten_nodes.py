@@ -130,6 +130,44 @@ def test_two_controllers_of_one_robot_are_named(add, node, capfd):
     assert f'{names} publish /goal_status: two controllers' in said(capfd)
 
 
+REMAPPED = [
+    argument
+    for name in ('odom', 'cmd_vel', 'joint_command', 'goal_pose', 'goals', 'goal_status')
+    for argument in ('-r', f'{name}:=my_{name}')
+]
+
+
+@pytest.mark.lockstep(args=['--ros-args', *REMAPPED])
+@pytest.mark.parametrize(
+    ('node_class', 'parameters', 'topic', 'expected'),
+    [
+        (GoToGoal, {}, None, 'no node is subscribed to /my_cmd_vel: start virtual_robot'),
+        (GoToGoal, {}, None, 'or remap the topic (cmd_vel:=NAME)'),
+        (GoToGoal, {}, (Odometry, 'odom', 2), 'publish /my_odom: their poses alternate'),
+        (GoToGoal, {}, (GoalStatus, 'goal_status', 1), 'publish /my_goal_status: two controllers'),
+        (WheelBridge, {}, None, 'no node is subscribed to /my_joint_command: start virtual_robot'),
+        (
+            VirtualRobot,
+            {'command_interface': 'wheels'},
+            None,
+            'no node publishes /my_joint_command: start wheel_bridge',
+        ),
+        (VirtualRobot, {}, (PoseStamped, 'goal_pose', 1), 'goals are lost: start go_to_goal'),
+        (VirtualRobot, {}, (Odometry, 'odom', 1), 'publish /my_odom: their poses alternate'),
+    ],
+)
+def test_nodes_with_remapped_topics_report_the_same(
+    add, node, capfd, node_class, parameters, topic, expected
+):
+    one = add(node_class, **parameters)
+    if topic is not None:
+        kind, name, count = topic
+        for _ in range(count):
+            node.create_publisher(kind, name, 10)
+    check(one)
+    assert expected in said(capfd)
+
+
 def test_goals_without_a_controller_are_reported_by_the_robot(lockstep, add, node, capfd):
     robot = add(VirtualRobot)
     publisher = node.create_publisher(PoseStamped, 'goal_pose', 10)

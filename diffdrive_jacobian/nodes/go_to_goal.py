@@ -67,7 +67,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._watchdog = Watchdog(self, self._on_stale_odometry)
         self._others = OtherDrivers(self, self._cmd_vel, self._on_other_driver)
         self._configure()
-        self.watch(unread(self._cmd_vel, lambda: self._others.subscriptions))
+        self.watch(unread(self._cmd_vel, 'cmd_vel', lambda: self._others.subscriptions))
         self.watch(several_publishers(self, 'odom'))
         self.watch(several_publishers(self, 'goal_status'))
         self.announce(subscribed=['goal_pose', 'goals'], publishing=['cmd_vel'])
