@@ -9,6 +9,7 @@ from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from lockstep_nodes import ACCEPTED, CANCELED, EXECUTING, SUCCEEDED, Controller, Topics, make
 from nav_msgs.msg import Goals, Odometry
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from ros_messages import goal, goals, odometry, twist, twists
 from sensor_msgs.msg import JointState
@@ -293,6 +294,25 @@ def test_its_own_subscription_is_no_reader_of_a_controller(lockstep, node, add, 
     assert controller._others.subscriptions == 1
     check(controller)
     assert 'no node is subscribed to /cmd_vel' in said(capfd)
+
+
+BEST_EFFORT = 'qos_overrides./cmd_vel.publisher.reliability:=best_effort'
+
+
+@pytest.mark.lockstep(args=['--ros-args', '-p', BEST_EFFORT])
+def test_a_controller_that_publishes_best_effort_knows_its_own_commands(lockstep, add, node, capfd):
+    profile = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    joystick = node.create_publisher(Twist, 'cmd_vel', profile)
+    controller = Controller(lockstep)
+    controller.send(goals(goal(1.0, 0.3)))
+    controller.at(0.0, 0.0)
+    check(controller.node)
+    text = said(capfd)
+    assert 'no node is subscribed' not in text
+    assert 'incompatible QoS' not in text
+    joystick.publish(twist(0.25, 0.0))
+    lockstep.settle()
+    assert [status for _, status in controller.statuses][-1] == CANCELED
 
 
 # --- Integers
