@@ -6,7 +6,7 @@ import struct
 
 import pytest
 from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist, TwistStamped
 from lockstep_nodes import ACCEPTED, CANCELED, EXECUTING, SUCCEEDED, Controller, Topics, make
 from nav_msgs.msg import Goals, Odometry
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -120,7 +120,18 @@ def test_two_robots_on_one_odom_are_named(add, node, capfd):
     names = f'{node.get_fully_qualified_name()} and /virtual_robot'
     for one in (robot, controller):
         check(one, 2 * FAULT_PATIENCE)
-        assert said(capfd).count(f'{names} publish /odom: their poses alternate') == 1
+        text = said(capfd)
+        assert text.count(f'{names} publish /odom: their poses alternate') == 1
+        assert 'killed' not in text
+
+
+def test_a_robot_that_was_killed_and_started_again_is_told(add, node, capfd):
+    controller = add(GoToGoal)
+    for _ in range(2):
+        node.create_publisher(Odometry, 'odom', 10)
+    check(controller)
+    assert '(2 times) publish /odom' in (text := said(capfd))
+    assert 'one that was killed disappears within 20 s' in text
 
 
 def test_two_controllers_of_one_robot_are_named(add, node, capfd):
@@ -372,3 +383,14 @@ def test_topics_of_a_controller_that_sees_odometry(lockstep):
     lockstep.run_for(1.5)
     assert topics.commands
     assert len(list(controller.subscriptions)) == before
+
+
+def test_an_integer_in_an_initial_pose_is_reported(lockstep, add, node, capfd):
+    add(VirtualRobot)
+    publisher = node.create_publisher(PoseWithCovarianceStamped, 'initialpose', 10)
+    message = PoseWithCovarianceStamped()
+    message.pose.pose.position.x = 1.0
+    message.pose.pose.orientation.w = 2.0
+    publisher.publish(integers(message, INTEGER, 1.0))
+    lockstep.settle()
+    assert 'initialpose has the value 4.94e-324: was an int assigned' in said(capfd)

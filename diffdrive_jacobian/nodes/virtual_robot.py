@@ -212,6 +212,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         advanced = self._advance()
         frame, ours = message.header.frame_id, self.parameters.odom_frame_id
+        self.warn_of_integers('initialpose', *messages.pose_values(message.pose.pose))
         try:
             if advanced is None:
                 raise MessageError(NO_CLOCK)
