@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import struct
 
 import pytest
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TwistStamped
 from lockstep_nodes import ABORTED, ACCEPTED, CANCELED, EXECUTING, Controller, change
 from nav_msgs.msg import Goals
@@ -208,6 +210,24 @@ def test_header_of_goals_is_read_without_the_poses(frame, count):
     message.header.stamp = stamp(-5_000_000_123)
     assert serialization.goals_header(serialize_message(message)) == (message.header.stamp, count)
     assert serialization.deserialized(serialize_message(message), Goals) == message
+
+
+def big_endian_goals(count):
+    """Serialize that many poses of zeros, without frames, in the byte order that only rclpy reads."""
+    header = struct.pack('>iII', 2, 0, 1) + bytes(4)
+    return b'\0\0\0\0' + header + struct.pack('>I', count) + bytes(72 * count)
+
+
+def test_long_goals_in_another_byte_order_are_not_converted(lockstep, monkeypatch, capfd):
+    assert serialization.goals_header(big_endian_goals(10)) == (Time(sec=2), 10)
+    controller = Controller(lockstep)
+    publisher = lockstep.node.create_publisher(Goals, 'goals', 10)
+    with monkeypatch.context() as patched:
+        patched.setattr(serialization, '_read_goals', None)
+        publisher.publish(big_endian_goals(MAX_WAYPOINTS + 1000))
+        lockstep.settle()
+    assert 'goals dropped: a Goals message must have at most 200000 bytes' in capfd.readouterr().err
+    assert controller.statuses == []
 
 
 @pytest.mark.parametrize('length', range(24))

@@ -272,6 +272,21 @@ def test_other_encapsulations_are_left_to_rclpy(encapsulation):
             Reader(Header, fields)(data)
 
 
+@pytest.mark.parametrize(('count', 'converted'), [(64, 0), (65, 1), (3000, 1)])
+def test_sequences_of_many_strings_are_left_to_rclpy(count, converted):
+    calls = []
+
+    def deserialize(data, kind):
+        calls.append(kind)
+        return deserialize_message(data, kind)
+
+    names = [str(one) for one in range(count)]
+    data = serialize_message(JointState(name=names, velocity=[0.5] * count))
+    read = Reader(JointState, ['name', 'velocity'], deserialize=deserialize)
+    assert read(data) == (tuple(names), (0.5,) * count)
+    assert len(calls) == converted
+
+
 def test_a_huge_length_takes_no_memory():
     data = b'\0\1\0\0' + bytes(8) + b'\1\0\0\0\0\0\0\0'
     read = Reader(JointState, ['name', 'position', 'velocity'])

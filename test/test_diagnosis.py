@@ -288,10 +288,12 @@ USUAL = Environment(python='3.12.3', versions={'rclpy': '7.1.6'}, sources=SOURCE
         ({'ROS_DOMAIN_ID': '101', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}, '', 0),
         ({'ROS_DOMAIN_ID': '233'}, "must be in 0 to 232, got '233'", 1),
         ({'ROS_DOMAIN_ID': 'x'}, "got 'x'", 1),
+        ({'ROS_DOMAIN_ID': '٣'}, 'must be in 0 to 232', 1),
         ({'ROS_DOMAIN_ID': '150'}, 'can be taken by other programs', 0),
         ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}, 'no other process is found', 1),
         ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'localhost'}, "got 'localhost': SUBNET is used", 1),
         ({'ROS_LOCALHOST_ONLY': '1'}, 'deprecated', 0),
+        ({'ROS_LOCALHOST_ONLY': 'true'}, "must be 0 or 1, got 'true': it has no effect", 1),
         ({'ROS_DISCOVERY_SERVER': '10.0.0.1'}, 'ROS_SUPER_CLIENT', 0),
         ({'ROS_DISTRO': 'humble'}, 'ROS_DISTRO is humble', 0),
         ({'FASTRTPS_DEFAULT_PROFILES_FILE': '/nowhere.xml'}, 'does not exist: /nowhere.xml', 1),
@@ -324,6 +326,7 @@ def test_the_reach_of_the_discovery():
         ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}, 'OFF'),
         ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF', 'ROS_LOCALHOST_ONLY': '1'}, 'LOCALHOST'),
         ({'ROS_LOCALHOST_ONLY': '0'}, 'SUBNET'),
+        ({'ROS_LOCALHOST_ONLY': 'true'}, 'SUBNET'),
     ):
         assert replace(USUAL, variables=variables).reach == reach
 

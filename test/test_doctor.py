@@ -71,6 +71,28 @@ def test_an_observer_describes_what_it_sees(ros):
     assert streams['/odom'].rate > 1.0
 
 
+def test_an_observer_ignores_names_that_cannot_be_queried(ros, monkeypatch):
+    from rclpy.node import Node
+
+    from diffdrive_jacobian.ros.observation import Observer
+
+    few_services = {'start_type_description_service': False}
+    ros.add(Node, node_name='n' * 240, start_parameter_services=False, parameters=few_services)
+    ros.add(Node, node_name='usual')
+    observer = ros.add(Observer, name='_doctor')
+    # As of programs that use DDS without ROS.
+    others = [('/not-a-name', ['a/msg/B']), ('/9', ['nav_msgs/msg/Odometry'])]
+    query = observer.get_topic_names_and_types
+    monkeypatch.setattr(observer, 'get_topic_names_and_types', lambda: [*query(), *others])
+
+    def clocks():
+        return {node.name: node.use_sim_time for node in observer.describe(1.0).nodes}
+
+    ros.until(lambda: clocks().get('/usual') is False, 'the clock of the usual node is known')
+    assert any('nnn' in name for name in clocks())
+    assert '/not-a-name' not in observer.describe(1.0).topics()
+
+
 def test_exit_code_and_report_depend_on_problems(observed, capsys):
     assert doctor.main([], Signals()) == 0
     assert capsys.readouterr().out.endswith('\n0 problems found\n')

@@ -6,9 +6,10 @@ import struct
 
 import pytest
 from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist, TwistStamped
 from lockstep_nodes import ACCEPTED, CANCELED, EXECUTING, SUCCEEDED, Controller, Topics, make
 from nav_msgs.msg import Goals, Odometry
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from ros_messages import goal, goals, odometry, twist, twists
 from sensor_msgs.msg import JointState
@@ -119,7 +120,18 @@ def test_two_robots_on_one_odom_are_named(add, node, capfd):
     names = f'{node.get_fully_qualified_name()} and /virtual_robot'
     for one in (robot, controller):
         check(one, 2 * FAULT_PATIENCE)
-        assert said(capfd).count(f'{names} publish /odom: their poses alternate') == 1
+        text = said(capfd)
+        assert text.count(f'{names} publish /odom: their poses alternate') == 1
+        assert 'killed' not in text
+
+
+def test_a_robot_that_was_killed_and_started_again_is_told(add, node, capfd):
+    controller = add(GoToGoal)
+    for _ in range(2):
+        node.create_publisher(Odometry, 'odom', 10)
+    check(controller)
+    assert '(2 times) publish /odom' in (text := said(capfd))
+    assert 'one that was killed disappears within 20 s' in text
 
 
 def test_two_controllers_of_one_robot_are_named(add, node, capfd):
@@ -128,6 +140,44 @@ def test_two_controllers_of_one_robot_are_named(add, node, capfd):
     check(controller)
     names = f'/go_to_goal and {node.get_fully_qualified_name()}'
     assert f'{names} publish /goal_status: two controllers' in said(capfd)
+
+
+REMAPPED = [
+    argument
+    for name in ('odom', 'cmd_vel', 'joint_command', 'goal_pose', 'goals', 'goal_status')
+    for argument in ('-r', f'{name}:=my_{name}')
+]
+
+
+@pytest.mark.lockstep(args=['--ros-args', *REMAPPED])
+@pytest.mark.parametrize(
+    ('node_class', 'parameters', 'topic', 'expected'),
+    [
+        (GoToGoal, {}, None, 'no node is subscribed to /my_cmd_vel: start virtual_robot'),
+        (GoToGoal, {}, None, 'or remap the topic (cmd_vel:=NAME)'),
+        (GoToGoal, {}, (Odometry, 'odom', 2), 'publish /my_odom: their poses alternate'),
+        (GoToGoal, {}, (GoalStatus, 'goal_status', 1), 'publish /my_goal_status: two controllers'),
+        (WheelBridge, {}, None, 'no node is subscribed to /my_joint_command: start virtual_robot'),
+        (
+            VirtualRobot,
+            {'command_interface': 'wheels'},
+            None,
+            'no node publishes /my_joint_command: start wheel_bridge',
+        ),
+        (VirtualRobot, {}, (PoseStamped, 'goal_pose', 1), 'goals are lost: start go_to_goal'),
+        (VirtualRobot, {}, (Odometry, 'odom', 1), 'publish /my_odom: their poses alternate'),
+    ],
+)
+def test_nodes_with_remapped_topics_report_the_same(
+    add, node, capfd, node_class, parameters, topic, expected
+):
+    one = add(node_class, **parameters)
+    if topic is not None:
+        kind, name, count = topic
+        for _ in range(count):
+            node.create_publisher(kind, name, 10)
+    check(one)
+    assert expected in said(capfd)
 
 
 def test_goals_without_a_controller_are_reported_by_the_robot(lockstep, add, node, capfd):
@@ -257,6 +307,25 @@ def test_its_own_subscription_is_no_reader_of_a_controller(lockstep, node, add, 
     assert 'no node is subscribed to /cmd_vel' in said(capfd)
 
 
+BEST_EFFORT = 'qos_overrides./cmd_vel.publisher.reliability:=best_effort'
+
+
+@pytest.mark.lockstep(args=['--ros-args', '-p', BEST_EFFORT])
+def test_a_controller_that_publishes_best_effort_knows_its_own_commands(lockstep, add, node, capfd):
+    profile = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    joystick = node.create_publisher(Twist, 'cmd_vel', profile)
+    controller = Controller(lockstep)
+    controller.send(goals(goal(1.0, 0.3)))
+    controller.at(0.0, 0.0)
+    check(controller.node)
+    text = said(capfd)
+    assert 'no node is subscribed' not in text
+    assert 'incompatible QoS' not in text
+    joystick.publish(twist(0.25, 0.0))
+    lockstep.settle()
+    assert [status for _, status in controller.statuses][-1] == CANCELED
+
+
 # --- Integers
 
 
@@ -314,3 +383,14 @@ def test_topics_of_a_controller_that_sees_odometry(lockstep):
     lockstep.run_for(1.5)
     assert topics.commands
     assert len(list(controller.subscriptions)) == before
+
+
+def test_an_integer_in_an_initial_pose_is_reported(lockstep, add, node, capfd):
+    add(VirtualRobot)
+    publisher = node.create_publisher(PoseWithCovarianceStamped, 'initialpose', 10)
+    message = PoseWithCovarianceStamped()
+    message.pose.pose.position.x = 1.0
+    message.pose.pose.orientation.w = 2.0
+    publisher.publish(integers(message, INTEGER, 1.0))
+    lockstep.settle()
+    assert 'initialpose has the value 4.94e-324: was an int assigned' in said(capfd)

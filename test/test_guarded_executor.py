@@ -241,6 +241,14 @@ def test_messages_that_were_announced_before_are_taken_before_nodes_move_back(se
     served.spin(lambda: served.received[-1] == 'after')
 
 
+def test_nodes_that_were_destroyed_are_moved_too(monkeypatch, served):
+    monkeypatch.setattr(guarded_executor, 'LONGEST_HOLD', 0.0)
+    for node in served.nodes:
+        node.destroy_node()
+    served.executor.use_single_threaded()
+    served.spin(lambda: not served.executor.fair)
+
+
 @pytest.mark.parametrize(
     'subscribe',
     [

@@ -108,6 +108,56 @@ def test_a_node_that_destroys_itself_receives_nothing_more(lockstep):
         lockstep.publish('a', Vector3())
 
 
+def test_a_subscription_that_its_callback_destroys_receives_nothing_more(lockstep):
+    heard = []
+
+    def once(message):
+        heard.append(message.x)
+        lockstep.node.destroy_subscription(subscription)
+
+    subscription = lockstep.node.create_subscription(Vector3, 'a', once, 10)
+    publisher = lockstep.node.create_publisher(Vector3, 'a', 10)
+    lockstep.settle()
+    for number in range(3):
+        publisher.publish(Vector3(x=float(number)))
+    lockstep.settle()
+    lockstep.run_for(0.1)
+    assert heard == [0.0]
+
+
+def test_a_node_that_another_one_destroys_receives_nothing_more(lockstep):
+    first, second = lockstep.add(Node('first')), lockstep.add(Node('second'))
+    heard = []
+    first.create_subscription(Vector3, 'a', lambda _: second.destroy_node(), 10)
+    second.create_subscription(Vector3, 'a', heard.append, 10)
+    lockstep.publish('a', Vector3())
+    assert heard == []
+    assert second not in lockstep._executor.nodes
+
+
+def test_a_node_processes_what_was_sent_before_it_is_removed(lockstep):
+    node, executors = lockstep.add(Node('short_lived')), []
+    node.create_subscription(Vector3, 'a', lambda _: executors.append(node.executor), 10)
+    publisher = lockstep.node.create_publisher(Vector3, 'a', 10)
+    lockstep.settle()
+    publisher.publish(Vector3())
+    lockstep.remove(node)
+    assert executors != [None]
+    assert len(executors) == 1
+
+
+def test_what_could_not_be_published_is_not_reported(lockstep):
+    publisher = lockstep.node.create_publisher(Vector3, 'a', 10)
+    with pytest.raises(TypeError):
+        publisher.publish('a')
+    assert 'none' in lockstep.report()
+    publisher.publish(Vector3(x=2.0))
+    with pytest.raises(TypeError):
+        publisher.publish('a')
+    assert lockstep.last('a') == Vector3(x=2.0)
+    assert 'a: 1 from' in lockstep.report()
+
+
 # --- Time
 
 

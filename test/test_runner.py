@@ -143,7 +143,7 @@ def test_names_of_the_greatest_length_are_accepted(arguments):
         runner.add(lambda: VirtualRobot(context=context))
 
 
-@pytest.mark.parametrize('domain', ['233', '-1', 'home'])
+@pytest.mark.parametrize('domain', ['233', '-1', 'home', '٣'])
 def test_domains_that_do_not_exist_are_named(monkeypatch, domain):
     monkeypatch.setenv('ROS_DOMAIN_ID', domain)
     with pytest.raises(UserError, match=f'must be in 0 to 232, got {domain!r}'), ros_context(['test']):

@@ -59,8 +59,7 @@ class Environment:
     @property
     def reach(self) -> str:
         """The discovery range."""
-        local = self.variables.get('ROS_LOCALHOST_ONLY', '')
-        if local not in ('', '0'):
+        if self.variables.get('ROS_LOCALHOST_ONLY') == '1':
             return 'LOCALHOST'
         given = self.variables.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '')
         return given if given in RANGES else 'SUBNET'
@@ -168,7 +167,7 @@ def _check_versions(found: Environment) -> Iterator[Finding]:
 
 def _check_domain(found: Environment) -> Iterator[Finding]:
     domain = found.domain
-    if not (domain.isdecimal() and int(domain) <= MAX_DOMAIN):
+    if not (domain.isascii() and domain.isdecimal() and int(domain) <= MAX_DOMAIN):
         yield Finding(
             f'ROS_DOMAIN_ID must be in 0 to {MAX_DOMAIN}, got {printable(domain)!r}',
             'export ROS_DOMAIN_ID=0, the same everywhere',
@@ -190,7 +189,12 @@ def _check_discovery(found: Environment) -> Iterator[Finding]:
             'export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST',
         )
     local = found.variables.get('ROS_LOCALHOST_ONLY', '')
-    if local not in ('', '0'):
+    if local not in ('', '0', '1'):
+        yield Finding(
+            f'ROS_LOCALHOST_ONLY must be 0 or 1, got {printable(local)!r}: it has no effect',
+            'unset ROS_LOCALHOST_ONLY; export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST',
+        )
+    if local == '1':
         yield Finding(
             'ROS_LOCALHOST_ONLY is set, which is deprecated and overrides ROS_AUTOMATIC_DISCOVERY_RANGE',
             'unset ROS_LOCALHOST_ONLY; export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST',

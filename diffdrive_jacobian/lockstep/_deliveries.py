@@ -57,16 +57,22 @@ class Deliveries:
                     continue
                 reader = known.pop(subscription, None)
                 self._readers[subscription] = reader or Reader(subscription, self._create_task)
-        gone = set(known.values())
-        for reader in gone:
+        for reader in known.values():
             reader.close()
-        self._polled = [reader for reader in self._polled if reader not in gone]
+        present = set(self._readers.values())
+        self._polled = [reader for reader in self._polled if reader in present]
         for readers in self._by_topic.values():
             readers.clear()
         for reader in self._readers.values():
             self.readers_of(reader.topic).append(reader)
         admitted = set(self._polled)
         return [reader for reader in self._readers.values() if reader not in admitted]
+
+    def drop_destroyed(self, nodes: Iterable[Node]) -> None:
+        """Deliver nothing more to subscriptions that the nodes do not have any more."""
+        present = {subscription for node in nodes for subscription in node.subscriptions}
+        for subscription in self._readers.keys() - present:
+            self._readers.pop(subscription).close()
 
     def admit(self, reader: Reader) -> None:
         """Deliver the messages that a new subscription has received before, and let it be polled."""

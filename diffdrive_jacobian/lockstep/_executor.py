@@ -96,9 +96,10 @@ class QuiescentExecutor:
         self._changed = True
 
     def remove(self, node: Node) -> None:
-        """Remove a node."""
+        """Remove a node, after it has processed what was sent to it."""
+        self.settle()
         self._forget(node)
-        self._changed = True
+        self._note_change()
         self.settle()
 
     def _forget(self, node: Node) -> None:
@@ -226,8 +227,12 @@ class QuiescentExecutor:
     # --- Entities
 
     def _note_change(self) -> None:
-        """Note that a node has created or destroyed an entity."""
+        """Note that a node has created or destroyed an entity.
+
+        New ones are registered when all is processed that waits. Destroyed ones receive nothing more.
+        """
         self._changed = True
+        self.deliveries.drop_destroyed(self._served)
 
     def _register(self) -> None:
         """Register entities that the nodes have created since the last call, and forget destroyed ones.

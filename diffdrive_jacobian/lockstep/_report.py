@@ -69,6 +69,7 @@ class Traffic:
 
         def counting(publish: Callable[..., None]) -> Callable[..., None]:
             def counted(self: Publisher, msg: Any) -> None:
+                publish(self, msg)
                 record = records.get(self)
                 if record is None:
                     record = records[self] = _Record(self, deliveries)
@@ -76,7 +77,6 @@ class Traffic:
                 record.order = next(numbers)
                 record.at = now()
                 record.message = msg
-                publish(self, msg)
                 extend(record.readers)
 
             return counted

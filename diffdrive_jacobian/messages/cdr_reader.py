@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
 from collections.abc import Sequence as Values
@@ -29,12 +30,18 @@ _MAX_LAYOUTS = 16
 """Layouts that a Reader keeps, one for each size of message."""
 _MAX_VALUES = 256
 """Largest number of values of a layout that is kept."""
+_MAX_ELEMENTS = 64
+"""Most strings or structures in a sequence that are read one by one. For more, rclpy takes less time."""
 _MAX_REMEMBERED = 1024
 """Largest message whose texts are remembered (bytes)."""
 
 
 class DecodingError(MessageError):
     """Bytes that are not a message of the type."""
+
+
+class _ManyElementsError(Exception):
+    """A sequence has more than _MAX_ELEMENTS strings or structures."""
 
 
 class Reader:
@@ -61,8 +68,9 @@ class Reader:
                 str, to an array or sequence of them a tuple. `len(goals)` gives the length of a
                 sequence.
             whole: Whether what follows the last field must be valid too.
-            deserialize: Reads the encapsulations that this class does not, such as big-endian
-                (`rclpy.serialization.deserialize_message`). None: they are invalid.
+            deserialize: Reads the encapsulations that this class does not, such as big-endian, and
+                sequences of many strings (`rclpy.serialization.deserialize_message`). None: these
+                encapsulations are invalid.
 
         Raises:
             ValueError: A field does not exist, or cannot be read on its own.
@@ -97,11 +105,14 @@ class Reader:
     def _read_new(self, data: bytes) -> tuple[Any, ...]:
         """Read a message whose layout is not known."""
         if len(data) >= ENCAPSULATION and data[:2] != LITTLE_ENDIAN:
-            return self._read_other_encapsulation(data)
+            return self._read_message(data)
+        most = math.inf if self._deserialize is None else _MAX_ELEMENTS
         try:
-            layout = _Walk(data, self._fields, self._whole).layout(self._type)
+            layout = _Walk(data, self._fields, self._whole, most).layout(self._type)
         except struct.error as error:
             raise self._undecodable() from error
+        except _ManyElementsError:
+            return self._read_message(data)
         values = layout.unpack_from(data)
         if len(values) <= _MAX_VALUES:
             if len(self._layouts) >= _MAX_LAYOUTS:
@@ -109,7 +120,8 @@ class Reader:
             self._layouts[len(data)] = layout
         return layout.fields(values)
 
-    def _read_other_encapsulation(self, data: bytes) -> tuple[Any, ...]:
+    def _read_message(self, data: bytes) -> tuple[Any, ...]:
+        """Return the fields of a message object."""
         if self._deserialize is None:
             raise self._undecodable()
         try:
@@ -136,8 +148,9 @@ class _Layout(NamedTuple):
 class _Walk:
     """One pass over a message, which collects its layout. Raises struct.error where the bytes end."""
 
-    def __init__(self, data: bytes, fields: tuple[str, ...], whole: bool) -> None:
+    def __init__(self, data: bytes, fields: tuple[str, ...], whole: bool, most: float) -> None:
         self._data = data
+        self._most = most
         self._fields = fields
         self._missing = set(fields)
         self._whole = whole
@@ -219,6 +232,8 @@ class _Walk:
             self._numbers(kind, count, wanted)
             if wanted:
                 self._picks[path] = slice(first, self._values)
+        elif count > self._most:
+            raise _ManyElementsError
         elif isinstance(kind, Text):
             for _ in range(count):
                 self._text(wanted)

@@ -116,8 +116,13 @@ def from_pose(message: Pose) -> NDArray[np.float64]:
         MessageError: The position is not finite or out of range, or the quaternion is not of unit
             length.
     """
+    return np.array(from_pose_values(*pose_values(message)))
+
+
+def pose_values(message: Pose) -> tuple[float, float, float, float, float, float]:
+    """Return the fields of a pose that `from_pose` reads: x, y and the quaternion x, y, z, w."""
     position, q = message.position, message.orientation
-    return np.array(from_pose_values(position.x, position.y, q.x, q.y, q.z, q.w))
+    return position.x, position.y, q.x, q.y, q.z, q.w
 
 
 def from_pose_values(

@@ -14,7 +14,7 @@ from diffdrive_jacobian.control import Arrival, Controller, LawError, saturate
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
-from diffdrive_jacobian.nodes.goal import Goal, goal_info, pose_fields, read_goal
+from diffdrive_jacobian.nodes.goal import Goal, goal_info, read_goal
 from diffdrive_jacobian.nodes.other_drivers import OtherDrivers
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 from diffdrive_jacobian.ros import serialization
@@ -67,7 +67,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._watchdog = Watchdog(self, self._on_stale_odometry)
         self._others = OtherDrivers(self, self._cmd_vel, self._on_other_driver)
         self._configure()
-        self.watch(unread(self._cmd_vel, lambda: self._others.subscriptions))
+        self.watch(unread(self._cmd_vel, 'cmd_vel', lambda: self._others.subscriptions))
         self.watch(several_publishers(self, 'odom'))
         self.watch(several_publishers(self, 'goal_status'))
         self.announce(subscribed=['goal_pose', 'goals'], publishing=['cmd_vel'])
@@ -116,7 +116,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
 
     def _warn_of_integers(self, topic: str, goals: Sequence[PoseStamped]) -> None:
         for goal in goals:
-            self.warn_of_integers(f'a pose on {topic}', *pose_fields(goal))
+            self.warn_of_integers(f'a pose on {topic}', *messages.pose_values(goal.pose))
 
     def _refuse(self, info: GoalInfo, error: MessageError) -> None:
         """Publish that a goal is aborted. The active goal is kept."""

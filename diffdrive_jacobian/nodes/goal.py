@@ -36,12 +36,6 @@ def goal_info(stamp: Time) -> GoalInfo:
     return GoalInfo(goal_id=UUID(uuid=list(uuid.uuid4().bytes)), stamp=stamp)
 
 
-def pose_fields(goal: PoseStamped) -> tuple[float, ...]:
-    """Return the fields of a goal that are read: x, y and the quaternion."""
-    position, q = goal.pose.position, goal.pose.orientation
-    return position.x, position.y, q.x, q.y, q.z, q.w
-
-
 def read_goal(frame: str, poses: Sequence[PoseStamped]) -> tuple[str, Waypoints]:
     """Return the frame and the poses of a goal.
 

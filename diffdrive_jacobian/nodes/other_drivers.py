@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.cdr import DecodingError
@@ -80,8 +81,10 @@ class OtherDrivers:
         if self._subscribed or self._node.count_publishers(topic) < 2:
             return
         self._subscribed = True
+        # Best effort matches every publisher, whatever its quality of service.
+        profile = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
         kind = self._publisher.msg_type
-        self._node.create_subscription(kind, topic, self._on_command, 10, raw=True)
+        self._node.create_subscription(kind, topic, self._on_command, profile, raw=True)
 
     def _on_command(self, data: bytes) -> None:
         if not self._active or data in self._sent:

@@ -78,7 +78,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             wheels = self.subscribe(
                 JointState, source, self._on_joint_command, fields=wire.JOINT_STATE, numbers=numbers
             )
-            self.watch(unpublished(wheels, self.count_publishers))
+            self.watch(unpublished(wheels, source, self.count_publishers))
         elif self.parameters.enable_stamped_cmd_vel:
             fields = wire.TWIST_STAMPED
             self.subscribe(TwistStamped, source, self._on_twist_stamped, fields=fields, numbers=numbers)
@@ -218,6 +218,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         advanced = self._advance()
         frame, ours = message.header.frame_id, self.parameters.odom_frame_id
+        self.warn_of_integers('initialpose', *messages.pose_values(message.pose.pose))
         try:
             if advanced is None:
                 raise MessageError(NO_CLOCK)

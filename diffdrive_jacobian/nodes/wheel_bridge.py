@@ -45,7 +45,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
             )
         else:
             self.subscribe(Twist, 'cmd_vel', self._on_twist, fields=wire.TWIST, numbers=numbers)
-        self.watch(unread(self._joint_command))
+        self.watch(unread(self._joint_command, 'joint_command'))
         self.watch(alternating_commands(self, 'cmd_vel', numbers), ALTERNATION_PATIENCE)
         self._last = 0
         self._moving = False

@@ -213,8 +213,9 @@ class GuardedExecutor:
         It is true after as many rounds as the deepest queue has messages. In a round at most one
         callback of each entity is executed.
         """
-        rounds = self._handled / sum(map(entity_count, self._nodes))
-        return rounds > max(map(queue_depth, self._nodes))
+        # Without entities, when all nodes were destroyed, there is no message either.
+        round_size = max(1, sum(map(entity_count, self._nodes)))
+        return self._handled > round_size * max(map(queue_depth, self._nodes))
 
     def _run_tasks(self) -> None:
         """Execute the tasks that are in the queue of the EventsExecutor."""

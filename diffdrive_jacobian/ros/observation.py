@@ -12,8 +12,10 @@ from typing import Any
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import GetParameters
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.validate_full_topic_name import validate_full_topic_name
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, JointState, LaserScan
 
@@ -85,17 +87,16 @@ class Observer(Node):  # type: ignore[misc]
 
     def _look(self) -> None:
         """Subscribe to new topics, and ask new nodes."""
-        for topic, kinds in self.get_topic_names_and_types():
+        for topic, kinds in self._topics():
             known = next((kind for kind in kinds if kind in RECEIVED), None)
             if known is None or topic in self._received or len(self._received) >= MAX_TOPICS:
                 continue
             if any(info.node_name != self.get_name() for info in self._publishers_of(topic)):
                 self._subscribe(topic, known)
         for name in self._names()[:MAX_NODES]:
-            if name not in self._parameter_clients and '/_' not in name:
-                self._parameter_clients[name] = self.create_client(
-                    GetParameters, f'{name}/get_parameters'
-                )
+            service = f'{name}/get_parameters'
+            if name not in self._parameter_clients and '/_' not in name and _is_valid(service):
+                self._parameter_clients[name] = self.create_client(GetParameters, service)
         for name, client in self._parameter_clients.items():
             if name not in self._asked and client.service_is_ready():
                 self._asked.add(name)
@@ -117,6 +118,13 @@ class Observer(Node):  # type: ignore[misc]
         if len(values) == 1 and values[0].type == 1:
             self._use_sim_time[name] = values[0].bool_value
 
+    def _topics(self) -> list[tuple[str, list[str]]]:
+        """Return the names and types of the topics.
+
+        Programs that use DDS without ROS may have others, which cannot be queried.
+        """
+        return [one for one in self.get_topic_names_and_types() if _is_valid(one[0])]
+
     def _publishers_of(self, topic: str) -> list[Any]:
         return list(self.get_publishers_info_by_topic(topic))
 
@@ -128,7 +136,7 @@ class Observer(Node):  # type: ignore[misc]
     def describe(self, seconds: float) -> Graph:
         """Return the graph as it is now, with what was received in the time before (s)."""
         endpoints = []
-        for topic, _ in self.get_topic_names_and_types():
+        for topic, _ in self._topics():
             for publishes in (True, False):
                 query = self._publishers_of if publishes else self.get_subscriptions_info_by_topic
                 endpoints += [
@@ -217,6 +225,15 @@ class _Received:
             age=self._age,
             simulated_age=self._simulated_age,
         )
+
+
+def _is_valid(name: str) -> bool:
+    """Return whether a topic or a service can have this fully qualified name."""
+    try:
+        validate_full_topic_name(name)
+    except InvalidTopicNameException:
+        return False
+    return True
 
 
 def _nearer(one: float | None, other: float) -> float:

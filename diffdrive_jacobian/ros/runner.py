@@ -64,7 +64,7 @@ def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[
         UserError: The arguments or the environment are invalid.
     """
     domain = os.environ.get('ROS_DOMAIN_ID', '')
-    if domain and not (domain.isdecimal() and int(domain) <= MAX_DOMAIN_ID):
+    if domain and not (domain.isascii() and domain.isdecimal() and int(domain) <= MAX_DOMAIN_ID):
         raise UserError(f'ROS_DOMAIN_ID must be in 0 to {MAX_DOMAIN_ID}, got {domain!r}')
     for flag, value in pairwise(arguments):
         if flag in ('-r', '--remap'):

@@ -11,10 +11,15 @@ from rclpy.serialization import deserialize_message
 
 from diffdrive_jacobian.diagnosis.lasting import Interleaving
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader
+from diffdrive_jacobian.messages.cdr_types import LITTLE_ENDIAN
 from diffdrive_jacobian.messages.wire import GOALS
 from diffdrive_jacobian.ros.rclpy_internals import with_message_info
 
 T = TypeVar('T')
+
+MAX_OTHER_ENCAPSULATION = 200_000
+"""Longest Goals message in an encapsulation that only rclpy reads (bytes): it creates an object for each
+of its poses, of which 2,000 have this size."""
 
 
 def deserialized(data: bytes, message_type: type[T]) -> T:
@@ -88,7 +93,13 @@ def goals_header(data: bytes) -> tuple[Time, int]:
     """Return the stamp and the number of poses of a serialized Goals message without its poses.
 
     Raises:
-        DecodingError: The bytes end before the poses, or are too few for them.
+        DecodingError: The bytes end before the poses, or are too few for them. Or it takes message
+            objects to read them, and they are too many for that.
     """
+    if data[:2] != LITTLE_ENDIAN and len(data) > MAX_OTHER_ENCAPSULATION:
+        raise DecodingError(
+            f'a Goals message must have at most {MAX_OTHER_ENCAPSULATION} bytes, unless it is plain '
+            f'little-endian CDR, got {len(data)}'
+        )
     sec, nanosec, count = _read_goals(data)
     return Time(sec=sec, nanosec=nanosec), count
