@@ -109,7 +109,7 @@ def test_rate_that_keeps_changing_starves_nobody(ros, executor_kind):
         lambda: changed.append(robot.set_parameters([Parameter('publish_rate', value=next(rates))])),
     )
     ros.until(lambda: len(odom) >= 10, 'odometry')
-    assert len(changed) > 2 * len(odom)
+    assert len(changed) > len(odom)
 
 
 # --- One executor

@@ -152,7 +152,7 @@ def test_acknowledgements_are_not_waited_for_after_a_signal(world, bag, monkeypa
 
 def test_it_waits_for_the_required_number_of_subscriptions(world, bag):
     path, run = bag
-    child = world.start('replay_run', str(path), '-w', '2', '-r', '4')
+    child = world.start('replay_run', str(path), '-w', '2', '-r', '4', '--wait-for-all-acked', '20000')
     received = [world.harness.listen(Twist, 'cmd_vel')]
     child.until_says('waiting: /cmd_vel has 1 of 2 subscriptions')
     received.append(world.harness.listen(Twist, 'cmd_vel'))

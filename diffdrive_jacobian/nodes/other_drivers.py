@@ -14,8 +14,9 @@ from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.conversion import MessageError, from_twist_values
 from diffdrive_jacobian.ros.graph_faults import publishers_of
 from diffdrive_jacobian.ros.serialization import reader
+from diffdrive_jacobian.time_units import NANOSECONDS
 
-PERIOD = 1_000_000_000
+PERIOD = NANOSECONDS
 """Shortest time between two searches for other publishers (ns)."""
 REMEMBERED = 64
 """Number of own commands that are remembered. At most as many as the queue is long arrive later."""
