@@ -43,7 +43,7 @@ SAMPLE_PERIOD = 0.1
 """or for the events of this time, whichever comes first (s)."""
 FEWEST = 8
 """The wait never counts if it was behind no more events than this."""
-FIRST_HOLD = 1.0
+FIRST_HOLD = 5.0
 """Time on the SingleThreadedExecutor until nodes move back (s). It doubles if that is too early."""
 LONGEST_HOLD = 60.0
 """Upper limit of that time (s). Then the nodes move back even if it is not quiet: more messages than the
