@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from calibration_data import NOISE, NOMINAL, TRUE, Drive, Simulation, umbmark
 
-from diffdrive_jacobian.calibration import CalibrationError, Given, Noise, calibrate
+from diffdrive_jacobian.calibration import CalibrationError, Given, Noise, calibrate, preparation
 from diffdrive_jacobian.calibration.errors import compared_distance, rms, tracks
 from diffdrive_jacobian.calibration.estimate import Estimate
 from diffdrive_jacobian.calibration.fit import information
@@ -296,6 +296,10 @@ def spoiled(recording, what):
         poses = np.cumsum(0.02 * random.standard_normal(poses.shape), axis=0)
     elif what == 'still':
         poses = 1e-3 * random.standard_normal(poses.shape)
+    elif what == 'one wheel':
+        angles = angles * [0.0, 1.0]
+    elif what == 'positions only':
+        poses[:, 2] = 0.0
     elif what == 'no overlap':
         time = time + 1e4
     elif what == 'NaN':
@@ -309,6 +313,8 @@ def spoiled(recording, what):
     ('what', 'words'),
     [
         ('rest', 'the wheels never turn'),
+        ('one wheel', 'the right wheel never turns'),
+        ('positions only', 'observes positions only'),
         ('swapped', 'swapped'),
         ('mirrored', 'mirrored'),
         ('other robot', 'reference'),
@@ -321,6 +327,49 @@ def spoiled(recording, what):
 def test_faults_are_named(what, words):
     with pytest.raises(CalibrationError, match=words):
         calibrate([spoiled(base(), what)], NOMINAL)
+
+
+def test_wheels_at_a_low_rate_and_slip_are_noted():
+    recording = base()
+    rare = replace(
+        recording,
+        wheel_time=recording.wheel_time[::50],
+        wheel_angles=recording.wheel_angles[::50],
+    )
+    notes = calibrate([rare], NOMINAL).notes
+    assert any('every 1 s' in note for note in notes)
+    assert any('m after 1 m: they slip' in note for note in notes)
+
+
+@pytest.mark.parametrize('overlap', ['reference first', 'wheels first'])
+def test_only_the_time_in_common_counts(overlap):
+    recording = base()
+    if overlap == 'wheels first':
+        late = recording.pose_time > 15.0
+        one = replace(recording, pose_time=recording.pose_time[late], poses=recording.poses[late])
+    else:
+        late = recording.wheel_time > 15.0
+        one = replace(
+            recording,
+            wheel_time=recording.wheel_time[late],
+            wheel_angles=recording.wheel_angles[late],
+        )
+    result = calibrate([one], NOMINAL)
+    assert_true(result)
+    assert result.motions[0].time[0] == pytest.approx(15.0, abs=0.5)
+
+
+def test_long_recordings_are_thinned(monkeypatch):
+    """The bounds that keep an hour at 100 Hz cheap, with smaller numbers."""
+    recording = replace(ROBOT, rate=1).recording(np.random.default_rng(19))
+    monkeypatch.setattr(preparation, 'MOST_SAMPLES', 1500)
+    monkeypatch.setattr(preparation, 'MOST_POSES', 150)
+    result = calibrate([recording], NOMINAL)
+    assert_true(result)
+    assert len(result.recordings[0].wheel_time) <= 1500 < len(recording.wheel_time)
+    assert sum(len(one.time) for one in result.segments) <= 150
+    (note,) = result.notes
+    assert 'poses of the reference are used, evenly spaced' in note
 
 
 def test_too_short_a_drive_is_refused():

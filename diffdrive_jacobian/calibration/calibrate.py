@@ -21,7 +21,14 @@ from diffdrive_jacobian.calibration.measurements import (
 )
 from diffdrive_jacobian.calibration.motion import Geometry, composed
 from diffdrive_jacobian.calibration.observability import undetermined
-from diffdrive_jacobian.calibration.preparation import gaps, overlapping, without_jumps
+from diffdrive_jacobian.calibration.preparation import (
+    SLOW,
+    gaps,
+    overlapping,
+    thinned_poses,
+    thinned_samples,
+    without_jumps,
+)
 from diffdrive_jacobian.calibration.rest import merged
 from diffdrive_jacobian.calibration.rough import rough
 
@@ -36,6 +43,8 @@ BOUNDS = (0.1, 10.0)
 START = Noise(wheel=1e-5, position=0.01, heading=0.02)
 LARGE_WHEEL_NOISE = 1e-2
 """Wheel travel variance beyond which the reference does not follow the wheels (m)."""
+NOTABLE_WHEEL_NOISE = 5e-4
+"""Wheel travel variance that is worth a note (m)."""
 DISAGREEMENT = 30.0
 """Largest squared distance of a recording's own estimate from that of all, in units of its covariance;
 a sum of three squares exceeds it once in a million."""
@@ -123,11 +132,12 @@ def calibrate(
         CalibrationError: The recordings contradict the model, or each other.
     """
     given = given or Given()
-    recordings = tuple(recordings)
-    notes = [note for one in recordings for note in _gap_notes(one)]
+    for one in recordings:
+        _check(one)
+    recordings = tuple(map(thinned_samples, recordings))
+    notes = [note for one in recordings for note in _sampling_notes(one)]
     offsets = np.zeros(len(recordings))
     for index, one in enumerate(recordings):
-        _check(one)
         found = given.time_offset if given.time_offset is not None else time_offset(one, nominal)
         offsets[index] = 0.0 if found is None else found
     segments = [
@@ -142,7 +152,8 @@ def calibrate(
     names = [one.name for one in recordings]
     first = rough(segments, nominal, offsets)
     segments, found_notes = without_jumps(segments, first, offsets, names)
-    notes += found_notes
+    segments, thinned = thinned_poses(segments)
+    notes += [*found_notes, thinned] if thinned else found_notes
     first = rough(segments, nominal, offsets)
     sensor = first.sensor.copy()
     if given.lever_arm is not None:
@@ -164,6 +175,11 @@ def calibrate(
         motions=tuple(motions),
     )
     _check_result(result)
+    if (wheel := estimate.noise.wheel) > NOTABLE_WHEEL_NOISE:
+        notes.append(
+            f'the wheels differ from the reference by {wheel**0.5:.2g} m after 1 m: they slip, a clock '
+            'drifts, or the reference is of another body'
+        )
     if len(recordings) > 1:
         _check_agreement(result, given)
     for one, offset in zip(recordings, result.time_offsets.tolist(), strict=True):
@@ -175,8 +191,14 @@ def calibrate(
     return replace(result, notes=tuple(notes))
 
 
-def _gap_notes(one: Recording) -> list[str]:
+def _sampling_notes(one: Recording) -> list[str]:
     lines = []
+    period = float(np.median(np.diff(one.wheel_time)))
+    if period > SLOW:
+        lines.append(
+            f'{one.name}: the wheels are recorded every {period:.2g} s, so that the motion between is '
+            'guessed: record them at 10 Hz or more'
+        )
     for what, time in (('reference', one.pose_time), ('wheels', one.wheel_time)):
         found = gaps(time)
         if found:

@@ -24,6 +24,11 @@ BLIND = 0.02
 FEWEST = 5
 """Fewest poses of a continuous motion that is used."""
 FEWEST_IN_ALL = 10
+MOST_SAMPLES, MOST_POSES = 400_000, 10_000
+"""Most samples of a recording that are read, and most poses of all that are estimated: both bound time
+and memory. Poses at a high rate have little more to say, because their errors depend on each other."""
+SLOW = 0.25
+"""Period of the wheels beyond which too little of the motion is known (s)."""
 FLOORS = np.array([0.03, 0.03, 0.06])
 """Differences that are never taken for a jump (m, m, rad)."""
 SIGMAS = 8.0
@@ -70,6 +75,36 @@ def overlapping(recording: Recording, index: int, offset: float, radius: float) 
                 )
             )
     return found
+
+
+def thinned_samples(recording: Recording) -> Recording:
+    """Return a recording with at most `MOST_SAMPLES` samples of wheels and of the reference each."""
+    wheels = slice(None, None, -(-len(recording.wheel_time) // MOST_SAMPLES) or 1)
+    poses = slice(None, None, -(-len(recording.pose_time) // MOST_SAMPLES) or 1)
+    return replace(
+        recording,
+        wheel_time=recording.wheel_time[wheels],
+        wheel_angles=recording.wheel_angles[wheels],
+        pose_time=recording.pose_time[poses],
+        poses=recording.poses[poses],
+    )
+
+
+def thinned_poses(segments: Sequence[Segment]) -> tuple[list[Segment], str]:
+    """Return motions with at most about `MOST_POSES` poses, and a note; '': all are kept."""
+    count = sum(len(one.time) for one in segments)
+    every = -(-count // MOST_POSES)
+    if every == 1:
+        return list(segments), ''
+    kept = []
+    for one in segments:
+        # Short motions keep enough poses.
+        step = max(1, min(every, len(one.time) // FEWEST))
+        kept.append(
+            replace(one, time=one.time[::step], poses=one.poses[::step], weights=one.weights[::step])
+        )
+    used = sum(len(one.time) for one in kept)
+    return kept, f'{used} of {count} poses of the reference are used, evenly spaced'
 
 
 def gaps(time: Array) -> list[tuple[float, float]]:
