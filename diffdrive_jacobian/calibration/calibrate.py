@@ -22,9 +22,8 @@ from diffdrive_jacobian.calibration.measurements import (
 from diffdrive_jacobian.calibration.motion import Geometry, composed
 from diffdrive_jacobian.calibration.observability import undetermined
 from diffdrive_jacobian.calibration.preparation import (
-    SLOW,
-    gaps,
     overlapping,
+    sampling_notes,
     thinned_poses,
     thinned_samples,
     without_jumps,
@@ -135,7 +134,7 @@ def calibrate(
     for one in recordings:
         _check(one)
     recordings = tuple(map(thinned_samples, recordings))
-    notes = [note for one in recordings for note in _sampling_notes(one)]
+    notes = [note for one in recordings for note in sampling_notes(one)]
     offsets = np.zeros(len(recordings))
     for index, one in enumerate(recordings):
         found = given.time_offset if given.time_offset is not None else time_offset(one, nominal)
@@ -189,25 +188,6 @@ def calibrate(
                 'of the wheels'
             )
     return replace(result, notes=tuple(notes))
-
-
-def _sampling_notes(one: Recording) -> list[str]:
-    lines = []
-    period = float(np.median(np.diff(one.wheel_time)))
-    if period > SLOW:
-        lines.append(
-            f'{one.name}: the wheels are recorded every {period:.2g} s, so that the motion between is '
-            'guessed: record them at 10 Hz or more'
-        )
-    for what, time in (('reference', one.pose_time), ('wheels', one.wheel_time)):
-        found = gaps(time)
-        if found:
-            begin, length = max(found, key=lambda gap: gap[1])
-            lines.append(
-                f'{one.name}: {len(found)} gap{"" if len(found) == 1 else "s"} in the {what}, '
-                f'the longest of {length:.1f} s at {begin:.3f} s'
-            )
-    return lines
 
 
 def _check(one: Recording) -> None:

@@ -50,6 +50,8 @@ PRIOR_WHEEL_NOISE, PRIOR_FREEDOM = 1e-5, 2.0
 """Wheel travel variance that is assumed in advance (m), and how many squares it counts as. In
 short drives with a coarse reference the likelihood alone is largest at zero, where the stated covariance
 would be far too small."""
+WIDEST = 1.5
+"""Largest standard deviation of the logarithm of the wheel travel variance."""
 LARGEST = Noise(wheel=1.0, position=1e3, heading=1e2)
 
 
@@ -117,13 +119,16 @@ def fit(
         )
         deviation = np.sqrt(np.diag(estimate.covariance())[estimate.free])
         if settled and (size <= np.maximum(tolerances * deviation, NEGLIGIBLE)).all():
-            return estimate
-    if (size[:3] <= deviation[:3] / 5.0).all():
-        return estimate
-    raise CalibrationError(
-        f'the estimate does not converge within {MAX_STEPS} steps: the poses of the reference do not '
-        'fit the motion of the wheels'
-    )
+            break
+    else:
+        if (size[:3] > deviation[:3] / 5.0).any():
+            raise CalibrationError(
+                f'the estimate does not converge within {MAX_STEPS} steps: the poses of the reference '
+                'do not fit the motion of the wheels'
+            )
+    if given.wheel_noise is None:
+        estimate = replace(estimate, information=_averaged(groups, noise, prior))
+    return estimate
 
 
 def information(segments: Sequence[Segment], nominal: Geometry, truth: Estimate) -> Array:
@@ -192,14 +197,10 @@ def _with_noise(
     )
     least, most = _weights(LARGEST), _weights(SMALLEST)
     solution = _solved(groups, weights, prior)
-    counts = np.array([one.count for one in groups])
     before: tuple[Array, Array] | None = None
     settled = not unknown.any()
     for _ in range(MAX_NOISE_STEPS if unknown.any() else 0):
-        costs = np.array(_costs(groups, solution, prior.free))
-        freedom = np.maximum(counts - _used(groups, weights, prior, solution), 1e-3 * counts)
-        freedom[0] += PRIOR_FREEDOM
-        costs[0] += PRIOR_FREEDOM * PRIOR_WHEEL_NOISE
+        freedom, costs = _freedom_and_costs(groups, weights, prior, solution)
         proposed = np.clip(freedom / np.maximum(costs, 1e-300), least, most)
         now, change = np.log(weights), np.where(unknown, np.log(proposed / weights), 0.0)
         target = now + change
@@ -216,6 +217,51 @@ def _with_noise(
             break
     wheel, position, heading = (1.0 / weights).tolist()
     return Noise(wheel=wheel, position=position**0.5, heading=heading**0.5), solution, settled
+
+
+def _averaged(groups: tuple[Group, Group, Group], noise: Noise, prior: _Prior) -> Array:
+    """Return the information of which the inverse is the covariance for uncertain wheel noise.
+
+    It is the mean over the posterior of the logarithm of the wheel travel variance, taken as Gaussian,
+    by Gauss-Hermite quadrature with three points.
+    """
+    weights = _weights(noise)
+
+    def at(shift: float) -> tuple[_Solution, Array]:
+        shifted = weights * [np.exp(shift), 1.0, 1.0]
+        return _solved(groups, shifted, prior), shifted
+
+    def slope(shift: float) -> float:
+        """Return twice the derivative of the log likelihood with respect to the log of the weight."""
+        solution, shifted = at(shift)
+        freedom, cost = _freedom_and_costs(groups, shifted, prior, solution)
+        return float(freedom[0] - shifted[0] * cost[0])
+
+    h = 0.3
+    curvature = (slope(-h) - slope(h)) / (2.0 * h) / 2.0
+    width = min(WIDEST, max(curvature, 1e-9) ** -0.5)
+    scales = prior_deviations(len(prior.free))[prior.free] ** -2.0
+    found = [at(sign * 3.0**0.5 * width)[0] for sign in (-1.0, 0.0, 1.0)]
+    shares = np.array([1.0, 4.0, 1.0]) / 6.0
+    changes = np.array([one.change for one in found])
+    off = changes - shares @ changes
+    covariance = sum(
+        share * (np.linalg.inv(one.information + np.diag(scales)) + np.outer(change, change))
+        for share, one, change in zip(shares, found, off, strict=True)
+    )
+    return np.asarray(np.linalg.inv(covariance) - np.diag(scales))
+
+
+def _freedom_and_costs(
+    groups: tuple[Group, Group, Group], weights: Array, prior: _Prior, solution: _Solution
+) -> tuple[Array, Array]:
+    """Return the degrees of freedom of the residuals of each group, and their sums of squares."""
+    costs = np.array(_costs(groups, solution, prior.free))
+    counts = np.array([one.count for one in groups])
+    freedom = np.maximum(counts - _used(groups, weights, prior, solution), 1e-3 * counts)
+    freedom[0] += PRIOR_FREEDOM
+    costs[0] += PRIOR_FREEDOM * PRIOR_WHEEL_NOISE
+    return freedom, costs
 
 
 def _costs(

@@ -116,6 +116,26 @@ def gaps(time: Array) -> list[tuple[float, float]]:
     return [(float(time[i]), float(steps[i])) for i in long]
 
 
+def sampling_notes(one: Recording) -> list[str]:
+    """Return descriptions of gaps, and of wheels that are recorded too rarely."""
+    lines = []
+    period = float(np.median(np.diff(one.wheel_time)))
+    if period > SLOW:
+        lines.append(
+            f'{one.name}: the wheels are recorded every {period:.2g} s, so that the motion between is '
+            'guessed: record them at 10 Hz or more'
+        )
+    for what, time in (('reference', one.pose_time), ('wheels', one.wheel_time)):
+        found = gaps(time)
+        if found:
+            begin, length = max(found, key=lambda gap: gap[1])
+            lines.append(
+                f'{one.name}: {len(found)} gap{"" if len(found) == 1 else "s"} in the {what}, '
+                f'the longest of {length:.1f} s at {begin:.3f} s'
+            )
+    return lines
+
+
 def without_jumps(
     segments: Sequence[Segment], found: Rough, offsets: Array, names: Sequence[str]
 ) -> tuple[list[Segment], list[str]]:
