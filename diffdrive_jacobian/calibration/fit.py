@@ -46,7 +46,7 @@ NEGLIGIBLE = 1e-7
 """Change of a parameter that is negligible in any case (-, m, rad, s)."""
 SMALLEST = Noise(wheel=1e-9, position=1e-5, heading=1e-5)
 """Smallest noise that is estimated: with less, rounding errors dominate."""
-PRIOR_WHEEL_NOISE, PRIOR_FREEDOM = 1e-5, 2.0
+PRIOR_WHEEL_NOISE, PRIOR_FREEDOM = 1e-5, 1.0
 """Wheel travel variance that is assumed in advance (m), and how many squares it counts as. In
 short drives with a coarse reference the likelihood alone is largest at zero, where the stated covariance
 would be far too small."""
