@@ -15,6 +15,7 @@ COMMANDS = [
     'recover_run',
     'replay_run',
     'verify_run',
+    'watch_run',
     'plot_run',
     'sweep_gains',
     'doctor',
@@ -31,7 +32,7 @@ setup(
     author_email='maintainers@example.com',
     license='Apache-2.0',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
-    package_data={PACKAGE: ['py.typed', 'ros/fastdds/*.xml']},
+    package_data={PACKAGE: ['py.typed', 'ros/fastdds/*.xml'], f'{PACKAGE}.live': ['page/*']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
@@ -65,6 +66,7 @@ setup(
             'ros-unique-identifier-msgs==2.5.0',
         ],
         'doc': ['pdoc>=15'],
+        'live': ['websockets>=15'],
         'plot': ['matplotlib>=3.5'],
         'test': [
             'mcap>=1.2',
@@ -73,6 +75,7 @@ setup(
             'pytest>=7',
             'pytest-xdist>=3',
             'pyyaml>=5',
+            'websockets>=15',
         ],
     },
     zip_safe=False,

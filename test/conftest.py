@@ -16,8 +16,40 @@ import pytest
 
 pytest_plugins = ['diffdrive_jacobian.testing.fixtures', 'pytester']
 
+LONGEST_FIRST = (
+    *(
+        'test_pages',
+        'test_recover_crash',
+        'test_processes',
+        'test_replay_run',
+        'test_tools',
+        'test_salvage',
+    ),
+    *('test_record_run', 'test_live_browser', 'test_secondary_tracking', 'test_fixtures', 'test_flood'),
+    *('test_own_controllers', 'test_se2', 'test_recording', 'test_calibrate_run', 'test_calibration'),
+)
+"""Files with tests that take seconds. They start first, so that none is left for the end."""
+CHUNK = 4
+"""Most tests that a worker of pytest-xdist gets at once."""
 PATIENCE = 20.0
 """How long a condition may take to come true before the test fails (s)."""
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers():
+    """Start two workers per core for `-n auto`: many tests wait for other processes."""
+    return 2 * len(os.sched_getaffinity(0))
+
+
+def pytest_configure(config):
+    if getattr(config.option, 'maxschedchunk', CHUNK) is None:
+        config.option.maxschedchunk = CHUNK
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items):
+    places = {name: place for place, name in enumerate(LONGEST_FIRST)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(places)))
 
 
 class Harness:
@@ -124,6 +156,15 @@ def add(lockstep):
     return lambda node_class, namespace='', **parameters: lockstep.add(
         make(node_class, namespace, **parameters)
     )
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Report loudly what a missing browser left untested."""
+    for report in terminalreporter.stats.get('skipped', []):
+        if 'chromium is not installed' in str(report.longrepr):
+            text = 'NOT TESTED: the live page in a browser. Install chromium (apt install chromium).'
+            terminalreporter.write_line(f'\n{text}\n', red=True, bold=True)
+            break
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ import pytest
 from diffdrive_jacobian import control, simulation
 from diffdrive_jacobian.control import Arrival, StraightLine, VelocityLimits, Waypoints
 from diffdrive_jacobian.kinematics import diff_drive, se2
-from diffdrive_jacobian.simulation import Robot, RobotModel, odometry_noise
+from diffdrive_jacobian.simulation import Drift, Robot, RobotModel, odometry_noise
 
 POSE, TWIST, GOAL = (0.3, -0.2, 1.0), (0.2, 0.5), (1.0, 2.0)
 WHEELS = {'r': 0.033, 'L': 0.16}
@@ -89,9 +89,11 @@ OTHERS = {
     WAYPOINTS.follow: {'pose': POSE, 'law': law, 'arrival': Arrival(), 'turning_gain': 3.0},
     StraightLine: {'start': [0.0, 0.0], 'end': [1.0, 0.0], 'speed': 0.1},
     LINE.position: {'t': 0.5},
+    Drift: {'seed': 3, 'right_wheel_radius_multiplier': 1.01, 'left_wheel_radius_multiplier': 0.99}
+    | {'wheel_separation_multiplier': 1.02},
     RobotModel: {
         **{'wheel_radius': 0.033, 'wheel_separation': 0.16, 'limits': LIMITS},
-        **{'command_timeout': 10**9, 'wheel_travel_variance': 1e-5},
+        **{'command_timeout': 10**9, 'wheel_travel_variance': 1e-5, 'drift': Drift(seed=3)},
     },
     MODEL.limited: {'command': TWIST},
     Robot: {
@@ -116,7 +118,7 @@ ELSEWHERE = {
     *('controller_names', 'find_controller'),
 }
 """Tested in test_resolved_rate and test_own_controllers."""
-OPTIONAL = {'h', 'arrival', 'progress', 'commanded_at'}
+OPTIONAL = {'h', 'arrival', 'progress', 'commanded_at', 'seed', 'drift'}
 """Arguments that may be None."""
 
 NOT_NUMBERS = [None, 'text', '', b'1', 1j, object(), {}, [1.0, [2.0, 3.0]], 10**400, 10**5000, float]

@@ -48,7 +48,7 @@ def _quick(request, monkeypatch):
     """Save time: no bag needs to survive a power cut, and few tests need the picture itself."""
     monkeypatch.setattr(os, 'fsync', lambda descriptor: None)
     if 'drawn' not in request.fixturenames:
-        monkeypatch.setattr(plot_run, 'draw', lambda runs, path: [trace(run) for run in runs])
+        monkeypatch.setattr(plot_run, 'draw', lambda runs, path, **_: [trace(run) for run in runs])
 
 
 @pytest.fixture

@@ -143,6 +143,19 @@ def test_goals_without_a_controller_are_reported_by_the_robot(lockstep, add, nod
     node.destroy_publisher(publisher)
 
 
+def test_remapped_topics_are_checked_under_their_names(lockstep, node, capfd):
+    remaps = ['--ros-args', '-r', 'odom:=pose', '-r', 'cmd_vel:=speed']
+    robot = lockstep.add(VirtualRobot(cli_args=[*remaps, '-r', 'goal_pose:=target']))
+    controller = lockstep.add(GoToGoal(cli_args=remaps))
+    node.create_publisher(PoseStamped, 'target', 1)
+    node.create_publisher(Odometry, 'pose', 1)
+    for one in (robot, controller):
+        check(one)
+    log = said(capfd)
+    assert log.count('/lockstep and /virtual_robot publish /pose') == 2
+    assert '/lockstep publishes /target, but no controller is subscribed to it' in log
+
+
 def test_nothing_is_reported_of_a_complete_team(lockstep, team, capfd):
     lockstep.publish('goals', goals(goal(0.2, 0.0)))
     lockstep.run_until(lambda: team.statuses[-1:] == [SUCCEEDED], 30.0, 'arrival')

@@ -20,7 +20,8 @@ LAYERS = (
     *('kinematics', 'control', 'simulation', 'calibration', 'sweeps'),
     *('messages', 'parameters', 'bags'),
     *('recovery', 'reading', 'diagnosis'),
-    *('plots', 'ros', 'nodes', 'recording', 'replay', 'lockstep', 'drives', 'testing', 'tools'),
+    *('plots', 'ros', 'nodes', 'recording', 'replay', 'lockstep', 'drives'),
+    *('live', 'testing', 'tools'),
 )
 PURE = LAYERS[:4]
 # These may load rosbags and what it needs, but nothing of ROS, and matplotlib only when they draw.

@@ -100,6 +100,18 @@ def wheel_contact(rng):
     return contact.wheel_contact_jacobian(q[:, 1], r), differences(point, q)
 
 
+def exponential(rng, side):
+    t = rng.uniform(-4.0, 4.0, (COUNT, 3))
+    here = se2.inverse(se2.exp(t))[:, np.newaxis]
+
+    def change(d):
+        there = se2.exp(t[:, np.newaxis] + d)
+        return se2.log(se2.compose(there, here) if side == 'left' else se2.compose(here, there))
+
+    jacobian = se2.left_jacobian(t) if side == 'left' else se2.right_jacobian(t)
+    return jacobian, differences(change, np.zeros((COUNT, 3)))
+
+
 def planar_arm(rng, links, heading):
     arm, q = PlanarArm(rng.uniform(0.1, 1.0, links)), rng.uniform(-4.0, 4.0, (COUNT, links))
     numeric = differences(lambda q: arm.forward_kinematics(q)[..., : 3 if heading else 2], q)
@@ -161,6 +173,8 @@ CASES = [
     ('diff_drive.single_wheel_jacobian', single_wheel, {}),
     ('diff_drive.offset_point_jacobian', offset_point, {}),
     ('contact.wheel_contact_jacobian', wheel_contact, {}),
+    ('se2.left_jacobian', exponential, {'side': 'left'}),
+    ('se2.right_jacobian', exponential, {'side': 'right'}),
     *(
         ('planar_arm.PlanarArm.jacobian', planar_arm, {'links': links, 'heading': heading})
         for links in (1, 2, 3, 7)

@@ -31,6 +31,7 @@ NODES = {
 FILES = sorted((Path(__file__).parent.parent / 'config').glob('*.yaml'))
 TYPES = {
     bool: ParameterType.PARAMETER_BOOL,
+    int: ParameterType.PARAMETER_INTEGER,
     float: ParameterType.PARAMETER_DOUBLE,
     str: ParameterType.PARAMETER_STRING,
 }
@@ -80,6 +81,9 @@ def test_every_parameter_is_described_as_declared(add, name):
         if type(default) is float and not specification.nan_is_none:
             (limits,) = description.floating_point_range
             assert limits.from_value <= default <= limits.to_value
+        if type(default) is int:
+            (limits,) = description.integer_range
+            assert (limits.from_value, limits.to_value) == (specification.low, specification.high)
         if type(default) is float:
             assert '[' in specification.description, f'{ros_name} has no unit'
 

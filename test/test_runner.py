@@ -11,6 +11,7 @@ from rclpy.node import Node
 
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.ros.guarded_executor import GuardedExecutor
 from diffdrive_jacobian.ros.runner import UserError, make_executor, ros_context, running
 
@@ -28,6 +29,16 @@ def test_callbacks_with_message_info_have_the_single_threaded_executor(ros):
     executor = make_executor(ros.context, isolated=False, with_info=True)
     assert isinstance(executor, SingleThreadedExecutor)
     executor.shutdown()
+
+
+@pytest.mark.parametrize('node_class', [VirtualRobot, GoToGoal, WheelBridge])
+def test_nodes_of_this_package_run_on_events(ros, node_class):
+    executor = make_executor(ros.context, isolated=False)
+    node = node_class(context=ros.context)
+    executor.add_node(node)
+    assert not executor.fair
+    executor.shutdown()
+    node.destroy_node()
 
 
 @pytest.mark.parametrize('isolated', [False, True])

@@ -219,6 +219,7 @@ class Controller:
                 )
             return v, omega
 
+        vars(bound)['accepts_tuples'] = True
         return bound
 
 

@@ -94,7 +94,8 @@ class Waypoints:
         while not here.turning:
             goal = here._goal
             if not arrival.reached(x, y, theta, goal[0], goal[1]):
-                return here, law(pose, goal if type(pose) is tuple else here.poses[here.index])
+                floats = type(pose) is tuple and hasattr(law, 'accepts_tuples')
+                return here, law(pose, goal if floats else here.poses[here.index])
             if here.index + 1 < len(here.poses):
                 here = here._progressed(here.index + 1, turning=False)
             elif arrival.use_heading:

@@ -205,7 +205,7 @@ def drive_in(
     wheels = WheelSpeeds(client, robot.parameters.wheel_names)
     nodes = (robot, bridge, controller, client)
     progress.nodes_created([node.get_fully_qualified_name() for node in nodes])
-    discover = _recorder(runner, recording)
+    discover = recorder_of(runner, recording)
     client.send_on_odometry()
     started = runner.seconds()
 
@@ -272,8 +272,12 @@ class WheelSpeeds:
             self.speeds = messages.from_joint_state(message, self._names)
 
 
-def _recorder(runner: NodeRunner, recording: Recording | None) -> Callable[[], None]:
-    """Record what the nodes publish. Return a function that finds new topics, to be called often."""
+def recorder_of(runner: NodeRunner, recording: Recording | None) -> Callable[[], None]:
+    """Record what the nodes publish, if there is a recording.
+
+    Returns:
+        A function that finds new topics, to be called often.
+    """
     if recording is None:
         return lambda: None
     recorder = runner.add(lambda: Recorder(Selection(), recording, context=runner.context))

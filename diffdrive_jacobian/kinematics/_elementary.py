@@ -221,7 +221,7 @@ def sinc_defect(angle: Any) -> Any:
     for coefficient in reversed(_DEFECT):
         series = series * square + coefficient
     far = where(square < 1.0, 1.0, angle)
-    return where(square < 1.0, series, (1.0 - sin(far) / far) / far**2)
+    return where(square < 1.0, series, (1.0 - sin(far) / far) / (far * far))
 
 
 def sqrt(x: Any) -> Any:

@@ -34,6 +34,10 @@ class LockstepRunner(NodeRunner):
         """Return the simulated time that has passed (s)."""
         return self._world.elapsed
 
+    def settle(self) -> None:
+        """Execute the callbacks that are due. No time passes."""
+        self._world.settle()
+
     def _add(self, node: Node) -> None:
         """Add a node.
 

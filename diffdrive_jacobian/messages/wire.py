@@ -76,6 +76,25 @@ def odometry_writer(message: Odometry) -> Callable[[Robot, float], bytes]:
     return written
 
 
+def ground_truth_writer(message: Odometry) -> Callable[[Robot], bytes]:
+    """Return a function that serializes the true pose and twist of a robot, without covariances."""
+    twist = 'twist.twist.linear.x', 'twist.twist.angular.z'
+    write = Writer(message, [*STAMP, *_POSE_WITH_COVARIANCE[:4], *twist])
+
+    def written(robot: Robot) -> bytes:
+        x, y, theta = robot.true_pose_tuple
+        return write(
+            *divmod(robot.stamp, NANOSECONDS),
+            x,
+            y,
+            math.sin(theta / 2.0),
+            math.cos(theta / 2.0),
+            *robot.true_twist,
+        )
+
+    return written
+
+
 def start_pose_writer(message: PoseWithCovarianceStamped) -> Callable[[Robot], bytes]:
     """Return a function that serializes the pose of a robot and its covariance."""
     write = Writer(message, [*STAMP, *_POSE_WITH_COVARIANCE])

@@ -17,6 +17,7 @@ from geometry_msgs.msg import (
     TwistStamped,
 )
 from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
 from rclpy.clock import JumpHandle, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from sensor_msgs.msg import JointState
@@ -49,7 +50,8 @@ Command: TypeAlias = tuple[tuple[float, float], int]
 
 class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
     """Node that subscribes to `cmd_vel` or `joint_command` and publishes `odom`, `joint_states`,
-    `cmd_vel_out`, `start_pose` and a transform. `initialpose` and `reset_odometry` set its pose.
+    `cmd_vel_out`, `start_pose` and a transform. `initialpose` and `reset_odometry` set its pose. If its
+    wheels slip or are not as nominal, it also publishes `ground_truth`.
 
     A command takes effect at its stamp, or on receipt if it has none. `cmd_vel_out` has each command as
     it was applied, `start_pose` the pose and the time at which the odometry started. Together they
@@ -66,6 +68,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self._joint_states = self.advertise(JointState, 'joint_states')
         self._applied = self.advertise(TwistStamped, 'cmd_vel_out')
         self._start_pose = self.advertise(PoseWithCovarianceStamped, 'start_pose', latched=True)
+        drifts = self.parameters.drift() is not None
+        self._ground_truth = self.advertise(Odometry, 'ground_truth') if drifts else None
         self._transforms = self._transform_broadcaster() if self.parameters.enable_odom_tf else None
         source, numbers = 'cmd_vel', Interleaving()
         self._commands = numbers
@@ -147,6 +151,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         state = robot.at(now)
         self._odom.publish(self._serialized_odometry(state, self._period))
         self._joint_states.publish(self._serialized_joints(now, state.wheel_speeds, state.wheel_angles))
+        if self._ground_truth is not None:
+            self._ground_truth.publish(self._serialized_truth(state))
         if self._transforms is not None:
             messages.set_time(self._odometry.header.stamp, now)
             messages.set_pose(self._odometry.pose.pose, state.pose)
@@ -230,7 +236,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             response.message = NO_CLOCK
             return response
         now, robot = advanced
-        self._set_pose(robot.placed(self._initial_pose(), np.zeros((3, 3)), now))
+        covariance = np.zeros((3, 3))
+        self._set_pose(robot.placed(self._initial_pose(), covariance, now, odometry_only=True))
         response.success, response.message = True, f'odometry was reset to {self._initial_pose()}'
         return response
 
@@ -239,6 +246,14 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self._publish_start(robot)
         x, y, theta = robot.pose
         self.log_event_info('pose set', f'pose set to x {x:.3f}, y {y:.3f}, theta {theta:.3f}')
+
+    @property
+    def truth(self) -> NDArray[np.float64]:
+        """`[x, y, theta]` where the robot truly is now, shape (3,) (m, m, rad)."""
+        robot = self._robot
+        if robot is None:
+            return self._initial_pose()
+        return robot.at(max(self.now(), self._latest)).true_pose
 
     # --- Parameters
 
@@ -257,7 +272,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             if self._robot.twist != robot.twist:
                 self._publish_applied(self._robot)
 
-    def _initial_pose(self) -> Any:
+    def _initial_pose(self) -> NDArray[np.float64]:
         parameters = self.parameters
         return np.array([parameters.x, parameters.y, wrap_angle(parameters.theta)])
 
@@ -266,10 +281,13 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         parameters = self.parameters
         self._period = 1.0 / parameters.publish_rate
         self._odometry = Odometry(child_frame_id=parameters.base_frame_id)
+        truth = Odometry(child_frame_id=parameters.base_frame_id)
+        truth.header.frame_id = parameters.ground_truth_frame_id
         start, command = PoseWithCovarianceStamped(), TwistStamped()
         self._odometry.header.frame_id = start.header.frame_id = parameters.odom_frame_id
         command.header.frame_id = parameters.base_frame_id
         self._serialized_odometry = wire.odometry_writer(self._odometry)
+        self._serialized_truth = wire.ground_truth_writer(truth)
         self._serialized_start = wire.start_pose_writer(start)
         self._serialized_command = wire.twist_stamped_writer(command)
         self._serialized_joints = wire.joint_state_writer(JointState(name=list(parameters.wheel_names)))

@@ -49,9 +49,9 @@ class Specification:
         if self.choices:
             words.append('one of ' + ', '.join(repr(choice) for choice in self.choices))
         if self.above is not None and self.high is not None:
-            words.append(f'in ({self.above:g}, {self.high:g}]')
+            words.append(f'in ({_bound(self.above)}, {_bound(self.high)}]')
         elif self.low is not None and self.high is not None:
-            words.append(f'in [{self.low:g}, {self.high:g}]')
+            words.append(f'in [{_bound(self.low)}, {_bound(self.high)}]')
         if self.nan_is_none:
             words.append('or .nan for none')
         return ' '.join(words)
@@ -69,6 +69,10 @@ class Specification:
             and (self.high is None or value <= self.high)
             and (self.above is None or value > self.above)
         )
+
+
+def _bound(value: float) -> str:
+    return str(value) if isinstance(value, int) else f'{value:g}'
 
 
 def parameter(
@@ -126,7 +130,7 @@ class NodeParameters:
             value, wanted = getattr(self, field), type(default_of(type(self), field))
             if type(value) is not wanted:
                 raise ParameterError(
-                    f"parameter '{name}' must be a {_TYPE_NAMES[wanted]}"
+                    f"parameter '{name}' must be {_TYPE_NAMES[wanted]}"
                     f'{_example(wanted)}, got {_got(value)}'
                 )
             if not specification.permits(value):
@@ -150,7 +154,7 @@ def _got(value: object) -> str:
     return f"'{printable(value)}'{length}"
 
 
-_TYPE_NAMES = {bool: 'bool', int: 'integer', float: 'double', str: 'string'}
+_TYPE_NAMES = {bool: 'a bool', int: 'an integer', float: 'a double', str: 'a string'}
 
 
 def _example(wanted: type) -> str:

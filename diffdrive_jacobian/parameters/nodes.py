@@ -15,67 +15,15 @@ from diffdrive_jacobian.control.controllers import CONTROLLERS as CONTROLLERS
 from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION, MAX_SPEED
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, parameter
+from diffdrive_jacobian.parameters.limits import LimitParameters, number_or
 from diffdrive_jacobian.simulation.robot import RobotModel
+from diffdrive_jacobian.simulation.slip import MAX_SEED, Drift
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import nanoseconds
 
 MIN_OFFSET = 1e-3
 """Smallest absolute offset (m). The yaw rate of the law is proportional to the inverse of the offset."""
 _STAMPED = 'Use TwistStamped instead of Twist for cmd_vel. Read-only.'
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class LimitParameters(NodeParameters):
-    """Limits of the body twist, with the names and the meaning of diff_drive_controller."""
-
-    linear_x_max_velocity: float = parameter(
-        math.nan,
-        'Maximum forward velocity [m/s]; .nan: no limit.',
-        name='linear.x.max_velocity',
-        bounds=(0.0, MAX_SPEED),
-        nan_is_none=True,
-    )
-    linear_x_min_velocity: float = parameter(
-        math.nan,
-        'Minimum velocity, zero or negative: the limit in reverse [m/s]; .nan: as forward.',
-        name='linear.x.min_velocity',
-        bounds=(-MAX_SPEED, 0.0),
-        nan_is_none=True,
-    )
-    angular_z_max_velocity: float = parameter(
-        math.nan,
-        'Maximum yaw rate, counter-clockwise [rad/s]; .nan: no limit.',
-        name='angular.z.max_velocity',
-        bounds=(0.0, MAX_SPEED),
-        nan_is_none=True,
-    )
-    angular_z_min_velocity: float = parameter(
-        math.nan,
-        'Minimum yaw rate, zero or negative: the limit clockwise [rad/s]; .nan: as counter-clockwise.',
-        name='angular.z.min_velocity',
-        bounds=(-MAX_SPEED, 0.0),
-        nan_is_none=True,
-    )
-
-    def twist_limits(self, default: float = math.inf) -> VelocityLimits:
-        """Return the limits of the twist, without a limit of the wheel speed.
-
-        Args:
-            default: The limit where none is set (m/s, rad/s).
-        """
-        max_v = _or(self.linear_x_max_velocity, default)
-        max_omega = _or(self.angular_z_max_velocity, default)
-        return VelocityLimits(
-            min_v=_or(self.linear_x_min_velocity, -max_v),
-            max_v=max_v,
-            min_omega=_or(self.angular_z_min_velocity, -max_omega),
-            max_omega=max_omega,
-        )
-
-
-def _or(value: float, otherwise: float) -> float:
-    """Return a value, or another one if it is NaN."""
-    return otherwise if math.isnan(value) else value
 
 
 def _wheel_radius() -> Any:
@@ -101,6 +49,15 @@ def _timeout(default: float, description: str) -> Any:
 
 def _multiplier(what: str) -> Any:
     return parameter(1.0, f'Correction factor for the {what} [-].', bounds=(0.1, 10.0))
+
+
+def _true_multiplier(what: str) -> Any:
+    return parameter(
+        1.0,
+        f'True {what}, relative to the nominal one [-]. Read-only.',
+        bounds=(0.1, 10.0),
+        read_only=True,
+    )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -146,11 +103,27 @@ class VirtualRobotParameters(LimitParameters):
         'Publish the transform from odom_frame_id to base_frame_id, if tf2_ros is installed. Read-only.',
         read_only=True,
     )
+    simulate_slip: bool = parameter(
+        False,
+        'Let the wheels slip as wheel_travel_variance says, and publish ground_truth. Read-only.',
+        read_only=True,
+    )
+    slip_seed: int = parameter(
+        0, 'Seed of the random slip. Read-only.', bounds=(0, MAX_SEED), read_only=True
+    )
+    true_left_wheel_radius_multiplier: float = _true_multiplier('radius of the left wheel')
+    true_right_wheel_radius_multiplier: float = _true_multiplier('radius of the right wheel')
+    true_wheel_separation_multiplier: float = _true_multiplier('wheel separation')
+    ground_truth_frame_id: str = parameter('map', 'Name of the frame of ground_truth.')
 
     def check(self) -> None:
         """Raise ParameterError if the names of the wheels or of the frames are equal."""
         _differ('left_wheel_name', self.left_wheel_name, 'right_wheel_name', self.right_wheel_name)
         _differ('odom_frame_id', self.odom_frame_id, 'base_frame_id', self.base_frame_id)
+        if self.drift() is not None:
+            truth = 'ground_truth_frame_id', self.ground_truth_frame_id
+            _differ(*truth, 'odom_frame_id', self.odom_frame_id)
+            _differ(*truth, 'base_frame_id', self.base_frame_id)
 
     @property
     def wheel_names(self) -> tuple[str, str]:
@@ -159,7 +132,7 @@ class VirtualRobotParameters(LimitParameters):
 
     def limits(self) -> VelocityLimits:
         """Return the limits of the twist and of the wheel speed."""
-        max_wheel_speed = _or(self.max_wheel_velocity, math.inf)
+        max_wheel_speed = number_or(self.max_wheel_velocity, math.inf)
         return replace(self.twist_limits(), max_wheel_speed=max_wheel_speed)
 
     def model(self) -> RobotModel:
@@ -170,7 +143,18 @@ class VirtualRobotParameters(LimitParameters):
             limits=self.limits(),
             command_timeout=nanoseconds(self.cmd_vel_timeout),
             wheel_travel_variance=self.wheel_travel_variance,
+            drift=self.drift(),
         )
+
+    def drift(self) -> Drift | None:
+        """Return in what the true motion differs from the odometry; None: in nothing."""
+        drift = Drift(
+            seed=self.slip_seed if self.simulate_slip else None,
+            right_wheel_radius_multiplier=self.true_right_wheel_radius_multiplier,
+            left_wheel_radius_multiplier=self.true_left_wheel_radius_multiplier,
+            wheel_separation_multiplier=self.true_wheel_separation_multiplier,
+        )
+        return None if drift == Drift() else drift
 
 
 def _controller(default: str, choices: Controllers) -> Any:
@@ -293,7 +277,7 @@ class WheelBridgeParameters(NodeParameters):
     @property
     def wheel_speed_limit(self) -> float:
         """The limit of the wheel speeds (rad/s); infinite: none."""
-        return _or(self.max_wheel_velocity, math.inf)
+        return number_or(self.max_wheel_velocity, math.inf)
 
 
 def _differ(first: str, value: str, second: str, other: str) -> None:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from diffdrive_jacobian.plots.ground_truth import draw_ground_truth, ground_truth_mark
 from diffdrive_jacobian.plots.output_files import FORMATS, create
 from diffdrive_jacobian.plots.style import DPI, styled
 from diffdrive_jacobian.plots.uncertainty import draw_uncertainty, uncertainty_marks
@@ -134,6 +135,7 @@ def figure(runs: Sequence[Run]) -> Figure:
         uncertain = len(runs) == 1 and draw_uncertainty(plane, traces[0])
         for one, label, color, style in zip(traces, labels, cycle(COLORS), cycle(STYLES), strict=False):
             _draw_path(plane, one, label, color, style)
+            draw_ground_truth(plane, one.run, *([color] if len(runs) > 1 else []))
             for quantity, panel in panels.items():
                 _draw_over_time(panel, one, quantity, color, style, alone=len(runs) == 1)
         _draw_goals(plane, traces)
@@ -141,6 +143,8 @@ def figure(runs: Sequence[Run]) -> Figure:
         below = drawing.add_subplot(grid[-1, :])
         below.axis('off')
         marks = [*_marks(traces), *(uncertainty_marks() if uncertain else [])]
+        if any(len(run.ground_truth) for run in runs):
+            marks.append(ground_truth_mark(*([GREY] if len(runs) > 1 else [])))
         below.legend(handles=marks, loc='center', ncol=4 if uncertain else 6, borderaxespad=0.0)
         if notes := _notes(runs, labels):
             drawing.supxlabel(notes, fontsize=8.0, color=GREY)

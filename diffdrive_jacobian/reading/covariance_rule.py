@@ -13,6 +13,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.reading.ground_truth import NODE, recorded_drift
 from diffdrive_jacobian.reading.run import Run
 from diffdrive_jacobian.simulation.odometry_noise import covariance_entries, propagate_covariance
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
@@ -22,21 +23,25 @@ EXACT_MOMENTS, FIRST_ORDER, NEITHER = 'exact moments', 'first order', 'neither'
 """Names of the rules."""
 TOLERANCE = 1e-9
 """Largest difference of a covariance, relative to the standard deviations."""
-_NODE, _PARAMETERS = 'virtual_robot', ('wheel_separation', 'wheel_travel_variance')
+_PARAMETERS = ('wheel_separation', 'wheel_travel_variance')
 
 
 def recorded_model(run: Run) -> RobotModel | None:
-    """Return the robot that determines the covariance; None: it was not recorded, or it changed."""
+    """Return the model of the robot; None: it was not recorded, or it changed."""
+    recorded = run.of_node(NODE)
+    # A robot that starts later than the recorder reports its first values as changes.
     changed = {
         name
         for _, node, values in run.parameter_events
-        if node.split('/')[-1] == _NODE
-        for name in values
+        if node.split('/')[-1] == NODE
+        for name, value in values.items()
+        if value != recorded.get(name)
     }
-    separation, variance = (run.number_of_node(_NODE, name, math.nan) for name in _PARAMETERS)
+    separation, variance = (run.number_of_node(NODE, name, math.nan) for name in _PARAMETERS)
     if changed & set(_PARAMETERS) or not (separation > 0.0 and variance >= 0.0):
         return None
-    return RobotModel(wheel_separation=separation, wheel_travel_variance=variance)
+    drift = recorded_drift(run)
+    return RobotModel(wheel_separation=separation, wheel_travel_variance=variance, drift=drift)
 
 
 def rule(

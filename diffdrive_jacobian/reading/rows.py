@@ -33,6 +33,11 @@ def _odometry(message: Any, _: tuple[str, str]) -> Rows:
     yield from_time(message.header.stamp), [*pose.tolist(), *twist, *covariances]
 
 
+def _ground_truth(message: Any, names: tuple[str, str]) -> Rows:
+    for stamp, values in _odometry(message, names):
+        yield stamp, values[:5]
+
+
 def _pose(message: Any, _: tuple[str, str]) -> Rows:
     yield from_time(message.header.stamp), from_pose(message.pose).tolist()
 
@@ -68,6 +73,7 @@ ROW_READERS: dict[tuple[str, str], Callable[[Any, tuple[str, str]], Rows]] = {
     ('cmd_vel', 'geometry_msgs/msg/TwistStamped'): _twist_stamped,
     ('cmd_vel_out', 'geometry_msgs/msg/TwistStamped'): _twist_stamped,
     ('odom', 'nav_msgs/msg/Odometry'): _odometry,
+    ('ground_truth', 'nav_msgs/msg/Odometry'): _ground_truth,
     ('start_pose', 'geometry_msgs/msg/PoseWithCovarianceStamped'): _pose_with_covariance,
     ('goal_pose', 'geometry_msgs/msg/PoseStamped'): _pose,
     ('goals', 'nav_msgs/msg/Goals'): _goals,
@@ -80,6 +86,7 @@ right wheel joint. The functions raise MessageError for messages that the nodes 
 PARAMETER_EVENTS = ('parameter_events', 'rcl_interfaces/msg/ParameterEvent')
 SERIES_TOPICS = {
     'odometry': ('odom',),
+    'ground_truth': ('ground_truth',),
     'cmd_vel': ('cmd_vel',),
     'cmd_vel_out': ('cmd_vel_out',),
     'start_pose': ('start_pose',),

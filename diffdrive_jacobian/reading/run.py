@@ -20,6 +20,7 @@ MAX_NUMBER = 1e6
 """Largest magnitude of the numeric parameters of our nodes (m, m/s, rad/s)."""
 COLUMNS = {
     'odometry': ('x', 'y', 'theta', 'v', 'omega'),
+    'ground_truth': ('x', 'y', 'theta', 'v', 'omega'),
     'cmd_vel': ('v', 'omega'),
     'cmd_vel_out': ('v', 'omega'),
     'start_pose': ('x', 'y', 'theta'),
@@ -70,6 +71,8 @@ class Run:
     path: Path
     odometry: Series
     """`[x, y, theta, v, omega]` of odom (m, m, rad, m/s, rad/s)."""
+    ground_truth: Series
+    """`[x, y, theta, v, omega]` of ground_truth, in its own frame (m, m, rad, m/s, rad/s)."""
     cmd_vel: Series
     """`[v, omega]` as commanded (m/s, rad/s); Twist or TwistStamped."""
     cmd_vel_out: Series

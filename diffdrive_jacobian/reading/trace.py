@@ -98,15 +98,23 @@ def seconds(run: Run, series: Series) -> Array:
     return np.asarray((stamps - odometry.stamps[0]) / NANOSECONDS, dtype=np.float64)
 
 
-def _breaks(run: Run) -> Indices:
-    """Return where the odometry is reset: after a start_pose, back in time, or by a teleport."""
-    stamps, values = run.odometry.stamps, run.odometry.values
+def jumps(series: Series) -> Indices:
+    """Return before which messages of odometry time goes back, or the robot is elsewhere at once."""
+    stamps, values = series.stamps, series.values
     dt, step = np.diff(stamps) / NANOSECONDS, np.hypot(*np.diff(values[:, :2], axis=0).T)
     moving = (dt > 0.0) & (step > 0.0)
     usual = np.median(step[moving] / dt[moving]) if moving.any() else 0.0
     speed = np.abs(values[:, 3])
     fastest = np.maximum(np.fmax(speed[:-1], speed[1:]), usual)
     reset = (dt < 0.0) | (step > np.fmax(TELEPORT, 3.0 * fastest * dt))
+    return np.flatnonzero(reset) + 1
+
+
+def _breaks(run: Run) -> Indices:
+    """Return where the odometry is reset: after a start_pose, back in time, or by a teleport."""
+    stamps, values = run.odometry.stamps, run.odometry.values
+    reset = np.zeros(len(stamps) - 1, dtype=np.bool_)
+    reset[jumps(run.odometry) - 1] = True
     for stamp, pose in zip(run.start_pose.stamps, run.start_pose.values, strict=True):
         first = int(np.searchsorted(stamps, stamp))
         if first < len(stamps) and stamps[first] == stamp:

@@ -23,6 +23,11 @@ from diffdrive_jacobian.messages.conversion import MessageError, plausible_twist
 from diffdrive_jacobian.parameters.declaration import from_ros
 from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
 from diffdrive_jacobian.reading.covariance_rule import NEITHER, recorded_model, rule, start_covariances
+from diffdrive_jacobian.reading.ground_truth import (
+    TruthDifferences,
+    placed_as_recorded,
+    truth_differences,
+)
 from diffdrive_jacobian.reading.reader import BagError
 from diffdrive_jacobian.reading.run import Run, Series
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
@@ -61,6 +66,9 @@ class Verification:
     its start were not recorded."""
     covariance_difference: float = 0.0
     """Largest difference of a covariance from the rule, relative to the standard deviations."""
+    truth: TruthDifferences | None = None
+    """Differences of the ground truth. None: it was not compared, because it, the parameters of the
+    robot or its start were not recorded."""
 
     @property
     def allowed(self) -> float:
@@ -72,6 +80,9 @@ class Verification:
         rule if they were compared.
         """
         near = np.all(self.distances <= tolerance) and np.all(self.headings <= yaw_tolerance)
+        if self.truth is not None:
+            near &= np.all(self.truth.distances <= tolerance)
+            near &= np.all(self.truth.headings <= yaw_tolerance)
         return bool(near) and self.covariance != NEITHER
 
 
@@ -152,6 +163,14 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
     if start == 'start_pose' and recorded_model(run) and len(run.odometry_covariances) == len(stamps):
         events = [(anchor.robot, not anchor.is_command) for anchor in anchors[0]]
         covariance = rule(events, messages, run.odometry_covariances[covariances, :6])
+    truth = None
+    if start == 'start_pose':
+        truth = truth_differences(run, (robot for _, robot in messages))
+    if truth is None and len(run.ground_truth):
+        notes += (
+            'ground_truth was not compared: it needs the parameters of virtual_robot, cmd_vel_out and '
+            'the first start_pose',
+        )
     difference: NDArray[np.float64] = np.array(measured) - np.array(poses)
     return Verification(
         source=source,
@@ -162,6 +181,7 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
         notes=notes,
         covariance=covariance[0],
         covariance_difference=covariance[1],
+        truth=truth,
     )
 
 
@@ -231,7 +251,10 @@ def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
             # From before the recording, or from before time went back.
             continue
         elif is_start:
-            robot = latest.placed(row[:3], row[3:].reshape(3, 3), stamp)
+            pose, covariance = row[:3], row[3:].reshape(3, 3)
+            moved = latest.placed(pose, covariance, stamp)
+            reset = latest.placed(pose, covariance, stamp, odometry_only=True)
+            robot = placed_as_recorded(run, (moved, reset))
         else:
             robot = latest.commanded((float(row[0]), float(row[1])), stamp)
         epochs[-1].append(_Anchor(robot, received, is_command=not is_start))

@@ -8,6 +8,7 @@ RUN_TOPICS = (
     'cmd_vel',
     'cmd_vel_out',
     'odom',
+    'ground_truth',
     'start_pose',
     'initialpose',
     'goal_pose',

@@ -70,9 +70,14 @@ def unpublished(subscription: Subscription, count: Callable[[str], int]) -> Chec
 
 
 def several_publishers(node: Node, topic: str) -> Check:
-    """Return a check whether several nodes publish a topic that must have one publisher."""
+    """Return a check whether several nodes publish a topic that must have one publisher.
+
+    Args:
+        node: The node that asks.
+        topic: Name of the topic before it is remapped, one of ONE_PUBLISHER.
+    """
+    remedy = ONE_PUBLISHER[topic]
     topic = node.resolve_topic_name(topic)
-    remedy = ONE_PUBLISHER[base_name(topic)]
 
     def check() -> str | None:
         if node.count_publishers(topic) < 2:
@@ -105,14 +110,14 @@ def alternating_commands(node: Node, topic: str, commands: Interleaving) -> Chec
 
 def goals_without_controller(node: Node, *topics: str) -> Check:
     """Return a check whether goals are published that no controller receives."""
-    resolved = [node.resolve_topic_name(topic) for topic in topics]
+    resolved = {node.resolve_topic_name(topic): START_READER[topic] for topic in topics}
 
     def check() -> str | None:
-        for topic in resolved:
+        for topic, start in resolved.items():
             if node.count_publishers(topic) and not node.count_subscribers(topic):
                 return (
                     f'{listed(publishers_of(node, topic))} publishes {topic}, but no controller is '
-                    f'subscribed to it, so that goals are lost: {START_READER[base_name(topic)]} '
+                    f'subscribed to it, so that goals are lost: {start} '
                     f'{SAME_NAMES.format(base_name(topic))}'
                 )
         return None

@@ -319,6 +319,7 @@ def with_message_info(
 
     Relies on `Subscription.callback` deciding by the signature whether the info is passed, and on the
     executors: the SingleThreadedExecutor passes two arguments, the EventsExecutor of Jazzy one tuple.
+    The times in the info are right on the SingleThreadedExecutor only.
     """
 
     def received(data: Any, info: Mapping[str, Any] | None = None) -> None:
@@ -329,6 +330,7 @@ def with_message_info(
     kind = inspect.Parameter.POSITIONAL_ONLY
     parameters = [inspect.Parameter(name, kind) for name in ('data', 'info')]
     vars(received)['__signature__'] = inspect.Signature(parameters)
+    vars(received)['any_executor'] = True
     return received
 
 
@@ -374,12 +376,14 @@ def queue_depth(node: Node) -> float:
 def requires_wait_set(node: Node) -> bool:
     """Return whether a node has callbacks that the EventsExecutor of Jazzy does not support.
 
-    It passes a message and its info as one argument, does not await coroutines of subscriptions and
-    services, and raises an exception for guard conditions.
+    It passes a message and its info as one argument, which only callbacks of `with_message_info` take,
+    does not await coroutines of subscriptions and services, and raises an exception for guard
+    conditions.
     Relies on `Subscription._callback_type`.
     """
     with_info = any(
         subscription._callback_type is not Subscription.CallbackType.MessageOnly
+        and not hasattr(subscription.callback, 'any_executor')
         for subscription in node.subscriptions
     )
     entities = (*node.subscriptions, *node.services)

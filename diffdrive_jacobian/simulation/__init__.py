@@ -6,20 +6,23 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
+from diffdrive_jacobian.simulation.slip import Drift
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.simulation.closed_loop import closed_loops, trajectories
     from diffdrive_jacobian.simulation.tracking import track_line
 
-__all__ = ['Robot', 'RobotModel', 'closed_loops', 'track_line', 'trajectories']
+__all__ = ['Drift', 'Robot', 'RobotModel', 'closed_loops', 'track_line', 'trajectories']
 _MODULES = {'closed_loops': 'closed_loop', 'trajectories': 'closed_loop', 'track_line': 'tracking'}
 
 
 def __getattr__(name: str) -> Any:
-    """Return a function. Nodes, which need none of them, start faster without."""
-    if name not in _MODULES:
-        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    return getattr(import_module(f'{__name__}.{_MODULES[name]}'), name)
+    """Return a function or its module. Nodes, which need none of them, start faster without."""
+    if name in _MODULES:
+        return getattr(import_module(f'{__name__}.{_MODULES[name]}'), name)
+    if name in _MODULES.values():
+        return import_module(f'{__name__}.{name}')
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
 
 
 def __dir__() -> list[str]:

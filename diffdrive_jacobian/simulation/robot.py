@@ -10,12 +10,16 @@ it along one exact arc, so the motion does not depend, to the last bit, on when 
 A state is computed in floats, and its covariance and its arrays when they are first read. A node that
 needs no arrays reads `pose_tuple` and `covariance_tuple`.
 
+The pose is that of the odometry, computed from the turns of the wheels. The robot is truly there, unless
+its model has a `drift`. `true_pose` is where it truly is.
+
 Source: doc/mathematics.md, "Motion".
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -39,11 +43,12 @@ from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_bod
 from diffdrive_jacobian.simulation._uncertainty import Uncertainty
 from diffdrive_jacobian.simulation.exact_moments import Moments, gaussian_moments
 from diffdrive_jacobian.simulation.odometry_noise import covariance_entries, twist_covariance_entries
+from diffdrive_jacobian.simulation.slip import Drift, Truth
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 STANDSTILL = (0.0, 0.0)
-_State: TypeAlias = tuple[tuple[float, float, float], tuple[float, float], Uncertainty]
-"""Pose, wheel angles and uncertainty at a time."""
+_State: TypeAlias = tuple[tuple[float, float, float], tuple[float, float], Uncertainty, Truth | None]
+"""Pose, wheel angles, uncertainty and truth at a time."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -52,7 +57,8 @@ class RobotModel:
 
     Raises:
         ValueError: A length is not positive and finite, the variance or the timeout is negative, the
-            timeout is not an integer, or the limits are not those of one robot.
+            timeout is not an integer, the limits are not those of one robot, or the drift is of
+            another class.
     """
 
     wheel_radius: float = 0.033
@@ -65,6 +71,8 @@ class RobotModel:
     """Time after which the last command is replaced by zero (ns); 0: never."""
     wheel_travel_variance: float = 1e-5
     """k, variance of each wheel's travel per distance travelled (m)."""
+    drift: Drift | None = None
+    """In what the true motion differs from the odometry; None: in nothing."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -73,6 +81,8 @@ class RobotModel:
         instance('limits', self.limits, VelocityLimits)
         if not self.limits.alike:
             raise ValueError(f'limits must be numbers for one robot, got {self.limits}')
+        if self.drift is not None:
+            instance('drift', self.drift, Drift)
         timeout = nanoseconds('command_timeout', self.command_timeout)
         if timeout < 0:
             raise ValueError(f'command_timeout must be zero or positive (ns), got {timeout}')
@@ -128,6 +138,8 @@ class Robot:
     pose_tuple: tuple[float, float, float] = field(init=False, repr=False)
     """`(x, y, theta)`, the pose as floats (m, m, rad)."""
     _uncertainty: Uncertainty = field(init=False, repr=False)
+    # None: the pose is the true one.
+    _truth: Truth | None = field(init=False, repr=False)
     # The last state that was computed from this one, because often the same one is needed next.
     _ahead: tuple[int, _State] | None = field(init=False, repr=False, default=None)
 
@@ -148,6 +160,7 @@ class Robot:
             'covariance': covariance,
             'pose_tuple': tuple(pose.tolist()),
             '_uncertainty': Uncertainty(gaussian_moments(entries)),
+            '_truth': _truth(self.model, pose.tolist()),
         }
         for name in ('wheel_angles', 'command', 'twist'):
             values[name] = _pair(name, getattr(self, name))
@@ -179,6 +192,24 @@ class Robot:
         """
         xx, xy, xt, yy, yt, tt, *_ = self._uncertainty.moments()
         return xx, xy, xt, xy, yy, yt, xt, yt, tt
+
+    @property
+    def true_pose_tuple(self) -> tuple[float, float, float]:
+        """`(x, y, theta)` of the true pose (m, m, rad); without drift that of the odometry."""
+        return self.pose_tuple if self._truth is None else self._truth.pose
+
+    @property
+    def true_pose(self) -> NDArray[np.float64]:
+        """`[x, y, theta]` of the true pose, shape (3,)."""
+        return np.array(self.true_pose_tuple)
+
+    @property
+    def true_twist(self) -> tuple[float, float]:
+        """The true twist `(v, omega)` from this time on, the slip included (m/s, rad/s)."""
+        truth, model = self._truth, self.model
+        if truth is None or self.twist == STANDSTILL:
+            return self.twist
+        return truth.twist(self.stamp, self.twist, model.wheel_separation, model.wheel_travel_variance)
 
     @property
     def moments(self) -> Moments:
@@ -260,20 +291,25 @@ class Robot:
         twist = saturate(v, omega, model.limits, model.wheel_radius, model.wheel_separation)
         return _robot(model, stamp, state, (v, omega), twist, None if v == omega == 0.0 else stamp)
 
-    def placed(self, pose: ArrayLike, covariance: ArrayLike, stamp: int) -> Robot:
+    def placed(
+        self, pose: ArrayLike, covariance: ArrayLike, stamp: int, *, odometry_only: bool = False
+    ) -> Robot:
         """Restart at a pose, with the same command and wheel angles.
 
         Args:
             pose: `[x, y, theta]`, shape (3,) (m, m, rad).
             covariance: Its covariance, shape (3, 3). The error is taken for Gaussian.
             stamp: The time (ns).
+            odometry_only: Whether the robot stays where it truly is. Otherwise this becomes the true
+                pose, too.
 
         Raises:
             ValueError: The pose or the covariance is invalid, as in the constructor; or as `at`.
         """
         here = self.at(stamp)
         placed = Robot(model=self.model, stamp=here.stamp, pose=pose, covariance=covariance)  # type: ignore[arg-type]
-        state = placed.pose_tuple, here.wheel_angles, placed._uncertainty
+        truth = here._truth if odometry_only else placed._truth
+        state = placed.pose_tuple, here.wheel_angles, placed._uncertainty, truth
         return _robot(here.model, here.stamp, state, here.command, here.twist, here.commanded_at)
 
     def remodelled(self, model: RobotModel, stamp: int, *, wheels_commanded: bool = False) -> Robot:
@@ -292,7 +328,13 @@ class Robot:
             speeds = body_to_wheel(*command, self.model.wheel_radius, self.model.wheel_separation)
             command = wheel_to_body(*speeds, model.wheel_radius, model.wheel_separation)
         limited = model.limited(command)
-        return _robot(model, here.stamp, here._present, command, limited, here.commanded_at)
+        pose, angles, uncertainty, truth = here._present
+        if truth is None or model.drift is None:
+            truth = _truth(model, pose)
+        else:
+            truth = truth.with_drift(model.drift)
+        state = pose, angles, uncertainty, truth
+        return _robot(model, here.stamp, state, command, limited, here.commanded_at)
 
     def restarted(self, stamp: int) -> Robot:
         """Stop at the same pose, at a time that may be earlier.
@@ -301,11 +343,13 @@ class Robot:
             ValueError: The time is not an integer (ns).
         """
         stamp = nanoseconds('stamp', stamp)
-        return _robot(self.model, stamp, self._present, STANDSTILL, STANDSTILL)
+        pose, angles, uncertainty, truth = self._present
+        state = pose, angles, uncertainty, None if truth is None else truth.at_rest()
+        return _robot(self.model, stamp, state, STANDSTILL, STANDSTILL)
 
     @property
     def _present(self) -> _State:
-        return self.pose_tuple, self.wheel_angles, self._uncertainty
+        return self.pose_tuple, self.wheel_angles, self._uncertainty, self._truth
 
     def _advanced(self, stamp: int) -> tuple[int, _State, bool]:
         """Return a time (ns), the state at that time, and whether the timeout stopped the robot before.
@@ -328,15 +372,21 @@ class Robot:
             return ahead[1]
         dt = (stamp - self.stamp) / NANOSECONDS
         twist = v, omega = self.twist
+        truth = self._truth
         if dt == 0.0 or twist == STANDSTILL:
-            return self._present
+            if truth is None or dt == 0.0:
+                return self._present
+            return self.pose_tuple, self.wheel_angles, self._uncertainty, truth.at_rest()
         model, (x, y, theta), (right, left) = self.model, self.pose_tuple, self.wheel_angles
         omega_R, omega_L = self.wheel_speeds
         angles = right + omega_R * dt, left + omega_L * dt
         if not (math.isfinite(angles[0]) and math.isfinite(angles[1])):
             raise ValueError(f'wheel_angles must be finite, got {list(angles)}')
-        arc = theta, twist, dt, model.wheel_separation, model.wheel_travel_variance
-        state = arc_end(x, y, theta, v, omega, dt), angles, self._uncertainty.after(arc)
+        L, k = model.wheel_separation, model.wheel_travel_variance
+        if truth is not None:
+            truth = truth.after(self.stamp, stamp, twist, L, k)
+        uncertainty = self._uncertainty.after((theta, twist, dt, L, k))
+        state = arc_end(x, y, theta, v, omega, dt), angles, uncertainty, truth
         _set(self, '_ahead', (stamp, state))
         return state
 
@@ -354,17 +404,24 @@ def _robot(
 ) -> Robot:
     """Return a robot with checked values, without checking them again for every message."""
     robot = object.__new__(Robot)
-    pose, angles, uncertainty = state
+    pose, angles, uncertainty, truth = state
     _set(robot, 'model', model)
     _set(robot, 'stamp', stamp)
     _set(robot, 'pose_tuple', pose)
     _set(robot, '_uncertainty', uncertainty)
+    _set(robot, '_truth', truth)
     _set(robot, 'wheel_angles', angles)
     _set(robot, 'command', command)
     _set(robot, 'twist', twist)
     _set(robot, 'commanded_at', commanded_at)
     _set(robot, '_ahead', None)
     return robot
+
+
+def _truth(model: RobotModel, pose: Sequence[float]) -> Truth | None:
+    """Return the truth of a robot whose pose is the true one; None: its model has no drift."""
+    x, y, theta = pose
+    return None if model.drift is None else Truth(model.drift, (x, y, theta))
 
 
 def _pair(name: str, value: Any) -> tuple[float, float]:

@@ -191,7 +191,7 @@ def _given(options: argparse.Namespace) -> Given:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _cli.Parser(
         prog=PROGRAM,
         description='Estimate the wheel radii and the wheel separation of a robot from recorded drives '
         'with a reference of its pose, such as motion capture or SLAM. Writes the multipliers of '

@@ -15,7 +15,7 @@ from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.nodes import CONTROLLERS
 from diffdrive_jacobian.plots.output_files import NOT_OVERWRITTEN
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools import _cli, _live
 from diffdrive_jacobian.tools._waiting import busy
 
 if TYPE_CHECKING:
@@ -38,7 +38,18 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     _cli.refuse_without(parser, options, '--force', '--output')
     if options.lockstep and options.open:
         parser.error('--lockstep and --open exclude each other: other processes have another clock')
+    if not options.live:
+        if not options.coordinates:
+            parser.error('the following arguments are required: X Y (only --live needs no goal)')
+        if options.port or options.no_browser:
+            parser.error('--port and --no-browser are options of --live')
+    elif options.timeout != parser.get_default('timeout'):
+        parser.error('--timeout has no effect with --live, which ends by Ctrl-C')
     ros = ['--ros-args', '--log-level', 'warn', '--', *_cli.with_params_file(ros, options)]
+    if options.live:
+        from diffdrive_jacobian.tools._live_drive import drive_with_page
+
+        return drive_with_page(options, heading, ros, signals)
     # Not above: --help needs no ROS.
     from diffdrive_jacobian.drives import DriveError, drive, waypoints_through
     from diffdrive_jacobian.recording.record import open_recording, saved_on_error
@@ -69,7 +80,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                     lockstep=options.lockstep,
                     isolated=not options.open,
                     timeout=options.timeout,
-                    parameters=_parameters(options),
+                    parameters=controller_parameters(options),
                     recording=recording,
                     ros_arguments=ros,
                     signals=signals,
@@ -83,9 +94,15 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     code = _cli.FAILED if outcome is None else _report(outcome, options)
     if recording is None:
         return code
-    saved = _save(recording, plot=not options.no_plot, replace=options.force)
+    saved = save(recording, plot=not options.no_plot, replace=options.force)
     # An interruption remains one.
     return code if code == _cli.INTERRUPTED else saved or code
+
+
+def _warn_of_unused_files(ros: Sequence[str], names: Sequence[str]) -> None:
+    from diffdrive_jacobian.tools._unused_files import warn_of_unused_files
+
+    warn_of_unused_files(PROGRAM, ros, names)
 
 
 class _Progress:
@@ -109,9 +126,7 @@ class _Progress:
         self._bar.__exit__()
 
     def nodes_created(self, names: Sequence[str]) -> None:
-        from diffdrive_jacobian.tools._unused_files import warn_of_unused_files
-
-        warn_of_unused_files(PROGRAM, self._ros, names)
+        _warn_of_unused_files(self._ros, names)
 
     def driving(self, seconds: float, index: int, distance: float, wheels: tuple[float, float]) -> None:
         self._seconds = seconds
@@ -122,7 +137,7 @@ class _Progress:
         self._bar.show(f'goal {index + 1}/{len(self._goals)} ({x:g}, {y:g})', distance, wheels)
 
 
-def _parameters(options: argparse.Namespace) -> dict[str, Any]:
+def controller_parameters(options: argparse.Namespace) -> dict[str, Any]:
     """Return the controller's parameters that were given by an option of their own."""
     given = {'xy_goal_tolerance': options.tolerance, 'controller': options.controller}
     if options.heading is not None:
@@ -134,7 +149,7 @@ def _picture(recording: Recording) -> Path:
     return recording.bag.with_name(recording.bag.name + '.png')
 
 
-def _save(recording: Recording, *, plot: bool, replace: bool) -> int:
+def save(recording: Recording, *, plot: bool, replace: bool) -> int:
     """Write the bag and its picture, and print their names; return the exit code."""
     from diffdrive_jacobian.plots.run_figure import draw
     from diffdrive_jacobian.reading.reader import BagError, read_run
@@ -211,7 +226,7 @@ def _parser() -> argparse.ArgumentParser:
         'or the recording is not complete; 2: wrong arguments; 130: interrupted.',
     )
     parser.add_argument(
-        'coordinates', metavar='X Y', nargs='+', type=_cli.coordinate, help='x and y of each goal (m)'
+        'coordinates', metavar='X Y', nargs='*', type=_cli.coordinate, help='x and y of each goal (m)'
     )
     parser.add_argument(
         '--timeout',
@@ -256,4 +271,11 @@ def _parser() -> argparse.ArgumentParser:
         help='let other processes (RViz, ros2 topic) communicate with the nodes (default: isolated, so '
         'that no real robot on the network can be moved by mistake)',
     )
+    parser.add_argument(
+        '--live',
+        action='store_true',
+        help='show the drive on a page in the browser and steer the robot there, until Ctrl-C; without '
+        'X Y the robot waits for goals; the bag is recorded, no picture is drawn',
+    )
+    _live.add_options(parser)
     return parser

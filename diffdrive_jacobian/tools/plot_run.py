@@ -24,6 +24,7 @@ from diffdrive_jacobian.tools.entry_points import OUTPUT_ERROR
 PROGRAM = 'plot_run'
 TOPICS = (
     'odom',
+    'ground_truth',
     'cmd_vel',
     'cmd_vel_out',
     'start_pose',

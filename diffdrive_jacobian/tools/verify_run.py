@@ -62,6 +62,11 @@ def report(verification: Verification, tolerance: float, yaw_tolerance: float) -
             f'covariance: {_RULES[verification.covariance]}; '
             f'maximum relative difference {verification.covariance_difference:.3g}'
         )
+    if (truth := verification.truth) is not None:
+        lines.append(
+            f'ground truth: maximum error {np.max(truth.distances):.3g} m, '
+            f'{np.max(truth.headings):.3g} rad in {len(truth.distances)} messages'
+        )
     verdict = 'as recorded' if verification.holds(tolerance, yaw_tolerance) else 'NOT as recorded'
     return '\n'.join([*lines, f'the robot moves {verdict}'])
 

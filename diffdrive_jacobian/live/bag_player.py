@@ -1,0 +1,192 @@
+"""A bag as a source of the page: time that plays, pauses and jumps."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffdrive_jacobian.live import settings
+from diffdrive_jacobian.live.commands import Command, Pause, Seek, SetSpeed, Step
+from diffdrive_jacobian.live.quantities import rounded
+from diffdrive_jacobian.live.recorded_runs import RecordedRobot
+from diffdrive_jacobian.live.robot_state import RobotState
+from diffdrive_jacobian.live.session import Session, Snapshot
+from diffdrive_jacobian.live.trail import MAX_POINTS, Trail
+from diffdrive_jacobian.messages.goal_status import GoalState
+
+PERIOD = 1.0 / 30.0
+"""Time between two states (s)."""
+STEP = 0.02
+"""Duration of a step, unless the odometry says otherwise (s)."""
+COMMAND_LIFE, WHEELS_LIFE = 0.5, 1.0
+"""Time for which a recorded cmd_vel and joint_states count (s)."""
+STRIP_POINTS = 1500
+"""Largest number of points of a curve over time."""
+
+
+class BagPlayer:
+    """Plays the robots of a bag."""
+
+    def __init__(
+        self, session: Session, path: Path, robots: Sequence[RecordedRobot], *, speed: float = 1.0
+    ) -> None:
+        """Start at the beginning, playing.
+
+        Args:
+            session: What the page shows, and where its commands come from.
+            path: The bag, for its name.
+            robots: Its robots, at least one.
+            speed: Speed relative to the clock on the wall.
+        """
+        self._session = session
+        self._films = [_Film(robot) for robot in robots]
+        self._end = max(float(robot.time[-1]) for robot in robots)
+        self.time, self.speed, self.paused = 0.0, speed, False
+        """Present time (s), speed, and whether it stands."""
+        self._last = time.monotonic()
+        self._shown: object = None
+        self._fixed = {
+            'bag': path.name,
+            'strips': {film.robot.name: film.strips() for film in self._films},
+            'settings': {film.robot.name: film.settings() for film in self._films},
+            'notes': [note for film in self._films for note in film.robot.run.notes][:5],
+        }
+
+    def work(self) -> None:
+        """Obey the page, advance, and store the state; to be called every PERIOD."""
+        for _, command in self._session.take_commands():
+            self._obey(command)
+        now = time.monotonic()
+        self.advance(now - self._last)
+        self._last = now
+
+    def advance(self, elapsed: float) -> None:
+        """Advance by a time on the wall (s), and store the state if it is new."""
+        if not self.paused:
+            self.time = min(self._end, self.time + elapsed * self.speed)
+            self.paused = self.time >= self._end
+        state = self.time, self.speed, self.paused
+        if state == self._shown:
+            return
+        self._shown = state
+        self._session.store(
+            Snapshot(
+                robots=[film.shown(self.time) for film in self._films],
+                trails={film.robot.name: film.trail for film in self._films},
+                world={
+                    'kind': 'bag',
+                    'time': round(self.time, 3),
+                    'duration': round(self._end, 3),
+                    'paused': self.paused,
+                    'speed': self.speed,
+                },
+                fixed=self._fixed,
+            )
+        )
+
+    def _obey(self, command: Command) -> None:
+        if isinstance(command, Pause):
+            self.paused = command.paused
+            if not self.paused and self.time >= self._end:
+                self.time = 0.0
+        elif isinstance(command, Step):
+            self.paused = True
+            self.time = min([film.next(self.time) for film in self._films] + [self._end])
+        elif isinstance(command, SetSpeed):
+            self.speed = command.speed
+        elif isinstance(command, Seek):
+            self.time = min(command.time, self._end)
+        else:
+            self._session.notify('this is a recording: it cannot be steered', 'warning')
+
+
+class _Film:
+    """One robot of a bag, at any time."""
+
+    def __init__(self, robot: RecordedRobot) -> None:
+        self.robot, run = robot, robot.run
+        self._state = RobotState(robot.name)
+        self._state.controller_values = run.of_node('go_to_goal')
+        self._state.robot_values = run.of_node('virtual_robot')
+        self._commands, self._wheels = robot.times(run.cmd_vel), robot.times(run.wheels)
+        self._statuses = robot.run.goal_status.received
+        self.trail = Trail()
+        self._trail_times: list[float] = []
+        step = max(1, len(robot.time) // MAX_POINTS)
+        breaks = set(robot.trace.breaks.tolist())
+        for index in range(0, len(robot.time), step):
+            if any(one in breaks for one in range(index - step + 1, index + 1)) and self.trail.points:
+                self.trail.points.append(None)
+                self._trail_times.append(float(robot.time[index]))
+            x, y = run.odometry.values[index, :2].tolist()
+            self.trail.points.append((round(x, 4), round(y, 4)))
+            self._trail_times.append(float(robot.time[index]))
+
+    def next(self, time: float) -> float:
+        """Return the time of the next odometry (s)."""
+        index = int(np.searchsorted(self.robot.time, time + 1e-9, side='right'))
+        return float(self.robot.time[index]) if index < len(self.robot.time) else time + STEP
+
+    def shown(self, time: float) -> dict[str, Any]:
+        """Return the JSON object of the robot at a time (s)."""
+        robot, run, state = self.robot, self.robot.run, self._state
+        index = robot.index(time)
+        values = run.odometry.values[index]
+        state.time = float(robot.time[index])
+        state.pose, state.twist = values[:3], (float(values[3]), float(values[4]))
+        state.covariance = robot.covariance[index]
+        state.command = robot.latest(self._commands, run.cmd_vel, time, COMMAND_LIFE)
+        state.wheels = robot.latest(self._wheels, run.wheels, time, WHEELS_LIFE)
+        self._set_goal(index)
+        travelled = int(np.searchsorted(self._trail_times, time, side='right'))
+        shown = state.shown(age=max(0.0, time - state.time), by_hand=False, travelled=travelled)
+        assert shown is not None
+        return shown
+
+    def _set_goal(self, index: int) -> None:
+        run, trace, goal = self.robot.run, self.robot.trace, self._state.goal
+        number = int(trace.goal[index])
+        if number < 0:
+            goal.goals, goal.index, goal.state = None, 0, GoalState.UNKNOWN
+            return
+        stamp = run.goals.received[number]
+        route = np.flatnonzero(run.goals.received == stamp)
+        goal.goals = run.goals.values[route]
+        goal.index = int(np.searchsorted(route, number))
+        reached = bool(np.isnan(trace.heading_error[index]))
+        goal.state = GoalState.SUCCEEDED if reached else GoalState.EXECUTING
+
+    def settings(self) -> list[dict[str, Any]]:
+        """Return the recorded parameters that the page shows."""
+        state = self._state
+        return settings.shown({'controller': state.controller_values, 'robot': state.robot_values})
+
+    def strips(self) -> Mapping[str, Any]:
+        """Return the curves over the whole bag."""
+        robot, run, trace = self.robot, self.robot.run, self.robot.trace
+        chosen = np.unique(np.linspace(0, len(robot.time) - 1, STRIP_POINTS).astype(np.intp))
+        at = robot.time[chosen]
+        curves: dict[str, NDArray[np.float64]] = {
+            'time': at,
+            'v': run.odometry.values[chosen, 3],
+            'omega': run.odometry.values[chosen, 4],
+            'distance': trace.distance[chosen],
+            'heading_error': trace.heading_error[chosen],
+        }
+        for names, times, series in (
+            (('command_v', 'command_omega'), self._commands, run.cmd_vel),
+            (('right', 'left'), self._wheels, run.wheels),
+        ):
+            if not len(series):
+                continue
+            index = np.searchsorted(times, at, side='right') - 1
+            for column, name in enumerate(names):
+                curve = series.values[np.maximum(index, 0), column].copy()
+                curve[(index < 0) | (at - times[np.maximum(index, 0)] > COMMAND_LIFE)] = np.nan
+                curves[name] = curve
+        return {name: rounded(curve) for name, curve in curves.items()}

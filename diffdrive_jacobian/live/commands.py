@@ -1,0 +1,251 @@
+"""The commands that the page sends, checked before anything acts on them.
+
+Each is a JSON object: `do` names the command, the other keys are its values. Every key must be there,
+no other key may be, and numbers must be finite and plausible.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any, NoReturn
+
+from diffdrive_jacobian.messages.plausibility import MAX_POSITION, MAX_SPEED
+from diffdrive_jacobian.text import printable
+
+MAX_SIZE = 4096
+"""Largest size of a command (bytes)."""
+MAX_TEXT = 256
+"""Largest length of a text in a command (characters)."""
+MAX_WORLD_SPEED = 1000.0
+"""Largest speed of simulated time or of a bag, relative to the clock on the wall."""
+MIN_WORLD_SPEED = 0.01
+"""Smallest such speed."""
+
+
+class CommandError(ValueError):
+    """The page sent something that is no command. The message says what is wrong."""
+
+
+@dataclass(frozen=True, slots=True)
+class SendGoal:
+    """Send a goal to a robot."""
+
+    robot: str
+    x: float
+    y: float
+    theta: float | None
+    """Heading at the goal (rad). None: the direction from which the robot comes."""
+    append: bool
+    """Whether it is a further waypoint after the present goals."""
+
+
+@dataclass(frozen=True, slots=True)
+class CancelGoal:
+    """Cancel the goal of a robot."""
+
+    robot: str
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """Drive a robot by hand. It must be repeated, otherwise the robot stops."""
+
+    robot: str
+    v: float
+    omega: float
+
+
+@dataclass(frozen=True, slots=True)
+class Release:
+    """End driving by hand: the robot stops."""
+
+    robot: str
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Set the pose of a robot."""
+
+    robot: str
+    x: float
+    y: float
+    theta: float
+
+
+@dataclass(frozen=True, slots=True)
+class Reset:
+    """Reset the odometry of a robot to its initial pose."""
+
+    robot: str
+
+
+@dataclass(frozen=True, slots=True)
+class ClearPath:
+    """Forget the path of a robot that the page draws."""
+
+    robot: str
+
+
+@dataclass(frozen=True, slots=True)
+class SetParameter:
+    """Set a parameter of a node."""
+
+    robot: str
+    parameter: str
+    """Name of the parameter on the page, `ROLE/NAME`."""
+    value: float | str | bool | None
+    """None: no limit."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pause:
+    """Stop or continue simulated time, or a bag."""
+
+    paused: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """Advance by one time step, and pause."""
+
+
+@dataclass(frozen=True, slots=True)
+class SetSpeed:
+    """Set the speed of simulated time, or of a bag."""
+
+    speed: float
+
+
+@dataclass(frozen=True, slots=True)
+class Seek:
+    """Go to a time of the bag (s)."""
+
+    time: float
+
+
+Command = (
+    SendGoal
+    | CancelGoal
+    | Drive
+    | Release
+    | Place
+    | Reset
+    | ClearPath
+    | SetParameter
+    | Pause
+    | Step
+    | SetSpeed
+    | Seek
+)
+
+
+def _number(low: float, high: float) -> Callable[[str, Any], float]:
+    def read(name: str, value: Any) -> float:
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+            raise CommandError(f'{name} must be a number in {low:g} to {high:g}, got {_short(value)}')
+        return float(value)
+
+    return read
+
+
+def _text(name: str, value: Any) -> str:
+    if not isinstance(value, str) or len(value) > MAX_TEXT:
+        raise CommandError(
+            f'{name} must be a text of at most {MAX_TEXT} characters, got {_short(value)}'
+        )
+    return value
+
+
+def _flag(name: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise CommandError(f'{name} must be true or false, got {_short(value)}')
+    return value
+
+
+def _heading(name: str, value: Any) -> float | None:
+    return None if value is None else _angle(name, value)
+
+
+def _setting(name: str, value: Any) -> float | str | bool | None:
+    if value is None or isinstance(value, bool):
+        return value
+    return _text(name, value) if isinstance(value, str) else _plausible(name, value)
+
+
+_position = _number(-MAX_POSITION, MAX_POSITION)
+_angle = _number(-2.0 * math.tau, 2.0 * math.tau)
+_velocity = _number(-MAX_SPEED, MAX_SPEED)
+_plausible = _number(-1e6, 1e6)
+_READERS: dict[str, Callable[[str, Any], Any]] = {
+    'robot': _text,
+    'x': _position,
+    'y': _position,
+    'append': _flag,
+    'v': _velocity,
+    'omega': _velocity,
+    'parameter': _text,
+    'value': _setting,
+    'paused': _flag,
+    'speed': _number(MIN_WORLD_SPEED, MAX_WORLD_SPEED),
+    'time': _number(0.0, 1e9),
+}
+_KINDS: dict[str, type[Any]] = {
+    'goal': SendGoal,
+    'cancel': CancelGoal,
+    'drive': Drive,
+    'release': Release,
+    'place': Place,
+    'reset': Reset,
+    'clear_path': ClearPath,
+    'set': SetParameter,
+    'pause': Pause,
+    'step': Step,
+    'speed': SetSpeed,
+    'seek': Seek,
+}
+
+
+def parse(text: str | bytes) -> Command:
+    """Return the command in a message of the page.
+
+    Raises:
+        CommandError: It is no command, or a value is invalid.
+    """
+    if not isinstance(text, str):
+        raise CommandError('a command must be text, got bytes')
+    try:
+        content = json.loads(text, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise CommandError(f'a command must be JSON, got {_short(text)}') from error
+    if not isinstance(content, dict):
+        raise CommandError(f'a command must be a JSON object, got {_short(content)}')
+    name = content.pop('do', None)
+    kind = _KINDS.get(name) if isinstance(name, str) else None
+    if kind is None:
+        raise CommandError(f'do must be one of {", ".join(_KINDS)}, got {_short(name)}')
+    names = [field.name for field in fields(kind)]
+    if sorted(content) != sorted(names):
+        raise CommandError(
+            f'{name} must have the keys {", ".join(names) or "of no value"}, got {_short(list(content))}'
+        )
+    command: Command = kind(*(_reader(kind, key)(key, content[key]) for key in names))
+    return command
+
+
+def _reader(kind: type[Any], key: str) -> Callable[[str, Any], Any]:
+    if key == 'theta':
+        return _heading if kind is SendGoal else _angle
+    return _READERS[key]
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f'{name} is no JSON')
+
+
+def _short(value: object) -> str:
+    """Return the beginning of an untrusted value."""
+    text = repr(value) if not isinstance(value, int) or abs(value) < 1e15 else 'a huge number'
+    return printable(text if len(text) <= 60 else f'{text[:60]}...')

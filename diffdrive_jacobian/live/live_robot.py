@@ -1,0 +1,298 @@
+"""One robot of the page: its topics, services and parameters, and driving it."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Goals
+from numpy.typing import NDArray
+from rclpy.node import Node
+
+from diffdrive_jacobian.live import settings
+from diffdrive_jacobian.live.commands import (
+    CancelGoal,
+    ClearPath,
+    Command,
+    Drive,
+    Place,
+    Release,
+    Reset,
+    SendGoal,
+    SetParameter,
+)
+from diffdrive_jacobian.live.hand import PERIOD, STANDSTILL, Act, HandDriving
+from diffdrive_jacobian.live.parameter_link import ParameterLink
+from diffdrive_jacobian.live.robot_state import RobotState
+from diffdrive_jacobian.live.robot_topics import RobotTopics
+from diffdrive_jacobian.live.session import Session
+from diffdrive_jacobian.live.trail import Trail
+from diffdrive_jacobian.live.trigger_link import TriggerLink
+from diffdrive_jacobian.messages import conversion as messages
+from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
+from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.time_units import NANOSECONDS, seconds
+
+COMMAND_LIFE = 0.5
+"""Time for which a cmd_vel is shown after it was received (s)."""
+ANSWER_PATIENCE = 1.0
+"""Time within which a controller reports the status of a goal (s)."""
+SERVICES = {
+    'cancel_goal': 'the goal cannot be canceled',
+    'reset_odometry': 'the odometry cannot be reset',
+}
+"""Services of a robot, and what it means if they fail."""
+
+
+class LiveRobot:
+    """Follows one robot, and does what the page asks for."""
+
+    def __init__(
+        self, node: Node, session: Session, namespace: str, names: dict[str, str], *, polled: bool
+    ) -> None:
+        """Subscribe to the topics of a robot.
+
+        Args:
+            node: The node that subscribes.
+            session: Receives notices.
+            namespace: Namespace of the robot, `/` or `/NAME`.
+            names: Names of topics without namespace, from the usual ones.
+            polled: As for `Latest`.
+
+        Raises:
+            ParameterError: A topic has another type in this process.
+        """
+        self._node, self._session = node, session
+        self.state = RobotState(namespace)
+        self.topics = RobotTopics(node, namespace, names, polled=polled)
+        self.topics.listen(GoalStatus, 'goal_status', self._on_status, latched=True)
+        self.topics.listen(PoseStamped, 'goal_pose', self._on_goal_pose, latched=False)
+        self.topics.listen(Goals, 'goals', self._on_goals, latched=False)
+        self.topics.prepare()
+        self.links: dict[str, ParameterLink] = {}
+        """Parameters by role."""
+        # Simulated time may be fast: then with each of its steps.
+        self.hand = HandDriving(PERIOD if polled else 0.0)
+        # Before they are needed, so that they are discovered by then.
+        self._services = {name: TriggerLink(node, self.topics.full(name)) for name in SERVICES}
+        self._frame = ''
+        self._seen = self._commanded = time.monotonic()
+        self._sent, self._stamp = -math.inf, 0
+
+    @property
+    def silence(self) -> float:
+        """Time since the last odometry (s)."""
+        return time.monotonic() - self._seen
+
+    # --- Messages
+
+    def poll(self) -> None:
+        """Take the latest messages."""
+        now = time.monotonic()
+        odometry = self.topics.odometry.take()
+        if odometry is not None:
+            self._on_odometry(odometry, now)
+        joints = self.topics.joints.take()
+        if joints is not None:
+            try:
+                self.state.wheels = messages.from_joint_state(joints, self.state.wheel_names)
+            except MessageError:
+                self.state.wheels = None
+        twist = self.topics.command.take() if self.topics.command is not None else None
+        if twist is not None:
+            try:
+                self.state.command = messages.from_twist(getattr(twist, 'twist', twist))
+                self._commanded = now
+            except MessageError:
+                pass
+        elif now - self._commanded > COMMAND_LIFE:
+            self.state.command = None
+
+    def _on_odometry(self, message: Any, now: float) -> None:
+        try:
+            pose = messages.from_pose(message.pose.pose)
+            twist = messages.from_twist(message.twist.twist)
+            stamp = messages.from_time(message.header.stamp)
+        except MessageError:
+            return
+        try:
+            _, covariance = messages.from_pose_with_covariance(message.pose)
+        except MessageError:
+            covariance = None
+        self._seen, self._frame = now, message.header.frame_id
+        self.state.moved(seconds(stamp), pose, twist, covariance)
+
+    def _on_goal_pose(self, message: PoseStamped) -> None:
+        self._on_poses([message], message.header.stamp)
+
+    def _on_goals(self, message: Goals) -> None:
+        self._on_poses(message.goals[:MAX_WAYPOINTS], message.header.stamp)
+
+    def _on_poses(self, poses: Any, stamp: Any) -> None:
+        try:
+            goals = np.array([messages.from_pose(one.pose) for one in poses], dtype=np.float64)
+        except MessageError:
+            return
+        self.state.goal.sent(goals.reshape(-1, 3), (stamp.sec, stamp.nanosec))
+
+    def _on_status(self, message: GoalStatus) -> None:
+        stamp = message.goal_info.stamp
+        if message.status not in set(GoalState):
+            return
+        goal = self.state.goal
+        before = goal.state
+        goal.reported(GoalState(message.status), (stamp.sec, stamp.nanosec))
+        # The latched status of a goal that was sent before is no news.
+        known = goal.goals is not None
+        if known and goal.state is GoalState.ABORTED and before is not GoalState.ABORTED:
+            self._session.notify(
+                'the controller refused or aborted the goal: its log says why', 'warning'
+            )
+
+    # --- Commands of the page
+
+    def obey(self, page: int, command: Command) -> None:
+        """Do what a page asks for."""
+        if isinstance(command, SendGoal):
+            self._send_goal(command)
+        elif isinstance(command, Drive):
+            if not self.hand.command(page, (command.v, command.omega), time.monotonic()):
+                self._session.notify('another page drives this robot by hand', 'warning')
+        elif isinstance(command, Release):
+            self.hand.release(page)
+        elif isinstance(command, CancelGoal):
+            self._call('cancel_goal')
+        elif isinstance(command, Reset):
+            self._call('reset_odometry')
+            self.state.interrupt()
+        elif isinstance(command, Place):
+            if not self.topics.readers('initialpose'):
+                self._warn(f'nobody is subscribed to {self.topics.full("initialpose")}: not placed')
+            else:
+                pose = np.array([command.x, command.y, command.theta])
+                self.topics.publish_pose(pose, self._frame, self._now())
+                self.state.interrupt()
+        elif isinstance(command, ClearPath):
+            self.state.trail = Trail()
+        elif isinstance(command, SetParameter):
+            self._set(command)
+
+    def _send_goal(self, command: SendGoal) -> None:
+        if self.hand.page is not None:
+            self._warn('the robot is driven by hand: release the keys before you send a goal')
+            return
+        state = self.state
+        fresh = time.monotonic() - self._sent < ANSWER_PATIENCE
+        remaining = state.goal.remaining(fresh=fresh) if command.append else np.empty((0, 3))
+        x, y = command.x, command.y
+        before = remaining[-1] if len(remaining) else state.pose
+        theta = command.theta
+        if theta is None:
+            theta = 0.0 if before is None else float(np.arctan2(y - before[1], x - before[0]))
+        goals = np.vstack([remaining, [x, y, theta]])
+        together = len(goals) > 1
+        topic = 'goals' if together else 'goal_pose'
+        if len(goals) > MAX_WAYPOINTS:
+            self._warn(f'a robot takes at most {MAX_WAYPOINTS} waypoints')
+        elif not self.topics.readers(topic):
+            self._warn(f'nobody is subscribed to {self.topics.full(topic)}: is go_to_goal running?')
+        else:
+            self.send(goals, together=together)
+
+    def _set(self, command: SetParameter) -> None:
+        try:
+            setting = settings.find(command.parameter)
+            value = setting.checked(command.value)
+        except settings.SettingError as error:
+            self._warn(str(error))
+            return
+        link = self.links.get(setting.role)
+        if link is None:
+            self._warn(f'there is no {setting.role} to set {setting.name} of')
+            return
+
+        def answer(successful: bool, reason: str) -> None:
+            if not successful:
+                self._session.notify(f'{setting.name} refused: {reason}', 'error')
+
+        link.set(setting.name, value, answer)
+
+    def _call(self, service: str) -> None:
+        self._services[service].call(lambda reason: self._warn(f'{SERVICES[service]}: {reason}'))
+
+    def _warn(self, text: str) -> None:
+        self._session.notify(text, 'warning')
+
+    def _now(self) -> int:
+        return int(self._node.get_clock().now().nanoseconds)
+
+    # --- Driving by hand
+
+    def drive(self) -> None:
+        """Drive by hand, if a page does; to be called often."""
+        act = self.hand.update(time.monotonic(), self._session.is_open, self.state.goal.active)
+        if act is Act.PUBLISH:
+            self.topics.publish_twist(self.hand.twist, self._now())
+        elif act is Act.STOP:
+            self.topics.publish_twist(STANDSTILL, self._now())
+        elif act is Act.CANCEL_GOAL:
+            self._session.notify('driving by hand: the goal is canceled')
+            self._call('cancel_goal')
+        elif act is Act.GIVE_UP:
+            self._warn('the controller did not cancel its goal: the robot is not driven by hand')
+
+    def stop(self) -> None:
+        """Stop what a page drives."""
+        if self.hand.page is not None:
+            self.topics.publish_twist(STANDSTILL, self._now())
+
+    # --- State
+
+    @property
+    def ready(self) -> bool:
+        """Whether a controller can receive goals, and the robot has odometry."""
+        return self.state.pose is not None and self.topics.readers('goals') > 0
+
+    def send(self, goals: NDArray[np.float64], *, together: bool = True) -> None:
+        """Send goals, `[x, y, theta]` each, shape (n, 3), on the topic goals or, one, on goal_pose."""
+        # The stamp distinguishes goals, also while simulated time stands.
+        now = self._stamp = max(self._now(), self._stamp + 1)
+        self.topics.publish_goals(goals, now, together=together)
+        # At once: the next command may append a waypoint.
+        self.state.goal.sent(goals, divmod(now, NANOSECONDS))
+        self._sent = time.monotonic()
+
+    def advance(self) -> None:
+        """Advance queries of parameters."""
+        for service in self._services.values():
+            service.advance()
+        for role, link in self.links.items():
+            link.advance()
+            if role == 'robot':
+                self.state.robot_values = link.values
+            else:
+                self.state.controller_values = link.values
+
+    def shown(self) -> dict[str, Any] | None:
+        """Return the JSON object for the page."""
+        return self.state.shown(age=self.silence, by_hand=self.hand.page is not None)
+
+    def settings(self) -> list[dict[str, Any]]:
+        """Return the settings for the page."""
+        return settings.shown({role: link.values for role, link in self.links.items()})
+
+    def destroy(self) -> None:
+        """Destroy all entities."""
+        self.topics.destroy()
+        for service in self._services.values():
+            service.destroy()
+
+    def use_nodes(self, found: dict[str, str]) -> None:
+        """Take the nodes that have the parameters, by role."""
+        for role, name in found.items():
+            if role not in self.links or self.links[role].target != name:
+                self.links[role] = ParameterLink(self._node, name)

@@ -1,0 +1,168 @@
+"""The node behind the page: it finds robots, follows them and steers them."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from rcl_interfaces.msg import ParameterEvent
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.context import Context
+from rclpy.node import Node
+
+from diffdrive_jacobian.live.commands import Command, Pause, Seek, SetSpeed, Step
+from diffdrive_jacobian.live.live_robot import LiveRobot
+from diffdrive_jacobian.live.pacing import Pacing
+from diffdrive_jacobian.live.session import Session, Snapshot
+from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.messages.parameter_values import changed_parameters
+from diffdrive_jacobian.parameters.declaration import ParameterError
+
+NAME = 'live_page'
+"""Name of the node."""
+PERIOD = 1.0 / 30.0
+"""Time between two looks at topics and commands (s)."""
+DISCOVERY_PERIOD = 0.5
+"""Time between two looks at the graph (s)."""
+MAX_ROBOTS = 16
+"""Largest number of robots that are shown."""
+LOST = 30.0
+"""Time without odometry and publisher after which a robot is no longer shown (s)."""
+TOPICS = ('odom', 'joint_states', 'cmd_vel', 'goal_pose', 'goals', 'goal_status', 'initialpose')
+
+
+class LivePage(Node):  # type: ignore[misc]
+    """Node behind the page. `work` does everything; callbacks only store."""
+
+    def __init__(
+        self, session: Session, context: Context, *, polled: bool, pacing: Pacing | None = None
+    ) -> None:
+        """Create the node without robots.
+
+        Args:
+            session: What the page shows, and where its commands come from.
+            context: Context of the node.
+            polled: Whether it is run by a SingleThreadedExecutor: it then polls its topics with a timer
+                of its own. Otherwise `work` must be called often.
+            pacing: Control of simulated time. None: time is real.
+        """
+        super().__init__(NAME, context=context, start_parameter_services=False)
+        self._session, self._polled, self._pacing = session, polled, pacing
+        self.robots: dict[str, LiveRobot] = {}
+        """Robots by namespace."""
+        self._names = {topic: self.resolve_topic_name(topic).rpartition('/')[2] for topic in TOPICS}
+        self._refused: set[str] = set()
+        self._discovered = self._worked = -1.0
+        self.create_subscription(ParameterEvent, '/parameter_events', self._on_parameter_event, 10)
+        if polled:
+            self.create_timer(PERIOD, self.work, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def work(self) -> None:
+        """Obey the page, look at topics and the graph as often as needed, and store the state."""
+        for page, command in self._session.take_commands():
+            self._obey(page, command)
+        now = time.monotonic()
+        if now - self._discovered >= DISCOVERY_PERIOD:
+            self._discovered = now
+            self._discover()
+        for robot in self.robots.values():
+            robot.drive()
+        if now - self._worked < 0.9 * PERIOD:
+            return
+        self._worked = now
+        for robot in self.robots.values():
+            robot.poll()
+            robot.advance()
+        if self._session.watched:
+            self._session.store(self._snapshot())
+
+    def stop(self) -> None:
+        """Stop what pages drive by hand."""
+        for robot in self.robots.values():
+            robot.stop()
+
+    def _snapshot(self) -> Snapshot:
+        shown = {name: robot.shown() for name, robot in sorted(self.robots.items())}
+        return Snapshot(
+            robots=[one for one in shown.values() if one is not None],
+            trails={name: robot.state.trail for name, robot in self.robots.items()},
+            world={'kind': 'robots'} if self._pacing is None else self._pacing.shown(),
+            fixed={
+                'settings': {name: robot.settings() for name, robot in self.robots.items()},
+            },
+        )
+
+    def _obey(self, page: int, command: Command) -> None:
+        if isinstance(command, (Pause, Step, SetSpeed, Seek)):
+            if self._pacing is None or isinstance(command, Seek):
+                self._session.notify(
+                    'time is real here: it can neither pause nor change its speed', 'warning'
+                )
+            else:
+                self._pacing.obey(command)
+            return
+        robot = self.robots.get(command.robot)
+        if robot is None:
+            self._session.notify('there is no such robot', 'warning')
+            return
+        try:
+            robot.obey(page, command)
+        except ParameterError as error:
+            self._session.notify(str(error), 'error')
+
+    # --- Discovery
+
+    def _discover(self) -> None:
+        types = dict(self.get_topic_names_and_types())
+        for topic, kinds in types.items():
+            namespace, _, name = topic.rpartition('/')
+            if name == self._names['odom'] and 'nav_msgs/msg/Odometry' in kinds:
+                self._add(namespace or '/')
+        for namespace, robot in list(self.robots.items()):
+            publishers = self._nodes(robot.topics.full('odom'))
+            if not publishers and robot.silence > LOST:
+                robot.destroy()
+                del self.robots[namespace]
+                continue
+            roles = {'robot': publishers, 'controller': self._nodes(robot.topics.full('goal_status'))}
+            robot.use_nodes({role: names[0] for role, names in roles.items() if names})
+            try:
+                robot.topics.use_twist_type(types.get(robot.topics.full('cmd_vel'), []))
+            except ParameterError as error:
+                self._refuse(robot.topics.full('cmd_vel'), error)
+
+    def _add(self, namespace: str) -> None:
+        if namespace in self.robots or namespace in self._refused or len(self.robots) >= MAX_ROBOTS:
+            return
+        if not self._nodes(f'{namespace.rstrip("/")}/{self._names["odom"]}'):
+            # Only somebody who listens, or the publisher's node is not discovered yet.
+            return
+        try:
+            self.robots[namespace] = LiveRobot(
+                self, self._session, namespace, self._names, polled=self._polled
+            )
+        except ParameterError as error:
+            self._refuse(namespace, error)
+
+    def _refuse(self, name: str, error: ParameterError) -> None:
+        if name not in self._refused:
+            self._refused.add(name)
+            self._session.notify(str(error), 'error')
+
+    def _nodes(self, topic: str) -> list[str]:
+        """Return the nodes that publish a topic."""
+        return [
+            f'{one.node_namespace.rstrip("/")}/{one.node_name}'
+            for one in self.get_publishers_info_by_topic(topic)
+            if not one.node_name.startswith('_')
+        ]
+
+    def _on_parameter_event(self, event: Any) -> None:
+        for robot in self.robots.values():
+            for link in robot.links.values():
+                if link.target == event.node:
+                    try:
+                        link.changed(changed_parameters(event))
+                    except MessageError:
+                        return

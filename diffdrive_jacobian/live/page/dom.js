@@ -1,0 +1,66 @@
+// Small helpers for elements and numbers.
+
+export const byId = (id) => document.getElementById(id);
+
+/** Return a new element with properties and children. */
+export function element(tag, properties = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(properties)) {
+    if (name === 'class') made.className = value;
+    else if (name.includes('-') || name === 'role') made.setAttribute(name, value);
+    else made[name] = value;
+  }
+  made.append(...children);
+  return made;
+}
+
+/** Set the text of an element if it is new. */
+export function setText(node, text) {
+  if (node.textContent !== text) node.textContent = text;
+}
+
+/** Return text as nodes in which `_x` and `_{xyz}` are subscripts. */
+export function math(text) {
+  return text.split(/(_\{[^}]*\}|_\w)/).map((part) => (part.startsWith('_') && part.length > 1
+    ? element('sub', {}, part.replace(/[_{}]/g, '')) : part));
+}
+
+/** Set such text if it is new. */
+export function setMath(node, text) {
+  if (node.dataset.text === text) return;
+  node.dataset.text = text;
+  node.replaceChildren(...math(text));
+}
+
+/** Return a number as text with a true minus sign; a dash if there is none. */
+export function format(value, digits = 3) {
+  if (value === null || value === undefined || !Number.isFinite(value)) return '–';
+  const text = value.toFixed(digits);
+  return (Number(text) === 0 ? (0).toFixed(digits) : text).replace('-', '−');
+}
+
+/** Return what a person typed as a number; NaN: it is none. */
+export function parseNumber(text) {
+  const plain = text.trim().replace('−', '-').replace(',', '.');
+  return plain === '' ? NaN : Number(plain);
+}
+
+/** Make the canvas as sharp as the screen; return its context and its size in CSS pixels. */
+export function prepared(canvas) {
+  const ratio = window.devicePixelRatio || 1;
+  const width = canvas.clientWidth, height = canvas.clientHeight;
+  if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
+    canvas.width = Math.round(width * ratio);
+    canvas.height = Math.round(height * ratio);
+  }
+  const context = canvas.getContext('2d');
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.clearRect(0, 0, width, height);
+  return { context, width, height };
+}
+
+/** Return 1, 2 or 5 times a power of ten, not below a value. */
+export function niceStep(value) {
+  const power = 10 ** Math.floor(Math.log10(value));
+  return power * [1, 2, 5, 10].find((factor) => factor * power >= value * (1 - 1e-9));
+}

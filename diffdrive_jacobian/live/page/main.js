@@ -1,0 +1,140 @@
+// The page: puts its parts together and draws.
+
+import { Chain } from './chain.js';
+import { Connection } from './connection.js';
+import { byId, element, parseNumber, setText } from './dom.js';
+import { HandDriving } from './hand.js';
+import { MapDrawing, themeColors } from './map.js';
+import { Model } from './model.js';
+import { Notices } from './notices.js';
+import { MapPointer } from './pointer.js';
+import { Settings } from './settings.js';
+import { showStatus } from './status.js';
+import { Strips } from './strips.js';
+import { followTheme } from './theme.js';
+import { Transport } from './transport.js';
+import { View } from './view.js';
+
+const HINTS = {
+  goal: 'click: goal · drag: with heading · shift-click: waypoint · drag the robot: place it · WASD or arrow keys: drive',
+  waypoint: 'click: a further place after the present goal · drag: with heading',
+  move: 'drag: move the map · wheel or pinch: zoom',
+  bag: 'drag: move the map · wheel or pinch: zoom · click a curve: go to that time · space: pause',
+};
+
+let changed = true;
+const model = new Model(), view = new View(), notices = new Notices(byId('notices'));
+const drawing = new MapDrawing(byId('map'), view, model);
+const send = (command) => {
+  const sent = connection.send(command);
+  if (!sent && command.do !== 'release' && command.do !== 'drive') notices.show('error', 'there is no connection: nothing was sent');
+  return sent;
+};
+const showFollow = () => byId('follow').setAttribute('aria-pressed', String(view.follow));
+const pointer = new MapPointer(byId('map'), view, drawing, model, send, showFollow);
+const hand = new HandDriving(model, send), chain = new Chain(byId('chain'));
+const settings = new Settings(model, send), transport = new Transport(model, send);
+const strips = new Strips(byId('strips'), model, (time) => transport.seek(time));
+followTheme(byId('theme'), () => { drawing.colors = themeColors(); changed = true; });
+
+const connection = new Connection((frame) => {
+  model.take(frame);
+  for (const notice of frame.notices ?? []) {
+    notices.show(notice.level, notice.text);
+    if (notice.level === 'error') settings.refused();
+  }
+  changed = true;
+}, (open) => {
+  byId('connection').className = open ? 'open' : 'lost';
+  setText(byId('connection'), open ? 'connected' : 'connection lost');
+  if (open) model.reconnected(); else hand.stop();
+});
+
+/** Show the tabs of the robots, if there are several. */
+function showRobots() {
+  const names = [...model.robots.keys()], bar = byId('robots');
+  bar.hidden = names.length < 2;
+  if (bar.dataset.names !== names.join(' ')) {
+    bar.dataset.names = names.join(' ');
+    bar.replaceChildren(...names.map((name) => {
+      const tab = element('button', { type: 'button' }, name);
+      tab.addEventListener('click', () => { hand.stop(); model.selectedName = name; changed = true; });
+      return tab;
+    }));
+  }
+  for (const tab of bar.children) tab.setAttribute('aria-pressed', String(tab.textContent === model.selected?.name));
+}
+
+function showPanels() {
+  const robot = model.selected, recorded = model.recorded;
+  showRobots();
+  showStatus(model, connection.open);
+  transport.show();
+  settings.show();
+  byId('hand').hidden = recorded || !robot;
+  byId('tools').hidden = byId('actions').hidden = byId('goto').hidden = recorded;
+  byId('chain').hidden = byId('legend').hidden = !robot;
+  setText(byId('title'), model.bag || 'diffdrive_jacobian');
+  setText(byId('hint'), HINTS[recorded ? 'bag' : pointer.tool]);
+  byId('map').classList.toggle('grab', recorded || pointer.tool === 'move');
+  if (robot) chain.show(robot);
+}
+
+for (const button of byId('tools').children) {
+  button.addEventListener('click', () => {
+    pointer.tool = button.dataset.tool;
+    for (const other of byId('tools').children) other.setAttribute('aria-pressed', String(other === button));
+    button.blur();
+    changed = true;
+  });
+}
+const onSelected = (id, command) => byId(id).addEventListener('click', () => {
+  if (model.selected) send({ do: command, robot: model.selected.name });
+  byId(id).blur();
+});
+onSelected('cancel', 'cancel');
+onSelected('reset', 'reset');
+onSelected('clear', 'clear_path');
+byId('follow').addEventListener('click', () => { view.follow = !view.follow; changed = true; showFollow(); byId('follow').blur(); });
+byId('fit').addEventListener('click', () => {
+  const points = [...model.paths.values()].flat().filter((point) => point !== null);
+  for (const robot of model.robots.values()) points.push(robot.pose, ...(robot.goal.goals ?? []));
+  view.fit(points.map(([x, y]) => [x, y]));
+  showFollow();
+  changed = true;
+});
+byId('in').addEventListener('click', () => { view.zoom(1.3); changed = true; });
+byId('out').addEventListener('click', () => { view.zoom(1 / 1.3); changed = true; });
+byId('map').addEventListener('wheel', () => { changed = true; }, { passive: true });
+byId('map').addEventListener('pointerup', () => { changed = true; });
+byId('goto').addEventListener('submit', (event) => {
+  event.preventDefault();
+  const [x, y, theta] = ['x', 'y', 'theta'].map((name) => parseNumber(byId(`goto-${name}`).value));
+  if (!Number.isFinite(x) || !Number.isFinite(y)) notices.show('error', 'x and y of the goal must be numbers, in metres');
+  else if (model.selected) send({ do: 'goal', robot: model.selected.name, x, y, theta: Number.isFinite(theta) ? theta : null, append: false });
+});
+addEventListener('keydown', (event) => {
+  if (event.code === 'Escape' && model.selected && !model.recorded) send({ do: 'cancel', robot: model.selected.name });
+});
+
+const STRIP_PERIOD = 80;
+let before = performance.now(), stripped = 0, moving = false, fitted = false;
+function draw(now) {
+  requestAnimationFrame(draw);
+  const fresh = changed, [x, y, scale] = [view.x, view.y, view.scale];
+  if (fresh) {
+    changed = false;
+    showPanels();
+  }
+  if (fresh && now - stripped > STRIP_PERIOD) {
+    stripped = now;
+    strips.draw(drawing.colors);
+  }
+  if (model.recorded && !fitted && model.paths.size) { fitted = true; drawing.draw(0); byId('fit').click(); }
+  // Without news there is nothing to draw.
+  if (fresh || pointer.action || moving) drawing.draw((now - before) / 1000);
+  before = now;
+  moving = Math.hypot(view.x - x, view.y - y) * view.scale > 0.2 || view.scale !== scale;
+}
+addEventListener('resize', () => { changed = true; });
+requestAnimationFrame(draw);

@@ -1,0 +1,176 @@
+"""What is known of one robot, and the JSON object that the page receives of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from contextlib import suppress
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffdrive_jacobian.control import Arrival, LawError
+from diffdrive_jacobian.control.controllers import BUILT_IN
+from diffdrive_jacobian.live import quantities
+from diffdrive_jacobian.live.goal_progress import GoalProgress
+from diffdrive_jacobian.live.quantities import rounded
+from diffdrive_jacobian.live.trail import JUMP, Trail
+from diffdrive_jacobian.parameters.nodes import GoToGoalParameters, VirtualRobotParameters
+from diffdrive_jacobian.reading.run import number
+
+ROBOT_DEFAULTS = VirtualRobotParameters()
+CONTROLLER_DEFAULTS = GoToGoalParameters()
+Values = Mapping[str, Any]
+PLACED_JUMP = 0.03
+"""Step from which the path of a robot is interrupted that is being placed (m)."""
+PLACED_LIFE = 15
+"""Number of odometry messages within which that counts."""
+MIN_LENGTH = 1e-4
+"""Smallest wheel radius and separation that count (m). Parameters of any node may be anything."""
+
+
+def _number(values: Values, name: str, default: float) -> float:
+    value = number(values.get(name))
+    return value if math.isfinite(value) else default
+
+
+class RobotState:
+    """State of one robot. Times are seconds, as the messages are stamped."""
+
+    def __init__(self, name: str) -> None:
+        """Start without odometry."""
+        self.name = name
+        self.pose: NDArray[np.float64] | None = None
+        """`[x, y, theta]`, shape (3,) (m, m, rad). None: no odometry was received."""
+        self.time = 0.0
+        """Stamp of the odometry (s)."""
+        self.twist = (0.0, 0.0)
+        """`(v, omega)` of the odometry (m/s, rad/s)."""
+        self.covariance = np.zeros((3, 3))
+        """Covariance of the pose."""
+        self.wheels: tuple[float, float] | None = None
+        """Speeds of the right and the left wheel (rad/s). None: unknown."""
+        self.command: tuple[float, float] | None = None
+        """Latest cmd_vel. None: none was received lately."""
+        self.goal = GoalProgress()
+        self.trail = Trail()
+        self._placed = 0
+        self.robot_values: Values = {}
+        """Parameters of the node that publishes odom."""
+        self.controller_values: Values = {}
+        """Parameters of the node that publishes goal_status."""
+
+    @property
+    def geometry(self) -> tuple[float, float]:
+        """Wheel radius and separation (m), of the virtual robot by default."""
+        values = self.robot_values
+        r = _number(values, 'wheel_radius', ROBOT_DEFAULTS.wheel_radius)
+        L = _number(values, 'wheel_separation', ROBOT_DEFAULTS.wheel_separation)
+        if min(r, L) < MIN_LENGTH:
+            return ROBOT_DEFAULTS.wheel_radius, ROBOT_DEFAULTS.wheel_separation
+        return r, L
+
+    @property
+    def wheel_names(self) -> tuple[str, str]:
+        """Names of the left and the right joint."""
+        left, right = (
+            self.robot_values.get(f'{side}_wheel_name', default)
+            for side, default in zip(('left', 'right'), ROBOT_DEFAULTS.wheel_names, strict=True)
+        )
+        return (
+            (left, right)
+            if isinstance(left, str) and isinstance(right, str)
+            else ROBOT_DEFAULTS.wheel_names
+        )
+
+    @property
+    def arrival(self) -> Arrival:
+        """Arrival criterion of the controller."""
+        values = self.controller_values
+        tolerance = _number(values, 'xy_goal_tolerance', CONTROLLER_DEFAULTS.xy_goal_tolerance)
+        controller = BUILT_IN.get(str(values.get('controller')))
+        offset = 0.0
+        if controller is not None and controller.offset:
+            offset = _number(values, controller.offset, CONTROLLER_DEFAULTS.offset)
+        heading = values.get('use_goal_heading') is True or (
+            controller is not None and controller.takes_heading
+        )
+        return Arrival(xy_tolerance=max(tolerance, 0.0), use_heading=heading, offset=offset)
+
+    def moved(
+        self,
+        time: float,
+        pose: NDArray[np.float64],
+        twist: tuple[float, float],
+        covariance: NDArray[np.float64] | None,
+    ) -> None:
+        """Take an odometry."""
+        # A motion is at most three times as long as speed and time say.
+        far = 3.0 * max(abs(twist[0]), abs(self.twist[0])) * abs(time - self.time)
+        jump = JUMP
+        if self._placed:
+            self._placed, jump = self._placed - 1, PLACED_JUMP
+        self.trail = self.trail.extended(float(pose[0]), float(pose[1]), max(jump, far))
+        self.time, self.pose, self.twist = time, pose, twist
+        if covariance is not None:
+            self.covariance = covariance
+        self.goal.moved(pose, self.arrival)
+
+    def interrupt(self) -> None:
+        """Expect a jump of the path: the robot is placed elsewhere."""
+        self._placed = PLACED_LIFE
+
+    def shown(self, *, age: float, by_hand: bool, **more: Any) -> dict[str, Any] | None:
+        """Return the JSON object for the page. None: there was no odometry.
+
+        Args:
+            age: Time since the last odometry was received (s).
+            by_hand: Whether a page drives it.
+            more: Further entries.
+        """
+        if self.pose is None:
+            return None
+        arrival, geometry = self.arrival, self.geometry
+        target = self.goal.current
+        distance, error = (
+            (None, None) if target is None else quantities.errors(self.pose, target, arrival.offset)
+        )
+        command = self.command or (0.0, 0.0)
+        return {
+            'name': self.name,
+            'time': round(self.time, 4),
+            'age': round(age, 2),
+            'pose': rounded(self.pose),
+            'twist': rounded(self.twist),
+            'region': quantities.region(self.covariance),
+            'geometry': geometry,
+            'goal': self.goal.shown(),
+            'tolerance': arrival.xy_tolerance,
+            'use_heading': arrival.use_heading,
+            'offset': arrival.offset,
+            'distance': rounded(distance),
+            'heading_error': rounded(error),
+            'law': self._law(target),
+            'by_hand': by_hand,
+            'commanded': self.command is not None,
+            'chain': quantities.chain(float(self.pose[2]), command, self.wheels, geometry),
+            **more,
+        }
+
+    def _law(self, target: NDArray[np.float64] | None) -> dict[str, Any]:
+        """Return the name of the law, its gains, and what it computes here without limits."""
+        values = self.controller_values
+        name = str(values.get('controller', ''))[:64]
+        gains = SimpleNamespace(
+            kp=_number(values, 'kp', math.nan),
+            kv=_number(values, 'kv', math.nan),
+            offset=_number(values, 'offset', math.nan),
+        )
+        twist = None
+        # Only built-in ones: another one may be slow, and runs in the controller.
+        if name in BUILT_IN and target is not None and self.pose is not None:
+            with suppress(LawError):
+                twist = BUILT_IN[name].bind(gains)(self.pose, target)
+        return {'name': name, 'kp': rounded(gains.kp), 'kv': rounded(gains.kv), 'twist': rounded(twist)}

@@ -1,0 +1,214 @@
+"""The topics of one robot: its latest messages, and what the page publishes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import islice
+from typing import Any, TypeVar
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist, TwistStamped
+from nav_msgs.msg import Goals, Odometry
+from numpy.typing import NDArray
+from rclpy.callback_groups import CallbackGroup
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import JointState
+
+from diffdrive_jacobian.messages import conversion as messages
+from diffdrive_jacobian.messages import wire
+from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.ros.rclpy_internals import waiting_messages
+from diffdrive_jacobian.ros.serialization import deserialized
+from diffdrive_jacobian.ros.topic_errors import explaining_failure, type_name
+
+T = TypeVar('T')
+
+LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Matches every publisher, and never makes one wait."""
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+TWISTS: dict[str, type] = {type_name(kind): kind for kind in (Twist, TwistStamped)}
+"""Types of cmd_vel by their names."""
+_twist, _twist_stamped = wire.twist_writer(Twist()), wire.twist_stamped_writer(TwistStamped())
+
+
+class Polled(CallbackGroup):  # type: ignore[misc]
+    """Entities of this group are left to `Latest.take`: no executor waits for them.
+
+    Many messages per second then cost next to nothing. The EventsExecutor ignores groups.
+    """
+
+    def can_execute(self, entity: Any) -> bool:
+        """Return False."""
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        """Return False."""
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        """Do nothing."""
+
+
+class Latest:
+    """The latest message of a topic, as bytes until somebody looks at it."""
+
+    def __init__(self, node: Node, kind: type, topic: str, *, polled: bool) -> None:
+        """Subscribe.
+
+        Args:
+            node: The node that subscribes.
+            kind: Type of the messages.
+            topic: Name of the topic.
+            polled: Whether `take` must fetch messages. Otherwise the executor delivers them.
+
+        Raises:
+            ParameterError: The topic has another type in this process.
+        """
+        self._kind, self._polled = kind, polled
+        self._data: bytes | None = None
+        group = Polled() if polled else None
+        with explaining_failure(node, kind, topic):
+            self._subscription: Subscription = node.create_subscription(
+                kind, topic, self._store, LATEST, raw=True, callback_group=group
+            )
+
+    def _store(self, data: bytes) -> None:
+        self._data = data
+
+    def take(self) -> Any | None:
+        """Return the message that was received since the last call. None: none, or it is damaged."""
+        if self._polled:
+            # The queue has one place; more than that is a flood, which must not hold up the page.
+            for data, _ in islice(waiting_messages(self._subscription), 2):
+                self._data = data
+        latest, self._data = self._data, None
+        if latest is None:
+            return None
+        try:
+            return deserialized(latest, self._kind)
+        except MessageError:
+            return None
+
+    def destroy(self, node: Node) -> None:
+        """Unsubscribe."""
+        node.destroy_subscription(self._subscription)
+
+
+class RobotTopics:
+    """Subscriptions and publishers of one robot. Publishers are created when they are first used."""
+
+    def __init__(self, node: Node, namespace: str, names: dict[str, str], *, polled: bool) -> None:
+        """Subscribe.
+
+        Args:
+            node: The node that subscribes.
+            namespace: Namespace of the robot, `/` or `/NAME`.
+            names: Names of topics without namespace, from the usual ones.
+            polled: As for `Latest`.
+
+        Raises:
+            ParameterError: A topic has another type in this process.
+        """
+        self._node, self._namespace, self._names, self._polled = node, namespace, names, polled
+        self._publishers: dict[str, Publisher] = {}
+        self.odometry = Latest(node, Odometry, self.full('odom'), polled=polled)
+        self.joints = Latest(node, JointState, self.full('joint_states'), polled=polled)
+        self.command: Latest | None = None
+        """cmd_vel. None: nobody publishes or reads it yet."""
+        self.twist_type: type = Twist
+        """Type of cmd_vel."""
+        self._subscriptions: list[Subscription] = []
+
+    def full(self, name: str) -> str:
+        """Return the fully qualified name of a topic or service of the robot."""
+        return f'{self._namespace.rstrip("/")}/{self._names.get(name, name)}'
+
+    def listen(self, kind: type[T], topic: str, callback: Callable[[T], None], *, latched: bool) -> None:
+        """Receive every message of a topic."""
+        with explaining_failure(self._node, kind, self.full(topic)):
+            self._subscriptions.append(
+                self._node.create_subscription(
+                    kind, self.full(topic), callback, LATCHED if latched else 10
+                )
+            )
+
+    def use_twist_type(self, types: list[str]) -> None:
+        """Take the types that cmd_vel has in the graph."""
+        known = [TWISTS[name] for name in types if name in TWISTS]
+        if not known or (self.command is not None and self.twist_type in known):
+            return
+        if self.command is not None:
+            self.command.destroy(self._node)
+        self._discard('cmd_vel')
+        self.twist_type = known[0]
+        self.command = Latest(self._node, self.twist_type, self.full('cmd_vel'), polled=self._polled)
+
+    # --- Publishing
+
+    def publish_twist(self, twist: tuple[float, float], now: int) -> None:
+        """Publish a command, at a time (ns)."""
+        stamped = self.twist_type is TwistStamped
+        data = _twist_stamped(twist, now) if stamped else _twist(*twist)
+        self._publisher(self.twist_type, 'cmd_vel').publish(data)
+
+    def publish_goals(self, goals: NDArray[np.float64], now: int, *, together: bool) -> None:
+        """Publish goals, `[x, y, theta]` each, shape (n, 3), at a time (ns).
+
+        Args:
+            goals: The goals. One is published as goal_pose unless `together`.
+            now: The time.
+            together: Whether to use the topic goals.
+        """
+        poses = [PoseStamped() for _ in goals]
+        for pose, goal in zip(poses, goals, strict=True):
+            messages.set_pose(pose.pose, goal)
+        message = Goals(goals=poses) if together else poses[0]
+        messages.set_time(message.header.stamp, now)
+        self._publisher(type(message), 'goals' if together else 'goal_pose').publish(message)
+
+    def publish_pose(self, pose: NDArray[np.float64], frame: str, now: int) -> None:
+        """Publish where the robot is, `[x, y, theta]` in a frame, at a time (ns)."""
+        message = PoseWithCovarianceStamped()
+        messages.set_time(message.header.stamp, now)
+        message.header.frame_id = frame
+        messages.set_pose(message.pose.pose, pose)
+        self._publisher(PoseWithCovarianceStamped, 'initialpose').publish(message)
+
+    def readers(self, topic: str) -> int:
+        """Return the number of subscriptions to a topic, without those of this node."""
+        own = {(self._node.get_namespace(), self._node.get_name())}
+        found = self._node.get_subscriptions_info_by_topic(self.full(topic))
+        return sum((one.node_namespace, one.node_name) not in own for one in found)
+
+    def stamp_type(self) -> str:
+        """Return the name of the type of cmd_vel."""
+        return type_name(self.twist_type)
+
+    def prepare(self) -> None:
+        """Create the publishers of goals, so that their readers are discovered before they are used."""
+        for kind, topic in ((PoseStamped, 'goal_pose'), (Goals, 'goals')):
+            self._publisher(kind, topic)
+
+    def _publisher(self, kind: type, topic: str) -> Publisher:
+        if topic not in self._publishers:
+            with explaining_failure(self._node, kind, self.full(topic)):
+                self._publishers[topic] = self._node.create_publisher(kind, self.full(topic), 10)
+        return self._publishers[topic]
+
+    def _discard(self, topic: str) -> None:
+        publisher = self._publishers.pop(topic, None)
+        if publisher is not None:
+            self._node.destroy_publisher(publisher)
+
+    def destroy(self) -> None:
+        """Destroy all subscriptions and publishers."""
+        for latest in (self.odometry, self.joints, self.command):
+            if latest is not None:
+                latest.destroy(self._node)
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        for topic in list(self._publishers):
+            self._discard(topic)

@@ -1,0 +1,192 @@
+"""The server of the page: HTTP and websockets on 127.0.0.1, in a thread of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import socket
+import threading
+import time
+from http import HTTPStatus
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from diffdrive_jacobian.live.access import HEADERS, Access, Refusal
+from diffdrive_jacobian.live.commands import MAX_SIZE, CommandError, parse
+from diffdrive_jacobian.live.files import page_files
+from diffdrive_jacobian.live.rate import TokenBucket
+from diffdrive_jacobian.live.session import Page, Session
+
+ADDRESS = '127.0.0.1'
+PERIOD = 0.04
+"""Time between two states that a page receives (s)."""
+MAX_PAGES = 8
+"""Largest number of pages at once."""
+COMMAND_RATE, COMMAND_BURST = 100.0, 200.0
+"""Commands of a page per second, and at once. A page that sends more is disconnected."""
+MAX_INVALID = 20
+"""Invalid commands after which a page is disconnected."""
+PING_PERIOD = 2.0
+"""Time between two pings, and the longest wait for the answer (s)."""
+PATIENCE = 5.0
+"""Longest wait for the thread of the server (s)."""
+POLICY_VIOLATION, TRY_AGAIN_LATER = 1008, 1013
+"""Codes with which a websocket is closed."""
+
+
+class LiveServer:
+    """Serves the page of a session."""
+
+    def __init__(self, session: Session, port: int = 0) -> None:
+        """Listen. `start` begins to answer.
+
+        Args:
+            session: What the page shows, and where its commands go.
+            port: TCP port. 0: any free one.
+
+        Raises:
+            OSError: The port is in use, or may not be used.
+        """
+        self._session = session
+        self._files = page_files()
+        self.access = Access()
+        """The secrets in the addresses."""
+        self._socket = socket.create_server((ADDRESS, port))
+        self.port: int = self._socket.getsockname()[1]
+        """TCP port."""
+        self._loop = asyncio.new_event_loop()
+        self._closing = asyncio.Event()
+        self._thread = threading.Thread(target=self._run, name='live page', daemon=True)
+
+    @property
+    def url(self) -> str:
+        """Address of the page. Whoever knows it can steer the robots."""
+        return f'http://{ADDRESS}:{self.port}/{self.access.token}/'
+
+    @property
+    def opening_url(self) -> str:
+        """Address that leads to the page once, for the command line of a browser."""
+        return f'http://{ADDRESS}:{self.port}{self.access.opening_path}'
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Disconnect all pages and end the thread."""
+        self._session.closed = True
+        if self._thread.is_alive():
+            self._loop.call_soon_threadsafe(self._closing.set)
+            self._thread.join(PATIENCE)
+        else:
+            self._socket.close()
+            self._loop.close()
+
+    # --- In the thread
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        try:
+            self._loop.run_until_complete(self._serve())
+        finally:
+            self._loop.close()
+
+    async def _serve(self) -> None:
+        logger = logging.getLogger('diffdrive_jacobian.live')
+        # Who cannot connect is told so. Nothing of that is for the terminal.
+        logger.addHandler(logging.NullHandler())
+        logger.propagate = False
+        server = await serve(
+            self._handle,
+            sock=self._socket,
+            process_request=self._answer,
+            compression=None,
+            max_size=MAX_SIZE,
+            max_queue=8,
+            open_timeout=PATIENCE,
+            ping_interval=PING_PERIOD,
+            ping_timeout=PING_PERIOD,
+            close_timeout=0.2,
+            server_header=None,
+            logger=logger,
+        )
+        await self._closing.wait()
+        await self._close(server)
+
+    @staticmethod
+    async def _close(server: Server) -> None:
+        server.close()
+        with contextlib.suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(server.wait_closed(), 0.5)
+
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Return the answer to a request. None: it may open the websocket."""
+        headers = request.headers
+        found = self.access.check(request.path, headers.get_all('Host'), headers.get_all('Origin'))
+        if isinstance(found, Refusal):
+            return _response(
+                HTTPStatus.FORBIDDEN, 'text/plain; charset=utf-8', f'{found.value}\n'.encode()
+            )
+        kind, name = found
+        if kind == 'redirect':
+            return _response(HTTPStatus.SEE_OTHER, 'text/plain', b'', Location=name)
+        if kind == 'socket':
+            return None
+        if name not in self._files:
+            return _response(HTTPStatus.NOT_FOUND, 'text/plain', b'there is no such file\n')
+        return _response(HTTPStatus.OK, *self._files[name])
+
+    async def _handle(self, connection: ServerConnection) -> None:
+        if len(connection.server.connections) > MAX_PAGES:
+            await connection.close(TRY_AGAIN_LATER, f'{MAX_PAGES} pages are open already')
+            return
+        page = self._session.enter()
+        sending = asyncio.ensure_future(self._send(connection, page))
+        try:
+            with contextlib.suppress(ConnectionClosed):
+                await self._receive(connection, page)
+        finally:
+            # First, because driving by hand ends with it.
+            self._session.leave(page)
+            sending.cancel()
+
+    async def _send(self, connection: ServerConnection, page: Page) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            while True:
+                frame = page.frame(self._session)
+                if frame is not None:
+                    # Waits while the page does not read; then the latest state is sent.
+                    await connection.send(json.dumps(frame, allow_nan=False, separators=(',', ':')))
+                await asyncio.sleep(PERIOD)
+
+    async def _receive(self, connection: ServerConnection, page: Page) -> None:
+        limit = TokenBucket(COMMAND_RATE, COMMAND_BURST, time.monotonic())
+        invalid = 0
+        async for text in connection:
+            if not limit.permits(time.monotonic()):
+                await connection.close(
+                    POLICY_VIOLATION, f'more than {COMMAND_RATE:g} commands per second'
+                )
+                return
+            try:
+                command = parse(text)
+            except CommandError as error:
+                invalid += 1
+                if invalid >= MAX_INVALID:
+                    await connection.close(POLICY_VIOLATION, f'{invalid} invalid commands')
+                    return
+                self._session.notify(f'command refused: {error}', 'error')
+                continue
+            if not self._session.put(page, command):
+                self._session.notify('too many commands are waiting: this one was dropped', 'warning')
+
+
+def _response(status: HTTPStatus, kind: str, body: bytes, **more: str) -> Response:
+    headers = Headers({'Content-Type': kind, 'Content-Length': str(len(body)), **HEADERS, **more})
+    headers['Connection'] = 'close'
+    return Response(status.value, status.phrase, headers, body)

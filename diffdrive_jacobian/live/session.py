@@ -1,0 +1,158 @@
+"""What the server and the nodes share: the latest state one way, the commands the other way.
+
+Each method may be called from any thread, and none waits. Nodes store their latest state, whether or
+not a page reads it. A slow page receives fewer states, never older ones.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from diffdrive_jacobian.live.commands import Command
+from diffdrive_jacobian.live.trail import Trail
+
+MAX_COMMANDS = 256
+"""Largest number of commands that wait."""
+MAX_NOTICES = 50
+"""Largest number of notices that are kept."""
+
+Level = Literal['info', 'warning', 'error']
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Snapshot:
+    """State of all robots at one time. Nothing in it is changed later."""
+
+    robots: Sequence[Mapping[str, Any]] = ()
+    """One JSON object for each robot; `name` is unique."""
+    trails: Mapping[str, Trail] = field(default_factory=dict)
+    """Path of each robot, by name."""
+    world: Mapping[str, Any] = field(default_factory=dict)
+    """Simulated time or bag: what can be controlled."""
+    fixed: Mapping[str, Any] = field(default_factory=dict)
+    """What seldom changes, sent only if it did."""
+
+
+class Page:
+    """One open page: what it has received so far."""
+
+    def __init__(self, number: int, notice: int) -> None:
+        """Start with a number of its own, after the last notice."""
+        self.number = number
+        self._version = -1
+        self._notice = notice
+        self._fixed: Mapping[str, Any] | None = None
+        self._trails: dict[str, tuple[Trail, int]] = {}
+
+    def frame(self, session: Session) -> dict[str, Any] | None:
+        """Return what has changed since the last frame. None: nothing."""
+        version, snapshot = session.latest()
+        notices = session.notices_after(self._notice)
+        if version == self._version and not notices:
+            return None
+        frame: dict[str, Any] = {'robots': snapshot.robots, 'world': snapshot.world}
+        self._version = version
+        if notices:
+            self._notice = notices[-1]['number']
+            frame['notices'] = notices
+        if snapshot.fixed != self._fixed:
+            self._fixed = frame['fixed'] = snapshot.fixed
+        paths = {name: self._path(name, trail) for name, trail in snapshot.trails.items()}
+        frame['paths'] = {name: path for name, path in paths.items() if path is not None}
+        return frame
+
+    def _path(self, name: str, trail: Trail) -> dict[str, Any] | None:
+        known, count = self._trails.get(name, (None, 0))
+        start = count if known is trail else 0
+        points = trail.points[start:]
+        self._trails[name] = trail, start + len(points)
+        if known is trail and not points:
+            return None
+        return {'new': known is not trail, 'points': points}
+
+
+class Session:
+    """The state that is shown, the pages that show it, and the commands that they sent."""
+
+    def __init__(self) -> None:
+        """Start without a state, pages and commands."""
+        self._lock = threading.Lock()
+        self._version, self._snapshot = 0, Snapshot()
+        self._commands: deque[tuple[int, Command]] = deque()
+        self._notices: deque[dict[str, Any]] = deque(maxlen=MAX_NOTICES)
+        self._notice_numbers, self._page_numbers = itertools.count(1), itertools.count(1)
+        self._last_notice = 0
+        self._pages: frozenset[int] = frozenset()
+        self.closed = False
+        """Whether the server has ended."""
+
+    # --- From the nodes
+
+    @property
+    def watched(self) -> bool:
+        """Whether a page is open."""
+        return bool(self._pages)
+
+    def is_open(self, page: int) -> bool:
+        """Return whether a page is still connected."""
+        return page in self._pages
+
+    def store(self, snapshot: Snapshot) -> None:
+        """Replace the state that pages receive."""
+        with self._lock:
+            self._version += 1
+            self._snapshot = snapshot
+
+    def take_commands(self) -> list[tuple[int, Command]]:
+        """Return the commands since the last call, each with the number of its page."""
+        if not self._commands:
+            return []
+        with self._lock:
+            commands = list(self._commands)
+            self._commands.clear()
+        return commands
+
+    def notify(self, text: str, level: Level = 'info') -> None:
+        """Show a notice on all pages."""
+        with self._lock:
+            self._last_notice = next(self._notice_numbers)
+            self._notices.append({'number': self._last_notice, 'level': level, 'text': text})
+
+    # --- From the server
+
+    def latest(self) -> tuple[int, Snapshot]:
+        """Return the latest state with its version."""
+        with self._lock:
+            return self._version, self._snapshot
+
+    def notices_after(self, number: int) -> list[dict[str, Any]]:
+        """Return the notices after one of them."""
+        if self._last_notice == number:
+            return []
+        with self._lock:
+            return [notice for notice in self._notices if notice['number'] > number]
+
+    def enter(self) -> Page:
+        """Return a new page."""
+        with self._lock:
+            page = Page(next(self._page_numbers), self._last_notice)
+            self._pages |= {page.number}
+        return page
+
+    def leave(self, page: Page) -> None:
+        """Remove a page. What it drives by hand stops."""
+        with self._lock:
+            self._pages -= {page.number}
+
+    def put(self, page: Page, command: Command) -> bool:
+        """Store a command for the nodes. Return False if too many are waiting."""
+        with self._lock:
+            if len(self._commands) >= MAX_COMMANDS:
+                return False
+            self._commands.append((page.number, command))
+        return True

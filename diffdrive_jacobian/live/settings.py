@@ -1,0 +1,139 @@
+"""The parameters that the page offers, and their values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal
+
+from diffdrive_jacobian.control import controller_names
+from diffdrive_jacobian.live.quantities import rounded
+from diffdrive_jacobian.text import printable
+
+Role = Literal['controller', 'robot']
+MAX_CHOICES = 32
+"""Largest number of controllers that are offered."""
+
+
+class SettingError(ValueError):
+    """The page wants to set what it cannot."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Setting:
+    """A parameter of a node as the page offers it."""
+
+    role: Role
+    """The node: the one that publishes goal_status, or the one that publishes odom."""
+    name: str
+    label: str
+    hint: str
+    """What happens when it changes."""
+    low: float = 0.0
+    """Range of the slider. The field beside it takes other values, too; the node decides."""
+    high: float = 1.0
+    unit: str = ''
+    kind: Literal['number', 'limit', 'choice', 'flag'] = 'number'
+    """`limit`: a number, or NaN for none."""
+
+    @property
+    def key(self) -> str:
+        """Name on the page."""
+        return f'{self.role}/{self.name}'
+
+    def checked(self, value: object) -> float | str | bool:
+        """Return a value of the page as the parameter takes it.
+
+        Raises:
+            SettingError: It is of another type.
+        """
+        if self.kind == 'choice' and isinstance(value, str):
+            return value
+        if self.kind == 'flag' and isinstance(value, bool):
+            return value
+        if self.kind in ('number', 'limit') and isinstance(value, float):
+            return value
+        if self.kind == 'limit' and value is None:
+            return math.nan
+        raise SettingError(f'{self.name} cannot be {printable(repr(value), 40)}')
+
+
+SETTINGS = (
+    Setting(role='controller', name='kp', label='Kp', unit='1/s', low=0.1, high=10.0,
+            hint='Gain on the heading error: how hard the robot turns towards the goal'),
+    Setting(role='controller', name='kv', label='Kv', unit='1/s', low=0.05, high=4.0,
+            hint='Gain on the distance: how fast it drives. Above Kp the robot spirals in'),
+    Setting(role='controller', name='controller', label='Control law', kind='choice',
+            hint='How goal and pose become v and ω'),
+    Setting(role='controller', name='use_goal_heading', label='Goal heading', kind='flag',
+            hint='Turn in place to the heading of the last goal'),
+    Setting(role='controller', name='xy_goal_tolerance', label='Tolerance', unit='m', low=0.005,
+            high=0.5, hint='Distance that counts as arrived: the circle around the goal'),
+    Setting(role='controller', name='offset', label='Offset d', unit='m', low=0.02, high=0.4,
+            hint='The point ahead of the axle that offset_point drives'),
+    Setting(role='controller', name='linear.x.max_velocity', label='Limit of v', unit='m/s', low=0.02,
+            high=2.0, kind='limit', hint='Both speeds are scaled alike, so the path stays the same'),
+    Setting(role='controller', name='angular.z.max_velocity', label='Limit of ω', unit='rad/s', low=0.1,
+            high=6.0, kind='limit', hint='Both speeds are scaled alike, so the path stays the same'),
+    Setting(role='robot', name='max_wheel_velocity', label='Wheel limit', unit='rad/s', low=1.0,
+            high=40.0, kind='limit', hint='Both wheels are scaled alike'),
+    Setting(role='robot', name='wheel_travel_variance', label='Wheel noise', unit='m', low=0.0,
+            high=0.002, hint='Variance per distance: how fast the uncertainty region grows'),
+)  # fmt: skip
+"""What the page offers. A node is asked for those that it has."""
+_BY_KEY = {setting.key: setting for setting in SETTINGS}
+
+
+def find(key: str) -> Setting:
+    """Return a setting by its name on the page.
+
+    Raises:
+        SettingError: There is none.
+    """
+    if key not in _BY_KEY:
+        raise SettingError(f'there is no setting {printable(key, 40)}')
+    return _BY_KEY[key]
+
+
+def shown(values: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the settings that nodes have, with their values, for the page.
+
+    Args:
+        values: Parameters by role.
+    """
+    found = []
+    for setting in SETTINGS:
+        value = values.get(setting.role, {}).get(setting.name)
+        expected = {'choice': str, 'flag': bool}.get(setting.kind, float)
+        if not isinstance(value, expected):
+            continue
+        row = {
+            'key': setting.key,
+            'label': setting.label,
+            'hint': setting.hint,
+            'unit': setting.unit,
+            'kind': setting.kind,
+            'low': setting.low,
+            'high': setting.high,
+            'value': rounded(value)
+            if isinstance(value, float)
+            else value[:64]
+            if isinstance(value, str)
+            else value,
+        }
+        if setting.kind == 'choice':
+            row['choices'] = _choices(str(row['value']))
+        found.append(row)
+    return found
+
+
+@lru_cache(maxsize=1)
+def _controllers() -> tuple[str, ...]:
+    # To find the installed ones takes many milliseconds.
+    return tuple(controller_names())
+
+
+def _choices(value: str) -> list[str]:
+    return list(dict.fromkeys([*_controllers()[:MAX_CHOICES], value]))

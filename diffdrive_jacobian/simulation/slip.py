@@ -1,0 +1,285 @@
+"""The true motion of a robot whose wheels slip, and whose wheels are not as its odometry assumes.
+
+Model: the wheels turn as commanded, and the odometry is computed from their nominal radius and
+separation. The true radii and the true separation may differ. In addition each wheel slips: the distance
+that it travels over the ground has a random error whose variance is `k |ds|`, as `odometry_noise` has
+it, where `ds` is the distance that its true rim rolls.
+
+Simulated time is divided into cells of `CELL`, at its multiples. For each wheel and each cell there is
+one standard normal number xi, a pure function of seed, wheel and cell: Philox4x64-10 with the key
+`(seed, wheel)` (right 0, left 1) and the cell as counter, and Box and Muller's transform. In a cell
+under one command the wheel slips at the constant speed `xi sqrt(k |v| / CELL)`, v its rim speed, so the
+true motion in the cell is one exact arc. After a command within a cell, the speed is
+
+    xi (sqrt(V + k |v| t) - a) / t
+
+with t the time that is left of the cell, V the variance `k |ds|` of the distance rolled so far in it,
+and `xi a` what has been slipped so far in it. So the variance in the whole cell is `k |ds|` again. A
+wheel at rest does not slip: what was missing from V then is left out.
+
+The state at a time follows from the last command through the cells between. It does not depend, to the
+last bit, on when it is computed. Under a command that is held for longer than `HOLD`, the width of cells
+doubles, and again with each doubling of the time held. So a long time takes few steps.
+
+Sources: doc/mathematics.md, "Slip"; Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as
+1, 2, 3", 2011.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from diffdrive_jacobian.kinematics._arc import arc_end
+from diffdrive_jacobian.kinematics._checks import number, positive, short
+from diffdrive_jacobian.time_units import NANOSECONDS
+
+CELL = 20_000_000
+"""Width of a cell (ns)."""
+HOLD = 600 * NANOSECONDS
+"""Time of one command after which cells become wider (ns)."""
+MAX_SEED = 2**63 - 1
+"""Largest seed, that of an integer parameter of ROS."""
+_BLOCK = 256
+"""Number of cells whose random numbers are computed at once."""
+
+Pose: TypeAlias = tuple[float, float, float]
+_Slipped: TypeAlias = tuple[int, int, float, float, float, float]
+"""Level and index of a cell; a and V of the right wheel, then of the left one (m, m^2)."""
+_NOT_SLIPPED: _Slipped = (-1, 0, 0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Drift:
+    """In what the true motion differs from the odometry.
+
+    Raises:
+        ValueError: The seed is not an integer from 0 to `MAX_SEED`, or a multiplier is not positive and
+            finite.
+    """
+
+    seed: int | None = None
+    """Seed of the random slip. None: the wheels do not slip."""
+    right_wheel_radius_multiplier: float = 1.0
+    """True radius of the right wheel, relative to the nominal one [-]."""
+    left_wheel_radius_multiplier: float = 1.0
+    """True radius of the left wheel, relative to the nominal one [-]."""
+    wheel_separation_multiplier: float = 1.0
+    """True wheel separation, relative to the nominal one [-]."""
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        if self.seed is not None:
+            object.__setattr__(self, 'seed', _seed(self.seed))
+        for name in (
+            'right_wheel_radius_multiplier',
+            'left_wheel_radius_multiplier',
+            'wheel_separation_multiplier',
+        ):
+            object.__setattr__(self, name, number(name, getattr(self, name), positive))
+
+
+def _seed(value: Any) -> int:
+    """Return a seed as an int.
+
+    Raises:
+        ValueError: It is not an integer from 0 to `MAX_SEED`.
+    """
+    try:
+        if isinstance(value, bool | np.bool_):
+            raise TypeError
+        seed = operator.index(value)
+    except TypeError:
+        seed = -1
+    if not 0 <= seed <= MAX_SEED:
+        raise ValueError(f'seed must be an integer from 0 to 2^63 - 1, got {short(value)}')
+    return seed
+
+
+class Truth:
+    """The true pose of a robot, at the time of the `Robot` that has it. An immutable value to its users.
+
+    The methods take the motion as the odometry has it: the nominal twist `(v, omega)` that is held, the
+    nominal wheel separation L (m) and k (m). All values were checked before.
+    """
+
+    __slots__ = ('_ahead', '_drift', '_held', '_slipped', 'pose')
+
+    def __init__(
+        self,
+        drift: Drift,
+        pose: Pose,
+        slipped: _Slipped = _NOT_SLIPPED,
+        held: tuple[tuple[float, float], int] | None = None,
+    ) -> None:
+        """Place the robot.
+
+        Args:
+            drift: In what its motion differs from its odometry.
+            pose: `(x, y, theta)` (m, m, rad).
+            slipped: What its wheels slipped in the present cell.
+            held: The twist that led here, and since when it is held (ns); None: the robot rested.
+        """
+        self.pose = pose
+        self._drift = drift
+        self._slipped = slipped
+        self._held = held
+        # The last boundary of cells that was reached from here, and the motion that led to it.
+        self._ahead: tuple[Any, int, Pose] | None = None
+
+    def with_drift(self, drift: Drift) -> Truth:
+        """Return the same pose with another drift."""
+        return self if drift == self._drift else Truth(drift, self.pose)
+
+    def at_rest(self) -> Truth:
+        """Return the same pose of a robot that rests."""
+        return self if self._held is None else Truth(self._drift, self.pose)
+
+    def after(self, start: int, stamp: int, twist: tuple[float, float], L: float, k: float) -> Truth:
+        """Return the truth after a motion.
+
+        Args:
+            start: Time of this value (ns).
+            stamp: A later time (ns).
+            twist: The nominal twist from `start` to `stamp`.
+            L: Nominal wheel separation (m).
+            k: Variance of each wheel's travel per distance (m).
+
+        Raises:
+            ValueError: The motion overflows.
+        """
+        drift = self._drift
+        right, left, separation = self._wheels(twist, L)
+        if drift.seed is None or not k:
+            dt = (stamp - start) / NANOSECONDS
+            v, omega = (right + left) / 2.0, (right - left) / separation
+            return Truth(drift, arc_end(*self.pose, v, omega, dt))
+        motion = start, twist, L, k
+        since = self._since(start, twist)
+        time, pose, slipped = start, self.pose, self._present(start, twist)
+        if self._ahead is not None and self._ahead[1] <= stamp and self._ahead[0] == motion:
+            _, time, pose = self._ahead
+            slipped = _NOT_SLIPPED
+        growth_R, growth_L = k * abs(right), k * abs(left)
+        while True:
+            begun = slipped is not _NOT_SLIPPED
+            level = slipped[0] if begun else ((time - since) // HOLD).bit_length()
+            cell = time // (CELL << level)
+            end = (cell + 1) * (CELL << level)
+            xi_R, xi_L = normals(drift.seed, level, cell)
+            rest = (end - time) / NANOSECONDS
+            if not begun:
+                # sqrt(k |v| rest) / rest
+                gain_R, gain_L = math.sqrt(growth_R / rest), math.sqrt(growth_L / rest)
+            else:
+                gain_R = _gain(slipped[2], slipped[3], growth_R, rest)
+                gain_L = _gain(slipped[4], slipped[5], growth_L, rest)
+            rim_R, rim_L = right + gain_R * xi_R, left + gain_L * xi_L
+            v, omega = (rim_R + rim_L) / 2.0, (rim_R - rim_L) / separation
+            if stamp < end:
+                break
+            pose = arc_end(*pose, v, omega, rest)
+            time, slipped = end, _NOT_SLIPPED
+        if time > start:
+            self._ahead = motion, time, pose
+        if time == stamp:
+            return Truth(drift, pose, slipped, (twist, since))
+        dt = (stamp - time) / NANOSECONDS
+        a_R, V_R = (slipped[2] + gain_R * dt, slipped[3] + growth_R * dt) if right else (0.0, 0.0)
+        a_L, V_L = (slipped[4] + gain_L * dt, slipped[5] + growth_L * dt) if left else (0.0, 0.0)
+        slipped = level, cell, a_R, V_R, a_L, V_L
+        return Truth(drift, arc_end(*pose, v, omega, dt), slipped, (twist, since))
+
+    def twist(self, stamp: int, twist: tuple[float, float], L: float, k: float) -> tuple[float, float]:
+        """Return the true twist from a time on, the slip included (m/s, rad/s).
+
+        Args:
+            stamp: Time of this value (ns).
+            twist: The nominal twist from then on.
+            L: Nominal wheel separation (m).
+            k: Variance of each wheel's travel per distance (m).
+        """
+        right, left, separation = self._wheels(twist, L)
+        seed = self._drift.seed
+        if seed is not None and k:
+            level, _, a_R, V_R, a_L, V_L = self._present(stamp, twist)
+            if level < 0:
+                level = ((stamp - self._since(stamp, twist)) // HOLD).bit_length()
+            cell, passed = divmod(stamp, CELL << level)
+            rest = ((CELL << level) - passed) / NANOSECONDS
+            xi_R, xi_L = normals(seed, level, cell)
+            right += xi_R * _gain(a_R, V_R, k * abs(right), rest)
+            left += xi_L * _gain(a_L, V_L, k * abs(left), rest)
+        return (right + left) / 2.0, (right - left) / separation
+
+    def _since(self, start: int, twist: tuple[float, float]) -> int:
+        """Return since when a twist from a time on is held (ns)."""
+        return self._held[1] if self._held is not None and self._held[0] == twist else start
+
+    def _present(self, start: int, twist: tuple[float, float]) -> _Slipped:
+        """Return what was slipped so far in the cell of a time, from which on a twist is held.
+
+        A wide cell ends with the twist that was held.
+        """
+        level, cell, *_ = slipped = self._slipped
+        valid = level == 0 or (level > 0 and self._since(start, twist) < start)
+        return slipped if valid and cell == start // (CELL << level) else _NOT_SLIPPED
+
+    def _wheels(self, twist: tuple[float, float], L: float) -> tuple[float, float, float]:
+        """Return the true rim speeds of right and left wheel without slip, and the true separation."""
+        (v, omega), drift = twist, self._drift
+        half = omega * L / 2.0
+        return (
+            (v + half) * drift.right_wheel_radius_multiplier,
+            (v - half) * drift.left_wheel_radius_multiplier,
+            L * drift.wheel_separation_multiplier,
+        )
+
+
+def _gain(a: float, variance: float, growth: float, rest: float) -> float:
+    """Return the slip speed for xi = 1 in the rest of a cell (m/s).
+
+    Args:
+        a: Distance slipped so far in the cell for xi = 1 (m).
+        variance: Variance of the slip that belongs to the distance so far (m^2).
+        growth: Its rate, `k |v|` (m^2/s).
+        rest: Time that is left of the cell (s).
+    """
+    return (math.sqrt(variance + growth * rest) - a) / rest if growth else 0.0
+
+
+def normals(seed: int, level: int, cell: int) -> tuple[float, float]:
+    """Return the standard normal numbers of the right and the left wheel in a cell.
+
+    Args:
+        seed: The seed, from 0 to `MAX_SEED`.
+        level: The width of the cell is `CELL << level`.
+        cell: Index of the cell, its start divided by its width.
+    """
+    block, place = divmod(cell, _BLOCK)
+    return _block(seed, level, block)[place]
+
+
+@lru_cache(maxsize=32)
+def _block(seed: int, level: int, block: int) -> tuple[tuple[float, float], ...]:
+    """Compute the numbers of `normals` for `_BLOCK` cells."""
+    first = level << 64 | block * _BLOCK % 2**64
+    wheels = []
+    for wheel in (0, 1):
+        # The generator increases its counter before each use. A counter gives four words.
+        generator = np.random.Philox(key=wheel << 64 | seed, counter=(first - 1) % 2**256)
+        words = generator.random_raw(4 * _BLOCK).tolist()
+        wheels.append(list(map(_normal, words[0::4], words[1::4])))
+    return tuple(zip(*wheels, strict=True))
+
+
+def _normal(first: int, second: int) -> float:
+    """Return a standard normal number from two random words of 64 bits."""
+    # Uniform in (0, 1] and in [0, 1), with 53 bits. Functions of NumPy may differ between processors.
+    radius = math.sqrt(-2.0 * math.log(((first >> 11) + 1) * 2.0**-53))
+    return radius * math.cos(math.tau * ((second >> 11) * 2.0**-53))

@@ -1,0 +1,89 @@
+"""Arguments of the tools that serve the page, and what they print about it."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import os
+import threading
+import webbrowser
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from diffdrive_jacobian.errors import UserError
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.live.server import LiveServer
+
+MAX_PORT = 65535
+DISPLAYS = ('DISPLAY', 'WAYLAND_DISPLAY')
+"""Environment variables without which no browser can open a window."""
+MISSING = "the page needs the Python module websockets: pip install 'diffdrive_jacobian[live]'"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the page."""
+    parser.add_argument(
+        '--port',
+        metavar='PORT',
+        type=_port,
+        default=0,
+        help='TCP port of the page (default: any free one)',
+    )
+    parser.add_argument(
+        '--no-browser', action='store_true', help='only print the address, do not open a browser'
+    )
+
+
+def _port(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and 1 <= int(text) <= MAX_PORT):
+        raise argparse.ArgumentTypeError(f'must be a whole number in 1 to {MAX_PORT}, got {text!r}')
+    return int(text)
+
+
+def announcing(options: argparse.Namespace, waiting: str = '') -> Callable[[LiveServer], None]:
+    """Return a function that prints the address of a server, and opens it in a browser.
+
+    Args:
+        options: The options of the page.
+        waiting: What happens when the page is open. Empty: nothing in particular.
+    """
+
+    def announce(server: LiveServer) -> None:
+        print(f'page: {server.url}')
+        if waiting:
+            print(f'{waiting} when the page is open')
+        print('whoever knows this address can steer the robot; Ctrl-C ends', flush=True)
+        if not options.no_browser and any(map(os.environ.get, DISPLAYS)):
+            # Starting a browser may take seconds.
+            arguments = (server.opening_url,)
+            threading.Thread(target=webbrowser.open, args=arguments, daemon=True).start()
+
+    return announce
+
+
+class PortError(UserError):
+    """The port that the user gave cannot be used."""
+
+
+@contextmanager
+def explaining_port(port: int) -> Iterator[None]:
+    """Raise PortError where the given port cannot be used."""
+    try:
+        yield
+    except OSError as error:
+        message = _port_message(error, port)
+        if message is None:
+            raise
+        raise PortError(message) from error
+
+
+def _port_message(error: OSError, port: int) -> str | None:
+    """Return what to print if a port cannot be used. None: the error is another one."""
+    reasons = {
+        errno.EADDRINUSE: 'is in use: choose another one, or none for any free one',
+        errno.EACCES: 'may not be used: choose one above 1023',
+    }
+    why = reasons.get(error.errno or 0)
+    return None if why is None or not port else f'--port {port} {why}'

@@ -1,0 +1,116 @@
+"""Robots that slip, compared with what their odometry reports: `python test/benchmark/drift.py`.
+
+For each drive: the mean normalized error squared (NEES, 3 is right) of the true pose about the odometry,
+with the published covariance, over 4,000 seeds, and the standard deviations. Commands take effect within
+cells. Then the CPU time of a message with and without slip, interleaved, and that of long gaps.
+`--seconds 60` drives longer: half a minute of CPU time for each ten seconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import statistics
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from moments_reference import DRIVES
+
+from diffdrive_jacobian.simulation import Drift, Robot, RobotModel
+from diffdrive_jacobian.time_units import nanoseconds
+
+START = 7_654_321
+PERIOD = 20_000_000
+GAPS = {'1 s': 1.0, '1 min': 60.0, '1 h': 3600.0, '1 day': 86400.0, '1 year': 3.15e7}
+
+
+def driven(model: RobotModel, name: str, duration: float) -> Robot:
+    """Return a robot after a drive."""
+    robot, stamp = Robot(model=model, stamp=START, pose=np.zeros(3)), START
+    for twist, held in DRIVES[name](duration):
+        robot = robot.commanded(tuple(map(float, twist)), stamp)
+        stamp += nanoseconds(held)
+    return robot.at(stamp)
+
+
+def errors(name: str, duration: float, seeds: range) -> np.ndarray:
+    """Return the errors of the odometry, shape (n, 3); they are those of the true pose."""
+    found = []
+    for seed in seeds:
+        robot = driven(RobotModel(drift=Drift(seed=seed)), name, duration)
+        x, y, theta = robot.true_pose - robot.pose
+        found.append((x, y, math.remainder(theta, math.tau)))
+    return np.array(found)
+
+
+def accuracy(count: int, duration: float) -> Table:
+    """Return the table of the errors."""
+    table = Table(title=f'ground_truth about odom after {duration:g} s, {count} seeds')
+    for name in ('drive', 'NEES', 'sigma x (m)', 'published', 'sigma y (m)', 'published'):
+        table.add_column(name, justify='right')
+    workers = os.cpu_count() or 1
+    shares = [range(count)[first::workers] for first in range(workers)]
+    with ProcessPoolExecutor(workers) as pool:
+        for name in DRIVES:
+            parts = pool.map(errors, [name] * workers, [duration] * workers, shares)
+            found = np.concatenate(list(parts))
+            covariance = driven(RobotModel(), name, duration).covariance
+            values = np.einsum('ni,ij,nj->n', found, np.linalg.inv(covariance), found)
+            sigma, published = np.sqrt(np.mean(found**2, axis=0)), np.sqrt(np.diag(covariance))
+            table.add_row(
+                *(name, f'{values.mean():.2f} ± {values.std() / math.sqrt(count):.2f}'),
+                *(f'{sigma[0]:.5f}', f'{published[0]:.5f}', f'{sigma[1]:.5f}', f'{published[1]:.5f}'),
+            )
+    return table
+
+
+def cost(rounds: int) -> Table:
+    """Return the table of CPU times of the state at each message of 50 Hz, both robots in turn."""
+    table = Table(title='CPU time')
+    for name in ('', 'slip', 'none', 'ratio'):
+        table.add_column(name, justify='right')
+    models = RobotModel(drift=Drift(seed=1)), RobotModel()
+    times: list[list[float]] = [[], []]
+    for one in range(rounds):
+        for model, found in zip(models, times, strict=True):
+            robot = Robot(model=model, stamp=START, pose=np.zeros(3)).commanded((0.2, 0.5), START)
+            begin = time.process_time()
+            for message in range(1, 501):
+                state = robot.at(START + (one + message) * PERIOD)
+                _ = state.true_pose_tuple, state.true_twist, state.pose_tuple, state.covariance_tuple
+            found.append((time.process_time() - begin) / 500 * 1e6)
+    slip, none = map(statistics.median, times)
+    table.add_row('a message (us)', f'{slip:.1f}', f'{none:.1f}', f'{slip / none:.2f}')
+    for name, seconds in GAPS.items():
+        found = []
+        for model in models:
+            robot = Robot(model=model, stamp=START, pose=np.zeros(3)).commanded((0.2, 0.5), START)
+            begin = time.process_time()
+            _ = robot.at(START + round(seconds * 1e9)).true_pose_tuple
+            found.append((time.process_time() - begin) * 1e3)
+        table.add_row(f'a gap of {name} (ms)', f'{found[0]:.2f}', f'{found[1]:.3f}', '')
+    return table
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--seeds', type=int, default=4000, help='number of seeds (default: 4000)')
+    parser.add_argument('--seconds', type=float, default=10.0, help='length of a drive (default: 10.0)')
+    parser.add_argument('--rounds', type=int, default=20, help='rounds of timing (default: 20)')
+    options = parser.parse_args()
+    console = Console(width=110)
+    console.print(accuracy(options.seeds, options.seconds))
+    console.print(cost(options.rounds))
+
+
+if __name__ == '__main__':
+    main()

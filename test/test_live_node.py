@@ -1,0 +1,289 @@
+"""The node behind the live page, in lockstep with robot, wheel bridge and controller."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import Twist
+from lockstep_nodes import QUICK, make
+
+from diffdrive_jacobian.live import hand
+from diffdrive_jacobian.live import node as live_node
+from diffdrive_jacobian.live.commands import (
+    CancelGoal,
+    ClearPath,
+    Drive,
+    Pause,
+    Place,
+    Release,
+    Reset,
+    SendGoal,
+    SetParameter,
+)
+from diffdrive_jacobian.live.node import LivePage
+from diffdrive_jacobian.live.session import Session
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+
+
+class Live:
+    """An open page, and the node behind it."""
+
+    def __init__(self, world):
+        self.world = world
+        self.session = Session()
+        self.page = self.session.enter()
+        self.node = world.add(LivePage(self.session, world.node.context, polled=False))
+        self.notices = []
+
+    def send(self, *commands, page=None):
+        for command in commands:
+            assert self.session.put(page or self.page, command)
+
+    def pass_time(self, seconds=0.02):
+        end = self.world.elapsed + seconds
+        while self.world.elapsed < end:
+            self.node.work()
+            self.world.step(0.02)
+        self.node.work()
+        self.world.settle()
+        self.node.work()
+
+    def until(self, condition, timeout=20.0):
+        end = self.world.elapsed + timeout
+        while not condition():
+            assert self.world.elapsed < end, (self.texts, self.robot())
+            self.pass_time()
+
+    def robot(self, name='/'):
+        """Return what the page shows of a robot."""
+        _, snapshot = self.session.latest()
+        return next((one for one in snapshot.robots if one['name'] == name), None)
+
+    @property
+    def texts(self):
+        return [notice['text'] for notice in self.session.notices_after(0)]
+
+    def settings(self, name='/'):
+        _, snapshot = self.session.latest()
+        return {row['key']: row for row in snapshot.fixed['settings'][name]}
+
+    def state(self, name='/'):
+        return self.robot(name)['goal']['state']
+
+
+@pytest.fixture
+def live(lockstep, monkeypatch):
+    monkeypatch.setattr(live_node, 'PERIOD', 0.0)
+    monkeypatch.setattr(live_node, 'DISCOVERY_PERIOD', 0.0)
+    # By the clock on the wall, which has nothing to do with simulated time.
+    monkeypatch.setattr(hand, 'DEAD_MAN', math.inf)
+    return Live(lockstep)
+
+
+@pytest.fixture
+def driven(live):
+    """A robot with controller and wheel bridge, known to the page."""
+    for node in (VirtualRobot, WheelBridge, GoToGoal):
+        parameters = {'command_interface': 'wheels'} if node is VirtualRobot else {}
+        live.world.add(make(node, **parameters, **(QUICK if node is GoToGoal else {})))
+    live.until(lambda: live.robot() and len(live.settings()) > 8)
+    return live
+
+
+def goal(x, y, theta=None, *, robot='/', append=False):
+    return SendGoal(robot, x, y, theta, append=append)
+
+
+def test_a_goal_is_driven_to_and_every_number_of_the_chain_is_there(driven):
+    driven.send(goal(0.4, 0.3))
+    driven.until(lambda: driven.state() == 'executing' and driven.robot()['commanded'])
+    robot = driven.robot()
+    assert robot['goal']['goals'][0][:2] == [0.4, 0.3]
+    assert robot['distance'] == pytest.approx(0.5, abs=0.02)
+    assert robot['law']['name'] == 'go_to_goal'
+    assert robot['law']['kp'] == QUICK['kp']
+    assert robot['tolerance'] == 0.02
+    chain = robot['chain']
+    assert chain['measured']
+    assert np.array(chain['inverse']) @ chain['command'] == pytest.approx(chain['wanted'], rel=1e-4)
+    assert np.array(chain['forward']) @ chain['wheels'] == pytest.approx(chain['twist'], rel=1e-4)
+    world = np.array(chain['unicycle']) @ chain['twist']
+    assert world == pytest.approx(np.array(chain['world']), rel=1e-4, abs=1e-6)
+    driven.until(lambda: driven.state() == 'succeeded')
+    x, y, _ = driven.robot()['pose']
+    assert math.dist((x, y), (0.4, 0.3)) <= 0.02
+    assert driven.robot()['region']['a'] > driven.robot()['region']['b'] > 0.0
+    _, snapshot = driven.session.latest()
+    assert len(snapshot.trails['/'].points) > 10
+
+
+def test_waypoints_are_appended_and_a_goal_is_canceled(driven):
+    driven.send(goal(0.3, 0.0))
+    driven.until(lambda: driven.state() == 'executing')
+    driven.send(goal(0.3, 0.3, append=True), goal(5.0, 5.0, 1.0, append=True))
+    driven.until(lambda: len(driven.robot()['goal']['goals']) > 1)
+    driven.until(lambda: driven.robot()['goal']['index'] == len(driven.robot()['goal']['goals']) - 1)
+    assert driven.robot()['goal']['goals'][-1] == [5.0, 5.0, 1.0]
+    driven.send(CancelGoal('/'))
+    driven.until(lambda: driven.state() == 'canceled')
+    driven.pass_time(0.1)
+    assert driven.robot()['twist'] == [0.0, 0.0]
+    driven.send(CancelGoal('/'))
+    driven.until(lambda: any('no goal is active' in text for text in driven.texts))
+
+
+def test_a_waypoint_is_appended_to_a_goal_that_was_sent_just_now(driven):
+    driven.send(goal(0.3, 0.0), goal(0.3, 0.3, append=True), goal(0.0, 0.3, append=True))
+    driven.until(lambda: driven.state() == 'executing')
+    places = [one[:2] for one in driven.robot()['goal']['goals']]
+    assert places == [[0.3, 0.0], [0.3, 0.3], [0.0, 0.3]]
+    driven.until(lambda: driven.state() == 'succeeded')
+    driven.send(goal(0.5, 0.5, append=True))
+    driven.until(lambda: driven.state() == 'executing')
+    assert len(driven.robot()['goal']['goals']) == 1
+
+
+def test_without_a_heading_the_goal_is_approached_straight(driven):
+    driven.send(goal(0.3, 0.3))
+    driven.until(lambda: driven.robot()['goal']['goals'])
+    assert driven.robot()['goal']['goals'][0][2] == pytest.approx(math.pi / 4, abs=1e-5)
+
+
+def test_driving_by_hand_cancels_the_goal_first_and_stops_with_the_page(driven):
+    commands = driven.world.listen(Twist, 'cmd_vel')
+    driven.send(goal(5.0, 0.0))
+    driven.until(lambda: driven.state() == 'executing')
+    driven.send(Drive('/', 0.25, 0.5))
+    driven.until(lambda: driven.robot()['by_hand'] and driven.robot()['commanded'], timeout=2.0)
+    driven.until(lambda: commands[-1].linear.x == 0.25, timeout=2.0)
+    assert driven.state() == 'canceled'
+    assert 'driving by hand: the goal is canceled' in driven.texts
+    # No command of the controller comes between.
+    by_hand = [(one.linear.x, one.angular.z) for one in commands]
+    first = by_hand.index((0.25, 0.5))
+    assert by_hand[first - 1] == (0.0, 0.0)
+    assert set(by_hand[first:]) == {(0.25, 0.5)}
+    driven.session.leave(driven.page)
+    driven.pass_time(0.1)
+    assert (commands[-1].linear.x, commands[-1].angular.z) == (0.0, 0.0)
+    stopped = len(commands)
+    driven.pass_time(0.5)
+    assert len(commands) == stopped
+
+
+def test_a_goal_is_refused_while_the_robot_is_driven_by_hand(driven):
+    driven.send(Drive('/', 0.2, 0.0), goal(1.0, 0.0))
+    driven.pass_time(0.1)
+    assert any('release the keys' in text for text in driven.texts)
+    assert not driven.robot()['goal']['active']
+    other = driven.session.enter()
+    driven.send(Drive('/', -0.9, 0.0), page=other)
+    driven.pass_time(0.1)
+    assert 'another page drives this robot by hand' in driven.texts
+    assert driven.robot()['twist'][0] == pytest.approx(0.2)
+    driven.send(Release('/'), page=other)
+    driven.pass_time(0.1)
+    assert driven.robot()['by_hand']
+    driven.send(Release('/'))
+    driven.pass_time(0.1)
+    assert driven.robot()['twist'] == [0.0, 0.0]
+
+
+def test_the_robot_is_placed_and_reset(driven):
+    driven.send(Place('/', 1.0, -2.0, 0.5))
+    driven.until(lambda: driven.robot()['pose'] == pytest.approx([1.0, -2.0, 0.5]))
+    driven.send(ClearPath('/'))
+    driven.pass_time(0.1)
+    assert driven.session.latest()[1].trails['/'].points == [(1.0, -2.0)]
+    driven.send(Reset('/'))
+    driven.until(lambda: driven.robot()['pose'] == [0.0, 0.0, 0.0])
+
+
+def test_parameters_are_set_and_refusals_are_shown(driven):
+    driven.send(
+        SetParameter('/', 'controller/kp', 5.0),
+        SetParameter('/', 'controller/controller', 'pose'),
+        SetParameter('/', 'robot/max_wheel_velocity', 9.0),
+        SetParameter('/', 'controller/linear.x.max_velocity', 0.1),
+        SetParameter('/', 'controller/linear.x.max_velocity', None),
+    )
+    driven.until(lambda: driven.settings()['controller/controller']['value'] == 'pose')
+    driven.pass_time(0.1)
+    rows = driven.settings()
+    assert rows['controller/kp']['value'] == 5.0
+    assert rows['robot/max_wheel_velocity']['value'] == 9.0
+    assert rows['controller/linear.x.max_velocity']['value'] is None
+    assert driven.robot()['use_heading']
+    assert driven.texts == []
+    driven.send(
+        SetParameter('/', 'controller/kp', -1.0),
+        SetParameter('/', 'controller/controller', 'none'),
+        SetParameter('/', 'controller/use_sim_time', False),
+    )
+    driven.until(lambda: len(driven.texts) == 3)
+    assert any(text.startswith('kp refused') for text in driven.texts)
+    assert any(text.startswith('controller refused') for text in driven.texts)
+    assert any('there is no setting' in text for text in driven.texts)
+    assert driven.settings()['controller/kp']['value'] == 5.0
+
+
+def test_changes_of_others_are_followed(driven):
+    controller = next(node for node in driven.world._executor.nodes if isinstance(node, GoToGoal))
+    from rclpy.parameter import Parameter
+
+    controller.set_parameters([Parameter('kv', value=1.25)])
+    driven.until(lambda: driven.settings()['controller/kv']['value'] == 1.25, timeout=2.0)
+
+
+def test_robots_in_namespaces(live):
+    for name in ('/one', '/two'):
+        live.world.add(make(VirtualRobot, name))
+        live.world.add(make(GoToGoal, name, **QUICK))
+    live.until(lambda: live.robot('/one') and live.robot('/two'))
+    live.pass_time(0.1)
+    live.send(goal(0.3, 0.0, robot='/two'))
+    live.until(lambda: live.state('/two') == 'succeeded')
+    assert live.robot('/one')['pose'] == [0.0, 0.0, 0.0]
+    live.send(goal(0.3, 0.0, robot='/three'))
+    live.pass_time(0.04)
+    assert 'there is no such robot' in live.texts
+
+
+def test_a_robot_without_a_controller(live):
+    live.world.add(make(VirtualRobot))
+    live.until(lambda: live.robot())
+    live.send(goal(1.0, 0.0), CancelGoal('/'), SetParameter('/', 'controller/kp', 1.0))
+    live.send(Pause(paused=True))
+    live.pass_time(0.1)
+    assert len(live.texts) == 4
+    assert 'nobody is subscribed to /goal_pose: is go_to_goal running?' in live.texts
+    assert any('there is no service /cancel_goal' in text for text in live.texts)
+    assert 'there is no controller to set kp of' in live.texts
+    assert any('time is real here' in text for text in live.texts)
+
+
+def test_a_robot_that_takes_stamped_commands(live):
+    live.world.add(make(VirtualRobot, enable_stamped_cmd_vel=True))
+    live.until(lambda: live.robot())
+    live.send(Drive('/', 0.3, 0.0))
+    live.until(lambda: live.robot()['twist'][0] == pytest.approx(0.3), timeout=2.0)
+
+
+def test_without_a_page_nothing_is_computed(live):
+    live.world.add(make(VirtualRobot))
+    live.session.leave(live.page)
+    live.pass_time(0.2)
+    assert live.node.robots
+    assert live.session.latest()[0] == 0
+
+
+def test_robots_that_are_silent_and_gone(live, monkeypatch):
+    robot = live.world.add(make(VirtualRobot))
+    live.until(lambda: live.robot())
+    live.world.remove(robot)
+    monkeypatch.setattr(live_node, 'LOST', 0.0)
+    live.until(lambda: live.robot() is None)

@@ -1,0 +1,303 @@
+"""The server of the live page: who may use it, and what it withstands."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import socket
+import threading
+import time
+
+import pytest
+from chromium import until
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from diffdrive_jacobian.live.access import Access, Refusal
+from diffdrive_jacobian.live.commands import Drive
+from diffdrive_jacobian.live.server import MAX_INVALID, MAX_PAGES, LiveServer
+from diffdrive_jacobian.live.session import Session, Snapshot
+
+DRIVE = json.dumps({'do': 'drive', 'robot': '/', 'v': 0.2, 'omega': 0.0})
+
+
+@pytest.fixture
+def server():
+    made = LiveServer(Session())
+    made.start()
+    yield made
+    made.close()
+    assert not made._thread.is_alive()
+
+
+def session_of(server):
+    return server._session
+
+
+def get(server, path, **headers):
+    """Request a path; return status, headers and body."""
+    connection = http.client.HTTPConnection('127.0.0.1', server.port, timeout=20)
+    with contextlib.closing(connection):
+        connection.putrequest('GET', path, skip_host='Host' in headers)
+        for name, value in headers.items():
+            connection.putheader(name, value)
+        connection.endheaders()
+        answer = connection.getresponse()
+        return answer.status, answer.headers, answer.read()
+
+
+def page(server, *, path=None, origin='own', host=None):
+    """Open the websocket, as a page of some origin would."""
+    own = f'http://127.0.0.1:{server.port}'
+    return connect(
+        f'ws://{host or f"127.0.0.1:{server.port}"}{path or f"/{server.access.token}/socket"}',
+        origin=own if origin == 'own' else origin,
+        sock=socket.create_connection(('127.0.0.1', server.port), timeout=20),
+        proxy=None,
+        open_timeout=20,
+    )
+
+
+# --- Access
+
+
+def test_the_page_with_its_token(server):
+    for name in ('', 'index.html', 'main.js', 'theme.css?x=1'):
+        status, headers, body = get(server, f'/{server.access.token}/{name}')
+        assert status == 200
+        assert body
+    assert headers['X-Content-Type-Options'] == 'nosniff'
+    policy = headers['Content-Security-Policy']
+    assert policy.startswith("default-src 'none'; script-src 'self'; style-src 'self'")
+    assert "frame-ancestors 'none'" in policy
+    assert 'unsafe' not in policy
+    assert headers['Referrer-Policy'] == 'no-referrer'
+    assert 'Set-Cookie' not in headers
+
+
+@pytest.mark.parametrize(
+    'path',
+    [
+        '/',
+        '/index.html',
+        '/main.js',
+        '/x/main.js',
+        '/%00/',
+        '//',
+        '/../',
+        '/open/',
+        '/open/x',
+        '/socket',
+    ],
+)
+def test_without_the_token_nothing_is_served(server, path):
+    status, headers, body = get(server, path)
+    assert status == 403
+    assert b'token' in body
+    assert 'Content-Security-Policy' in headers
+
+
+@pytest.mark.parametrize('name', ['../server.py', '%2e%2e/server.py', '/etc/passwd', 'no.js', '..'])
+def test_only_the_files_of_the_page_are_served(server, name):
+    assert get(server, f'/{server.access.token}/{name}')[0] == 404
+
+
+@pytest.mark.parametrize(
+    'host',
+    ['evil.example', 'evil.example:80', '127.0.0.1.evil.example', '127.0.0.1@evil', '', '10.0.0.1'],
+)
+def test_another_name_of_this_machine_is_refused(server, host):
+    """DNS rebinding: a page of evil.example, whose name now leads to 127.0.0.1."""
+    path = f'/{server.access.token}/'
+    assert get(server, path, Host=host)[0] == 403
+    if '@' not in host and host:
+        with pytest.raises(InvalidStatus, match='403'):
+            page(server, host=host, origin=f'http://{host}')
+
+
+def test_localhost_and_a_forwarded_port(server):
+    path = f'/{server.access.token}/'
+    for host in (f'localhost:{server.port}', 'localhost:9000', '127.0.0.1:9000'):
+        assert get(server, path, Host=host)[0] == 200
+        with page(server, host=host, origin=f'http://{host}'):
+            pass
+
+
+@pytest.mark.parametrize(
+    'origin',
+    [
+        None,
+        'null',
+        'http://evil.example',
+        'https://127.0.0.1:{port}',
+        'http://127.0.0.1',
+        'http://127.0.0.1:1',
+        'http://localhost:{port}',
+        'http://127.0.0.1:{port}.evil.example',
+    ],
+)
+def test_a_page_of_another_origin_cannot_connect(server, origin):
+    """Even if it knew the token."""
+    origin = origin and origin.format(port=server.port)
+    with pytest.raises(InvalidStatus, match='403'):
+        page(server, origin=origin)
+    assert not session_of(server).watched
+    if origin:
+        assert get(server, f'/{server.access.token}/', Origin=origin)[0] == 403
+
+
+@pytest.mark.parametrize('path', ['/socket', '/wrong/socket', '/', '/open/x'])
+def test_without_the_token_no_page_connects(server, path):
+    with pytest.raises(InvalidStatus, match='403'):
+        page(server, path=path)
+    assert not session_of(server).watched
+
+
+def test_the_ticket_opens_the_page_once(server):
+    path = server.opening_url.removeprefix(f'http://127.0.0.1:{server.port}')
+    assert server.access.token not in path
+    status, headers, _ = get(server, path)
+    assert (status, headers['Location']) == (303, f'/{server.access.token}/')
+    assert get(server, path)[0] == 403
+
+
+def test_tokens_are_long_and_differ():
+    first, second = Access(), Access()
+    assert len(first.token) >= 32
+    assert first.token != second.token
+    assert first.check('/\udcff\udcfe/', ['localhost'], []) is Refusal.TOKEN
+    assert first.check(f'/{second.token}/', ['localhost'], []) is Refusal.TOKEN
+    assert first.check(f'/{first.token}/', ['localhost', 'localhost'], []) is Refusal.HOST
+
+
+def test_it_listens_on_this_machine_only(server):
+    assert server._socket.getsockname()[0] == '127.0.0.1'
+    with pytest.raises(OSError, match='in use'):
+        LiveServer(Session(), server.port)
+
+
+# --- What it withstands
+
+
+def test_commands_arrive_with_their_page(server):
+    with page(server) as first, page(server) as second:
+        first.send(DRIVE)
+        second.send(DRIVE)
+        taken = []
+        until(lambda: taken.extend(session_of(server).take_commands()) or len(taken) == 2, 'commands')
+    assert [command for _, command in taken] == [Drive('/', 0.2, 0.0)] * 2
+    numbers = [number for number, _ in taken]
+    assert len(set(numbers)) == 2
+    until(lambda: not any(map(session_of(server).is_open, numbers)), 'both pages are gone')
+
+
+def closed(socket):
+    """Wait until the server has closed a websocket; return the code."""
+    with contextlib.suppress(ConnectionClosed):
+        for _ in socket:
+            pass
+    return socket.close_code
+
+
+def test_a_flood_disconnects_the_page(server):
+    with page(server) as flooding, page(server) as other:
+        with contextlib.suppress(ConnectionClosed):
+            for _ in range(3000):
+                flooding.send(DRIVE)
+        assert closed(flooding) == 1008
+        session_of(server).take_commands()
+        other.send(DRIVE)
+        until(session_of(server).take_commands, 'the other page is served')
+
+
+def test_malformed_commands_are_refused_and_then_disconnect(server):
+    with page(server) as bad:
+        bad.send('{"do": "drive", "robot": "/", "v": NaN, "omega": 0}')
+        while 'notices' not in (frame := json.loads(bad.recv(timeout=20))):
+            pass
+        assert frame['notices'][0]['text'].startswith('command refused: a command must be JSON')
+        for _ in range(MAX_INVALID):
+            bad.send(b'\x00\xff')
+        assert closed(bad) == 1008
+    assert session_of(server).take_commands() == []
+
+
+@pytest.mark.parametrize('message', ['x' * 5000, b'\x00' * 100_000])
+def test_large_messages_disconnect(server, message):
+    with page(server) as bad:
+        bad.send(message)
+        assert closed(bad) == 1009
+
+
+def test_pages_are_limited(server):
+    with contextlib.ExitStack() as stack:
+        for _ in range(MAX_PAGES):
+            stack.enter_context(page(server))
+        assert closed(stack.enter_context(page(server))) == 1013
+
+
+def test_what_is_no_http_is_disconnected(server):
+    for garbage in (
+        b'\x16\x03\x01' * 50 + b'\r\n\r\n',
+        b'GET / HTTP/1.1\r\n' + b'a: b\r\n' * 500,
+        b'POST / HTTP/1.1\r\n\r\n',
+    ):
+        with socket.create_connection(('127.0.0.1', server.port), timeout=20) as raw:
+            raw.sendall(garbage)
+            received = b''
+            with contextlib.suppress(ConnectionResetError):
+                while data := raw.recv(4096):
+                    received += data
+            assert b'200' not in received.split(b'\r\n')[0]
+    assert get(server, f'/{server.access.token}/')[0] == 200
+
+
+def test_a_page_that_does_not_read_delays_nobody(server):
+    """Its states are dropped, what waits is bounded, and storing a state takes no time."""
+    session = session_of(server)
+    big = [{'name': '/', 'filling': 'x' * 100_000}]
+    with page(server) as reading:
+        raw = socket.create_connection(('127.0.0.1', server.port), timeout=20)
+        raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        token = server.access.token
+        raw.sendall(
+            f'GET /{token}/socket HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n'
+            f'Origin: http://127.0.0.1:{server.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n'
+            'Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n'.encode()
+        )
+        until(lambda: len(session._pages) == 2, 'both pages')
+        stop = threading.Event()
+        spent = []
+
+        def store():
+            before = time.thread_time()
+            for number in range(200):
+                session.store(Snapshot(robots=big, world={'number': number}))
+            spent.append(time.thread_time() - before)
+            stop.set()
+
+        thread = threading.Thread(target=store)
+        thread.start()
+        numbers = [json.loads(reading.recv(timeout=20))['world'].get('number', 0)]
+        while numbers[-1] != 199:
+            numbers.append(json.loads(reading.recv(timeout=20))['world'].get('number', 0))
+        thread.join()
+        assert numbers == sorted(numbers)
+        assert spent[0] < 0.1
+        raw.close()
+
+
+def test_it_ends_while_pages_are_open():
+    server = LiveServer(Session())
+    server.start()
+    with page(server) as open_page:
+        server.close()
+        assert not server._thread.is_alive()
+        assert closed(open_page) == 1001
+    with pytest.raises(OSError, match='refused'):
+        socket.create_connection(('127.0.0.1', server.port), timeout=5)
+
+
+def test_it_can_be_closed_before_it_started():
+    LiveServer(Session()).close()

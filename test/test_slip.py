@@ -1,0 +1,352 @@
+"""The true motion of a robot that slips, or whose wheels are not as nominal."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from diffdrive_jacobian.kinematics import se2
+from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
+from diffdrive_jacobian.simulation import Robot, RobotModel
+from diffdrive_jacobian.simulation.slip import CELL, HOLD, Drift, _block, normals
+
+SECOND = 1_000_000_000
+MULTIPLIERS = (
+    'right_wheel_radius_multiplier',
+    'left_wheel_radius_multiplier',
+    'wheel_separation_multiplier',
+)
+
+
+def robot(stamp=0, pose=(0.0, 0.0, 0.0), variance=1e-5, **drift):
+    model = RobotModel(wheel_travel_variance=variance, drift=Drift(**drift))
+    return Robot(model=model, stamp=stamp, pose=pose)
+
+
+def driven(start, commands, end):
+    for twist, stamp in commands:
+        start = start.commanded(twist, stamp)
+    return start.at(end)
+
+
+def slips(one, other):
+    """Distances that the wheels slipped between two states on a short path, right and left."""
+    error = other.true_pose - other.pose - (one.true_pose - one.pose)
+    along, turn = error[0], error[2]
+    half = turn * one.model.wheel_separation / 2.0
+    return along + half, along - half
+
+
+def irregular(seed, count, longest=30_000_000):
+    """Commands at irregular times: straight, arcs, in place, and stops."""
+    generator = np.random.default_rng(seed)
+    stamps = np.cumsum(generator.integers(1, longest, count)).tolist()
+    twists = [(0.2, 0.0), (0.2, 1.0), (0.0, -2.0), (0.0, 0.0), (-0.1, 0.3), (0.08, 1.0)]
+    return [(twists[index], stamp) for index, stamp in enumerate(stamps) for index in [index % 6]]
+
+
+# --- Random numbers
+
+
+def test_the_generator_is_philox_with_seed_and_wheel_as_key_and_the_cell_as_counter():
+    """The first words for key 0 and counter 0 are those that its authors published."""
+    first, second = 0x16554D9ECA36314C, 0xDB20FE9D672D0FDC
+    radius = math.sqrt(-2.0 * math.log(((first >> 11) + 1) / 2**53))
+    expected = radius * math.cos(2.0 * math.pi * (second >> 11) / 2**53)
+    assert normals(0, 0, 0)[0] == pytest.approx(expected, rel=1e-15)
+    for seed, cell in ((7, 5), (7, 256), (3, 123_456), (2**63 - 1, 1_700_000_000 * 50)):
+        for wheel in (0, 1):
+            words = np.random.Philox(key=[seed, wheel], counter=[cell - 1, 0, 0, 0]).random_raw(2)
+            u, w = (int(word) >> 11 for word in words)
+            expected = math.sqrt(-2.0 * math.log((u + 1) / 2**53)) * math.cos(math.tau * (w / 2**53))
+            assert normals(seed, 0, cell)[wheel] == expected
+
+
+def test_the_numbers_are_normal_and_independent():
+    values = np.array([normals(11, 0, cell) for cell in range(20_000)])
+    assert np.abs(values.mean(axis=0)).max() < 0.03
+    np.testing.assert_allclose(values.var(axis=0), 1.0, atol=0.04)
+    np.testing.assert_allclose((values**4).mean(axis=0), 3.0, atol=0.3)
+    others = [values[1:, 0], values[:-1, 1], np.array([normals(12, 0, n)[0] for n in range(19_999)])]
+    for other in others:
+        assert abs(np.corrcoef(values[:-1, 0], other)[0, 1]) < 0.03
+
+
+def test_negative_times_and_wide_cells_have_numbers_of_their_own():
+    found = [
+        normals(5, level, cell)
+        for level in (0, 1, 20)
+        for cell in (-257, -256, -255, -1, 0, 1, 255, 256, 257)
+    ]
+    assert len({number for pair in found for number in pair}) == 2 * len(found)
+
+
+# --- The same motion however it is computed
+
+
+@pytest.mark.parametrize('drift', [{'seed': 3}, {'right_wheel_radius_multiplier': 1.01}], ids=str)
+def test_the_truth_does_not_depend_on_when_it_is_computed(drift):
+    commands = irregular(1, 60)
+    end = commands[-1][1] + SECOND
+    expected = driven(robot(**drift), commands, end)
+    generator = np.random.default_rng(2)
+    asked = robot(**drift)
+    events = [*commands, (None, end)]
+    for (twist, stamp), (_, later) in pairwise(events):
+        asked = asked.commanded(twist, stamp)
+        # In any order, and again after the numbers were forgotten.
+        for one in generator.integers(stamp, later, 5, endpoint=True).tolist():
+            asked.at(one)
+            _block.cache_clear()
+    assert asked.at(end).true_pose_tuple == expected.true_pose_tuple
+    assert asked.at(end).true_twist == expected.true_twist
+    assert expected.true_pose_tuple != expected.pose_tuple
+
+
+def test_seeds_differ_and_a_seed_repeats():
+    poses = [driven(robot(seed=seed), [((0.2, 0.1), 7)], SECOND).true_pose_tuple for seed in (1, 2, 1)]
+    assert poses[0] == poses[2] != poses[1]
+
+
+def test_odometry_is_that_of_a_perfect_robot():
+    commands = irregular(4, 40)
+    end = commands[-1][1] + SECOND
+    slipping = driven(robot(seed=1, wheel_separation_multiplier=1.1), commands, end)
+    perfect = driven(Robot(model=RobotModel(), stamp=0, pose=[0, 0, 0]), commands, end)
+    assert slipping.pose_tuple == perfect.pose_tuple == perfect.true_pose_tuple
+    assert slipping.covariance_tuple == perfect.covariance_tuple
+    assert slipping.wheel_angles == perfect.wheel_angles
+    assert perfect.true_twist == perfect.twist
+
+
+def test_a_robot_at_rest_does_not_slip():
+    moved = driven(robot(seed=1), [((0.2, 0.0), 0), ((0.0, 0.0), SECOND + 3)], 2 * SECOND)
+    later = moved.at(3600 * SECOND)
+    assert later.true_pose_tuple == moved.true_pose_tuple
+    assert later.true_twist == (0.0, 0.0)
+
+
+def test_a_wheel_at_rest_does_not_slip():
+    """The left one, about which the robot turns, also if it is inexact by the rounding of the twist."""
+    start = robot(seed=1)
+    turned = driven(start, [((0.16, 2.0), 0)], SECOND // 10)
+    _, _, theta = turned.true_pose_tuple
+    x, y = 0.08 * math.sin(theta), 0.08 - 0.08 * math.cos(theta)
+    assert turned.true_pose[:2] == pytest.approx([x, y], abs=1e-12)
+
+
+def test_a_timeout_stops_the_truth_as_well():
+    model = RobotModel(command_timeout=SECOND // 2, drift=Drift(seed=1))
+    commanded = Robot(model=model, stamp=0, pose=[0, 0, 0]).commanded((0.2, 0.0), 5)
+    assert commanded.at(SECOND).true_pose_tuple == commanded.at(SECOND // 2 + 5).true_pose_tuple
+
+
+# --- What the noise is
+
+
+def test_in_a_cell_the_robot_moves_along_one_arc_with_its_numbers():
+    start = driven(robot(variance=1e-4, seed=9), [((0.2, 0.5), 0)], 10 * CELL)
+    (r, left), L, k = normals(9, 0, 10), 0.16, 1e-4
+    rims = [0.2 + 0.5 * L / 2.0, 0.2 - 0.5 * L / 2.0]
+    gains = [math.sqrt(k * rim / (CELL * 1e-9)) for rim in rims]
+    true = [rim + gain * xi for rim, gain, xi in zip(rims, gains, (r, left), strict=True)]
+    twist = (true[0] + true[1]) / 2.0, (true[0] - true[1]) / L
+    assert start.true_twist == pytest.approx(twist, rel=1e-12)
+    for part in (0.25, 0.5, 1.0):
+        end = start.at(10 * CELL + round(part * CELL))
+        expected = se2.integrate(start.true_pose, twist, part * CELL * 1e-9)
+        np.testing.assert_allclose(end.true_pose, expected, rtol=1e-12)
+
+
+def test_the_slip_in_a_cell_has_the_variance_of_its_distance_whatever_the_commands():
+    """Divided by xi, the slip of the whole cell is the square root of k |ds|."""
+    k, cell, offsets = 1e-5, 50, (0, 3_000_000, 3_000_001, 11_000_000, 19_000_000)
+    speeds = 0.1, 0.3, 0.3, -0.05, 0.9
+    begin, end = cell * CELL, (cell + 1) * CELL
+    start = robot(begin, seed=4)
+    commands = [((v, 0.0), begin + offset) for v, offset in zip(speeds, offsets, strict=True)]
+    durations = np.diff([*offsets, CELL]) * 1e-9
+    distance = float(np.abs(speeds) @ durations)
+    slipped = slips(start, driven(start, commands, end))
+    for distance_slipped, xi in zip(slipped, normals(4, 0, cell), strict=True):
+        # The path is so short that the slip adds up along x.
+        assert distance_slipped / xi == pytest.approx(math.sqrt(k * distance), rel=1e-4)
+
+
+def test_a_stop_within_a_cell_leaves_no_slip_for_later():
+    begin = 50 * CELL
+    start = robot(begin, seed=4)
+    stopped = driven(start, [((0.5, 0.0), begin), ((0.0, 0.0), begin + CELL // 2)], begin + CELL - 1000)
+    again = stopped.commanded((1e-6, 0.0), stopped.stamp)
+    assert abs(again.true_twist[0]) < 0.1
+    fresh = robot(stopped.stamp, seed=4).commanded((1e-6, 0.0), stopped.stamp)
+    assert again.true_twist == fresh.true_twist
+
+
+@pytest.mark.parametrize('hold', [HOLD, SECOND // 2], ids='wide cells after {} ns'.format)
+def test_the_same_command_again_changes_nothing_but_rounding(monkeypatch, hold):
+    monkeypatch.setattr('diffdrive_jacobian.simulation.slip.HOLD', hold)
+    begin = 123_456_789
+    once = driven(robot(seed=8), [((0.2, 0.4), begin)], 5 * SECOND)
+    often = [((0.2, 0.4), stamp) for stamp in range(begin, 5 * SECOND, 7_777_777)]
+    repeated = driven(robot(seed=8), often, 5 * SECOND)
+    np.testing.assert_allclose(repeated.true_pose, once.true_pose, rtol=0.0, atol=1e-13)
+
+
+def test_the_true_pose_is_the_integral_of_the_true_twist(monkeypatch):
+    """Within a cell, also after some commands in it, and in the wide cells of a long time."""
+    monkeypatch.setattr('diffdrive_jacobian.simulation.slip.HOLD', SECOND)
+    start = robot(seed=6, variance=1e-3, left_wheel_radius_multiplier=0.97)
+    held = start.commanded((0.2, 0.3), 5)
+    states = [held.at(stamp) for stamp in np.geomspace(10, 50 * SECOND, 20).astype(int).tolist()]
+    states += [driven(start, irregular(7, count), irregular(7, count)[-1][1]) for count in range(1, 20)]
+    for state in states:
+        end = state.at(state.stamp + 1)
+        turned = math.remainder(end.true_pose[2] - state.true_pose[2], math.tau)
+        v, omega = state.true_twist
+        moved = np.linalg.norm(end.true_pose[:2] - state.true_pose[:2])
+        # A nanosecond crosses no boundary of cells here.
+        assert moved == pytest.approx(abs(v) * 1e-9, abs=2e-14)
+        assert turned == pytest.approx(omega * 1e-9, abs=2e-14)
+
+
+@pytest.mark.parametrize('commands', ['straight', 'arc', 'in place', 'irregular'])
+def test_nees_against_the_odometry_is_three(commands):
+    """Of 200 seeds. The standard error of the mean is sqrt(6 / 200)."""
+    drives = {
+        'straight': [((0.22, 0.0), 7_654_321)],
+        'arc': [((0.22, 0.5), 7_654_321)],
+        'in place': [((0.0, 1.0), 7_654_321)],
+        'irregular': irregular(5, 60),
+    }
+    values = []
+    for seed in range(200):
+        state = driven(robot(seed=seed), drives[commands], 2 * SECOND)
+        error = state.true_pose - state.pose
+        error[2] = math.remainder(error[2], math.tau)
+        values.append(error @ np.linalg.solve(state.covariance, error))
+    assert np.mean(values) == pytest.approx(3.0, abs=0.55)
+
+
+# --- Wheels that are not as nominal
+
+
+def test_wheels_of_other_radii_and_separation_move_as_the_jacobian_says():
+    right, left, separation = 1.02, 0.99, 1.05
+    multipliers = dict(zip(MULTIPLIERS, (right, left, separation), strict=True))
+    start = robot(**multipliers)
+    state = driven(start, [((0.2, 0.3), 0)], 4 * SECOND)
+    omega_R, omega_L = state.wheel_speeds
+    model = state.model
+    # Wheels of one radius, turning as much faster as their radius is larger.
+    speeds = right * omega_R, left * omega_L
+    twist = wheel_to_body(*speeds, model.wheel_radius, separation * model.wheel_separation)
+    assert state.true_twist == pytest.approx(twist, rel=1e-14)
+    np.testing.assert_allclose(state.true_pose, se2.integrate([0, 0, 0], twist, 4.0), rtol=1e-13)
+
+
+def test_wrong_wheels_that_slip_do_so_about_their_own_path():
+    multipliers = {'right_wheel_radius_multiplier': 1.1, 'wheel_separation_multiplier': 0.9}
+    drives = [driven(robot(seed=n, **multipliers), [((0.2, 0.1), 0)], SECOND) for n in range(200)]
+    sure = driven(robot(**multipliers), [((0.2, 0.1), 0)], SECOND).true_pose
+    errors = np.array([one.true_pose for one in drives]) - sure
+    assert np.all(np.abs(errors.mean(axis=0)) < 4.0 * errors.std(axis=0) / math.sqrt(200.0))
+    assert np.all(errors.std(axis=0) > 0.0)
+
+
+def test_without_variance_a_seed_has_no_effect():
+    one, other = (driven(robot(variance=0.0, seed=n), [((0.2, 0.1), 0)], SECOND) for n in (1, 2))
+    assert one.true_pose_tuple == other.true_pose_tuple
+    np.testing.assert_allclose(one.true_pose, one.pose, rtol=1e-14)
+
+
+# --- Placing the robot
+
+
+def test_placing_moves_the_robot_and_resetting_its_odometry_does_not():
+    moved = driven(robot(seed=1), [((0.2, 0.1), 0)], SECOND)
+    placed = moved.placed([5.0, 6.0, 1.0], np.zeros((3, 3)), SECOND)
+    assert placed.true_pose_tuple == placed.pose_tuple == (5.0, 6.0, 1.0)
+    reset = moved.placed([5.0, 6.0, 1.0], np.zeros((3, 3)), SECOND, odometry_only=True)
+    assert reset.pose_tuple == (5.0, 6.0, 1.0)
+    assert reset.true_pose_tuple == moved.true_pose_tuple
+    assert reset.at(2 * SECOND).true_pose_tuple == moved.at(2 * SECOND).true_pose_tuple
+
+
+def test_the_robot_stays_where_it_is_when_time_goes_back_or_its_drift_changes():
+    moved = driven(robot(seed=1), [((0.2, 0.1), 0)], SECOND)
+    assert moved.restarted(0).true_pose_tuple == moved.true_pose_tuple
+    other = dataclasses.replace(moved.model, drift=Drift(seed=2))
+    changed = moved.remodelled(other, SECOND)
+    assert changed.true_pose_tuple == moved.true_pose_tuple
+    assert changed.at(2 * SECOND).true_pose_tuple != moved.at(2 * SECOND).true_pose_tuple
+    perfect = moved.remodelled(RobotModel(), SECOND)
+    assert perfect.true_pose_tuple == perfect.pose_tuple
+    assert perfect.remodelled(other, SECOND).true_pose_tuple == perfect.pose_tuple
+
+
+# --- Long times
+
+
+def test_a_command_that_is_held_for_long_takes_few_steps(monkeypatch):
+    """Ten minutes in cells of the usual width, then half as many for each doubling of the time."""
+    steps = 0
+
+    def counted(seed, level, cell):
+        nonlocal steps
+        steps += 1
+        return 0.1, -0.1
+
+    monkeypatch.setattr('diffdrive_jacobian.simulation.slip.normals', counted)
+    commanded = robot(seed=1).commanded((0.2, 0.1), 5)
+    commanded.at(HOLD)
+    assert steps == HOLD // CELL + 1
+    commanded.at(16 * HOLD)
+    assert steps == pytest.approx(3 * HOLD // CELL, rel=0.01)
+    before = steps
+    commanded.at(16 * HOLD + CELL)
+    assert steps == before + 1
+
+
+def test_wide_cells_have_the_same_variance(monkeypatch):
+    """The turn of a robot that drives straight has the variance 2 k |ds| / L^2."""
+    monkeypatch.setattr('diffdrive_jacobian.simulation.slip.HOLD', SECOND)
+    start, end = 32 * SECOND, 64 * SECOND
+    ratios = []
+    for seed in range(100):
+        commanded = robot(seed=seed).commanded((0.1, 0.0), 0)
+        one, other = (commanded.at(stamp) for stamp in (start, end))
+        turn = math.remainder(other.true_pose[2] - one.true_pose[2], math.tau)
+        ratios.append(turn * turn / (2.0 * 1e-5 * 0.1 * 32.0 / 0.16**2))
+    # Its standard error is sqrt(2 / 100).
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.5)
+
+
+# --- Bad input
+
+
+@pytest.mark.parametrize('seed', [1.5, '1', -1, 2**63, True, math.nan, [1]], ids=str)
+def test_a_seed_that_is_no_integer_or_out_of_range_is_refused(seed):
+    with pytest.raises(ValueError, match=r'^seed must be an integer from 0 to 2\^63 - 1, got '):
+        Drift(seed=seed)
+
+
+@pytest.mark.parametrize('name', MULTIPLIERS)
+@pytest.mark.parametrize('value', [0.0, -1.0, math.nan, math.inf], ids=str)
+def test_multipliers_that_are_not_positive_are_refused(name, value):
+    with pytest.raises(ValueError, match=name):
+        Drift(**{name: value})
+
+
+def test_a_drift_of_another_class_is_refused():
+    with pytest.raises(ValueError, match='drift'):
+        RobotModel(drift=3)
+
+
+def test_a_motion_that_overflows_is_refused():
+    with pytest.raises(ValueError, match='overflow'):
+        driven(robot(right_wheel_radius_multiplier=1e200), [((1e200, 0.0), 0)], SECOND)
