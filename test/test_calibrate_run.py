@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from calibration_data import JOINTS, NOMINAL, TRUE, Drive, Simulation, bag_messages, umbmark
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from ros_messages import twist
 from sensor_msgs.msg import JointState
@@ -28,6 +28,12 @@ from diffdrive_jacobian.tools.calibrate_run import main
 
 ROBOT = Simulation(drive=Drive.of(umbmark(side=0.6, runs=1)))
 RECORDING = ROBOT.recording(np.random.default_rng(1))
+# At 25 Hz bags are written and read faster.
+RECORDING = replace(
+    RECORDING,
+    wheel_time=RECORDING.wheel_time[::2],
+    wheel_angles=RECORDING.wheel_angles[::2],
+)
 DIMENSIONS = {'/wheel_bridge': {'wheel_radius': 0.033, 'wheel_separation': 0.16}}
 STRAIGHT = replace(ROBOT, drive=Drive.of([(1.0, 0.0, 0.0), (20.0, 0.2, 0.0), (1.0, 0.0, 0.0)]))
 
@@ -37,6 +43,14 @@ def bag(tmp_path_factory):
     """A drive of UMBmark with a reference as PoseStamped."""
     path = tmp_path_factory.mktemp('bags') / 'bag'
     return write_bag(path, bag_messages(RECORDING), parameters=DIMENSIONS)
+
+
+@pytest.fixture(scope='module')
+def plain(bag):
+    """The multipliers that the tool finds for it."""
+    path = bag.parent / 'plain.yaml'
+    assert run(bag, '-o', path, '--no-plot') == 0
+    return multipliers(path)
 
 
 @pytest.fixture(autouse=True)
@@ -109,15 +123,15 @@ def test_files_are_beside_the_bag_by_default(tmp_path):
     assert not (tmp_path / 'drive_calibration.png').exists()
 
 
-@pytest.mark.parametrize('kind', [PoseStamped, PoseWithCovarianceStamped, Odometry])
-def test_each_type_of_reference_gives_the_same(bag, folder, kind):
+@pytest.mark.parametrize('kind', [PoseWithCovarianceStamped, Odometry])
+def test_each_type_of_reference_gives_the_same(plain, folder, kind):
     other = write_bag(
         folder / 'other',
         bag_messages(RECORDING, kind=kind, topic='/ground_truth'),
         parameters=DIMENSIONS,
     )
-    assert run(bag, '-o', 'one.yaml', '--no-plot') == run(other, '-o', 'two.yaml', '--no-plot') == 0
-    assert multipliers(folder / 'one.yaml') == multipliers(folder / 'two.yaml')
+    assert run(other, '-o', 'other.yaml', '--no-plot') == 0
+    assert multipliers(folder / 'other.yaml') == plain
 
 
 def test_speeds_serve_where_there_are_no_angles(folder, capsys):
@@ -204,6 +218,7 @@ def test_missing_topics_are_listed(folder, capsys):
         (['--reference', 'joint_states'], ['must be of type nav_msgs/msg/Odometry']),
         (['--wheels-topic', '/mocap/pose'], ['must be of type sensor_msgs/msg/JointState']),
         (['--wheels', 'left', 'right'], ["no joint 'left'", JOINTS[0]]),
+        (['--wheels', JOINTS[0], JOINTS[0]], ['both wheels', JOINTS[0]]),
         (['--wheel-radius', '50'], ['wheel radius must be from 0.001 to 10 m']),
         (['-o', 'found.txt'], ['must end in .yaml']),
         (['-o', 'nowhere/found.yaml'], ['nowhere']),
@@ -350,7 +365,7 @@ def test_some_bad_messages_are_skipped_and_counted(folder, capsys):
     assert expected in capsys.readouterr().err
 
 
-def test_odd_but_valid_bags_give_the_same(bag, folder):
+def test_odd_but_valid_bags_give_the_same(plain, folder):
     """UTM coordinates, joints of others between, messages twice and in another order."""
     sent = []
     for index, (time, topic, message) in enumerate(bag_messages(RECORDING)):
@@ -367,9 +382,8 @@ def test_odd_but_valid_bags_give_the_same(bag, folder):
         # Received late, and so in another order than that of the stamps.
         sent.append((time + 0.1 * (index % 7 == 0), topic, message))
     write_bag(folder / 'odd', sorted(sent, key=lambda one: one[0]), parameters=DIMENSIONS)
-    assert run('odd', '-o', 'odd.yaml', '--no-plot') == run(bag, '-o', 'plain.yaml', '--no-plot') == 0
-    odd, plain = multipliers(folder / 'odd.yaml')[0], multipliers(folder / 'plain.yaml')[0]
-    np.testing.assert_allclose(odd, plain, atol=2e-6)
+    assert run('odd', '-o', 'odd.yaml', '--no-plot') == 0
+    np.testing.assert_allclose(multipliers(folder / 'odd.yaml')[0], plain[0], atol=2e-6)
 
 
 def test_too_short_and_no_bag(folder, capsys):
@@ -402,6 +416,7 @@ def test_the_recipe_of_the_page_determines_all_parameters(folder, monkeypatch):
     perfect = calibrate([read.recording], NOMINAL)
     np.testing.assert_allclose(perfect.multipliers, 1.0, atol=1e-6)
     assert (np.sqrt(np.diag(perfect.covariance)) < 2e-4).all()
+    assert any('odometry that was computed from these wheels' in note for note in perfect.notes)
     # The stamps of both are the same, so that the time offset is at kinks of the interpolated wheels.
     assert len(steps) <= 12
     # The same commands, driven by a robot with other wheels.

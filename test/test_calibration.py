@@ -193,6 +193,7 @@ def test_a_perfect_robot_is_reproduced_exactly():
     robot = replace(ROBOT, noise=Noise(wheel=0.0, position=0.0, heading=0.0))
     result = calibrate([robot.recording(np.random.default_rng(9))], NOMINAL)
     np.testing.assert_allclose(result.multipliers, TRUE, rtol=1e-7)
+    assert result.notes[0].startswith('the reference follows the wheels without error')
 
 
 def test_the_odometry_is_better_afterwards():

@@ -44,6 +44,8 @@ LARGE_WHEEL_NOISE = 1e-2
 """Wheel travel variance beyond which the reference does not follow the wheels (m)."""
 NOTABLE_WHEEL_NOISE = 5e-4
 """Wheel travel variance that is worth a note (m)."""
+EXACT = Noise(wheel=1e-7, position=2e-5, heading=2e-5)
+"""Noise below which a reference is no observation of a real robot."""
 DISAGREEMENT = 30.0
 """Largest squared distance of a recording's own estimate from that of all, in units of its covariance;
 a sum of three squares exceeds it once in a million."""
@@ -174,7 +176,13 @@ def calibrate(
         motions=tuple(motions),
     )
     _check_result(result)
-    if (wheel := estimate.noise.wheel) > NOTABLE_WHEEL_NOISE:
+    found, exact = estimate.noise, EXACT
+    if found.wheel < exact.wheel and found.position < exact.position and found.heading < exact.heading:
+        notes.append(
+            'the reference follows the wheels without error: it is simulated without slip, or odometry '
+            'that was computed from these wheels, which does not show their true dimensions'
+        )
+    if (wheel := found.wheel) > NOTABLE_WHEEL_NOISE:
         notes.append(
             f'the wheels differ from the reference by {wheel**0.5:.2g} m after 1 m: they slip, a clock '
             'drifts, or the reference is of another body'
