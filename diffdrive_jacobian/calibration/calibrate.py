@@ -176,17 +176,7 @@ def calibrate(
         motions=tuple(motions),
     )
     _check_result(result)
-    found, exact = estimate.noise, EXACT
-    if found.wheel < exact.wheel and found.position < exact.position and found.heading < exact.heading:
-        notes.append(
-            'the reference follows the wheels without error: it is simulated without slip, or odometry '
-            'that was computed from these wheels, which does not show their true dimensions'
-        )
-    if (wheel := found.wheel) > NOTABLE_WHEEL_NOISE:
-        notes.append(
-            f'the wheels differ from the reference by {wheel**0.5:.2g} m after 1 m: they slip, a clock '
-            'drifts, or the reference is of another body'
-        )
+    notes += _noise_notes(estimate.noise)
     if len(recordings) > 1:
         _check_agreement(result, given)
     for one, offset in zip(recordings, result.time_offsets.tolist(), strict=True):
@@ -209,6 +199,20 @@ def _check(one: Recording) -> None:
             raise CalibrationError(f'{one.name}: {what} must be finite')
         if (np.diff(time) <= 0.0).any():
             raise CalibrationError(f'{one.name}: the times of {what} must increase')
+
+
+def _noise_notes(noise: Noise) -> list[str]:
+    if noise.wheel < EXACT.wheel and noise.position < EXACT.position and noise.heading < EXACT.heading:
+        return [
+            'the reference follows the wheels without error: it is simulated without slip, or odometry '
+            'that was computed from these wheels, which does not show their true dimensions'
+        ]
+    if noise.wheel > NOTABLE_WHEEL_NOISE:
+        return [
+            f'the wheels differ from the reference by {noise.wheel**0.5:.2g} m after 1 m: they slip, a '
+            'clock drifts, or the reference is of another body'
+        ]
+    return []
 
 
 def _free(given: Given, count: int) -> np.typing.NDArray[np.bool_]:

@@ -18,8 +18,6 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
-Table = Any
-"""An `array.array`, which Python 3.10 and 3.11 cannot parametrize at run time."""
 
 JOINTS = 'sensor_msgs/msg/JointState'
 POSES: dict[str, Callable[[Any], Any]] = {
@@ -54,10 +52,10 @@ class Samples:
 class _Layout:
     """Messages with the same joints, as columns: a bag may have millions of them."""
 
-    order: Table = field(default_factory=lambda: array('q'))
+    order: array[int] = field(default_factory=lambda: array('q'))
     """Index of each message on its topic, time of recording and stamp (ns), one after the other."""
-    positions: Table = field(default_factory=lambda: array('d'))
-    speeds: Table = field(default_factory=lambda: array('d'))
+    positions: array[float] = field(default_factory=lambda: array('d'))
+    speeds: array[float] = field(default_factory=lambda: array('d'))
 
 
 @dataclass(slots=True)
@@ -128,9 +126,9 @@ class JointRows:
 class PoseRows:
     """Messages of the reference: time of recording, stamp, x, y, theta, z, tilt."""
 
-    times: Table = field(default_factory=lambda: array('q'))
+    times: array[int] = field(default_factory=lambda: array('q'))
     """Time of recording and stamp of each message, one after the other (ns)."""
-    poses: Table = field(default_factory=lambda: array('d'))
+    poses: array[float] = field(default_factory=lambda: array('d'))
     """x, y, theta, z and tilt of each."""
     frames: Counter[str] = field(default_factory=Counter)
     count: int = 0
@@ -174,7 +172,7 @@ class PoseRows:
             )
 
 
-def _columns(table: Table, width: int) -> Array:
+def _columns(table: array[float], width: int) -> Array:
     """Return a table as rows, shape (n, width)."""
     return np.frombuffer(table, dtype=np.float64).reshape(-1, width)
 
