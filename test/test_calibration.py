@@ -159,6 +159,23 @@ def test_errors_are_those_of_the_cramer_rao_bound_and_of_the_stated_covariance()
     assert abs(np.mean(nees) - 3.0) < 3.5 * np.sqrt(6.0 / count)
 
 
+def test_wheel_noise_that_is_not_known_makes_the_multipliers_less_certain():
+    """The more so, the less of it a coarse reference shows."""
+    ratios = []
+    for coarse in (1.0, 10.0):
+        noise = replace(NOISE, position=coarse * NOISE.position, heading=coarse * NOISE.heading)
+        recording = replace(ROBOT, noise=noise).recording(np.random.default_rng(17))
+        unknown = calibrate([recording], NOMINAL)
+        found = unknown.estimate.noise
+        given = Given(
+            wheel_noise=found.wheel, position_noise=found.position, heading_noise=found.heading
+        )
+        known = calibrate([recording], NOMINAL, given)
+        np.testing.assert_allclose(unknown.multipliers, known.multipliers, atol=1e-4)
+        ratios.append(float((deviations(unknown) / deviations(known)).mean()))
+    assert 1.001 < ratios[0] < ratios[1] < 1.2
+
+
 @pytest.mark.parametrize('sensor', [(0.1, -0.05, 1.5), (-0.2, 0.0, 3.1), (0.0, 0.3, -0.4)])
 def test_the_place_of_the_sensor_is_estimated(sensor):
     result = calibrate([replace(ROBOT, sensor=sensor).recording(np.random.default_rng(6))], NOMINAL)
