@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from calibration_data import NOISE, NOMINAL, TRUE, Drive, Simulation, umbmark
 
-from diffdrive_jacobian.calibration import CalibrationError, Given, Noise, calibrate
+from diffdrive_jacobian.calibration import CalibrationError, Given, Noise, calibrate, preparation
 from diffdrive_jacobian.calibration.errors import compared_distance, rms, tracks
 from diffdrive_jacobian.calibration.estimate import Estimate
 from diffdrive_jacobian.calibration.fit import information
@@ -159,6 +159,23 @@ def test_errors_are_those_of_the_cramer_rao_bound_and_of_the_stated_covariance()
     assert abs(np.mean(nees) - 3.0) < 3.5 * np.sqrt(6.0 / count)
 
 
+def test_wheel_noise_that_is_not_known_makes_the_multipliers_less_certain():
+    """The more so, the less of it a coarse reference shows."""
+    ratios = []
+    for coarse in (1.0, 10.0):
+        noise = replace(NOISE, position=coarse * NOISE.position, heading=coarse * NOISE.heading)
+        recording = replace(ROBOT, noise=noise).recording(np.random.default_rng(17))
+        unknown = calibrate([recording], NOMINAL)
+        found = unknown.estimate.noise
+        given = Given(
+            wheel_noise=found.wheel, position_noise=found.position, heading_noise=found.heading
+        )
+        known = calibrate([recording], NOMINAL, given)
+        np.testing.assert_allclose(unknown.multipliers, known.multipliers, atol=1e-4)
+        ratios.append(float((deviations(unknown) / deviations(known)).mean()))
+    assert 1.001 < ratios[0] < ratios[1] < 1.2
+
+
 @pytest.mark.parametrize('sensor', [(0.1, -0.05, 1.5), (-0.2, 0.0, 3.1), (0.0, 0.3, -0.4)])
 def test_the_place_of_the_sensor_is_estimated(sensor):
     result = calibrate([replace(ROBOT, sensor=sensor).recording(np.random.default_rng(6))], NOMINAL)
@@ -193,6 +210,7 @@ def test_a_perfect_robot_is_reproduced_exactly():
     robot = replace(ROBOT, noise=Noise(wheel=0.0, position=0.0, heading=0.0))
     result = calibrate([robot.recording(np.random.default_rng(9))], NOMINAL)
     np.testing.assert_allclose(result.multipliers, TRUE, rtol=1e-7)
+    assert result.notes[0].startswith('the reference follows the wheels without error')
 
 
 def test_the_odometry_is_better_afterwards():
@@ -296,6 +314,10 @@ def spoiled(recording, what):
         poses = np.cumsum(0.02 * random.standard_normal(poses.shape), axis=0)
     elif what == 'still':
         poses = 1e-3 * random.standard_normal(poses.shape)
+    elif what == 'one wheel':
+        angles = angles * [0.0, 1.0]
+    elif what == 'positions only':
+        poses[:, 2] = 0.0
     elif what == 'no overlap':
         time = time + 1e4
     elif what == 'NaN':
@@ -309,6 +331,8 @@ def spoiled(recording, what):
     ('what', 'words'),
     [
         ('rest', 'the wheels never turn'),
+        ('one wheel', 'the right wheel never turns'),
+        ('positions only', 'observes positions only'),
         ('swapped', 'swapped'),
         ('mirrored', 'mirrored'),
         ('other robot', 'reference'),
@@ -321,6 +345,49 @@ def spoiled(recording, what):
 def test_faults_are_named(what, words):
     with pytest.raises(CalibrationError, match=words):
         calibrate([spoiled(base(), what)], NOMINAL)
+
+
+def test_wheels_at_a_low_rate_and_slip_are_noted():
+    recording = base()
+    rare = replace(
+        recording,
+        wheel_time=recording.wheel_time[::50],
+        wheel_angles=recording.wheel_angles[::50],
+    )
+    notes = calibrate([rare], NOMINAL).notes
+    assert any('every 1 s' in note for note in notes)
+    assert any('m after 1 m: they slip' in note for note in notes)
+
+
+@pytest.mark.parametrize('overlap', ['reference first', 'wheels first'])
+def test_only_the_time_in_common_counts(overlap):
+    recording = base()
+    if overlap == 'wheels first':
+        late = recording.pose_time > 15.0
+        one = replace(recording, pose_time=recording.pose_time[late], poses=recording.poses[late])
+    else:
+        late = recording.wheel_time > 15.0
+        one = replace(
+            recording,
+            wheel_time=recording.wheel_time[late],
+            wheel_angles=recording.wheel_angles[late],
+        )
+    result = calibrate([one], NOMINAL)
+    assert_true(result)
+    assert result.motions[0].time[0] == pytest.approx(15.0, abs=0.5)
+
+
+def test_long_recordings_are_thinned(monkeypatch):
+    """The bounds that keep an hour at 100 Hz cheap, with smaller numbers."""
+    recording = replace(ROBOT, rate=1).recording(np.random.default_rng(19))
+    monkeypatch.setattr(preparation, 'MOST_SAMPLES', 1500)
+    monkeypatch.setattr(preparation, 'MOST_POSES', 150)
+    result = calibrate([recording], NOMINAL)
+    assert_true(result)
+    assert len(result.recordings[0].wheel_time) <= 1500 < len(recording.wheel_time)
+    assert sum(len(one.time) for one in result.segments) <= 150
+    (note,) = result.notes
+    assert 'poses of the reference are used, evenly spaced' in note
 
 
 def test_too_short_a_drive_is_refused():

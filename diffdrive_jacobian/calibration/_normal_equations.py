@@ -53,16 +53,23 @@ class Group:
 
 
 def linearized(
-    segments: Sequence[Segment], nominal: Geometry, estimate: Estimate
+    segments: Sequence[Segment], nominal: Geometry, estimate: Estimate, window: float = np.inf
 ) -> tuple[Group, Group, Group]:
-    """Return the normal equations of the motion, the positions and the headings."""
+    """Return the normal equations of the motion, the positions and the headings.
+
+    Args:
+        segments: Continuous motions.
+        nominal: Nominal dimensions.
+        estimate: Parameters and poses at which they are linearized.
+        window: As of `increments`.
+    """
     count = len(estimate.parameters)
     geometry, sensor = estimate.geometry(nominal), estimate.sensor
     parts: tuple[list[Group], ...] = ([], [], [])
     for segment, states in zip(segments, estimate.states, strict=True):
         offset = TIME_OFFSETS + segment.recording
         at = segment.time + estimate.parameters[offset]
-        moved = increments(segment.wheel_time, segment.wheel_angles, at, geometry)
+        moved = increments(segment.wheel_time, segment.wheel_angles, at, geometry, window)
         parts[0].append(_motion(moved, states, offset, count))
         for kind, part in enumerate(_observation(segment, states, sensor, count), 1):
             parts[kind].append(part)

@@ -21,7 +21,13 @@ from diffdrive_jacobian.calibration.measurements import (
 )
 from diffdrive_jacobian.calibration.motion import Geometry, composed
 from diffdrive_jacobian.calibration.observability import undetermined
-from diffdrive_jacobian.calibration.preparation import gaps, overlapping, without_jumps
+from diffdrive_jacobian.calibration.preparation import (
+    overlapping,
+    sampling_notes,
+    thinned_poses,
+    thinned_samples,
+    without_jumps,
+)
 from diffdrive_jacobian.calibration.rest import merged
 from diffdrive_jacobian.calibration.rough import rough
 
@@ -36,6 +42,10 @@ BOUNDS = (0.1, 10.0)
 START = Noise(wheel=1e-5, position=0.01, heading=0.02)
 LARGE_WHEEL_NOISE = 1e-2
 """Wheel travel variance beyond which the reference does not follow the wheels (m)."""
+NOTABLE_WHEEL_NOISE = 5e-4
+"""Wheel travel variance that is worth a note (m)."""
+EXACT = Noise(wheel=1e-7, position=2e-5, heading=2e-5)
+"""Noise below which a reference is no observation of a real robot."""
 DISAGREEMENT = 30.0
 """Largest squared distance of a recording's own estimate from that of all, in units of its covariance;
 a sum of three squares exceeds it once in a million."""
@@ -123,11 +133,12 @@ def calibrate(
         CalibrationError: The recordings contradict the model, or each other.
     """
     given = given or Given()
-    recordings = tuple(recordings)
-    notes = [note for one in recordings for note in _gap_notes(one)]
+    for one in recordings:
+        _check(one)
+    recordings = tuple(map(thinned_samples, recordings))
+    notes = [note for one in recordings for note in sampling_notes(one)]
     offsets = np.zeros(len(recordings))
     for index, one in enumerate(recordings):
-        _check(one)
         found = given.time_offset if given.time_offset is not None else time_offset(one, nominal)
         offsets[index] = 0.0 if found is None else found
     segments = [
@@ -142,7 +153,8 @@ def calibrate(
     names = [one.name for one in recordings]
     first = rough(segments, nominal, offsets)
     segments, found_notes = without_jumps(segments, first, offsets, names)
-    notes += found_notes
+    segments, thinned = thinned_poses(segments)
+    notes += [*found_notes, thinned] if thinned else found_notes
     first = rough(segments, nominal, offsets)
     sensor = first.sensor.copy()
     if given.lever_arm is not None:
@@ -164,6 +176,7 @@ def calibrate(
         motions=tuple(motions),
     )
     _check_result(result)
+    notes += _noise_notes(estimate.noise)
     if len(recordings) > 1:
         _check_agreement(result, given)
     for one, offset in zip(recordings, result.time_offsets.tolist(), strict=True):
@@ -173,19 +186,6 @@ def calibrate(
                 'of the wheels'
             )
     return replace(result, notes=tuple(notes))
-
-
-def _gap_notes(one: Recording) -> list[str]:
-    lines = []
-    for what, time in (('reference', one.pose_time), ('wheels', one.wheel_time)):
-        found = gaps(time)
-        if found:
-            begin, length = max(found, key=lambda gap: gap[1])
-            lines.append(
-                f'{one.name}: {len(found)} gap{"" if len(found) == 1 else "s"} in the {what}, '
-                f'the longest of {length:.1f} s at {begin:.3f} s'
-            )
-    return lines
 
 
 def _check(one: Recording) -> None:
@@ -199,6 +199,20 @@ def _check(one: Recording) -> None:
             raise CalibrationError(f'{one.name}: {what} must be finite')
         if (np.diff(time) <= 0.0).any():
             raise CalibrationError(f'{one.name}: the times of {what} must increase')
+
+
+def _noise_notes(noise: Noise) -> list[str]:
+    if noise.wheel < EXACT.wheel and noise.position < EXACT.position and noise.heading < EXACT.heading:
+        return [
+            'the reference follows the wheels without error: it is simulated without slip, or odometry '
+            'that was computed from these wheels, which does not show their true dimensions'
+        ]
+    if noise.wheel > NOTABLE_WHEEL_NOISE:
+        return [
+            f'the wheels differ from the reference by {noise.wheel**0.5:.2g} m after 1 m: they slip, a '
+            'clock drifts, or the reference is of another body'
+        ]
+    return []
 
 
 def _free(given: Given, count: int) -> np.typing.NDArray[np.bool_]:

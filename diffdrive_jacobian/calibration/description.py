@@ -52,6 +52,7 @@ def describe(result: Calibration) -> list[str]:
         result.recordings, result.time_offsets.tolist(), full[6:].tolist(), strict=True
     ):
         if deviation:
+            offset = round(offset, 4) + 0.0
             lines.append(f'time offset of the reference in {one.name}: {offset:.4f} ± {deviation:.4f} s')
     noise = result.estimate.noise
     lines.append(
@@ -77,6 +78,7 @@ def _sensor(result: Calibration) -> str:
     values = result.estimate.sensor.tolist()
     deviations = np.sqrt(np.diag(result.estimate.covariance()))[3:6].tolist()
     values[2] = math.remainder(values[2], math.tau)
+    values = [round(value, 4) + 0.0 for value in values]  # no negative zeros
     texts = [
         f'{value:.4f} ± {deviation:.4f}' if deviation else f'{value:.4f} (given)'
         for value, deviation in zip(values, deviations, strict=True)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.calibration import _block_tridiagonal
 from diffdrive_jacobian.calibration._normal_equations import Group, linearized
-from diffdrive_jacobian.calibration.estimate import Estimate, prior_deviations
+from diffdrive_jacobian.calibration.estimate import TIME_OFFSETS, Estimate, prior_deviations
 from diffdrive_jacobian.calibration.measurements import (
     Array,
     CalibrationError,
@@ -27,22 +27,31 @@ from diffdrive_jacobian.calibration.measurements import (
 )
 from diffdrive_jacobian.calibration.motion import Geometry, composed, inverted
 
-MAX_STEPS = 25
+MAX_STEPS = 40
 FULL_STEPS = 10
-"""Steps after which they are halved: the interpolated motion of the wheels has kinks."""
-MAX_NOISE_STEPS = 40
+"""Steps after which they are halved."""
+WINDOW = 4.0
+"""Half of the time over which wheel speeds are means, in units of the last change of the time offset:
+the interpolated motion of the wheels has kinks at its samples, which long steps must overlook."""
+MAX_NOISE_STEPS = 5
+"""For one step of the parameters."""
 NOISE_CONVERGED = 2e-3
 """Largest relative change of a variance in the last step."""
 CONVERGED = 0.02
 """Largest change of a parameter in the last step, relative to its standard deviation."""
+TIME_CONVERGED = 0.25
+"""The same of a time offset. It may alternate between both sides of a kink, without effect on the
+others."""
 NEGLIGIBLE = 1e-7
 """Change of a parameter that is negligible in any case (-, m, rad, s)."""
 SMALLEST = Noise(wheel=1e-9, position=1e-5, heading=1e-5)
 """Smallest noise that is estimated: with less, rounding errors dominate."""
-PRIOR_WHEEL_NOISE, PRIOR_FREEDOM = 1e-5, 2.0
+PRIOR_WHEEL_NOISE, PRIOR_FREEDOM = 1e-5, 1.0
 """Wheel travel variance that is assumed in advance (m), and how many squares it counts as. In
 short drives with a coarse reference the likelihood alone is largest at zero, where the stated covariance
 would be far too small."""
+WIDEST = 1.5
+"""Largest standard deviation of the logarithm of the wheel travel variance."""
 LARGEST = Noise(wheel=1.0, position=1e3, heading=1e2)
 
 
@@ -88,11 +97,14 @@ def fit(
         estimate = replace(estimate, states=tuple(composed(one.poses, sensor) for one in segments))
     anchor = start.parameters if anchor is None else anchor
     scales = prior_deviations(len(anchor))
+    window = np.inf
+    tolerances = np.where(np.arange(len(anchor)) < TIME_OFFSETS, CONVERGED, TIME_CONVERGED)[start.free]
     for count in range(MAX_STEPS):
-        groups = linearized(segments, nominal, estimate)
+        groups = linearized(segments, nominal, estimate, window)
         prior = _Prior(free=estimate.free, pull=(estimate.parameters - anchor) / scales**2)
-        noise, solution = _with_noise(groups, estimate.noise, given, prior)
+        noise, solution, settled = _with_noise(groups, estimate.noise, given, prior)
         size = np.abs(solution.change)
+        window = WINDOW * float(size[np.count_nonzero(estimate.free[:TIME_OFFSETS]) :].max(initial=0.0))
         limit = scales[estimate.free]
         shorten = float(min(1.0, np.min(limit / np.maximum(size, 1e-12), initial=1.0)))
         shorten *= 1.0 if count < FULL_STEPS else 0.5
@@ -106,15 +118,17 @@ def fit(
             information=solution.information,
         )
         deviation = np.sqrt(np.diag(estimate.covariance())[estimate.free])
-        if (size <= np.maximum(CONVERGED * deviation, NEGLIGIBLE)).all():
-            return estimate
-    if (size[:3] <= deviation[:3] / 5.0).all():
-        # The time offset may alternate between two sides of a kink in the motion of the wheels.
-        return estimate
-    raise CalibrationError(
-        f'the estimate does not converge within {MAX_STEPS} steps: the poses of the reference do not '
-        'fit the motion of the wheels'
-    )
+        if settled and (size <= np.maximum(tolerances * deviation, NEGLIGIBLE)).all():
+            break
+    else:
+        if (size[:3] > deviation[:3] / 5.0).any():
+            raise CalibrationError(
+                f'the estimate does not converge within {MAX_STEPS} steps: the poses of the reference '
+                'do not fit the motion of the wheels'
+            )
+    if given.wheel_noise is None:
+        estimate = replace(estimate, information=_averaged(groups, noise, prior))
+    return estimate
 
 
 def information(segments: Sequence[Segment], nominal: Geometry, truth: Estimate) -> Array:
@@ -166,8 +180,8 @@ def _solved(groups: tuple[Group, Group, Group], weights: Array, prior: _Prior) -
 
 def _with_noise(
     groups: tuple[Group, Group, Group], noise: Noise, given: Given, prior: _Prior
-) -> tuple[Noise, _Solution]:
-    """Return the most likely noise at a linearization, and the step for it.
+) -> tuple[Noise, _Solution, bool]:
+    """Return more likely noise at a linearization, the step for it, and whether it is the most likely.
 
     At the maximum of the restricted likelihood the weighted squares of each group equal its degrees of
     freedom, which follow from the derivative of the log det of the normal matrix.
@@ -183,13 +197,10 @@ def _with_noise(
     )
     least, most = _weights(LARGEST), _weights(SMALLEST)
     solution = _solved(groups, weights, prior)
-    counts = np.array([one.count for one in groups])
     before: tuple[Array, Array] | None = None
+    settled = not unknown.any()
     for _ in range(MAX_NOISE_STEPS if unknown.any() else 0):
-        costs = np.array(_costs(groups, solution, prior.free))
-        freedom = np.maximum(counts - _used(groups, weights, prior), 1e-3 * counts)
-        freedom[0] += PRIOR_FREEDOM
-        costs[0] += PRIOR_FREEDOM * PRIOR_WHEEL_NOISE
+        freedom, costs = _freedom_and_costs(groups, weights, prior, solution)
         proposed = np.clip(freedom / np.maximum(costs, 1e-300), least, most)
         now, change = np.log(weights), np.where(unknown, np.log(proposed / weights), 0.0)
         target = now + change
@@ -201,10 +212,56 @@ def _with_noise(
         before = now, change
         weights = np.clip(np.exp(target), least, most)
         solution = _solved(groups, weights, prior)
-        if np.abs(change).max() < NOISE_CONVERGED:
+        settled = bool(np.abs(change).max() < NOISE_CONVERGED)
+        if settled:
             break
     wheel, position, heading = (1.0 / weights).tolist()
-    return Noise(wheel=wheel, position=position**0.5, heading=heading**0.5), solution
+    return Noise(wheel=wheel, position=position**0.5, heading=heading**0.5), solution, settled
+
+
+def _averaged(groups: tuple[Group, Group, Group], noise: Noise, prior: _Prior) -> Array:
+    """Return the information of which the inverse is the covariance for uncertain wheel noise.
+
+    It is the mean over the posterior of the logarithm of the wheel travel variance, taken as Gaussian,
+    by Gauss-Hermite quadrature with three points.
+    """
+    weights = _weights(noise)
+
+    def at(shift: float) -> tuple[_Solution, Array]:
+        shifted = weights * [np.exp(shift), 1.0, 1.0]
+        return _solved(groups, shifted, prior), shifted
+
+    def slope(shift: float) -> float:
+        """Return twice the derivative of the log likelihood with respect to the log of the weight."""
+        solution, shifted = at(shift)
+        freedom, cost = _freedom_and_costs(groups, shifted, prior, solution)
+        return float(freedom[0] - shifted[0] * cost[0])
+
+    h = 0.3
+    curvature = (slope(-h) - slope(h)) / (2.0 * h) / 2.0
+    width = min(WIDEST, max(curvature, 1e-9) ** -0.5)
+    scales = prior_deviations(len(prior.free))[prior.free] ** -2.0
+    found = [at(sign * 3.0**0.5 * width)[0] for sign in (-1.0, 0.0, 1.0)]
+    shares = np.array([1.0, 4.0, 1.0]) / 6.0
+    changes = np.array([one.change for one in found])
+    off = changes - shares @ changes
+    covariance = sum(
+        share * (np.linalg.inv(one.information + np.diag(scales)) + np.outer(change, change))
+        for share, one, change in zip(shares, found, off, strict=True)
+    )
+    return np.asarray(np.linalg.inv(covariance) - np.diag(scales))
+
+
+def _freedom_and_costs(
+    groups: tuple[Group, Group, Group], weights: Array, prior: _Prior, solution: _Solution
+) -> tuple[Array, Array]:
+    """Return the degrees of freedom of the residuals of each group, and their sums of squares."""
+    costs = np.array(_costs(groups, solution, prior.free))
+    counts = np.array([one.count for one in groups])
+    freedom = np.maximum(counts - _used(groups, weights, prior, solution), 1e-3 * counts)
+    freedom[0] += PRIOR_FREEDOM
+    costs[0] += PRIOR_FREEDOM * PRIOR_WHEEL_NOISE
+    return freedom, costs
 
 
 def _costs(
@@ -216,17 +273,14 @@ def _costs(
 
 
 def _used(
-    groups: tuple[Group, Group, Group],
-    weights: Array,
-    prior: _Prior,
+    groups: tuple[Group, Group, Group], weights: Array, prior: _Prior, solution: _Solution
 ) -> Array:
     """Return the degrees of freedom that the estimate takes from each group, shape (3,)."""
-    h = 0.05
+    h = 1e-3
     used = np.zeros(3)
     for kind in (1, 2):
-        shifted = [weights * np.where(np.arange(3) == kind, np.exp(sign * h), 1.0) for sign in (1, -1)]
-        more, less = (_solved(groups, one, prior).logarithm for one in shifted)
-        used[kind] = (more - less) / (2.0 * h)
+        shifted = weights * np.where(np.arange(3) == kind, np.exp(h), 1.0)
+        used[kind] = (_solved(groups, shifted, prior).logarithm - solution.logarithm) / h
     # The derivatives add up to the number of unknowns.
     used[0] = groups[0].diagonal.shape[0] * 3 + int(prior.free.sum()) - used[1] - used[2]
     return used

@@ -24,6 +24,11 @@ BLIND = 0.02
 FEWEST = 5
 """Fewest poses of a continuous motion that is used."""
 FEWEST_IN_ALL = 10
+MOST_SAMPLES, MOST_POSES = 400_000, 10_000
+"""Most samples of a recording that are read, and most poses of all that are estimated: both bound time
+and memory. Poses at a high rate have little more to say, because their errors depend on each other."""
+SLOW = 0.25
+"""Period of the wheels beyond which too little of the motion is known (s)."""
 FLOORS = np.array([0.03, 0.03, 0.06])
 """Differences that are never taken for a jump (m, m, rad)."""
 SIGMAS = 8.0
@@ -72,6 +77,36 @@ def overlapping(recording: Recording, index: int, offset: float, radius: float) 
     return found
 
 
+def thinned_samples(recording: Recording) -> Recording:
+    """Return a recording with at most `MOST_SAMPLES` samples of wheels and of the reference each."""
+    wheels = slice(None, None, -(-len(recording.wheel_time) // MOST_SAMPLES) or 1)
+    poses = slice(None, None, -(-len(recording.pose_time) // MOST_SAMPLES) or 1)
+    return replace(
+        recording,
+        wheel_time=recording.wheel_time[wheels],
+        wheel_angles=recording.wheel_angles[wheels],
+        pose_time=recording.pose_time[poses],
+        poses=recording.poses[poses],
+    )
+
+
+def thinned_poses(segments: Sequence[Segment]) -> tuple[list[Segment], str]:
+    """Return motions with at most about `MOST_POSES` poses, and a note; '': all are kept."""
+    count = sum(len(one.time) for one in segments)
+    every = -(-count // MOST_POSES)
+    if every == 1:
+        return list(segments), ''
+    kept = []
+    for one in segments:
+        # Short motions keep enough poses.
+        step = max(1, min(every, len(one.time) // FEWEST))
+        kept.append(
+            replace(one, time=one.time[::step], poses=one.poses[::step], weights=one.weights[::step])
+        )
+    used = sum(len(one.time) for one in kept)
+    return kept, f'{used} of {count} poses of the reference are used, evenly spaced'
+
+
 def gaps(time: Array) -> list[tuple[float, float]]:
     """Return pauses between samples that are much longer than usual: their beginning and length (s)."""
     steps = np.diff(time)
@@ -79,6 +114,26 @@ def gaps(time: Array) -> list[tuple[float, float]]:
         return []
     long = np.flatnonzero(steps > max(2.0 * GAP, 10.0 * float(np.median(steps))))
     return [(float(time[i]), float(steps[i])) for i in long]
+
+
+def sampling_notes(one: Recording) -> list[str]:
+    """Return descriptions of gaps, and of wheels that are recorded too rarely."""
+    lines = []
+    period = float(np.median(np.diff(one.wheel_time)))
+    if period > SLOW:
+        lines.append(
+            f'{one.name}: the wheels are recorded every {period:.2g} s, so that the motion between is '
+            'guessed: record them at 10 Hz or more'
+        )
+    for what, time in (('reference', one.pose_time), ('wheels', one.wheel_time)):
+        found = gaps(time)
+        if found:
+            begin, length = max(found, key=lambda gap: gap[1])
+            lines.append(
+                f'{one.name}: {len(found)} gap{"" if len(found) == 1 else "s"} in the {what}, '
+                f'the longest of {length:.1f} s at {begin:.3f} s'
+            )
+    return lines
 
 
 def without_jumps(

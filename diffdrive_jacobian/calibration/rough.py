@@ -27,6 +27,10 @@ PARTS = 400
 ROUNDS = 6
 LEAST = 0.05
 """Wheel angle below which the wheels count as never turning (rad)."""
+LEAST_MOVE = 0.1
+"""Extent of the path of a reference that moves (m)."""
+LEAST_TURN, FIXED = 1.0, 0.05
+"""Turn of the robot (rad), and share of it, below which the heading of the reference is fixed."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -76,6 +80,8 @@ def rough(segments: Sequence[Segment], nominal: Geometry, offsets: Array) -> Rou
             f'the wheels never turn: they move by {np.abs(angles).sum():.3g} rad in all'
         )
     turns = np.concatenate([turn for _, turn in parts])
+    moves = max(float(np.ptp(one.poses[:, :2], axis=0).max()) for one in segments) > LEAST_MOVE
+    _check_turning(angles, turns, (rims[:, 0] - rims[:, 1]) / separation, moves)
     gains, _ = _robust(
         np.column_stack([rims[:, 0], -rims[:, 1]]) / separation, turns, [1.0, 1.0], [0.7, 0.7], 0.02
     )
@@ -116,6 +122,23 @@ def rough(segments: Sequence[Segment], nominal: Geometry, offsets: Array) -> Rou
         multipliers=(left, right, float(np.clip(scale, 0.05, 20.0))),
     )
     return Rough(geometry=geometry, sensor=np.array([*lever, yaw]))
+
+
+def _check_turning(angles: Array, turns: Array, expected: Array, moves: bool) -> None:
+    """Raise CalibrationError if a wheel never turns, or only the headings of the reference are fixed."""
+    right, left = np.abs(angles).sum(axis=0).tolist()
+    for name, value, other in (('right', right, left), ('left', left, right)):
+        if value < LEAST:
+            raise CalibrationError(
+                f'the {name} wheel never turns: it moves by {value:.3g} rad in all, the other one by '
+                f'{other:.3g} rad'
+            )
+    turned, should = float(np.abs(turns).sum()), float(np.abs(expected).sum())
+    if moves and should > LEAST_TURN and turned < FIXED * should:
+        raise CalibrationError(
+            f'the heading of the reference changes by {turned:.2g} rad while the wheels turn the robot '
+            f'by {should:.3g} rad: it observes positions only, but its headings are needed'
+        )
 
 
 def _ends(travel: Array, length: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -83,6 +83,8 @@ def wheel_names(
         BagError: They are missing, or not to be told apart by their names.
     """
     if given is not None:
+        if given[0] == given[1]:
+            raise BagError(f"{where}: both wheels are given as the joint '{printable(given[0])}'")
         for name in given:
             if name not in joints:
                 raise BagError(

@@ -84,7 +84,7 @@ def read_wheels_and_reference(
         joints, poses = JointRows(), PoseRows()
         tally = _read(reader, {wheels_topic: joints, poses_topic: poses})
     where = printable(path, PATH_LIMIT)
-    for topic, count in ((wheels_topic, len(joints.rows)), (poses_topic, len(poses.rows))):
+    for topic, count in ((wheels_topic, joints.count), (poses_topic, poses.count)):
         if not count:
             raise BagError(f'{where} has no usable message on {topic}{_why(tally, topic)}')
     chosen = wheel_names(where, wheels_topic, joints.names, names, parameters)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.bag_reader import BagError
-from diffdrive_jacobian.messages.conversion import MessageError, from_pose, from_time, quoted
+from diffdrive_jacobian.messages.conversion import MessageError, from_pose_values, from_time, quoted
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 Array = NDArray[np.float64]
@@ -27,6 +28,8 @@ POSES: dict[str, Callable[[Any], Any]] = {
 """Types of a reference, and where they have the pose."""
 MOST_TILT = 0.5
 """Median tilt of the sensor beyond which its frame is not that of a floor (rad)."""
+FARTHEST = 2e7
+"""Largest coordinate of a reference, such as UTM coordinates (m)."""
 FASTEST = 300.0
 """Wheel speed beyond which angles jump (rad/s)."""
 BACK = 0.5
@@ -44,19 +47,23 @@ class Samples:
     values: Array
     """Shape (n, k)."""
 
-    @classmethod
-    def of(cls, times: Sequence[tuple[int, int]], values: Sequence[Sequence[float]]) -> Samples:
-        """Return samples of times of recording with stamps, and of values."""
-        received, stamps = np.array(times, dtype=np.int64).T
-        return cls(received=received, stamps=stamps, values=np.array(values, dtype=np.float64))
+
+@dataclass(slots=True)
+class _Layout:
+    """Messages with the same joints, as columns: a bag may have millions of them."""
+
+    order: array[int] = field(default_factory=lambda: array('q'))
+    """Index of each message on its topic, time of recording and stamp (ns), one after the other."""
+    positions: array[float] = field(default_factory=lambda: array('d'))
+    speeds: array[float] = field(default_factory=lambda: array('d'))
 
 
 @dataclass(slots=True)
 class JointRows:
     """Messages of the joints: time of recording, stamp, positions and speeds by name."""
 
-    rows: list[tuple[int, int, dict[str, float], dict[str, float]]] = field(default_factory=list)
-    names: Counter[str] = field(default_factory=Counter)
+    layouts: dict[tuple[str, ...], _Layout] = field(default_factory=dict)
+    count: int = 0
 
     def add(self, received: int, message: Any, kind: str) -> None:
         """Add a message.
@@ -64,15 +71,21 @@ class JointRows:
         Raises:
             MessageError: It is invalid.
         """
-        names = list(message.name)
-        found: list[dict[str, float]] = []
+        names = tuple(message.name)
         for values in (message.position, message.velocity):
             if len(values) not in (0, len(names)):
                 raise MessageError('joint state must have as many values as names')
-            found.append(dict(zip(names, values if len(values) else (), strict=False)))
+        layout = self.layouts.setdefault(names, _Layout())
         stamp = from_time(message.header.stamp) or received
-        self.rows.append((received, stamp, found[0], found[1]))
-        self.names.update(names)
+        layout.order.extend((self.count, received, stamp))
+        for table, values in ((layout.positions, message.position), (layout.speeds, message.velocity)):
+            table.extend(values if len(values) else [math.nan] * len(names))
+        self.count += 1
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the joints, each once."""
+        return list(dict.fromkeys(name for names in self.layouts for name in names))
 
     def of(self, wheels: tuple[str, str], where: object, topic: str) -> tuple[Samples, bool]:
         """Return the angles of the right and the left wheel, or their speeds if there are none.
@@ -90,15 +103,19 @@ class JointRows:
         """
         left, right = wheels
         for are_speeds in (False, True):
-            times, values = [], []
-            for received, stamp, *both in self.rows:
-                joints = both[are_speeds]
-                pair = joints.get(right, math.nan), joints.get(left, math.nan)
-                if all(map(math.isfinite, pair)):
-                    times.append((received, stamp))
-                    values.append(pair)
-            if len(values) > 1:
-                return Samples.of(times, values), are_speeds
+            orders, values = [np.empty((0, 3), dtype=np.int64)], [np.empty((0, 2))]
+            for names, layout in self.layouts.items():
+                if left not in names or right not in names:
+                    continue
+                table = layout.speeds if are_speeds else layout.positions
+                pairs = _columns(table, len(names))[:, [names.index(right), names.index(left)]]
+                finite = np.isfinite(pairs).all(axis=1)
+                orders.append(np.frombuffer(layout.order, dtype=np.int64).reshape(-1, 3)[finite])
+                values.append(pairs[finite])
+            order, found = np.concatenate(orders), np.concatenate(values)
+            if len(order) > 1:
+                order, found = order[(rank := np.argsort(order[:, 0]))], found[rank]
+                return Samples(received=order[:, 1], stamps=order[:, 2], values=found), are_speeds
         raise BagError(
             f'{where}: {topic} has less than two messages with finite positions or velocities of '
             f'{quoted(wheels)}'
@@ -109,8 +126,12 @@ class JointRows:
 class PoseRows:
     """Messages of the reference: time of recording, stamp, x, y, theta, z, tilt."""
 
-    rows: list[tuple[int, int, float, float, float, float, float]] = field(default_factory=list)
+    times: array[int] = field(default_factory=lambda: array('q'))
+    """Time of recording and stamp of each message, one after the other (ns)."""
+    poses: array[float] = field(default_factory=lambda: array('d'))
+    """x, y, theta, z and tilt of each."""
     frames: Counter[str] = field(default_factory=Counter)
+    count: int = 0
 
     def add(self, received: int, message: Any, kind: str) -> None:
         """Add a message.
@@ -119,16 +140,20 @@ class PoseRows:
             MessageError: It is invalid.
         """
         pose = POSES[kind](message)
-        x, y, theta = from_pose(pose).tolist()
-        q = pose.orientation
+        place, q = pose.position, pose.orientation
+        if not (abs(place.x) <= FARTHEST and abs(place.y) <= FARTHEST):
+            raise MessageError(f'position must be finite and within {FARTHEST:g} m')
+        _, _, theta = from_pose_values(0.0, 0.0, q.x, q.y, q.z, q.w)
         tilt = math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (q.x**2 + q.y**2))))
-        stamp = from_time(message.header.stamp) or received
-        self.rows.append((received, stamp, x, y, theta, float(pose.position.z), tilt))
+        self.times.extend((received, from_time(message.header.stamp) or received))
+        self.poses.extend((place.x, place.y, theta, place.z, tilt))
         self.frames[str(message.header.frame_id)] += 1
+        self.count += 1
 
     def samples(self) -> Samples:
         """Return `[x, y, theta]` over time."""
-        return Samples.of([row[:2] for row in self.rows], [row[2:5] for row in self.rows])
+        received, stamps = np.frombuffer(self.times, dtype=np.int64).reshape(-1, 2).T
+        return Samples(received=received, stamps=stamps, values=_columns(self.poses, 5)[:, :3])
 
     def check(self, where: object, topic: str) -> None:
         """Raise BagError if the poses are in several frames, or not in one of the floor."""
@@ -137,7 +162,7 @@ class PoseRows:
                 f'{where}: the poses on {topic} are in several frames, '
                 f'{quoted(sorted(self.frames))}: one is needed'
             )
-        values = np.array([row[2:] for row in self.rows])
+        values = _columns(self.poses, 5)
         x, y, z = (float(np.ptp(values[:, column])) for column in (0, 1, 3))
         tilt = float(np.median(values[:, 4]))
         if tilt > MOST_TILT or (np.isfinite(z) and z > 0.2 and z > 0.5 * max(x, y)):
@@ -145,6 +170,11 @@ class PoseRows:
                 f'{where}: the frame of {topic} is not that of a floor with z up: the sensor is tilted '
                 f'by {tilt:.2g} rad and moves by {z:.2g} m in z, {x:.2g} m in x and {y:.2g} m in y'
             )
+
+
+def _columns(table: array[float], width: int) -> Array:
+    """Return a table as rows, shape (n, width)."""
+    return np.frombuffer(table, dtype=np.float64).reshape(-1, width)
 
 
 def common_clock(
