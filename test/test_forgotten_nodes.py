@@ -394,3 +394,12 @@ def test_an_integer_in_an_initial_pose_is_reported(lockstep, add, node, capfd):
     publisher.publish(integers(message, INTEGER, 1.0))
     lockstep.settle()
     assert 'initialpose has the value 4.94e-324: was an int assigned' in said(capfd)
+
+
+def test_an_integer_as_a_wheel_speed_is_reported(lockstep, add, node, capfd):
+    robot = add(VirtualRobot, command_interface='wheels')
+    publisher = node.create_publisher(JointState, 'joint_command', 10)
+    names = list(robot.parameters.wheel_names)
+    publisher.publish(integers(JointState(name=names, velocity=[1.0, 2.0]), INTEGER, INTEGER))
+    lockstep.settle()
+    assert 'a command on joint_command has the value 4.94e-324: was an int' in said(capfd)

@@ -146,6 +146,13 @@ def test_a_node_processes_what_was_sent_before_it_is_removed(lockstep):
     assert len(executors) == 1
 
 
+def test_a_node_that_was_destroyed_can_be_removed(lockstep):
+    node = lockstep.add(Node('short_lived'))
+    node.destroy_node()
+    lockstep.remove(node)
+    assert lockstep._executor.nodes == [lockstep.node]
+
+
 def test_what_could_not_be_published_is_not_reported(lockstep):
     publisher = lockstep.node.create_publisher(Vector3, 'a', 10)
     with pytest.raises(TypeError):

@@ -98,7 +98,9 @@ class QuiescentExecutor:
     def remove(self, node: Node) -> None:
         """Remove a node, after it has processed what was sent to it."""
         self.settle()
-        self._forget(node)
+        if node in self._served:
+            # Otherwise it was destroyed before.
+            self._forget(node)
         self._note_change()
         self.settle()
 

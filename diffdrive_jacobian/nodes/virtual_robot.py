@@ -182,6 +182,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
     ) -> Command:
         parameters = self.parameters
         speeds = messages.from_joint_values(joints, velocities, parameters.wheel_names)
+        # Not later: the twist of such speeds is zero.
+        self.warn_of_integers('a command on joint_command', *speeds)
         v, omega = wheel_to_body(*speeds, parameters.wheel_radius, parameters.wheel_separation)
         return messages.plausible_twist(v, omega), messages.from_time_values(sec, nanosec)
 
