@@ -18,6 +18,8 @@ from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
 from diffdrive_jacobian.bags.journal import JournalWriter, Message, read_journal
+from diffdrive_jacobian.recording.record import Status
+from diffdrive_jacobian.ros.runner import discovery_off
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import record_run
 
@@ -229,3 +231,28 @@ def test_wrong_arguments_are_reported_and_no_file_is_changed(
     assert line.startswith('record_run: error: ')
     assert words in line
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_topics_without_a_publisher_are_named(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with discovery_off():
+        assert record_run.main(['quick', '--max-duration', '1'], Signals()) == 1
+    said = capsys.readouterr()
+    missing = '/quick has no publisher (-o names the bag); topics with a publisher: none'
+    assert f'\nwaiting: {missing}\n' in said.out
+    assert said.out.endswith('is complete and empty: no message was received\n')
+    assert said.err == f'record_run: error: {missing}\n'
+
+
+def test_the_topics_with_a_publisher_are_named():
+    status = Status(
+        messages=0, topics=0, size=0, seconds=1.0, lost=0, missing=('/a', '/b'), published=('/odom',)
+    )
+    assert record_run.describe_missing(status) == (
+        '/a, /b have no publisher; topics with a publisher: /odom'
+    )
+    many = status._replace(missing=(), published=tuple(f'/t{index}' for index in range(9)))
+    assert record_run.describe_missing(many) == (
+        'no topic that is selected has a publisher; '
+        'topics with a publisher: /t0, /t1, /t2, /t3, /t4, /t5, /t6, /t7, ...'
+    )
