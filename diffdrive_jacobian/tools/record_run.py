@@ -160,7 +160,7 @@ def _pattern(text: str) -> str:
     return text
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} [TOPIC ...] [options] [--ros-args ...]',

@@ -132,7 +132,7 @@ def _hint(result: GoalResult) -> str:
     }.get(_end(result), '')
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} X Y [options] [--ros-args ...]',
