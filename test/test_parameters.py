@@ -153,7 +153,7 @@ def test_unknown_parameters_are_named_with_what_was_meant(add, capfd):
     said = capfd.readouterr().err
     assert "unknown parameter 'kpp' is ignored; did you mean 'kp'?" in said
     assert "unknown parameter 'kq' is ignored; did you mean 'kp' or 'kv'?" in said
-    assert "unknown parameter 'colour' is ignored; --help of go_to_goal lists them" in said
+    assert "unknown parameter 'colour' is ignored; see go_to_goal --help" in said
     assert 'qos_overrides' not in said
 
 

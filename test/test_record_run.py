@@ -192,12 +192,13 @@ def test_topics_are_selected_and_time_is_limited(world, bag):
     talk = Talk(world, ('cmd_vel', Twist, 10), ('other', Twist, 10), ('_hidden', Twist, 10))
     all_of_them = world.start('record_run', '-a', '-o', str(bag), '--max-duration', '4')
     some = world.start('record_run', '-e', '/oth.*', '-o', f'{bag}2', '--max-duration', '4')
-    one = world.start('record_run', 'cmd_vel', '-o', f'{bag}3', '--max-duration', '4')
+    one = world.start('record_run', 'cmd_vel', 'typo', '-o', f'{bag}3', '--max-duration', '4')
     for topic, count in (('cmd_vel', 2), ('other', 2)):
         publisher = talk.publishers[topic]
         talk.harness.until(lambda p=publisher, n=count: p.get_subscription_count() == n, topic)
         talk.say(topic, twist(1))
     assert [child.exit() for child in (all_of_them, some, one)] == [0, 0, 0]
+    assert (some.stderr, one.stderr) == ('', 'record_run: warning: no publisher: /typo\n')
     assert set(content(bag)) >= {'/cmd_vel', '/other'}
     assert '/_hidden' not in content(bag)
     assert set(content(f'{bag}2')) == {'/other'}

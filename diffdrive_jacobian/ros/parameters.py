@@ -133,11 +133,11 @@ def report_unknown(nodes: Sequence[Node]) -> None:
     import difflib
 
     known = sorted(name for name in declared if not name.startswith(PARAMETERS_OF_RCLPY))
-    programs = sorted({_program(node) for node in nodes})
+    programs = sorted({f'{_program(node)} --help' for node in nodes})
     for name, node in sorted(unknown.items()):
         close = difflib.get_close_matches(name, known, n=1)
         if not close and len(name) <= SHORT:
             close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
         hint = ' or '.join(f"'{one}'" for one in sorted(close))
-        hint = f'did you mean {hint}?' if close else f'--help of {", ".join(programs)} lists them'
+        hint = f'did you mean {hint}?' if close else f'see {" or ".join(programs)}'
         node.get_logger().warning(f"unknown parameter '{name}' is ignored; {hint}")

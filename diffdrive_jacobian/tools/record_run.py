@@ -39,6 +39,8 @@ class StatusLine:
         """
         self.missing = ''
         """What is missing, as long as no topic is recorded."""
+        self.never_published: tuple[str, ...] = ()
+        """Topics that were selected by name and had no publisher so far, fully qualified."""
         self._hint = hint
         self._terminal = sys.stdout.isatty()
         self._shown = 0.0
@@ -48,6 +50,7 @@ class StatusLine:
     def show(self, status: Status) -> None:
         """Print the status if it is due."""
         self.missing = '' if status.topics else describe_missing(status, self._hint)
+        self.never_published = status.missing
         if self.missing and not self._terminal:
             self._waiting.show(self.missing)
         elapsed = status.seconds - self._shown
@@ -62,7 +65,8 @@ class StatusLine:
         if status.lost:
             line += f', {status.lost} LOST'
         if self.missing and self._terminal:
-            line = f'waiting: {printable(self.missing)}'
+            # Not more than fits in one line.
+            line = f'waiting: {printable(self.missing, 70)}'
         print(
             f'\r{line}\x1b[K' if self._terminal else line, end='' if self._terminal else '\n', flush=True
         )
@@ -127,6 +131,8 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     if topics and not summary.messages:
         reason = line.missing or f'no message was received on {", ".join(topics)}'
         return _cli.complain(PROGRAM, reason, _cli.FAILED)
+    if topics and line.never_published:
+        print(f'{PROGRAM}: warning: no publisher: {_listed(line.never_published)}', file=sys.stderr)
     return _cli.DONE
 
 
