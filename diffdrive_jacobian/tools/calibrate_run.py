@@ -200,7 +200,7 @@ def _given(options: argparse.Namespace) -> Given:
     )
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
         description='Estimate the wheel radii and the wheel separation of a robot from recorded drives '
