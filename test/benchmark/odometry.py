@@ -37,7 +37,7 @@ def cpu(nodes: str, executor: str, bridge: bool, rate: float, seconds: float) ->
     """Measure CPU per odometry message (us)."""
     import sides
 
-    with _spinning(executor) as (context, spin):
+    with _spinning(executor, guarded=nodes == 'our') as (context, spin):
         if nodes == 'our':
             made = sides.our_nodes(rate=rate, bridge=bridge, context=context)
         else:
@@ -57,7 +57,7 @@ def latency(nodes: str, executor: str, bridge: bool, rate: float, seconds: float
     """Measure the median time from an odometry message to the command (us)."""
     import sides
 
-    with _spinning(executor) as (context, spin):
+    with _spinning(executor, guarded=nodes == 'our') as (context, spin):
         make = sides.our_controller if nodes == 'our' else sides.BareController
         prober = _prober(context, rate)
         spin([prober, make(context=context)], seconds, prober.latencies.clear, lambda: None)
@@ -92,16 +92,21 @@ def _prober(context: Any, rate: float) -> Any:
 
 
 @contextlib.contextmanager
-def _spinning(name: str) -> Any:
-    """Give a context and a function that spins nodes: `begin` after the warm-up, `end` at the end."""
+def _spinning(name: str, *, guarded: bool) -> Any:
+    """Give a context and a function that spins nodes: `begin` after the warm-up, `end` at the end.
+
+    Ours run on the guarded EventsExecutor, as their programs do, others on that of rclpy.
+    """
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 
+    from diffdrive_jacobian.ros.rclpy_internals import events_executor
     from diffdrive_jacobian.ros.runner import make_executor, ros_context
 
     with ros_context(['benchmark', '--ros-args', '--log-level', 'error']) as context:
-        executor = make_executor(context, isolated=name == 'events')
-        assert isinstance(executor, SingleThreadedExecutor) == (name != 'events')
+        executor: Any = SingleThreadedExecutor(context=context)
+        if name == 'events':
+            executor = make_executor(context, isolated=False) if guarded else events_executor(context)
         nodes: list[Any] = []
 
         def spin(given: list[Any], seconds: float, begin: Any, end: Any = None) -> None:
