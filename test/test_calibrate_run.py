@@ -257,14 +257,22 @@ def test_files_are_not_overwritten(bag, folder, capsys):
         (folder / name).unlink()
 
 
+def test_force_replaces_both_files(bag, folder, capsys):
+    for name in ('found.yaml', 'found.png'):
+        (folder / name).write_text('mine')
+    assert run(bag, '-o', 'found.yaml', '--force') == 0
+    assert 'multiplier' in (folder / 'found.yaml').read_text()
+    assert (folder / 'found.png').read_bytes().startswith(b'\x89PNG')
+
+
 def test_nothing_stays_if_the_picture_cannot_be_written(bag, folder, capsys, monkeypatch):
     real = _calibrate_run.create
     monkeypatch.setattr(_calibrate_run, 'draw', lambda *_: b'picture')
 
-    def create(path, data):
+    def create(path, data, *, replace):
         if path.suffix == '.png':
             raise OSError(28, 'No space left on device')
-        real(path, data)
+        real(path, data, replace=replace)
 
     monkeypatch.setattr(_calibrate_run, 'create', create)
     assert run(bag, '-o', 'found.yaml') == 1

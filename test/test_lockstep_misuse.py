@@ -96,6 +96,31 @@ def test_nodes_that_cannot_be_added_are_refused(lockstep):
         lockstep.run_for(1.0)
 
 
+def test_arguments_of_a_wrong_kind_are_refused(lockstep):
+    for use, words in (
+        (
+            lambda: lockstep.add(Blinker),
+            'add takes a node, got the class Blinker; create one: add(Blinker(...))',
+        ),
+        (lambda: lockstep.add('blinker'), "add takes a node, got 'blinker'"),
+        (
+            lambda: lockstep.listen('twist', Twist),
+            "listen takes a type and a topic, got 'twist' and the class Twist",
+        ),
+        (
+            lambda: lockstep.publish(Vector3(), 'vector'),
+            "publish takes a topic and a message, got an object of the class Vector3 and 'vector'",
+        ),
+        (
+            lambda: lockstep.publish('vector', Vector3),
+            "publish takes a topic and a message, got 'vector' and the class Vector3",
+        ),
+    ):
+        with pytest.raises(LockstepError) as caught:
+            use()
+        assert str(caught.value) == words
+
+
 def test_closed_lockstep_cannot_be_used(lockstep):
     blinker = lockstep.add(Blinker())
     lockstep.close()

@@ -238,7 +238,7 @@ def test_plot_run_writes_one_of_several_robots(robots, capsys, monkeypatch):
 
 
 def test_playback_chooses_a_namespace(robots):
-    from diffdrive_jacobian.bags.bag_reader import open_bag
+    from diffdrive_jacobian.bags.bag_reader import BagError, open_bag
     from diffdrive_jacobian.replay import NothingToPlayError, Playback
 
     def topics(**how):
@@ -251,6 +251,12 @@ def test_playback_chooses_a_namespace(robots):
     assert {'/two/odom', '/two/cmd_vel_out'} <= everything
     assert all(one.startswith('/two/') for one in everything)
     assert topics(names=None, namespace='/') == topics(names=None)
+    assert topics(topics=('/one/odom', 'two/odom')) == {'/one/odom', '/two/odom'}
+    with pytest.raises(BagError, match='odom is ambiguous, it can be /one/odom or /two/odom'):
+        topics(topics=('odom',))
+    for missing in ('dom', '/odom', '', 'one'):
+        with pytest.raises(BagError, match=f'has no topic {missing}; it has /clock, '):
+            topics(topics=(missing,))
     with pytest.raises(NothingToPlayError, match='cmd_vel in the namespace /three'):
         topics(namespace='/three')
 
@@ -402,6 +408,9 @@ class Progress:
         pass
 
     def no_odometry(self, topic, seconds):
+        pass
+
+    def standing(self, seconds):
         pass
 
 

@@ -149,10 +149,11 @@ def test_one_of_several_changes_that_is_bad_refuses_all_when_atomic(add):
 
 
 def test_unknown_parameters_are_named_with_what_was_meant(add, capfd):
-    report_unknown([add(GoToGoal, kpp=1.0, colour='red')])
+    report_unknown([add(GoToGoal, kpp=1.0, kq=2.0, colour='red')])
     said = capfd.readouterr().err
     assert "unknown parameter 'kpp' is ignored; did you mean 'kp'?" in said
-    assert "unknown parameter 'colour' is ignored; known parameters: " in said
+    assert "unknown parameter 'kq' is ignored; did you mean 'kp' or 'kv'?" in said
+    assert "unknown parameter 'colour' is ignored; see go_to_goal --help" in said
     assert 'qos_overrides' not in said
 
 

@@ -18,6 +18,8 @@ from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
 from diffdrive_jacobian.bags.journal import JournalWriter, Message, read_journal
+from diffdrive_jacobian.recording.record import Status
+from diffdrive_jacobian.ros.runner import discovery_off
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import record_run
 
@@ -190,12 +192,13 @@ def test_topics_are_selected_and_time_is_limited(world, bag):
     talk = Talk(world, ('cmd_vel', Twist, 10), ('other', Twist, 10), ('_hidden', Twist, 10))
     all_of_them = world.start('record_run', '-a', '-o', str(bag), '--max-duration', '4')
     some = world.start('record_run', '-e', '/oth.*', '-o', f'{bag}2', '--max-duration', '4')
-    one = world.start('record_run', 'cmd_vel', '-o', f'{bag}3', '--max-duration', '4')
+    one = world.start('record_run', 'cmd_vel', 'typo', '-o', f'{bag}3', '--max-duration', '4')
     for topic, count in (('cmd_vel', 2), ('other', 2)):
         publisher = talk.publishers[topic]
         talk.harness.until(lambda p=publisher, n=count: p.get_subscription_count() == n, topic)
         talk.say(topic, twist(1))
     assert [child.exit() for child in (all_of_them, some, one)] == [0, 0, 0]
+    assert (some.stderr, one.stderr) == ('', 'record_run: warning: no publisher: /typo\n')
     assert set(content(bag)) >= {'/cmd_vel', '/other'}
     assert '/_hidden' not in content(bag)
     assert set(content(f'{bag}2')) == {'/other'}
@@ -229,3 +232,28 @@ def test_wrong_arguments_are_reported_and_no_file_is_changed(
     assert line.startswith('record_run: error: ')
     assert words in line
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_topics_without_a_publisher_are_named(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with discovery_off():
+        assert record_run.main(['quick', '--max-duration', '1'], Signals()) == 1
+    said = capsys.readouterr()
+    missing = '/quick has no publisher (-o names the bag); topics with a publisher: none'
+    assert f'\nwaiting: {missing}\n' in said.out
+    assert said.out.endswith('is complete and empty: no message was received\n')
+    assert said.err == f'record_run: error: {missing}\n'
+
+
+def test_the_topics_with_a_publisher_are_named():
+    status = Status(
+        messages=0, topics=0, size=0, seconds=1.0, lost=0, missing=('/a', '/b'), published=('/odom',)
+    )
+    assert record_run.describe_missing(status) == (
+        '/a, /b have no publisher; topics with a publisher: /odom'
+    )
+    many = status._replace(missing=(), published=tuple(f'/t{index}' for index in range(9)))
+    assert record_run.describe_missing(many) == (
+        'no topic that is selected has a publisher; '
+        'topics with a publisher: /t0, /t1, /t2, /t3, /t4, /t5, /t6, /t7, ...'
+    )

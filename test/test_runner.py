@@ -88,6 +88,25 @@ def test_mistakes_of_the_user_are_named():
         pass
 
 
+@pytest.mark.parametrize(
+    ('flag', 'rule', 'message'),
+    [
+        ('-p', 'kp=2', "-p must be NAME:=VALUE, got 'kp=2'; did you mean 'kp:=2'?"),
+        ('--param', 'kp', "--param must be NAME:=VALUE, got 'kp'"),
+        ('-r', 'a=b', "-r must be OLD:=NEW, got 'a=b'; did you mean 'a:=b'?"),
+        (
+            '-r',
+            '__ns:=robot1',
+            "a namespace must begin with a slash, got '__ns:=robot1'; did you mean '__ns:=/robot1'?",
+        ),
+    ],
+)
+def test_rules_of_ros_arguments_get_a_hint(flag, rule, message):
+    with pytest.raises(UserError) as caught, ros_context(['test', '--ros-args', flag, rule]):
+        pass
+    assert str(caught.value) == f'ROS arguments: {message}'
+
+
 LONG = {
     'topic': (('-r', f'odom:={248 * "t"}'), 'with its leading slash, got 249'),
     'absolute topic': (('--remap', f'odom:=/{247 * "t"}'), 'with its leading slash, got 248'),

@@ -218,6 +218,13 @@ def test_drive_to_arrives_with_nothing_but_defaults(drives):
         (('1', '1', '--params-file', 'nowhere.yaml'), "no such file: 'nowhere.yaml'"),
         (('1', '1', '--bogus'), '--bogus'),
         (
+            ('1', '1', '--kp', '2'),
+            'unrecognized arguments: --kp 2 (kp is a ROS parameter: --ros-args -p kp:=2)',
+        ),
+        (('1', '1', '--max-wheel-velocity=-5'), '--ros-args -p max_wheel_velocity:=-5)'),
+        (('1', '1', '--kp'), '--ros-args -p kp:=VALUE)'),
+        (('1', '1', '--lock-step'), 'unrecognized arguments: --lock-step (did you mean --lockstep?)'),
+        (
             ('1', '1', '--heading', '90'),
             "must be in radians, from -2 pi to 2 pi, got '90' (90 degrees",
         ),
@@ -252,6 +259,27 @@ def test_options_after_the_ros_arguments_are_refused_with_a_hint(capsys, late, l
     line = capsys.readouterr().err.splitlines()[-1]
     assert line.startswith(f"drive_to: error: unknown ROS arguments: ['{late}']")
     assert 'come before --ros-args' in line
+
+
+@pytest.mark.parametrize(
+    ('node', 'arguments', 'error'),
+    [
+        ('go_to_goal', ('1', '1'), '1 1 (send_goal X Y sends a goal)'),
+        ('go_to_goal', ('-1', '1'), '-1 1 (send_goal X Y sends a goal)'),
+        ('go_to_goal', ('--kp', '2'), '--kp 2 (kp is a ROS parameter: --ros-args -p kp:=2)'),
+        ('go_to_goal', ('--robott', 'create3'), '--robott create3 (did you mean --robot?)'),
+        ('virtual_robot', ('1',), '1'),
+    ],
+)
+def test_arguments_that_a_node_does_not_take_get_a_hint(capsys, node, arguments, error):
+    from diffdrive_jacobian.signals import Signals
+    from diffdrive_jacobian.tools import run_node
+
+    with pytest.raises(SystemExit) as end:
+        run_node.run_node(node, arguments, Signals())
+    assert end.value.code == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line == f'{node}: error: unrecognized arguments: {error}'
 
 
 @pytest.mark.parametrize('arguments', [('-p', 'kp:=1'), ('kp:=1',), ('-r', '__ns:=/a')])

@@ -37,6 +37,9 @@ class Messaging(SimulatedTime):
                 node that was not added.
         """
         self._check_open()
+        if not isinstance(topic, str) or isinstance(message, type):
+            got = f'{described(topic)} and {described(message)}'
+            raise LockstepError(f'publish takes a topic and a message, got {got}')
         key = type(message), topic
         if key not in self._publishers:
             create = self.node.create_publisher
@@ -87,9 +90,13 @@ class Messaging(SimulatedTime):
             latched: Whether to include earlier messages of a latched topic.
 
         Raises:
-            LockstepError: The topic has another type.
+            LockstepError: The topic has another type, or an argument is no type or no name.
         """
         self._check_open()
+        if not isinstance(message_type, type) or not isinstance(topic, str):
+            raise LockstepError(
+                f'listen takes a type and a topic, got {described(message_type)} and {described(topic)}'
+            )
         received: list[Any] = []
         profile = QoSProfile(depth=LISTENING_DEPTH)
         if latched:
@@ -152,6 +159,13 @@ class Messaging(SimulatedTime):
 
 def _type_name(interface: Any, kind: str = 'msg') -> str:
     return f'{interface.__module__.split(".")[0]}/{kind}/{interface.__name__}'
+
+
+def described(value: Any) -> str:
+    """Return a description of an argument of a wrong kind."""
+    if isinstance(value, type):
+        return f'the class {value.__name__}'
+    return f"'{value}'" if isinstance(value, str) else f'an object of the class {type(value).__name__}'
 
 
 def _is_of_rclpy(types: list[str]) -> bool:

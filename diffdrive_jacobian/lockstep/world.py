@@ -20,7 +20,7 @@ from rosgraph_msgs.msg import Clock
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
 from diffdrive_jacobian.lockstep._guard import Guard
-from diffdrive_jacobian.lockstep._messaging import Messaging
+from diffdrive_jacobian.lockstep._messaging import Messaging, described
 from diffdrive_jacobian.lockstep._simulated_time import checked_nanoseconds
 from diffdrive_jacobian.ros.rclpy_internals import wrap_sleep
 from diffdrive_jacobian.ros.runner import UserError, discovery_off, ros_context
@@ -129,9 +129,12 @@ class Lockstep(Messaging):
 
         Raises:
             LockstepError: The node was already added, is in another context or executor, or runs on wall
-                time.
+                time; or it is no node.
         """
         self._check_open()
+        if not isinstance(node, Node):
+            hint = f'; create one: add({node.__name__}(...))' if isinstance(node, type) else ''
+            raise LockstepError(f'add takes a node, got {described(node)}{hint}')
         try:
             name = node.get_fully_qualified_name()
         except InvalidHandle as error:

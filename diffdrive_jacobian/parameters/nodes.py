@@ -280,6 +280,10 @@ class WheelBridgeParameters(NodeParameters):
         return number_or(self.max_wheel_velocity, math.inf)
 
 
+NODE_PARAMETERS = (VirtualRobotParameters, GoToGoalParameters, WheelBridgeParameters)
+"""The parameters of all nodes of this package."""
+
+
 def _differ(first: str, value: str, second: str, other: str) -> None:
     if value == other:
         raise ParameterError(

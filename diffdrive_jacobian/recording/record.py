@@ -8,6 +8,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
+from rclpy.exceptions import NameValidationException
+from rclpy.node import Node
+
 from diffdrive_jacobian.bags.bag_writer import Summary
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.recording.recorder import Recorder
@@ -20,6 +23,8 @@ NAME = 'record_run'
 """Name of the node."""
 DISCOVERY_PERIOD = 0.2
 """Time between two searches for new topics (s)."""
+EVERY_NODE = ('/parameter_events', '/rosout')
+"""Topics that every node publishes."""
 
 
 class Status(NamedTuple):
@@ -35,6 +40,10 @@ class Status(NamedTuple):
     """Time since the start (s)."""
     lost: int
     """Number of messages that are known to be lost."""
+    missing: tuple[str, ...] = ()
+    """Topics that were selected by name and had no publisher so far, fully qualified."""
+    published: tuple[str, ...] = ()
+    """Topics of other nodes that have a publisher, if no topic is recorded. For messages."""
 
 
 def open_recording(
@@ -170,4 +179,18 @@ def _status(recorder: Recorder, recording: Recording) -> Status:
         size=recording.journal.size,
         seconds=time.monotonic() - recording.started,
         lost=sum(recording.lost.values()),
+        missing=tuple(recorder.missing),
+        published=() if recorder.topics else tuple(_published(recorder)),
     )
+
+
+def _published(node: Node) -> list[str]:
+    """Return the topics that have a publisher. Those that every node publishes are left out."""
+    topics = sorted(topic for topic, _ in node.get_topic_names_and_types())
+    found = []
+    for topic in topics:
+        # A DDS application without ROS can use any name.
+        with suppress(ValueError, NameValidationException):
+            if topic not in EVERY_NODE and node.count_publishers(topic):
+                found.append(topic)
+    return found

@@ -102,6 +102,11 @@ class Recorder(Node):  # type: ignore[misc]
         """The topics that are recorded."""
         return list(self._channels)
 
+    @property
+    def missing(self) -> list[str]:
+        """The topics that were selected by name and had no publisher so far, fully qualified."""
+        return sorted(self._names - self._channels.keys() - self._refused)
+
     def discover(self) -> None:
         """Subscribe to new topics, and query parameters of new nodes; to be called often."""
         for topic, _ in self.get_topic_names_and_types():

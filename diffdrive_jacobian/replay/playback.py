@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rclpy.expand_topic_name import expand_topic_name
@@ -38,7 +38,8 @@ class Playback:
     names: tuple[str, ...] | None = COMMANDS
     """Base names of the topics; None: all."""
     topics: tuple[str, ...] = ()
-    """Fully qualified names of the topics, instead of `names`."""
+    """Names of the topics, instead of `names`. A name without its leading slash is in the namespace /,
+    or in the only namespace of the bag that has it."""
     namespace: str | None = None
     """Namespace of the topics of `names`, such as `/robot1`. With all names also the namespaces in it.
     None: every namespace."""
@@ -60,16 +61,12 @@ class Playback:
         """Return the connections of a bag that are played.
 
         Raises:
-            BagError: The bag lacks one of `topics`.
+            BagError: The bag lacks one of `topics`, or has several of that relative name.
             NothingToPlayError: It has no message of them.
         """
         there = sorted({connection.topic for connection in reader.connections})
-        missing = [topic for topic in self.topics if topic not in there]
-        if missing:
-            raise BagError(
-                f'{reader.path} has no topic {missing[0]}; it has {", ".join(there) or "none"}'
-            )
-        chosen = [one for one in reader.connections if self._wants(one.topic)]
+        topics = {_resolved(topic, there, reader) for topic in self.topics}
+        chosen = [one for one in reader.connections if self._wants(one.topic, topics)]
         if not any(connection.msgcount for connection in chosen):
             if not reader.message_count:
                 raise NothingToPlayError(f'nothing to play: {reader.path} has no messages')
@@ -145,10 +142,28 @@ class Playback:
                 f'{MAX_STAMP // NANOSECONDS} s, the bag ends at {reader.end_time / NANOSECONDS:.3f} s'
             )
 
-    def _wants(self, topic: str) -> bool:
-        if self.topics:
-            return topic in self.topics
+    def _wants(self, topic: str, topics: Collection[str]) -> bool:
+        if topics:
+            return topic in topics
         namespace = self.namespace
         if self.names is None:
             return namespace in (None, '/') or topic.startswith(f'{namespace}/')
         return base_name(topic) in self.names and namespace in (None, namespace_of(topic))
+
+
+def _resolved(name: str, there: Sequence[str], reader: Reader) -> str:
+    """Return the fully qualified name of a topic of a bag.
+
+    Raises:
+        BagError: The bag does not have it, or has it in several namespaces, none of which is /.
+    """
+    for topic in (name, f'/{name}'):
+        if topic in there:
+            return topic
+    relative = name and not name.startswith('/')
+    found = [topic for topic in there if relative and topic.endswith(f'/{name}')]
+    if len(found) > 1:
+        raise BagError(f'{name} is ambiguous, it can be {" or ".join(found)}')
+    if not found:
+        raise BagError(f'{reader.path} has no topic {name}; it has {", ".join(there) or "none"}')
+    return found[0]

@@ -30,6 +30,9 @@ from diffdrive_jacobian.ros.rclpy_internals import (
     parameter_overrides,
 )
 
+SHORT = 3
+"""Length of names of parameters that are close to each other if half of the letters agree."""
+
 P = TypeVar('P', bound=NodeParameters)
 
 
@@ -106,6 +109,14 @@ def validate(parameters: NodeParameters, changes: Iterable[Parameter]) -> SetPar
     return SetParametersResult(successful=True)
 
 
+def _program(node: Node) -> str:
+    """Return the name of the program that runs a node of this class."""
+    modules = [one.__module__ for one in type(node).__mro__]
+    package = __name__.partition('.')[0]
+    ours = [one for one in modules if one.startswith(f'{package}.nodes.')]
+    return ours[0].rpartition('.')[2] if ours else str(node.get_name())
+
+
 def report_unknown(nodes: Sequence[Node]) -> None:
     """Log a warning for each parameter that the user gave and that no node of this process declares.
 
@@ -122,7 +133,11 @@ def report_unknown(nodes: Sequence[Node]) -> None:
     import difflib
 
     known = sorted(name for name in declared if not name.startswith(PARAMETERS_OF_RCLPY))
+    programs = sorted({f'{_program(node)} --help' for node in nodes})
     for name, node in sorted(unknown.items()):
         close = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean '{close[0]}'?" if close else f'known parameters: {", ".join(known)}'
+        if not close and len(name) <= SHORT:
+            close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+        hint = ' or '.join(f"'{one}'" for one in sorted(close))
+        hint = f'did you mean {hint}?' if close else f'see {" or ".join(programs)}'
         node.get_logger().warning(f"unknown parameter '{name}' is ignored; {hint}")

@@ -12,9 +12,10 @@ from typing import Any, Protocol
 
 import numpy as np
 from action_msgs.msg import GoalStatus
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.control.controllers import BUILT_IN
+from diffdrive_jacobian.ros import standstill
 from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
 from diffdrive_jacobian.ros.goal_client import (
     DRIVEN_POINT_PARAMETERS,
@@ -115,6 +116,9 @@ class RemoteProgress(Protocol):
     def no_odometry(self, topic: str, seconds: float) -> None:
         """Receive that no odometry was received on a topic for so long (s), once."""
 
+    def standing(self, seconds: float) -> None:
+        """Receive that the robot has not moved for so long (s) with the goal, once per standstill."""
+
 
 def send_goal(
     goal: ArrayLike,
@@ -184,6 +188,9 @@ class _Silent:
     def no_odometry(self, topic: str, seconds: float) -> None:
         pass
 
+    def standing(self, seconds: float) -> None:
+        pass
+
 
 class _Session:
     """The exchange with a controller about one goal."""
@@ -198,6 +205,7 @@ class _Session:
         self._lost: str | None = None
         self._duplicates: dict[str, float] = {}
         self._warned: set[str] = set()
+        self._standstill = standstill.Standstill()
 
     def run(self, patience: float, timeout: float, *, follow: bool, heading_matters: bool) -> GoalResult:
         client, signals = self._client, self._signals
@@ -292,6 +300,7 @@ class _Session:
             self._use(liveness)
             if client.robot is not None and not missing:
                 self._progress.driving(client.distance)
+                self._watch_motion(client.robot.pose, now)
             elif client.robot is None:
                 self._progress.waiting(f'no odometry on {client.resolve_topic_name("odom")}')
             if client.ended:
@@ -305,6 +314,13 @@ class _Session:
             return self._lost is not None
 
         self._spin(timeout, over)
+
+    def _watch_motion(self, pose: NDArray[np.float64], now: float) -> None:
+        """Report a robot that does not move while the controller drives it."""
+        if self._client.status != GoalStatus.STATUS_EXECUTING:
+            self._standstill.reset()
+        elif self._standstill.update(pose, now):
+            self._progress.standing(standstill.PATIENCE)
 
     def _warn_of_duplicates(
         self, names: Sequence[str], partial_silence: Mapping[str, float], now: float

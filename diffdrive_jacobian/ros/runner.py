@@ -31,6 +31,13 @@ MAX_DOMAIN_ID = 232
 """Largest domain id. The ports of larger ones do not exist."""
 CHECK_PERIOD = 0.1
 """Longest time between two checks of the condition of the loop (s)."""
+RULES = {
+    '-p': 'NAME:=VALUE',
+    '--param': 'NAME:=VALUE',
+    '-r': 'OLD:=NEW',
+    '--remap': 'OLD:=NEW',
+}
+"""Form of the rule after each flag."""
 
 
 @contextmanager
@@ -86,13 +93,34 @@ def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[
             'that ends the ROS arguments'
         ) from error
     except (RuntimeError, UnicodeError) as error:
-        raise UserError(f'ROS arguments: {reason(error)}') from error
+        raise UserError(_rule_error(arguments) or f'ROS arguments: {reason(error)}') from error
     try:
         yield context
     finally:
         # Without an argument rclpy also replaces the default context by a new one.
         rclpy.try_shutdown(context=None if default else context)
         set_logger_level('', log_level)
+
+
+def _rule_error(arguments: Sequence[str]) -> str:
+    """Describe a rule without `:=`, or a namespace without its slash. Empty: there is none.
+
+    The error of rcl gives numbers of its lexemes instead.
+    """
+    for flag, rule in pairwise(arguments):
+        if flag not in RULES:
+            continue
+        left, separator, right = rule.partition(':=')
+        if not separator:
+            left, equals, right = rule.partition('=')
+            meant = f"; did you mean '{printable(f'{left}:={right}')}'?" if equals else ''
+            return f"ROS arguments: {flag} must be {RULES[flag]}, got '{printable(rule)}'{meant}"
+        if flag in ('-r', '--remap') and left.endswith('__ns') and not right.startswith('/'):
+            return (
+                f"ROS arguments: a namespace must begin with a slash, got '{printable(rule)}'; "
+                f"did you mean '{printable(f'{left}:=/{right}')}'?"
+            )
+    return ''
 
 
 def _check_name_length(rule: str) -> None:

@@ -13,7 +13,11 @@ from typing import Any
 from diffdrive_jacobian import __version__
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION
 from diffdrive_jacobian.parameters.configurations import configurations
-from diffdrive_jacobian.parameters.declaration import ParameterError
+from diffdrive_jacobian.parameters.declaration import (
+    NodeParameters,
+    ParameterError,
+    specifications,
+)
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 
 DONE, FAILED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
@@ -28,6 +32,11 @@ class Parser(argparse.ArgumentParser):
         super().__init__(prog=prog, **kwargs)
         version = f'{prog} (diffdrive_jacobian) {__version__}'
         self.add_argument('--version', action='version', version=version, help='print the version')
+
+    @property
+    def long_options(self) -> list[str]:
+        """The options that begin with two dashes."""
+        return [name for name in self._option_string_actions if name.startswith('--')]
 
 
 def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -52,24 +61,53 @@ def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def parse(
-    parser: argparse.ArgumentParser, own: Sequence[str], *, ros: bool = True
+    parser: Parser,
+    own: Sequence[str],
+    *,
+    ros: bool = True,
+    parameters: Sequence[type[NodeParameters]] = (),
+    hint: str = '',
 ) -> argparse.Namespace:
     """Parse a tool's own arguments.
 
-    An error message about ROS arguments among them says where these belong.
+    An error message about arguments that are not known says what was probably meant.
 
     Args:
         parser: The parser.
         own: The arguments.
         ros: Whether the tool takes ROS arguments.
+        parameters: Parameters of the nodes that the tool runs.
+        hint: Hint if there is no better one and an argument is no option. Empty: none.
     """
     options, unknown = parser.parse_known_args(own)
     if unknown:
-        hint = ''
-        if any(word in _ROS_OPTIONS or ':=' in word for word in unknown):
-            hint = f' ({ROS_HINT})' if ros else f' ({parser.prog} takes no ROS arguments)'
-        parser.error(f'unrecognized arguments: {" ".join(word.strip() for word in unknown)}{hint}')
+        words = [word.strip() for word in unknown]
+        if any(word in _ROS_OPTIONS or ':=' in word for word in words):
+            found = ROS_HINT if ros else f'{parser.prog} takes no ROS arguments'
+        else:
+            found = _meant(parser, words, parameters)
+        if not found and not words[0].startswith('--'):
+            found = hint
+        parser.error(f'unrecognized arguments: {" ".join(words)}' + (f' ({found})' if found else ''))
     return options
+
+
+def _meant(parser: Parser, words: Sequence[str], parameters: Sequence[type[NodeParameters]]) -> str:
+    """Return what was probably meant by the first unknown option. Empty: this is not known."""
+    place = next((index for index, word in enumerate(words) if word.startswith('--')), None)
+    if place is None:
+        return ''
+    option, _, value = words[place].partition('=')
+    name = option[2:].replace('-', '_')
+    if any(name in specifications(one) for one in parameters):
+        after = ''.join(words[place + 1 : place + 2])
+        value = value or (after if after and not after.startswith('--') else 'VALUE')
+        return f'{name} is a ROS parameter: --ros-args -p {name}:={value}'
+    # Slow to import.
+    import difflib
+
+    close = difflib.get_close_matches(option, parser.long_options, n=1)
+    return f'did you mean {close[0]}?' if close else ''
 
 
 ROS_HINT = 'ROS arguments come after --ros-args, as in --ros-args -p NAME:=VALUE'

@@ -73,7 +73,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     _print_summary(result, read)
     if missing := explain_undetermined(result):
         return _cli.complain(PROGRAM, f'{missing}. Nothing was written', _cli.FAILED)
-    return _write(result, read, output, picture)
+    return _write(result, read, output, picture, replace=options.force)
 
 
 def _note(text: str) -> None:
@@ -96,7 +96,12 @@ def _print_summary(result: Calibration, read: Sequence[WheelsAndReference]) -> N
 
 
 def _write(
-    result: Calibration, read: Sequence[WheelsAndReference], output: Path, picture: Path | None
+    result: Calibration,
+    read: Sequence[WheelsAndReference],
+    output: Path,
+    picture: Path | None,
+    *,
+    replace: bool,
 ) -> int:
     """Write the parameter file and the picture, and return the exit code."""
     names = ', '.join(printable(Path(one.recording.name).name) for one in read)
@@ -111,11 +116,15 @@ def _write(
     done: list[Path] = []
     for path, data in files:
         try:
-            create(path, data)
+            create(path, data, replace=replace)
         except OSError as error:
-            for one in done:
-                one.unlink(missing_ok=True)
-            message = f'{path} cannot be written: {error.strerror or error}; nothing was written'
+            message = f'{path} cannot be written: {error.strerror or error}'
+            if replace:
+                message += f'; written: {", ".join(map(str, done)) or "nothing"}'
+            else:
+                for one in done:
+                    one.unlink(missing_ok=True)
+                message += '; nothing was written'
             return _cli.complain(PROGRAM, printable(message, PATH_LIMIT), _cli.FAILED)
         done.append(path)
     for path in done:
@@ -132,7 +141,7 @@ def _outputs(options: argparse.Namespace, bags: Sequence[Path]) -> tuple[Path, P
     """Return the paths of the parameter file and of the picture.
 
     Raises:
-        FileExistsError: One of them exists.
+        FileExistsError: One of them exists, and must not be replaced.
         OSError: One of them cannot be written.
         ValueError: The parameter file has another ending.
     """
@@ -140,10 +149,11 @@ def _outputs(options: argparse.Namespace, bags: Sequence[Path]) -> tuple[Path, P
     if name is None:
         stem = '_and_'.join(bag.resolve().name for bag in bags)
         name = str(bags[0].resolve().parent / f'{stem}_calibration.yaml')
-    output = new_file(name, ENDINGS, 'parameter file')
+    output = new_file(name, ENDINGS, 'parameter file', replace=options.force)
     picture = None
     if not options.no_plot:
-        picture = new_file(os.path.splitext(name)[0] + '.png', ('png',), 'picture')
+        path = os.path.splitext(name)[0] + '.png'
+        picture = new_file(path, ('png',), 'picture', replace=options.force)
     return output, picture
 
 
@@ -190,7 +200,7 @@ def _given(options: argparse.Namespace) -> Given:
     )
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
         description='Estimate the wheel radii and the wheel separation of a robot from recorded drives '
@@ -209,6 +219,7 @@ def _parser() -> argparse.ArgumentParser:
         'beside the first bag)',
     )
     parser.add_argument('--no-plot', action='store_true', help='do not draw')
+    _cli.add_force(parser, 'the parameter file and the picture')
     parser.add_argument(
         '--reference',
         metavar='TOPIC',

@@ -153,7 +153,7 @@ def _topics(graph: Graph) -> list[str]:
     return lines
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} [options] [--ros-args ...]',

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.errors import UserError
-from diffdrive_jacobian.parameters.nodes import CONTROLLERS
+from diffdrive_jacobian.parameters.nodes import CONTROLLERS, NODE_PARAMETERS
 from diffdrive_jacobian.plots.output_files import NOT_OVERWRITTEN
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli, _live
@@ -29,7 +29,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
     own, ros = _cli.split_arguments(arguments)
     parser = _parser()
-    options = _cli.parse(parser, own)
+    options = _cli.parse(parser, own, parameters=NODE_PARAMETERS)
     if len(options.coordinates) % 2:
         parser.error(f'coordinates must be pairs X Y, got {len(options.coordinates)} of them')
     heading = _cli.given_heading(parser, options)
@@ -217,7 +217,7 @@ def _reason(outcome: Outcome, timeout: float) -> str:
     return reasons.get(outcome.status, 'ROS was shut down')
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} X Y [X Y ...] [options] [--ros-args ...]',

@@ -171,7 +171,7 @@ def _topic(text: str) -> tuple[str, str]:
     return name, topic if topic.startswith('/') else f'/{topic}'
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
         description='Draw runs that record_run or ros2 bag record has written: the path with its goals, '

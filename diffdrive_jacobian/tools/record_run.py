@@ -24,13 +24,24 @@ STORAGES = ('mcap', 'sqlite3')
 """File formats of bags."""
 STATUS_PERIOD = {True: 0.5, False: 10.0}
 """Time between two lines about the status, on a terminal and elsewhere (s)."""
+MAX_LISTED = 8
+"""Largest number of topics in a message."""
 
 
 class StatusLine:
     """A line about the state of the recording."""
 
-    def __init__(self) -> None:
-        """Start without messages."""
+    def __init__(self, hint: str = '') -> None:
+        """Start without messages.
+
+        Args:
+            hint: What follows a list of topics without a publisher.
+        """
+        self.missing = ''
+        """What is missing, as long as no topic is recorded."""
+        self.never_published: tuple[str, ...] = ()
+        """Topics that were selected by name and had no publisher so far, fully qualified."""
+        self._hint = hint
         self._terminal = sys.stdout.isatty()
         self._shown = 0.0
         self._messages = 0
@@ -38,20 +49,24 @@ class StatusLine:
 
     def show(self, status: Status) -> None:
         """Print the status if it is due."""
-        if not status.topics and not self._terminal:
-            self._waiting.show('none of the topics has a publisher')
+        self.missing = '' if status.topics else describe_missing(status, self._hint)
+        self.never_published = status.missing
+        if self.missing and not self._terminal:
+            self._waiting.show(self.missing)
         elapsed = status.seconds - self._shown
         if elapsed < STATUS_PERIOD[self._terminal]:
             return
         rate = (status.messages - self._messages) / elapsed
         self._shown, self._messages = status.seconds, status.messages
-        line = 'waiting for a publisher of the topics: ' * (not status.topics)
-        line += (
+        line = (
             f'{_cli.counted(status.messages, "message")} of {_cli.counted(status.topics, "topic")}, '
             f'{rate:.0f} per second, {status.size / 1e6:.1f} MB, {status.seconds:.0f} s'
         )
         if status.lost:
             line += f', {status.lost} LOST'
+        if self.missing and self._terminal:
+            # Not more than fits in one line.
+            line = f'waiting: {printable(self.missing, 70)}'
         print(
             f'\r{line}\x1b[K' if self._terminal else line, end='' if self._terminal else '\n', flush=True
         )
@@ -88,7 +103,9 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         return _cli.complain(PROGRAM, error)
     bag = recording.bag
     print(f'recording to {printable(bag, PATH_LIMIT)}; Ctrl-C ends it', flush=True)
-    line, ending = StatusLine(), ExitStack()
+    # A word that is meant as the name of the bag is read as that of a topic.
+    hint = ' (-o names the bag)' if topics and options.output is None else ''
+    line, ending = StatusLine(hint), ExitStack()
     try:
         try:
             summary = record(
@@ -111,7 +128,32 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         print(f'{PROGRAM}: error: {error}', file=sys.stderr)
         return _cli.FAILED
     print(describe(bag, summary))
+    if topics and not summary.messages:
+        reason = line.missing or f'no message was received on {", ".join(topics)}'
+        return _cli.complain(PROGRAM, reason, _cli.FAILED)
+    if topics and line.never_published:
+        print(f'{PROGRAM}: warning: no publisher: {_listed(line.never_published)}', file=sys.stderr)
     return _cli.DONE
+
+
+def describe_missing(status: Status, hint: str = '') -> str:
+    """Return which topics have no publisher, and which others have one, in one line.
+
+    Args:
+        status: The status of a recording of no topic so far.
+        hint: What follows the topics without a publisher.
+    """
+    verb = 'has' if len(status.missing) == 1 else 'have'
+    line = f'{_listed(status.missing)} {verb} no publisher'
+    if not status.missing:
+        line = 'no topic that is selected has a publisher'
+    return f'{line}{hint}; topics with a publisher: {_listed(status.published) or "none"}'
+
+
+def _listed(topics: Sequence[str]) -> str:
+    """Return the first `MAX_LISTED` topics as text."""
+    shown = [printable(topic) for topic in topics[:MAX_LISTED]]
+    return ', '.join([*shown, '...'] if len(topics) > MAX_LISTED else shown)
 
 
 def _pattern(text: str) -> str:
@@ -124,13 +166,14 @@ def _pattern(text: str) -> str:
     return text
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} [TOPIC ...] [options] [--ros-args ...]',
         description='Record topics as a rosbag2 bag until Ctrl-C. Messages are on the disk within a '
         'second: after a crash recover_run writes the bag from them. Exit code 0: the bag is complete; '
-        '1: it is not complete (messages were lost, or the disk failed); 2: wrong arguments.',
+        '1: it is not complete (messages were lost, or the disk failed), or no message of a named TOPIC '
+        'was received; 2: wrong arguments.',
     )
     parser.add_argument(
         'topics',

@@ -152,7 +152,7 @@ def _not_negative(text: str) -> float:
     return value
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} BAG [options] [--ros-args ...]',
@@ -165,7 +165,10 @@ def _parser() -> argparse.ArgumentParser:
     what.add_argument('--goals', action='store_true', help='play the goals of the controller')
     what.add_argument('--all-topics', action='store_true', help='play all topics')
     what.add_argument(
-        '--topics', nargs='+', metavar='TOPIC', help='play these topics (fully qualified names)'
+        '--topics',
+        nargs='+',
+        metavar='TOPIC',
+        help='play these topics; the namespace can be left out where only one robot has the topic',
     )
     what.add_argument(VERIFY, action='store_true', help='run verify_run instead, with its options')
     _cli.add_namespace(parser)

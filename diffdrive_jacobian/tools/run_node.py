@@ -73,7 +73,9 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
     own, ros = _cli.split_arguments(arguments)
     if own:
         # Not otherwise: to create the parser describes all parameters, which takes time.
-        ros = _cli.with_params_file(ros, _cli.parse(_parser(name, program), own))
+        hint = 'send_goal X Y sends a goal' if name == 'go_to_goal' else ''
+        parser, parameters = _parser(name, program), [program.parameters]
+        ros = _cli.with_params_file(ros, _cli.parse(parser, own, parameters=parameters, hint=hint))
     # Not above: --help needs no ROS. Only the node that runs: each takes time to import.
     from diffdrive_jacobian.ros.runner import ros_context, running
 
@@ -91,7 +93,7 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
     return _cli.DONE
 
 
-def _parser(name: str, program: Program) -> argparse.ArgumentParser:
+def _parser(name: str, program: Program) -> _cli.Parser:
     parser = _cli.Parser(
         prog=name,
         usage=f'{name} [-h] [--params-file FILE | --robot NAME] '

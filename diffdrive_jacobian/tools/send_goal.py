@@ -87,6 +87,9 @@ class _Progress:
     def no_odometry(self, topic: str, seconds: float) -> None:
         print(f'no odometry on {topic} for {seconds:g} s: is the robot running?', flush=True)
 
+    def standing(self, seconds: float) -> None:
+        print(f'the robot has not moved for {seconds:g} s: call doctor to find out why', flush=True)
+
 
 def _report(result: GoalResult, options: argparse.Namespace) -> list[str]:
     """Return lines that describe what became of a goal."""
@@ -107,11 +110,12 @@ def _report(result: GoalResult, options: argparse.Namespace) -> list[str]:
     line = lines[result.result]
     if result.canceled is None:
         return [line]
-    stopped = (
-        f'{_end(result)}: the robot was stopped'
-        if result.canceled
-        else 'the controller has not confirmed that it canceled: the robot may still drive'
-    )
+    if not result.canceled:
+        stopped = 'the controller has not confirmed that it canceled: the robot may still drive'
+    elif result.distance is None:
+        stopped = f'{_end(result)}: no odometry was received, so it is not known whether a robot drove'
+    else:
+        stopped = f'{_end(result)}: the robot was stopped'
     return [line, stopped] if line else [stopped]
 
 
@@ -132,7 +136,7 @@ def _hint(result: GoalResult) -> str:
     }.get(_end(result), '')
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} X Y [options] [--ros-args ...]',

@@ -167,7 +167,7 @@ def _whole(text: str) -> int:
     return int(text)
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} [options]',

@@ -74,7 +74,7 @@ def _rate(text: str) -> float:
     return value
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} [BAG] [options] [--ros-args ...]',
