@@ -169,6 +169,23 @@ def test_other_widths_and_colours(live):
     browser.scheme('light')
 
 
+def test_nothing_is_clipped_on_usual_screens(live):
+    browser = live.browser
+    for width, height in ((1440, 900), (1366, 768), (1000, 700), (420, 800)):
+        browser.size(width, height)
+        clipped = """[...document.querySelectorAll('.strip p, #goto, #actions')].filter(
+            (node) => node.scrollWidth > node.clientWidth).length"""
+        assert browser.evaluate(clipped) == 0, width
+        assert browser.evaluate("document.getElementById('goto').offsetHeight") < 40
+        if width >= 1280:
+            # Neither column scrolls.
+            scrolled = """['controls', 'mathematics'].filter((id) => {
+                const node = document.getElementById(id);
+                return node.scrollHeight > node.clientHeight; })"""
+            assert browser.evaluate(scrolled) == [], width
+    browser.size(1280, 800)
+
+
 @contextmanager
 def other_site():
     """Serve an empty page of another origin, in this browser."""

@@ -136,6 +136,22 @@ def test_waypoints_are_appended_and_a_goal_is_canceled(driven):
     driven.until(lambda: any('no goal is active' in text for text in driven.texts))
 
 
+def test_the_ends_of_goals_are_reported_with_the_place_of_the_robot(driven):
+    ends = []
+    driven.node.robots['/'].on_end = ends.append
+    driven.send(goal(0.2, 0.0), goal(0.3, 0.1, append=True))
+    driven.until(lambda: driven.state() == 'succeeded')
+    driven.send(goal(5.0, 5.0))
+    driven.until(lambda: driven.state() == 'executing')
+    driven.send(CancelGoal('/'))
+    driven.until(lambda: driven.state() == 'canceled')
+    assert [(end.robot, end.state.name) for end in ends] == [('/', 'SUCCEEDED'), ('/', 'CANCELED')]
+    np.testing.assert_array_equal([end.goal[:2] for end in ends], [[0.3, 0.1], [5.0, 5.0]])
+    for end in ends:
+        assert end.distance == pytest.approx(math.dist(end.pose[:2], end.goal[:2]))
+    assert ends[0].distance <= 0.021
+
+
 def test_a_waypoint_is_appended_to_a_goal_that_was_sent_just_now(driven):
     driven.send(goal(0.3, 0.0), goal(0.3, 0.3, append=True), goal(0.0, 0.3, append=True))
     driven.until(lambda: driven.state() == 'executing')

@@ -71,6 +71,11 @@ def test_drive_to_live_waits_for_the_page_records_and_ends_by_a_signal(world, tm
         until(lambda: robots(page).get('/', {}).get('goal', {}).get('state') == 'succeeded', 'arrives')
     drive.signal(signal.SIGTERM)
     assert drive.exit() == 0
+    assert 'it goes on after the goals, until Ctrl-C' in drive.stdout
+    (end,) = (line for line in drive.stdout.splitlines() if line.startswith('goal '))
+    assert re.fullmatch(
+        r'goal \(0\.2, 0\.1\) arrived: the robot is at x 0\..* 0\.0\d\d m from the goal', end
+    )
     assert drive.last_line == f'recorded: {tmp_path / "bag"}'
     assert drive.stderr == ''
     watch = world.start('watch_run', str(tmp_path / 'bag'), '--no-browser', '--rate', '5')
@@ -78,6 +83,9 @@ def test_drive_to_live_waits_for_the_page_records_and_ends_by_a_signal(world, tm
         frame = json.loads(page.recv(timeout=20))
         assert frame['world']['speed'] == 5.0
         assert len(frame['paths']['/']['points']) > 10
+    # There is no robot to steer.
+    assert 'steer' not in watch.stdout
+    assert 'plays the bag' in watch.stdout
     watch.signal(signal.SIGINT)
     assert watch.exit() == 0
 

@@ -183,6 +183,43 @@ def test_a_recording_that_begins_late_is_held_from_its_first_odometry(lockstep, 
     assert verification.start == 'odometry'
 
 
+@pytest.mark.parametrize('slip', [False, True])
+def test_a_robot_that_stood_until_the_recording_is_held_from_its_start(
+    lockstep, robot_at, tmp_path, slip
+):
+    """As where a process creates its nodes long before it spins them."""
+    robot_at(x=0.3, theta=0.7, simulate_slip=slip)
+    lockstep.run_for(0.5)
+    with recorded(lockstep, tmp_path / 'run') as made:
+        lockstep.run_for(0.1)
+        lockstep.publish('cmd_vel', twist(0.1, 0.9))
+        lockstep.run_for(1.0)
+    verification = held(made.run)
+    assert (verification.start, verification.covariance) == ('start_pose', 'exact moments')
+    assert (verification.truth is not None) == slip
+    driven = replace(made.run, odometry=rows(made.run.odometry, slice(20, None)))
+    driven = replace(driven, odometry_covariances=made.run.odometry_covariances[20:])
+    assert held(driven).start == 'odometry'
+
+
+def test_after_a_reset_of_the_odometry_alone_the_truth_has_no_known_start(lockstep, robot_at, tmp_path):
+    robot_at(simulate_slip=True, cmd_vel_timeout=0.1)
+    lockstep.publish('cmd_vel', twist(0.3, -0.7))
+    lockstep.run_for(0.5)
+    lockstep.call(Trigger, 'reset_odometry')
+    lockstep.run_for(0.5)
+    with recorded(lockstep, tmp_path / 'run') as made:
+        lockstep.run_for(0.1)
+        lockstep.publish('cmd_vel', twist(0.1, 0.9))
+        lockstep.run_for(0.5)
+        lockstep.publish('initialpose', PoseWithCovarianceStamped())
+        lockstep.run_for(0.1)
+    verification = held(made.run)
+    assert (verification.start, verification.truth) == ('odometry', None)
+    assert len(made.run.start_pose) == 3
+    assert len(verification.seconds) == len(made.run.odometry)
+
+
 def test_what_was_altered_is_found_with_its_place(drive):
     run = drive()
     odometry = run.odometry

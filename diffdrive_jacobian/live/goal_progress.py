@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,25 @@ from diffdrive_jacobian.messages.goal_status import GoalState
 
 ACTIVE = (GoalState.ACCEPTED, GoalState.EXECUTING, GoalState.CANCELING)
 """States in which a controller drives to a goal."""
+ENDED = (GoalState.SUCCEEDED, GoalState.CANCELED, GoalState.ABORTED)
+"""States of a goal that no controller drives to any more."""
 MAX_KNOWN = 8
 """Number of earlier goals that are kept, in case the later ones are refused."""
+
+
+class GoalEnd(NamedTuple):
+    """The end of a goal."""
+
+    robot: str
+    """Namespace of the robot, `/` or `/NAME`."""
+    state: GoalState
+    """One of `ENDED`."""
+    goal: NDArray[np.float64]
+    """`[x, y, theta]` of the goal that was driven to last, shape (3,) (m, m, rad)."""
+    pose: NDArray[np.float64] | None
+    """`[x, y, theta]` of the robot, shape (3,) (m, m, rad). None: there is no odometry."""
+    distance: float
+    """Distance from the driven point to the goal (m). NaN without odometry."""
 
 
 class GoalProgress:
@@ -29,6 +46,8 @@ class GoalProgress:
         self.state = GoalState.UNKNOWN
         """State of the last goal that has a status."""
         self._stamp: tuple[int, int] | None = None
+        self._ended: tuple[int, int] | None = None
+        self._newest: tuple[int, int] | None = None
         self._answered = False
         self._early: tuple[tuple[int, int], GoalState] | None = None
         self._known: dict[tuple[int, int], NDArray[np.float64]] = {}
@@ -59,7 +78,7 @@ class GoalProgress:
             # Those that this program has sent come back by their topic.
             return
         self.goals, self.index, self._stamp, self._answered = goals, 0, stamp, False
-        self._known[stamp] = goals
+        self._known[stamp], self._newest = goals, stamp
         while len(self._known) > MAX_KNOWN:
             del self._known[next(iter(self._known))]
         if self._early is not None and self._early[0] == stamp:
@@ -77,6 +96,19 @@ class GoalProgress:
                 # The end of goals that were replaced by the present ones.
                 return
         self.state, self._answered = state, True
+
+    def has_ended(self) -> bool:
+        """Return whether the latest goals have ended. True only once for each of them.
+
+        Goals that were replaced by others do not count.
+        """
+        own = self._early is not None and self._early[0] == self._stamp
+        # Unless the newest ones were refused.
+        own &= self._newest in (self._stamp, self._ended)
+        if not own or self.state not in ENDED or self.goals is None or self._ended == self._stamp:
+            return False
+        self._ended = self._stamp
+        return True
 
     def moved(self, pose: NDArray[np.float64], arrival: Arrival) -> None:
         """Take a pose of the robot, `[x, y, theta]`: a waypoint may be reached."""

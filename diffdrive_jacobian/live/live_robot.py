@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from diffdrive_jacobian.live.commands import (
     SendGoal,
     SetParameter,
 )
+from diffdrive_jacobian.live.goal_progress import GoalEnd
 from diffdrive_jacobian.live.hand import PERIOD, STANDSTILL, Act, HandDriving
 from diffdrive_jacobian.live.parameter_link import ParameterLink
 from diffdrive_jacobian.live.robot_state import RobotState
@@ -82,6 +84,8 @@ class LiveRobot:
         self._frame = ''
         self._seen = self._commanded = time.monotonic()
         self._sent, self._stamp = -math.inf, 0
+        self.on_end: Callable[[GoalEnd], None] | None = None
+        """Receives the end of each goal that was sent. None: nothing does."""
 
     @property
     def silence(self) -> float:
@@ -146,6 +150,10 @@ class LiveRobot:
         goal = self.state.goal
         before = goal.state
         goal.reported(GoalState(message.status), (stamp.sec, stamp.nanosec))
+        if goal.has_ended() and self.on_end is not None:
+            # Where the robot is by now.
+            self.poll()
+            self.on_end(self.state.goal_end())
         # The latched status of a goal that was sent before is no news.
         known = goal.goals is not None
         if known and goal.state is GoalState.ABORTED and before is not GoalState.ABORTED:

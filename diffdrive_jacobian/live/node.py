@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 from rcl_interfaces.msg import ParameterEvent
@@ -12,6 +13,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from diffdrive_jacobian.live.commands import Command, Pause, Seek, SetSpeed, Step
+from diffdrive_jacobian.live.goal_progress import GoalEnd
 from diffdrive_jacobian.live.live_robot import LiveRobot
 from diffdrive_jacobian.live.pacing import Pacing
 from diffdrive_jacobian.live.session import Session, Snapshot
@@ -36,7 +38,13 @@ class LivePage(Node):  # type: ignore[misc]
     """Node behind the page. `work` does everything; callbacks only store."""
 
     def __init__(
-        self, session: Session, context: Context, *, polled: bool, pacing: Pacing | None = None
+        self,
+        session: Session,
+        context: Context,
+        *,
+        polled: bool,
+        pacing: Pacing | None = None,
+        goal_ended: Callable[[GoalEnd], None] | None = None,
     ) -> None:
         """Create the node without robots.
 
@@ -46,9 +54,11 @@ class LivePage(Node):  # type: ignore[misc]
             polled: Whether it is run by a SingleThreadedExecutor: it then polls its topics with a timer
                 of its own. Otherwise `work` must be called often.
             pacing: Control of simulated time. None: time is real.
+            goal_ended: Receives the end of each goal. None: nothing does.
         """
         super().__init__(NAME, context=context, start_parameter_services=False)
         self._session, self._polled, self._pacing = session, polled, pacing
+        self._goal_ended = goal_ended
         self.robots: dict[str, LiveRobot] = {}
         """Robots by namespace."""
         self._names = {topic: self.resolve_topic_name(topic).rpartition('/')[2] for topic in TOPICS}
@@ -142,6 +152,7 @@ class LivePage(Node):  # type: ignore[misc]
             self.robots[namespace] = LiveRobot(
                 self, self._session, namespace, self._names, polled=self._polled
             )
+            self.robots[namespace].on_end = self._goal_ended
         except ParameterError as error:
             self._refuse(namespace, error)
 

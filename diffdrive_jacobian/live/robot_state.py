@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from diffdrive_jacobian.control import Arrival, LawError
 from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.live import quantities
-from diffdrive_jacobian.live.goal_progress import GoalProgress
+from diffdrive_jacobian.live.goal_progress import GoalEnd, GoalProgress
 from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.live.trail import JUMP, Trail
+from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters, VirtualRobotParameters
 from diffdrive_jacobian.reading.run import number
 
@@ -98,6 +99,19 @@ class RobotState:
             controller is not None and controller.takes_heading
         )
         return Arrival(xy_tolerance=max(tolerance, 0.0), use_heading=heading, offset=offset)
+
+    def goal_end(self) -> GoalEnd:
+        """Return the end of the goals that have just ended, and where the robot is."""
+        state, goals = self.goal.state, self.goal.goals
+        assert goals is not None
+        goal = goals[-1 if state is GoalState.SUCCEEDED else self.goal.index]
+        distance = math.nan
+        if self.pose is not None:
+            x, y, theta = self.pose.tolist()
+            offset = float(self.arrival.offset)
+            x, y = x + offset * math.cos(theta), y + offset * math.sin(theta)
+            distance = math.hypot(float(goal[0]) - x, float(goal[1]) - y)
+        return GoalEnd(self.name, state, goal, self.pose, distance)
 
     def moved(
         self,

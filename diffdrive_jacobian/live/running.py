@@ -12,6 +12,7 @@ from rclpy.parameter import Parameter
 
 from diffdrive_jacobian.drives import in_lockstep, in_real_time
 from diffdrive_jacobian.drives.driving import recorder_of
+from diffdrive_jacobian.live.goal_progress import GoalEnd
 from diffdrive_jacobian.live.node import LivePage
 from diffdrive_jacobian.live.pacing import Pacing
 from diffdrive_jacobian.live.serving import Ready, serving
@@ -64,6 +65,7 @@ def drive_live(
     signals: Signals,
     ready: Ready,
     nodes_created: Callable[[Sequence[str]], None],
+    goal_ended: Callable[[GoalEnd], None] | None = None,
 ) -> None:
     """Run robot, wheel bridge and controller in this process, with the page, until a signal comes.
 
@@ -79,6 +81,7 @@ def drive_live(
         signals: Counter of the signals that end it.
         ready: As for `serving`.
         nodes_created: Receives the fully qualified names of the nodes.
+        goal_ended: Receives the end of each goal. None: nothing does.
 
     Raises:
         UserError: A node cannot run with the parameters or ROS arguments given.
@@ -99,7 +102,9 @@ def drive_live(
         nodes_created([node.get_fully_qualified_name() for node in nodes])
         pacing = Pacing() if lockstep else None
         # The executor of nodes that others can reach leaves the topics to `work`.
-        page = runner.add(lambda: LivePage(session, context, polled=not isolated, pacing=pacing))
+        page = runner.add(
+            lambda: LivePage(session, context, polled=not isolated, pacing=pacing, goal_ended=goal_ended)
+        )
         discover = recorder_of(runner, recording)
         waiting = [goals] if len(goals) else []
 

@@ -222,9 +222,10 @@ def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
     """Return the robot after each event of `cmd_vel_out` and `start_pose`, one list for each restart."""
     first = _beginning(run)
     starts = run.start_pose
-    whole = len(starts) > 0 and int(starts.stamps[0]) >= first.stamp - _period(run)
-    # Otherwise the first one is latched, from before the recording.
-    skipped = 0 if whole else 1
+    skipped = _starts_before_recording(run)
+    whole = not skipped and len(starts) > 0
+    if skipped and _stood_since(run, skipped - 1):
+        whole, skipped = True, skipped - 1
     placed = start_covariances(run)
     events: list[tuple[int, int, bool, NDArray[np.float64]]] = []
     for is_start, series, begin in ((True, starts, skipped), (False, run.cmd_vel_out, 0)):
@@ -266,6 +267,39 @@ def _beginning(run: Run) -> Robot:
     x, y, theta, v, omega = run.odometry.values[0].tolist()
     robot = Robot(model=RobotModel(), stamp=int(run.odometry.stamps[0]), pose=np.array([x, y, theta]))
     return robot.commanded((v, omega), robot.stamp)
+
+
+def _starts_before_recording(run: Run) -> int:
+    """Return how many messages of `start_pose` are latched, from before the recording."""
+    starts = run.start_pose
+    begun = int(run.odometry.stamps[0]) - _period(run)
+    count = 0
+    for stamp, received in zip(starts.stamps.tolist(), starts.received.tolist(), strict=True):
+        late = received - int(starts.received[0])
+        if stamp >= begun or not 0 <= late <= _MAX_DELAY * NANOSECONDS:
+            break
+        count += 1
+    return count
+
+
+def _stood_since(run: Run, index: int) -> bool:
+    """Return whether the first odometry is still that of a `start_pose`: nothing has moved since.
+
+    In a process that creates its nodes before it spins them, the first odometry follows late.
+    """
+    start, first, truth = run.start_pose, run.odometry.values[0], run.ground_truth
+    covariances = run.odometry_covariances
+    if len(covariances) != len(run.odometry) or len(run.start_covariances) != len(start):
+        return False
+    return bool(
+        # Commands that were recorded before it could not be applied to it.
+        not (run.cmd_vel_out.received < start.received[index]).any()
+        and not first[3:5].any()
+        and np.array_equal(first[:3], start.values[index])
+        # Not after a reset of the odometry alone.
+        and (not len(truth) or np.array_equal(truth.values[0, :3], start.values[index]))
+        and np.array_equal(covariances[0, :6], run.start_covariances[index])
+    )
 
 
 def _period(run: Run) -> int:

@@ -2,10 +2,10 @@
 
 After a long drive the positions that a robot may have form a banana, not an ellipse. In exponential
 coordinates `xi = log(pose^-1 q)` of SE(2) about the reported pose the distribution of the true pose q
-is nearly Gaussian. Its covariance is propagated to first order by Long et al., and to fourth order by
-Barfoot and Furgale. Driving straight for a minute, the first order is already too thin along the path.
-Here it is taken to all orders, from runs of the noise model along the reported path that are drawn at
-random with a fixed seed.
+is nearer to a Gaussian, though after long straight drives it is clearly none. Its covariance is
+propagated to first order by Long et al., and to fourth order by Barfoot and Furgale. Driving straight
+for a minute, the first order is already too thin along the path. Here it is taken to all orders, from
+runs of the noise model along the reported path that are drawn at random with a fixed seed.
 
 The region of positions is the projection of the ellipsoid `xi^T covariance^-1 xi <= level` onto the
 plane. The level is that at which the region holds 95 % of the drawn runs: 5.99 for a Gaussian.

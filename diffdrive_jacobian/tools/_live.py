@@ -21,6 +21,11 @@ DISPLAYS = ('DISPLAY', 'WAYLAND_DISPLAY')
 """Environment variables without which no browser can open a window."""
 MISSING = "the page needs the Python module websockets: pip install 'diffdrive_jacobian[live]'"
 
+STEERS = 'whoever knows this address can steer the robot; Ctrl-C ends'
+PLAYS = 'the page plays the bag; Ctrl-C ends'
+DRIVES = 'whoever knows this address can steer the robot; it goes on after the goals, until Ctrl-C'
+"""Last line that a tool prints about its page."""
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the page."""
@@ -42,19 +47,22 @@ def _port(text: str) -> int:
     return int(text)
 
 
-def announcing(options: argparse.Namespace, waiting: str = '') -> Callable[[LiveServer], None]:
+def announcing(
+    options: argparse.Namespace, waiting: str = '', notice: str = STEERS
+) -> Callable[[LiveServer], None]:
     """Return a function that prints the address of a server, and opens it in a browser.
 
     Args:
         options: The options of the page.
         waiting: What happens when the page is open. Empty: nothing in particular.
+        notice: The last line: what the page can do, and how it ends.
     """
 
     def announce(server: LiveServer) -> None:
         print(f'page: {server.url}')
         if waiting:
             print(f'{waiting} when the page is open')
-        print('whoever knows this address can steer the robot; Ctrl-C ends', flush=True)
+        print(notice, flush=True)
         if not options.no_browser and any(map(os.environ.get, DISPLAYS)):
             # Starting a browser may take seconds.
             arguments = (server.opening_url,)

@@ -4,13 +4,25 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli, _live
 from diffdrive_jacobian.tools.drive_to import PROGRAM, controller_parameters, save
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.live.goal_progress import GoalEnd
+
+ENDS = {
+    GoalState.SUCCEEDED: 'arrived',
+    GoalState.CANCELED: 'canceled',
+    GoalState.ABORTED: 'refused or aborted',
+}
+"""How a goal ended, in words."""
 
 
 def drive_with_page(
@@ -55,8 +67,13 @@ def drive_with_page(
                 ros_arguments=ros,
                 port=options.port,
                 signals=signals,
-                ready=_live.announcing(options, waiting='the drive starts' if len(goals) else ''),
+                ready=_live.announcing(
+                    options,
+                    waiting='the drive starts' if len(goals) else '',
+                    notice=_live.DRIVES if len(goals) else _live.STEERS,
+                ),
                 nodes_created=lambda names: warn_of_unused_files(PROGRAM, ros, names),
+                goal_ended=_report,
             )
     except ModuleNotFoundError as error:
         if (error.name or '').split('.')[0] != 'websockets':
@@ -69,3 +86,16 @@ def drive_with_page(
     except (DriveError, OSError) as error:
         return _cli.complain(PROGRAM, error, _cli.FAILED)
     return _cli.DONE if recording is None else save(recording, plot=False, replace=options.force)
+
+
+def _report(end: GoalEnd) -> None:
+    """Print the end of a goal in one line."""
+    where = 'there is no odometry'
+    if end.pose is not None:
+        x, y, theta = end.pose
+        where = (
+            f'the robot is at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, '
+            f'{end.distance:.3f} m from the goal'
+        )
+    robot = '' if end.robot == '/' else f'{end.robot}: '
+    print(f'{robot}goal ({end.goal[0]:g}, {end.goal[1]:g}) {ENDS[end.state]}: {where}', flush=True)

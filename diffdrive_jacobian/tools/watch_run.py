@@ -44,7 +44,7 @@ def _bag(options: argparse.Namespace, signals: Signals) -> int:
             port=options.port,
             speed=options.rate or 1.0,
             signals=signals,
-            ready=_live.announcing(options),
+            ready=_live.announcing(options, notice=_live.PLAYS),
         )
     except BagError as error:
         return _cli.complain(PROGRAM, error)
