@@ -119,10 +119,10 @@ def test_offset_leaves_the_beginning_out(world, bag):
     assert twists(commands) == run.cmd_vel.values[-count:].tolist()
 
 
-def test_fast_playback_is_acknowledged_within_a_second(world, bag):
+def test_fast_playback_is_acknowledged_before_the_usual_heartbeat(world, bag):
     path, run = bag
     commands = world.harness.listen(Twist, 'cmd_vel')
-    child = world.start('replay_run', str(path), '-w', '1', '-r', '20', '--wait-for-all-acked', '1000')
+    child = world.start('replay_run', str(path), '-w', '1', '-r', '20', '--wait-for-all-acked', '2500')
     world.harness.until(lambda: len(commands) == len(run.cmd_vel), 'all have come')
     assert (child.exit(), child.stderr) == (0, '')
     assert child.last_line == f'{len(run.cmd_vel)} messages played'

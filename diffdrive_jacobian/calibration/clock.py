@@ -48,7 +48,7 @@ def time_offset(recording: Recording, nominal: Geometry) -> float | None:
 def _derivative(time: Array, values: Array, grid: Array) -> Array:
     """Return the mean derivative within each cell of a grid, 0 outside of the times, shape (n, ...)."""
     inside = np.column_stack([np.interp(grid, time, column) for column in values.T])
-    return np.diff(inside, axis=0) / np.diff(grid)[:, None]
+    return np.asarray(np.diff(inside, axis=0) / np.diff(grid)[:, None], dtype=np.float64)
 
 
 def _centred(values: Array) -> Array:

@@ -80,7 +80,7 @@ def rough(segments: Sequence[Segment], nominal: Geometry, offsets: Array) -> Rou
             f'the wheels never turn: they move by {np.abs(angles).sum():.3g} rad in all'
         )
     turns = np.concatenate([turn for _, turn in parts])
-    moves = max(float(np.ptp(one.poses[:, :2], axis=0).max()) for one in segments) > LEAST_MOVE
+    moves = max(float(np.max(np.ptp(one.poses[:, :2], axis=0))) for one in segments) > LEAST_MOVE
     _check_turning(angles, turns, (rims[:, 0] - rims[:, 1]) / separation, moves)
     gains, _ = _robust(
         np.column_stack([rims[:, 0], -rims[:, 1]]) / separation, turns, [1.0, 1.0], [0.7, 0.7], 0.02
@@ -193,9 +193,9 @@ def _robust(
     """
     ridge = np.diag(noise**2 / np.square(deviations))
     target = ridge @ np.asarray(prior)
-    weights = np.ones(len(b))
+    weights: Array = np.ones(len(b))
     scale = noise
-    x = np.asarray(prior, dtype=np.float64)
+    x: Array = np.asarray(prior, dtype=np.float64)
     for _ in range(ROUNDS):
         weighted = A * weights[:, None]
         x = np.linalg.solve(weighted.T @ A + ridge, weighted.T @ b + target)

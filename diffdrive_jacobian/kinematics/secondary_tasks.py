@@ -154,7 +154,7 @@ def _deviation(q: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[Any, A
     if not (high > low).all():
         raise ValueError(f'upper must be above lower for every joint, got {high} and {low}')
     unit: Any = 1.0
-    if not all(abs(value).max(initial=0.0) < _LARGE for value in (angles, low, high)):
+    if not all(np.max(np.abs(value), initial=0.0) < _LARGE for value in (angles, low, high)):
         largest = np.maximum(np.abs(angles), np.maximum(np.abs(low), np.abs(high)))
         unit = np.where(largest < _LARGE, 1.0, _UNIT)
         angles, low, high = angles * unit, low * unit, high * unit

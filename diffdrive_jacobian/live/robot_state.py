@@ -49,7 +49,7 @@ class RobotState:
         """Stamp of the odometry (s)."""
         self.twist = (0.0, 0.0)
         """`(v, omega)` of the odometry (m/s, rad/s)."""
-        self.covariance = np.zeros((3, 3))
+        self.covariance: NDArray[np.float64] = np.zeros((3, 3))
         """Covariance of the pose."""
         self.wheels: tuple[float, float] | None = None
         """Speeds of the right and the left wheel (rad/s). None: unknown."""

@@ -131,7 +131,7 @@ def _knots(poses: Array, begin: int, wanted: Indices) -> Indices:
     measure = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.unwrap(poses[begin : end + 1, 2]))))])
     measure = measure / TURN + np.linspace(0.0, PIECES, end - begin + 1)
     even = np.searchsorted(measure, np.arange(np.ceil(measure[-1])))
-    return np.unique([begin, *(begin + even).tolist(), *wanted.tolist()])
+    return np.asarray(np.unique([begin, *(begin + even).tolist(), *wanted.tolist()]), dtype=np.int64)
 
 
 def _along(poses: Array, covariances: Array, knots: Indices, wanted: Indices) -> list[Uncertainty]:

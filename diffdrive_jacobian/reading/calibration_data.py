@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from rosbags.rosbag2 import Reader
 
 from diffdrive_jacobian.bags.bag_reader import (
@@ -97,7 +98,7 @@ def read_wheels_and_reference(
     observed = poses.samples()
     wheel_time, pose_time, note = common_clock(measured, observed, wheels_topic, poses_topic)
     notes += [note] if note else []
-    origin = min(int(wheel_time.min()), int(pose_time.min()))
+    origin = min(int(np.min(wheel_time)), int(np.min(pose_time)))
     wheel_seconds, angles = increasing(wheel_time - origin, measured.values, f'{where}: {wheels_topic}')
     pose_seconds, values = increasing(pose_time - origin, observed.values, f'{where}: {poses_topic}')
     if from_speeds:

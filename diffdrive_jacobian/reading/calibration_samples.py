@@ -103,7 +103,8 @@ class JointRows:
         """
         left, right = wheels
         for are_speeds in (False, True):
-            orders, values = [np.empty((0, 3), dtype=np.int64)], [np.empty((0, 2))]
+            orders: list[Any] = [np.empty((0, 3), dtype=np.int64)]
+            values: list[Any] = [np.empty((0, 2))]
             for names, layout in self.layouts.items():
                 if left not in names or right not in names:
                     continue
@@ -185,8 +186,8 @@ def common_clock(
     These are the stamps. If the stamps have no time in common, the clocks differ, and the times of
     recording are returned.
     """
-    begin = max(wheels.stamps.min(), poses.stamps.min())
-    end = min(wheels.stamps.max(), poses.stamps.max())
+    begin = max(int(np.min(wheels.stamps)), int(np.min(poses.stamps)))
+    end = min(int(np.max(wheels.stamps)), int(np.max(poses.stamps)))
     if begin < end:
         return wheels.stamps, poses.stamps, ''
     apart = (int(poses.stamps[0]) - int(wheels.stamps[0])) / NANOSECONDS
@@ -208,7 +209,8 @@ def increasing(times: Times, values: Array, what: str) -> tuple[Array, Array]:
         at = int(np.argmin(steps))
         raise BagError(
             f'{what} goes back in time by {-steps[at] / NANOSECONDS:.3f} s after '
-            f'{(times[at] - times.min()) / NANOSECONDS:.3f} s: its clock was reset; split the bag there'
+            f'{(times[at] - np.min(times)) / NANOSECONDS:.3f} s: its clock was reset; '
+            'split the bag there'
         )
     unique, first = np.unique(times, return_index=True)
     return np.asarray(unique / NANOSECONDS), values[first]
@@ -228,9 +230,9 @@ def unwrapped(time: Array, angles: Array, what: str) -> Array:
         BagError: An angle jumps.
     """
     if len(angles) > 1 and np.ptp(angles) <= 2.0 * math.pi + 1e-3:
-        angles = np.unwrap(angles, axis=0)
+        angles = np.asarray(np.unwrap(angles, axis=0), dtype=np.float64)
     speeds = np.abs(np.diff(angles, axis=0)).max(axis=1) / np.maximum(np.diff(time), 1e-3)
-    if len(speeds) and speeds.max() > FASTEST:
+    if len(speeds) and np.max(speeds) > FASTEST:
         at = int(np.argmax(speeds))
         step = float(np.abs(angles[at + 1] - angles[at]).max())
         raise BagError(

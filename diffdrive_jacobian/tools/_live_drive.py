@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.messages.goal_status import GoalState
@@ -45,7 +46,7 @@ def drive_with_page(
     try:
         from diffdrive_jacobian.live.running import drive_live
 
-        goals = np.empty((0, 3))
+        goals: NDArray[np.float64] = np.empty((0, 3))
         if options.coordinates:
             places = np.reshape(options.coordinates, (-1, 2))
             goals = waypoints_through(places, heading or 0.0)
