@@ -33,6 +33,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+from domains import domain_id
+
 from diffdrive_jacobian.parameters.declaration import NodeParameters, specifications
 from diffdrive_jacobian.parameters.nodes import (
     GoToGoalParameters,
@@ -108,7 +110,7 @@ class Session:
             **os.environ,
             'PATH': os.pathsep.join([sysconfig.get_path('scripts'), os.environ['PATH']]),
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-            'ROS_DOMAIN_ID': str(1 + os.getpid() % 100),
+            'ROS_DOMAIN_ID': str(domain_id()),
             'PYTHONUNBUFFERED': '1',
         }
 

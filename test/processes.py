@@ -15,8 +15,9 @@ from functools import cached_property
 from unittest import mock
 
 from conftest import PATIENCE, Harness
+from domains import domain_id
 
-from diffdrive_jacobian.ros.fastdds_profiles import announce_frequently
+from diffdrive_jacobian.ros.fastdds_profiles import VARIABLE, announce_frequently
 
 LIMIT = 90.0
 """How long a child may live (s): then it is killed, whatever became of its test."""
@@ -42,6 +43,8 @@ class Child:
                 stdin=subprocess.DEVNULL,
                 stdout=out if stdout is None else stdout,
                 stderr=err,
+                # Children choose their own profiles: this file may be that of another installation.
+                env={name: value for name, value in os.environ.items() if name != VARIABLE},
             )
         self._limit = threading.Timer(LIMIT, self._process.kill)
         self._limit.daemon = True
@@ -196,10 +199,9 @@ class Drive:
 def open_world(directory):
     """Hold a world of its own; files go into a directory."""
     # Domains beyond 101 collide with the ports that Linux gives to clients.
-    domain = (os.getpid() * 37 + next(_numbers)) % 100 + 1
     environment = {
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-        'ROS_DOMAIN_ID': str(domain),
+        'ROS_DOMAIN_ID': str(domain_id()),
         'ROS_LOG_DIR': str(directory),
         # Numpy starts a thread for every core otherwise: a fifth of what it costs to start a child.
         'OPENBLAS_NUM_THREADS': '1',

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
-
 import pytest
+from domains import domain_id
 from geometry_msgs.msg import TwistStamped
 from rclpy.node import Node
 
@@ -25,7 +24,7 @@ def test_other_type_in_another_process_is_reported_once(monkeypatch, capfd, endp
     monkeypatch.setattr(ros_node, 'WATCH_PERIOD', 0.2)
     monkeypatch.setattr(type_mismatches, 'MAX_AGE', 0.1)
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(os.getpid() % 100 + 1))
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(domain_id()))
     with ros_context(['test']) as context, ros_context(['other']) as other:
         harness = Harness(context, make_executor(context, isolated=False))
         harness.add(VirtualRobot if endpoint == 'publishes' else GoToGoal)

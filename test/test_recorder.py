@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
-
 import pytest
 from conftest import PATIENCE
+from domains import domain_id
 from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -214,7 +213,7 @@ def test_a_later_publisher_with_weaker_qos_is_recorded(ros, executor_kind, first
 def local_discovery(monkeypatch):
     """Contexts that are created after this discover each other, as processes do."""
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(os.getpid() % 100 + 1))
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(domain_id()))
 
 
 def test_publishers_of_another_type_are_reported(local_discovery, ros, executor_kind):
