@@ -106,7 +106,8 @@ def test_offset_leaves_the_beginning_out(world, bag):
     path, run = bag
     commands = world.harness.listen(Twist, 'cmd_vel')
     for _ in range(3):
-        child = world.start('replay_run', str(path), '--start-offset', '1.5', '-r', '5')
+        options = ('--start-offset', '1.5', '-r', '5', '--wait-for-all-acked', '20000')
+        child = world.start('replay_run', str(path), *options)
         assert child.exit() == 0
         count = int(child.last_line.split()[0])
         assert 20 <= count <= 30
@@ -122,7 +123,7 @@ def test_offset_leaves_the_beginning_out(world, bag):
 def test_fast_playback_is_acknowledged_before_the_usual_heartbeat(world, bag):
     path, run = bag
     commands = world.harness.listen(Twist, 'cmd_vel')
-    child = world.start('replay_run', str(path), '-w', '1', '-r', '20', '--wait-for-all-acked', '2500')
+    child = world.start('replay_run', str(path), '-w', '1', '-r', '20', '--wait-for-all-acked', '2900')
     world.harness.until(lambda: len(commands) == len(run.cmd_vel), 'all have come')
     assert (child.exit(), child.stderr) == (0, '')
     assert child.last_line == f'{len(run.cmd_vel)} messages played'
@@ -199,7 +200,8 @@ def test_relative_names_are_remapped(world, bag):
         world.harness.listen(Twist, 'cmd_vel'),
         world.harness.listen(Twist, 'sim/cmd_vel'),
     )
-    child = world.start('replay_run', str(path), '-r', '4', '-w', '1', '-m', 'cmd_vel:=sim/cmd_vel')
+    options = ('-r', '4', '-w', '1', '-m', 'cmd_vel:=sim/cmd_vel', '--wait-for-all-acked', '20000')
+    child = world.start('replay_run', str(path), *options)
     world.harness.until(lambda: len(commands) == len(run.cmd_vel), 'all have come')
     assert child.exit() == 0
     assert recorded == []
