@@ -37,8 +37,8 @@ PATIENCE = 20.0
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers():
-    """Start two workers per core for `-n auto`: many tests wait for other processes."""
-    return 2 * len(os.sched_getaffinity(0))
+    """Start one worker more than there are cores for `-n auto`: many tests wait for processes."""
+    return len(os.sched_getaffinity(0)) + 1
 
 
 def pytest_configure(config):

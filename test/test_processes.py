@@ -34,7 +34,7 @@ def test_nodes_exit_0_on_a_signal(world):
         for number in numbers:
             child.signal(number)
     for child, _ in children:
-        assert child.exit(5.0) == 0
+        assert child.exit() == 0
         assert 'Traceback' not in child.stderr
 
 
