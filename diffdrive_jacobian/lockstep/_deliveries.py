@@ -140,7 +140,7 @@ class Reader:
             self._create_task(result)
 
     def close(self) -> None:
-        """Let the subscription be destroyed. No message can be taken afterwards."""
+        """Release the subscription. No message can be taken afterwards."""
         self.take = _nothing
         self._close()
 
