@@ -3,7 +3,7 @@
 from diffdrive_jacobian.lockstep import Lockstep, LockstepError
 """
 
-from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._errors import LockstepError, PropertyViolation
 from diffdrive_jacobian.lockstep.world import Lockstep
 
-__all__ = ['Lockstep', 'LockstepError']
+__all__ = ['Lockstep', 'LockstepError', 'PropertyViolation']
