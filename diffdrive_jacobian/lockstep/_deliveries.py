@@ -34,7 +34,11 @@ class Deliveries:
         """
         self.pending: deque[Reader | None] = deque()
         """One entry for each message and subscription. None: a request or a response of a service."""
-        self._create_task = create_task
+        self.create_task = create_task
+        self.new_reader: Callable[[Subscription, Node], Reader] = lambda subscription, node: Reader(
+            subscription, node, self
+        )
+        """Creates the reader of a subscription of a node."""
         self._readers: dict[Subscription, Reader] = {}
         self._by_topic: dict[str, list[Reader]] = {}
         self._observers: dict[str, list[Delivered]] = {}
@@ -64,9 +68,7 @@ class Deliveries:
                 if subscription in without:
                     continue
                 reader = known.pop(subscription, None)
-                self._readers[subscription] = reader or Reader(
-                    subscription, self._create_task, node, self.observers_of(subscription.topic_name)
-                )
+                self._readers[subscription] = reader or self.new_reader(subscription, node)
         for reader in known.values():
             reader.close()
         present = set(self._readers.values())
@@ -77,6 +79,19 @@ class Deliveries:
             self.readers_of(reader.topic).append(reader)
         admitted = set(self._polled)
         return [reader for reader in self._readers.values() if reader not in admitted]
+
+    def replace(self, nodes: Iterable[Node]) -> None:
+        """Let `new_reader` create the readers of all present subscriptions again."""
+        owners = {subscription: node for node in nodes for subscription in node.subscriptions}
+        replaced = {}
+        for subscription, reader in self._readers.items():
+            replaced[reader] = self._readers[subscription] = self.new_reader(
+                subscription, owners[subscription]
+            )
+            reader.close()
+        self._polled = [replaced[reader] for reader in self._polled if reader in replaced]
+        for readers in self._by_topic.values():
+            readers[:] = [replaced[reader] for reader in readers]
 
     def drop_destroyed(self, nodes: Iterable[Node]) -> None:
         """Deliver nothing more to subscriptions that the nodes do not have any more."""
@@ -125,19 +140,14 @@ class Reader:
         'topic',
     )
 
-    def __init__(
-        self,
-        subscription: Subscription,
-        create_task: Callable[..., Any],
-        node: Node,
-        observers: list[Delivered],
-    ) -> None:
-        """Keep the subscription alive until `close`."""
-        self.node, self.observers = node, observers
+    def __init__(self, subscription: Subscription, node: Node, deliveries: Deliveries) -> None:
+        """Keep the subscription of a node alive until `close`."""
+        self.node = node
         self.topic: str = subscription.topic_name
+        self.observers = deliveries.observers_of(self.topic)
         self.latched = is_latched(subscription)
         self._subscription = subscription
-        self._create_task = create_task
+        self._create_task = deliveries.create_task
         self.message_type, self.raw = subscription.msg_type, subscription.raw
         self.take, self._close = message_taker(subscription)
 

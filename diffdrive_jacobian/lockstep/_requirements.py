@@ -9,13 +9,14 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.service import Service
 
+from diffdrive_jacobian.lockstep._disturbed import Disturbed
 from diffdrive_jacobian.lockstep._errors import LockstepError
-from diffdrive_jacobian.lockstep._messaging import Messaging, described
+from diffdrive_jacobian.lockstep._messaging import described
 from diffdrive_jacobian.lockstep._report import OMITTED
 from diffdrive_jacobian.lockstep._requirement import Required, Requirement
 
 
-class Requirements(Messaging):
+class Requirements(Disturbed):
     """Requiring properties, and observing messages without subscriptions. Base class of `Lockstep`.
 
     The functions that observe are called while a node publishes or receives. They must not raise,
