@@ -3,10 +3,10 @@
 Names of this package, which are imported on first use:
 
 - `Lockstep`, `LockstepError`: as in the package `lockstep`.
+- `faults`: the package of the faults that a `Lockstep` injects.
 - `RecordedRun`, `GoldenRun`: types of the fixtures `recorded_run` and `golden_run`.
 
-pytest loads the plugin in every project, so this module imports neither rclpy nor NumPy
-by itself.
+pytest loads the plugin in every project, so this module imports neither rclpy nor NumPy by itself.
 """
 
 from __future__ import annotations
@@ -15,18 +15,22 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from diffdrive_jacobian import faults
     from diffdrive_jacobian.lockstep import Lockstep, LockstepError
     from diffdrive_jacobian.testing.golden_run import GoldenRun
     from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
-__all__ = ['GoldenRun', 'Lockstep', 'LockstepError', 'RecordedRun']
+__all__ = ['GoldenRun', 'Lockstep', 'LockstepError', 'RecordedRun', 'faults']
 
+_PACKAGES = ('faults',)
+"""Packages beside this one that are names of it, too."""
 _MODULES = {
-    'GoldenRun': 'diffdrive_jacobian.testing.golden_run',
-    'Lockstep': 'diffdrive_jacobian.lockstep',
-    'LockstepError': 'diffdrive_jacobian.lockstep',
-    'RecordedRun': 'diffdrive_jacobian.testing.recorded_run',
+    'GoldenRun': 'testing.golden_run',
+    'Lockstep': 'lockstep',
+    'LockstepError': 'lockstep',
+    'RecordedRun': 'testing.recorded_run',
 }
+"""The module of each other name."""
 
 
 def __getattr__(name: str) -> Any:
@@ -36,9 +40,11 @@ def __getattr__(name: str) -> Any:
         AttributeError: There is no such name.
         ModuleNotFoundError: ROS is not installed.
     """
-    if name not in _MODULES:
-        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    return getattr(importlib.import_module(_MODULES[name]), name)
+    if name in _PACKAGES:
+        return importlib.import_module(f'diffdrive_jacobian.{name}')
+    if name in _MODULES:
+        return getattr(importlib.import_module(f'diffdrive_jacobian.{_MODULES[name]}'), name)
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
 
 
 def __dir__() -> list[str]:
