@@ -264,9 +264,7 @@ def sweep(
     return Sweep(setup, setup.gains('kp'), setup.gains('kv'), outcomes)
 
 
-def _drive(
-    setup: Setup, rows: slice, progress: Callable[[int], object] | None = None
-) -> Outcomes:
+def _drive(setup: Setup, rows: slice, progress: Callable[[int], object] | None = None) -> Outcomes:
     """Return the outcomes of some rows of the grid, shape (rows, n, starts)."""
     controller = setup.resolved_controller
     values: dict[str, Any] = {
@@ -293,9 +291,7 @@ def _drive(
     )
 
 
-def _drive_on(
-    executor: Executor, setup: Setup, progress: Callable[[int], object] | None
-) -> Outcomes:
+def _drive_on(executor: Executor, setup: Setup, progress: Callable[[int], object] | None) -> Outcomes:
     """Return the outcomes of all rows, computed by an executor."""
     try:
         pickle.dumps(setup)
