@@ -166,6 +166,7 @@ class Lockstep(Requirements):
         self._check_open()
         if node is self.node or node not in self._executor.nodes:
             raise LockstepError('the node to remove was not added')
+        self.killed.add(node)
         with self._watched():
             self._executor.remove(node)
             node.destroy_node()

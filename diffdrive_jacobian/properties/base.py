@@ -8,6 +8,9 @@ from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import MISSING, dataclass, field, fields
 
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+
 from diffdrive_jacobian.faults.fault import literal
 from diffdrive_jacobian.lockstep import Lockstep
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -112,6 +115,7 @@ class Watch:
         self.world = world
         self._recent: deque[str] = deque(maxlen=RECENT)
         self._found: str | None = None
+        self._owners: dict[Publisher, Node | None] = {}
 
     @property
     def seconds(self) -> float:
@@ -125,6 +129,17 @@ class Watch:
     def finish(self) -> str | None:
         """Return what is violated at the end of the run; None: nothing."""
         return None
+
+    def owner(self, publisher: Publisher) -> Node | None:
+        """Return the node that has a publisher; None: it was removed."""
+        if publisher not in self._owners:
+            self._owners[publisher] = self.world.node_of(publisher)
+        return self._owners[publisher]
+
+    @staticmethod
+    def _is_named(node: Node, name: str) -> bool:
+        """Return whether a node has a name. Each one has the empty name."""
+        return not name or node.get_fully_qualified_name().lstrip('/') == name.lstrip('/')
 
     def note(self, text: str) -> None:
         """Note something that happened, for the description of a violation."""
