@@ -138,7 +138,7 @@ def _of_kind(
 ) -> st.SearchStrategy[Fault]:
     """Return a strategy of the faults of one kind that have ended at `duration` (s)."""
     last_start = round(duration - STEP, 1)
-    lasting = numbers(STEP, duration)
+    starts, lasting = times(last_start), numbers(STEP, duration)
     if endless:
         lasting = st.one_of(lasting, st.just(math.inf))
 
@@ -146,7 +146,7 @@ def _of_kind(
     def draw_fault(draw: st.DrawFn) -> Fault:
         # A fault that lasts less long is smaller than one that begins earlier.
         values = {name: draw(strategy) for name, strategy in fields.items()}
-        length, start = draw(lasting), draw(times(last_start))
+        length, start = draw(lasting), draw(starts)
         if math.isfinite(length):
             length = round(min(length, duration - start), 1)
         return kind(**values, start=start, duration=length)

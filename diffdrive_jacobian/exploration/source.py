@@ -59,7 +59,8 @@ class Source:
     def _dataclass(self, value: Any) -> str:
         """Return a call with the arguments that differ from their defaults."""
         parts = []
-        for one in fields(value):
+        # Fields of a base class come first, also those that are given by name.
+        for one in sorted(fields(value), key=lambda one: bool(one.kw_only)):
             given = getattr(value, one.name)
             if not one.init or given == one.default:
                 continue

@@ -26,36 +26,28 @@ def numbers(low: float, high: float, *, decimals: int = 1) -> st.SearchStrategy[
     Args:
         low: Smallest number.
         high: Largest number.
-        decimals: Number of decimals, 0 to 6.
+        decimals: Number of decimals, 0 to 3.
 
     Raises:
         ValueError: An argument is invalid, or no number of the grid is between `low` and `high`.
     """
     if not (math.isfinite(low) and math.isfinite(high) and low <= high):
         raise ValueError(f'low and high must be finite and low <= high, got {low!r} and {high!r}')
-    if decimals not in range(7):
-        raise ValueError(f'decimals must be an integer from 0 to 6, got {decimals!r}')
+    if decimals not in range(4):
+        raise ValueError(f'decimals must be an integer from 0 to 3, got {decimals!r}')
     scale = 10**decimals
     first, last = math.ceil(low * scale - 1e-9), math.floor(high * scale + 1e-9)
     if first > last:
         raise ValueError(f'no number with {decimals} decimals is between {low!r} and {high!r}')
-    nearest = min(max(0, first), last)
+    # The part after the point is drawn first: 0 is simpler than a half, and that than the others.
+    parts = sorted(range(scale), key=lambda part: (part != 0, part * 2 != scale, part))
+    below, above = first // scale, last // scale
 
-    @st.composite
-    def draw_number(draw: st.DrawFn) -> float:
-        # The digits after the point, the finest first, then the integer, then the sign.
-        sides = [side for side, room in ((1, last - nearest), (-1, nearest - first)) if room]
-        if not sides:
-            return float(nearest / scale)
-        fraction = 0
-        for place in range(decimals):
-            fraction += draw(st.integers(0, 9)) * 10**place
-        room = max(last - nearest, nearest - first)
-        steps = draw(st.integers(0, room // scale)) * scale + fraction
-        side = draw(st.sampled_from(sides))
-        return float(min(max(nearest + side * steps, first), last) / scale)
+    def number(part: int, whole: int) -> float:
+        return float(min(max(whole * scale + part, first), last) / scale)
 
-    return draw_number()
+    fraction = st.sampled_from(parts) if any(parts) and first < last else st.just(0)
+    return st.builds(number, fraction, st.integers(below, above))
 
 
 def times(last: float) -> st.SearchStrategy[float]:
