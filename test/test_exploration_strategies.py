@@ -91,11 +91,8 @@ def test_a_schedule_shrinks_to_one_round_fault():
         [faults.Loss('cmd_vel', start=4.0, duration=1.0)],
         [faults.Loss('cmd_vel', duration=5.0)],
     )
-    two = find(strategy, lambda s: len({type(one) for one in s}) == 2, settings=SHRINK)
-    assert two == [
-        faults.Loss('cmd_vel', duration=0.1),
-        faults.Delay('cmd_vel', 0.1, duration=0.1),
-    ]
+    any_two = find(strategy, lambda schedule: len(schedule) == 2, settings=SHRINK)
+    assert any_two == [faults.Loss('cmd_vel', duration=0.1)] * 2
 
 
 @FEW

@@ -20,6 +20,9 @@ Kind = type[Fault] | st.SearchStrategy[Fault]
 
 LONGEST = 2.0
 """Longest delay of a message or a response that is tried (s)."""
+CHOICES = 3
+"""Least number of choices of a fault besides start and duration: as many as `Loss` has. Hypothesis prefers
+values of fewer choices, so otherwise a loss would shrink to a fault of another kind."""
 SHORT = (0.1, 0.5, 0.2, 0.05, 0.02, 0.01)
 """Durations of callbacks and of jitter that are tried (s)."""
 RATES = (1.0, 2.0, 5.0, 10.0, 20.0, 0.5)
@@ -128,9 +131,22 @@ def fault_schedules(
         fields, field, names = found[0]
         if field and not names:
             raise ValueError(f'{kind.__name__} needs {field}s')
-        target: Fields = {field: st.sampled_from(list(names))} if field else {}
+        target: Fields = {field: _one_of(names)} if field else {}
         strategies.append(_of_kind(kind, {**target, **fields()}, duration, endless))
-    return st.lists(st.one_of(strategies), max_size=max_faults)
+    fault = st.one_of(strategies)
+
+    @st.composite
+    def draw_schedule(draw: st.DrawFn) -> list[Fault]:
+        # Hypothesis lowers a number that is drawn first, and removes any one of the faults with it. From
+        # a list of `st.lists` it could not remove values of so many choices, except the last ones.
+        return [draw(fault) for _ in range(draw(st.integers(0, max_faults)))]
+
+    return draw_schedule()
+
+
+def _one_of(names: Sequence[str]) -> st.SearchStrategy[str]:
+    """Return a strategy of names that makes a choice also if there is only one."""
+    return st.integers(0, len(names) - 1).map(list(names).__getitem__)
 
 
 def _of_kind(
@@ -146,6 +162,8 @@ def _of_kind(
     def draw_fault(draw: st.DrawFn) -> Fault:
         # A fault that lasts less long is smaller than one that begins earlier.
         values = {name: draw(strategy) for name, strategy in fields.items()}
+        for _ in range(CHOICES - len(fields)):
+            draw(st.integers(0, 0))
         length, start = draw(lasting), draw(starts)
         if math.isfinite(length):
             length = round(min(length, duration - start), 1)
