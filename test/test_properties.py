@@ -665,7 +665,7 @@ def test_a_goal_that_is_canceled_is_not_due(lockstep, robot_at):
 def drive(lockstep, robot_at, *faults, seconds=12.0, goal=None):
     """Drive the robot of this package to a goal three meters away, and finish."""
     robot_at()
-    lockstep.create(lambda: make(GoToGoal, kp=4.0, kv=2.0))
+    lockstep.create(lambda: make(GoToGoal, kp=4.0, kv=1.0))
     lockstep.inject(*faults)
     lockstep.publish('goal_pose', goal or goal_at(3.0, stamp=1))
     lockstep.run_for(seconds)
@@ -673,23 +673,23 @@ def drive(lockstep, robot_at, *faults, seconds=12.0, goal=None):
 
 
 def test_arrives_once_faults_end(lockstep, robot_at):
-    lockstep.require(ArrivesOnceFaultsEnd(4.0))
-    drive(lockstep, robot_at, Loss('odom', start=1.0, duration=3.0), seconds=9.0)
+    lockstep.require(ArrivesOnceFaultsEnd(5.0))
+    drive(lockstep, robot_at, Loss('odom', start=0.5, duration=3.0), seconds=9.0)
 
 
 def test_arrives_too_late(lockstep, robot_at):
     lockstep.require(ArrivesOnceFaultsEnd(0.5))
     with pytest.raises(PropertyViolation) as raised:
-        drive(lockstep, robot_at, Loss('odom', start=1.0, duration=3.0))
-    assert 4.5 < raised.value.seconds < 4.53
+        drive(lockstep, robot_at, Loss('odom', start=0.5, duration=3.0))
+    assert 4.0 < raised.value.seconds < 4.03
     assert 's after the faults have ended the robot is 0.' in raised.value.text
     assert 'm from the goal of /go_to_goal at x 3 m, y 0 m' in raised.value.text
 
 
 def test_a_run_that_ends_too_early_shows_nothing(lockstep, robot_at):
-    lockstep.require(ArrivesOnceFaultsEnd(4.0))
+    lockstep.require(ArrivesOnceFaultsEnd(5.0))
     with pytest.raises(PropertyViolation, match=r'the run ended 0.5 s after the faults have ended'):
-        drive(lockstep, robot_at, Loss('odom', start=1.0, duration=3.0), seconds=4.5)
+        drive(lockstep, robot_at, Loss('odom', start=0.5, duration=3.0), seconds=4.0)
 
 
 @pytest.mark.parametrize(

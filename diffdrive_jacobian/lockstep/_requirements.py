@@ -30,8 +30,6 @@ class Requirements(Disturbed):
         super().__init__(start)
         self.faults: list[Any] = []
         """The faults that were injected."""
-        self.killed: set[Node] = set()
-        """The nodes that were removed without being stopped."""
         self._offered: set[str] = set()
         self._expected: list[tuple[Requirement, tuple[str, ...]]] = []
         self._requiring: Requirement | None = None
@@ -77,7 +75,7 @@ class Requirements(Disturbed):
         Raises:
             PropertyViolation: A property is violated: something that had to happen has not happened.
             LockstepError: A property observes a topic of which no node has had a publisher, or a service
-                that no node has had. Its name may be misspelt.
+                that no node has had, or a fault met nothing. A name may be misspelt.
         """
         self._check_open()
         self.settle()
@@ -95,11 +93,17 @@ class Requirements(Disturbed):
         for required in watches:
             if (text := required.watch.finish()) is not None:
                 raise self._violation(required.requirement, text)
+        self.check_faults()
 
     @property
     def nodes(self) -> list[Node]:
         """The nodes that are there now, with that of the test."""
         return self._executor.nodes
+
+    @property
+    def killed(self) -> set[Node]:
+        """The nodes that were removed without being stopped."""
+        return self._executor.killed
 
     def expect(self, *names: str) -> None:
         """Expect that some node has a publisher of one of these topics, or one of these services.
@@ -135,19 +139,21 @@ class Requirements(Disturbed):
         self._observe(self._executor.deliveries.observers_of(name), observe)
         return name
 
-    def on_response(self, service: str, observe: Callable[[Node | None, Any], None]) -> str:
-        """Call a function with the node and each response of a service, when the service has sent it.
+    def on_response(self, service: str, observe: Callable[[Node, Any], None]) -> str:
+        """Call a function with the node and each response of a service, when the node has given it.
+
+        A fault may delay the response on its way.
 
         Returns:
             The full name of the service.
         """
         name = str(self.node.resolve_service_name(service))
 
-        def observe_call(endpoint: Any, message: Any, *_: Any) -> None:
-            if isinstance(endpoint, Service) and endpoint.service_name == name:
-                observe(self.node_of(endpoint), message)
+        def observe_response(node: Node, endpoint: Service, response: Any) -> None:
+            if endpoint.service_name == name:
+                observe(node, response)
 
-        self._observe(self._executor.call_observers, observe_call)
+        self._observe(self._executor.response_observers, observe_response)
         return name
 
     def _observe(self, observers: list[Any], observe: Any) -> None:
@@ -155,11 +161,10 @@ class Requirements(Disturbed):
         if self._requiring is not None:
             self._observing.append((observers, observe))
 
-    def node_of(self, entity: Publisher | Service) -> Node | None:
-        """Return the node that has a publisher or a service; None: it was removed."""
+    def node_of(self, publisher: Publisher) -> Node | None:
+        """Return the node that has a publisher; None: it was removed."""
         for node in self._executor.nodes:
-            entities = node.publishers if isinstance(entity, Publisher) else node.services
-            if any(one is entity for one in entities):
+            if any(one is publisher for one in node.publishers):
                 return node
         return None
 

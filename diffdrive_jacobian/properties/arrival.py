@@ -82,8 +82,8 @@ class _ArrivesWatch(Watch):
         self._goals[node] = goal
         self.note(f'{node.get_fully_qualified_name()} received a goal at {goal.pose}')
 
-    def _on_cancel(self, node: Node | None, _: Any) -> None:
-        if node is not None and self._goals.pop(node, None) is not None:
+    def _on_cancel(self, node: Node, _: Any) -> None:
+        if self._goals.pop(node, None) is not None:
             self.note('canceled')
 
     def _on_status(self, publisher: Publisher, message: Any) -> None:

@@ -58,10 +58,9 @@ class _CancelWatch(Watch):
         self._canceled.pop(node, None)
         self.note(f'{node.get_fully_qualified_name()} received a goal')
 
-    def _on_cancel(self, node: Node | None, _: Any) -> None:
-        if node is not None:
-            self._canceled[node] = self.seconds
-            self.note(f'{node.get_fully_qualified_name()} responded to {self._cancel}')
+    def _on_cancel(self, node: Node, _: Any) -> None:
+        self._canceled[node] = self.seconds
+        self.note(f'{node.get_fully_qualified_name()} responded to {self._cancel}')
 
     def _on_command(self, publisher: Publisher, message: Any) -> None:
         twist = self._read(publisher.msg_type, message)
