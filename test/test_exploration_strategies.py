@@ -234,7 +234,7 @@ def test_source_of_nan_and_of_defaults():
     source = Source()
     assert source.expression(faults.Loss('odom', start=2.0)) == "Loss('odom', start=2.0)"
     assert source.imports == {('diffdrive_jacobian.faults', 'Loss')}
-    with pytest.raises(ExplorationError, match='a case must consist of .* got object'):
+    with pytest.raises(ExplorationError, match=r'a case must consist of .* got object'):
         Source().expression([object()])
 
 
