@@ -94,7 +94,7 @@ def shrink(
     raise ExplorationError(f'no trial of block {block} failed again')
 
 
-class StopShrinking(BaseException):  # noqa: N818
+class StopShrinking(BaseException):
     """Ends shrinking. Not an Exception, which Hypothesis would take for a failure."""
 
 

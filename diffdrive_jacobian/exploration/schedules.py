@@ -21,8 +21,10 @@ Kind = type[Fault] | st.SearchStrategy[Fault]
 LONGEST = 2.0
 """Longest delay of a message or a response that is tried (s)."""
 CHOICES = 3
-"""Least number of choices of a fault besides start and duration: as many as `Loss` has. Hypothesis prefers
-values of fewer choices, so otherwise a loss would shrink to a fault of another kind."""
+"""Least number of choices of a fault besides start and duration: as many as `Loss` has.
+
+Hypothesis prefers values of fewer choices, so otherwise a loss would shrink to a fault of another kind.
+"""
 SHORT = (0.1, 0.5, 0.2, 0.05, 0.02, 0.01)
 """Durations of callbacks and of jitter that are tried (s)."""
 RATES = (1.0, 2.0, 5.0, 10.0, 20.0, 0.5)
