@@ -45,8 +45,8 @@ PROPERTIES = (
 def drive(world, case):
     """Send goals to a controller, cancel them, and shut it down.
 
-    The case has the name of the `controller`, the `start` of the robot, `goals` as a list of a time and a
-    position each, and the times of `cancel` and `shutdown`, or None.
+    The case has the name of the `controller`, the `start` of the robot, `goals` as a list of a time and
+    a position each, and the times of `cancel` and `shutdown`, or None.
     """
     x, y, theta = case['start']
     values = {'x': x, 'y': y, 'theta': theta, 'publish_rate': 20.0}

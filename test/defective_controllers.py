@@ -1,7 +1,7 @@
 """Twelve controllers with one defect each, as students write them, and the one without a defect.
 
-`Controller` drives to the goals of `goal_pose` by the odometry. It publishes `cmd_vel` and `goal_status`,
-and has the service `cancel_goal`. Each of the others overrides what its author got wrong.
+`Controller` drives to the goals of `goal_pose` by the odometry. It publishes `cmd_vel` and
+`goal_status`, and has the service `cancel_goal`. Each of the others overrides what its author got wrong.
 """
 
 from __future__ import annotations

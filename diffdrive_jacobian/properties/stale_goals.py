@@ -17,11 +17,12 @@ from diffdrive_jacobian.properties.base import Property, Watch
 class NoStaleGoals(Property):
     """A controller accepts no goal that is older than one that it has accepted, and none twice.
 
-    The stamps of the goals that it reports as ACCEPTED must increase. Goals without a stamp do not count.
-    When the clock of the nodes jumps back, stamps may decrease. Each publisher is checked on its own.
+    The stamps of the goals that it reports as ACCEPTED must increase. Goals without a stamp do not
+    count. When the clock of the nodes jumps back, stamps may decrease. Each publisher is checked on its
+    own.
 
-    A node that receives late or repeated messages (`Reorder`, `Duplicate`) would otherwise drive to where
-    nobody wants it any more.
+    Messages may arrive late or repeatedly (`Reorder`, `Duplicate`). A controller that accepts them drives
+    to where nobody wants it any more.
 
     Attributes:
         topic: Topic of type action_msgs/GoalStatus (default: 'goal_status').
