@@ -77,6 +77,11 @@ class Injections:
         deliveries.new_reader = create
         deliveries.replace(self.executor.nodes)
 
+    def meet(self, node: Node) -> None:
+        """Apply the faults to a node that was added."""
+        for injection in self.all:
+            injection.meet(node)
+
     def ineffective(self) -> list[str]:
         """Return descriptions of the faults that met nothing that they could affect."""
         return [text for injection in self.all if (text := injection.unmatched())]
@@ -98,6 +103,8 @@ class Injection:
         """Whether the fault has begun and has not ended."""
         self._begun: Counter[str] = Counter()
         self._filter: Callable[[GatedReader], None] | None = None
+        self.meet: Callable[[Node], None] = lambda _: None
+        """Called with each node that is added, or has created or destroyed an entity."""
         self._missing: str | None = None
         self._on_start: list[Callable[[], None]] = []
         self._on_end: list[Callable[[], None]] = []
@@ -139,6 +146,38 @@ class Injection:
     def unmatched(self) -> str | None:
         """Return why the fault affects nothing; None: it has met what it could affect."""
         return f'{self._fault!r}: {self._missing}' if self._missing else None
+
+    # --- One node, whenever it is there
+
+    def affect_node(self, name: str, begin: Callable[[Node], None], end: Callable[[Node], None]) -> None:
+        """Call functions with the node that has a name.
+
+        Args:
+            name: Name of the node.
+            begin: Called with the node when the fault begins, and with each one that is added later.
+            end: Called with it when the fault ends, if it is still there.
+        """
+        owner = full_name(name)
+        self._missing = f'no node {owner} was seen'
+        affected: Node | None = None
+
+        def meet(node: Node) -> None:
+            nonlocal affected
+            if self.active and node is not affected and node.get_fully_qualified_name() == owner:
+                affected, self._missing = node, None
+                begin(node)
+
+        def meet_all() -> None:
+            for node in self._injections.executor.nodes:
+                meet(node)
+
+        def leave() -> None:
+            if affected is not None and affected in self._injections.executor.nodes:
+                end(affected)
+
+        self.meet = meet
+        self.at_start(meet_all)
+        self.at_end(leave)
 
     # --- Topics
 

@@ -184,6 +184,8 @@ class Lockstep(Disturbed):
             name = node.get_fully_qualified_name()
             raise LockstepError(f'node {name} publishes /clock, which only lockstep may do')
         self._refuse_sleep(node)
+        if self._injections is not None:
+            self._injections.meet(node)
         for callback in self._on_new:
             callback()
 
