@@ -172,6 +172,18 @@ def test_a_command_replaces_the_one_that_is_still_approached():
     assert turned == pytest.approx(angle, rel=1e-9)
 
 
+def test_a_motor_that_dies_while_it_lags_runs_out():
+    tau = 0.1
+    moving = lagging(tau).commanded((0.2, 0.0), 0).at(5 * SECOND)
+    dead = replace(moving.model, actuators=Actuators(lag=tau, max_right_speed=0.0))
+    robot = moving.remodelled(dead, 5 * SECOND)
+    turned = robot.at(5 * SECOND + 5 * STEP).wheel_angles[0] - robot.wheel_angles[0]
+    assert turned == pytest.approx(0.2 / R * tau * (1.0 - math.exp(-0.1 / tau)), rel=1e-4)
+    end = robot.at(15 * SECOND)
+    assert end.next_change is None
+    assert end.wheel_speeds == pytest.approx((0.0, 0.2 / R))
+
+
 def test_without_effect_actuators_change_no_bit():
     plain, same = at_rest(), at_rest(actuators=Actuators())
     for stamp, command in ((0, (0.2, 0.3)), (SECOND, (0.0, -1.0)), (2 * SECOND, (0.0, 0.0))):
@@ -252,6 +264,9 @@ def test_a_slow_wheel_is_seen_as_bursts_of_whole_increments():
     # 1 rad in 1 s: one increment of 0.628 rad, seen in one period of 0.02 s.
     assert sorted(set(speeds)) == pytest.approx([0.0, math.tau / 10 * 50])
     assert speeds.count(0.0) == 49
+    # Four increments in the next 3 s.
+    assert encoders.read(robot.at(4 * SECOND)).speeds == pytest.approx((math.tau / 10 * 5 / 3.0,) * 2)
+    assert encoders.read(robot.at(4 * SECOND).restarted(SECOND)).speeds == (0.0, 0.0)
 
 
 # --- Pushes, as values
@@ -383,6 +398,7 @@ def test_coarse_encoders_in_a_world(lockstep, robot_at):
     exact = integrate((0.0, 0.0, 0.0), (0.2, 1.0), 1.4)
     close(robot.truth, exact, 1e-9)
     close(pose_of(truths[-1]), exact, 1e-9)
+    np.testing.assert_allclose(twists(one.twist for one in truths), [(0.2, 1.0)] * len(truths))
     # During the fault the angles are whole increments, and the twist is what was counted.
     during = slice(*np.searchsorted(instants(topics.states), [13 * SECOND // 10, 21 * SECOND // 10]))
     counted = topics.states[during]
@@ -396,6 +412,21 @@ def test_coarse_encoders_in_a_world(lockstep, robot_at):
     assert np.hypot(*jumps.T).max() < R * increment + 0.2 / 50.0
     assert len(topics.starts) == 1
     assert math.dist(pose_of(topics.odom[-1])[:2], exact[:2]) > 1e-4
+
+
+def test_coarse_odometry_can_be_reset(lockstep, robot_at):
+    robot = robot_at(x=0.5)
+    topics = Topics(lockstep)
+    lockstep.inject(EncoderSteps(16))
+    drive(lockstep)
+    lockstep.run_for(0.3)
+    lockstep.call(Trigger, 'reset_odometry')
+    lockstep.run_for(0.002)
+    assert pose_of(topics.odom[-1])[0] > 0.52
+    drive(lockstep, 0.0)
+    lockstep.run_for(0.1)
+    close(pose_of(topics.odom[-1]), (0.5, 0.0, 0.0))
+    close(robot.truth, (0.5604, 0.0, 0.0), 1e-9)
 
 
 @pytest.mark.parametrize('noticed', [False, True])
@@ -458,8 +489,8 @@ def test_faults_add_up_and_parameters_still_change(lockstep, robot_at):
     robot = robot_at(cmd_vel_timeout=0.0)
     topics = Topics(lockstep)
     lockstep.inject(
-        SaturatedWheel('left', 4.0),
         SaturatedWheel('left', 2.0, start=0.5, duration=0.5),
+        SaturatedWheel('left', 4.0, start=0.1),
         DeadWheel('right', start=0.7),
     )
     drive(lockstep)
@@ -472,6 +503,18 @@ def test_faults_add_up_and_parameters_still_change(lockstep, robot_at):
     assert np.array(seen) == pytest.approx(
         np.array([(full, min(4.0, full)), (full, 2.0), (0.0, 2.0), (0.0, min(4.0, full))]), abs=1e-9
     )
+
+
+def test_lags_count_once_and_multipliers_multiply(lockstep, robot_at):
+    robot = robot_at(true_wheel_separation_multiplier=2.0)
+    topics = Topics(lockstep)
+    half = WrongGeometry(wheel_separation_multiplier=0.5)
+    lockstep.inject(ActuatorLag(0.3), ActuatorLag(0.1), half, half)
+    drive(lockstep, 0.0, 1.0)
+    lockstep.run_for(0.2)
+    turned = pose_of(topics.odom[-1])[2]
+    assert turned == pytest.approx(reached(0.3, 0.2))
+    assert robot.truth[2] == pytest.approx(turned / (2.0 * 0.5 * 0.5))
 
 
 def test_a_fault_applies_to_a_robot_that_is_added_later_and_again(lockstep):
