@@ -17,6 +17,7 @@ from ros_messages import instants, pose_of, twist, twist_stamped, twists
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.control import VelocityLimits
+from diffdrive_jacobian.faults.nodes import Kill
 from diffdrive_jacobian.faults.robot import (
     ActuatorLag,
     DeadWheel,
@@ -489,8 +490,8 @@ def test_faults_add_up_and_parameters_still_change(lockstep, robot_at):
     robot = robot_at(cmd_vel_timeout=0.0)
     topics = Topics(lockstep)
     lockstep.inject(
-        SaturatedWheel('left', 2.0, start=0.5, duration=0.5),
-        SaturatedWheel('left', 4.0, start=0.1),
+        SaturatedWheel('left', 2.0, start=0.1, duration=0.9),
+        SaturatedWheel('left', 2.5, start=0.5),
         DeadWheel('right', start=0.7),
     )
     drive(lockstep)
@@ -501,12 +502,12 @@ def test_faults_add_up_and_parameters_still_change(lockstep, robot_at):
         seen.append(body_to_wheel(*measured(topics), R, L))
     full = 0.1 / R
     assert np.array(seen) == pytest.approx(
-        np.array([(full, min(4.0, full)), (full, 2.0), (0.0, 2.0), (0.0, min(4.0, full))]), abs=1e-9
+        np.array([(full, 2.0), (full, 2.0), (0.0, 2.0), (0.0, 2.5)]), abs=1e-9
     )
 
 
 def test_lags_count_once_and_multipliers_multiply(lockstep, robot_at):
-    robot = robot_at(true_wheel_separation_multiplier=2.0)
+    robot = robot_at(true_wheel_separation_multiplier=3.0)
     topics = Topics(lockstep)
     half = WrongGeometry(wheel_separation_multiplier=0.5)
     lockstep.inject(ActuatorLag(0.3), ActuatorLag(0.1), half, half)
@@ -514,7 +515,7 @@ def test_lags_count_once_and_multipliers_multiply(lockstep, robot_at):
     lockstep.run_for(0.2)
     turned = pose_of(topics.odom[-1])[2]
     assert turned == pytest.approx(reached(0.3, 0.2))
-    assert robot.truth[2] == pytest.approx(turned / (2.0 * 0.5 * 0.5))
+    assert robot.truth[2] == pytest.approx(turned / (3.0 * 0.5 * 0.5))
 
 
 def test_a_fault_applies_to_a_robot_that_is_added_later_and_again(lockstep):
@@ -528,6 +529,25 @@ def test_a_fault_applies_to_a_robot_that_is_added_later_and_again(lockstep):
         assert measured(topics) == pytest.approx((0.1, 0.2 / L))
         lockstep.remove(robot)
     lockstep.check_faults()
+
+
+def test_a_robot_that_is_killed_comes_back_with_its_fault(lockstep):
+    lockstep.create(lambda: make(VirtualRobot, cmd_vel_timeout=0.0))
+    topics = Topics(lockstep)
+    lockstep.inject(
+        DeadWheel('left', duration=1.0), Kill('virtual_robot', start=0.2, duration=0.2), Push(0.3)
+    )
+    lockstep.run_for(0.5)
+    drive(lockstep)
+    lockstep.run_for(0.1)
+    assert measured(topics) == pytest.approx((0.1, 0.2 / L))
+    lockstep.run_for(0.5)
+    assert measured(topics) == pytest.approx((0.2, 0.0))
+    # It has lost its pose.
+    robot = lockstep.find('virtual_robot')
+    turned = 0.2 / L * 0.5
+    centre = compose((0.0, L / 2.0, 0.0), (0.0, 0.0, turned))
+    close(robot.truth, compose(centre, (0.02, -L / 2.0, 0.0)), 1e-9)
 
 
 def test_a_fault_without_a_robot_is_reported_and_one_of_another_node_refused(lockstep):

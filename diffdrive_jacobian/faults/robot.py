@@ -77,7 +77,7 @@ class RobotFault(Fault):
                 if affected is node:
                     undo()
 
-        injection.affect_node(self.robot, begin, end)
+        injection.change_node(self.robot, begin, end)
 
     def _wheel(self, wheel: str) -> None:
         """Check the name of a wheel.

@@ -23,17 +23,16 @@ from diffdrive_jacobian.ros.rclpy_internals import message_taker, receives_info
 class Deliveries:
     """Subscriptions that may have messages, in the order in which these were published."""
 
-    def __init__(self, create_task: Callable[..., Any]) -> None:
+    def __init__(self, create_task: Callable[[Node], Callable[..., Any]]) -> None:
         """Start without subscriptions.
 
         Args:
-            create_task: Called with each coroutine that a callback returns.
+            create_task: Returns the function for the coroutines that callbacks of a node return.
         """
         self.pending: deque[Reader | None] = deque()
         """One entry for each message and subscription. None: a request or a response of a service."""
-        self.create_task = create_task
-        self.new_reader: Callable[[Subscription, Node], Reader] = lambda subscription, _: Reader(
-            subscription, create_task
+        self.new_reader: Callable[[Subscription, Node], Reader] = lambda subscription, node: Reader(
+            subscription, create_task(node)
         )
         """Creates the reader of a subscription of a node."""
         self._readers: dict[Subscription, Reader] = {}
@@ -84,6 +83,10 @@ class Deliveries:
         self._polled = [replaced[reader] for reader in self._polled if reader in replaced]
         for readers in self._by_topic.values():
             readers[:] = [replaced[reader] for reader in readers]
+
+    def readers(self) -> list[Reader]:
+        """Return all readers."""
+        return list(self._readers.values())
 
     def drop_destroyed(self, nodes: Iterable[Node]) -> None:
         """Deliver nothing more to subscriptions that the nodes do not have any more."""
