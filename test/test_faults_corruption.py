@@ -11,14 +11,17 @@ import sys
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, Twist
+from lockstep_nodes import QUICK, Topics, add_team, arrives
 from nav_msgs.msg import Odometry, Path
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, ParameterValue
+from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
-from ros_messages import odometry
+from ros_messages import goal, odometry
 from sensor_msgs.msg import BatteryState, Image, JointState, LaserScan
 from std_msgs.msg import Bool, Byte, Empty, Int8, Int64, String, UInt8
 
 from diffdrive_jacobian.faults.corruption import CHANGES, Corrupt
+from diffdrive_jacobian.messages.conversion import from_time
 
 SECOND = 1_000_000_000
 
@@ -313,3 +316,52 @@ def test_a_corruption_is_a_value_and_its_repr_makes_it_again(change):
     fault = Corrupt('odom', 'header.frame_id', change, amount, probability=0.5, start=2.0, node='robot')
     assert eval(repr(fault)) == fault == pickle.loads(pickle.dumps(fault)) == copy.deepcopy(fault)
     assert fault != Corrupt('odom', 'header.frame_id', change, amount)
+
+
+# --- In a world
+
+
+def test_a_receiver_gets_the_wrong_value_and_the_others_the_right_one(lockstep, robot_at):
+    robot_at()
+    fine = lockstep.listen(Odometry, 'odom')
+    wrong = []
+    node = lockstep.add(Node('receiver'))
+    node.create_subscription(Odometry, 'odom', wrong.append, 10)
+    lockstep.inject(
+        Corrupt('odom', 'pose.pose.position.x', 'set', 7.0, start=0.1, duration=0.1, node='receiver'),
+        Corrupt('odom', 'header.frame_id', 'set', 'map', start=0.15),
+    )
+    lockstep.run_for(0.3)
+    assert {one.pose.pose.position.x for one in fine} == {0.0}
+    received = {(one.pose.pose.position.x, one.header.frame_id) for one in wrong}
+    assert received == {(0.0, 'odom'), (7.0, 'odom'), (7.0, 'map'), (0.0, 'map')}
+    times = [from_time(one.header.stamp) - SECOND for one in wrong if one.pose.pose.position.x]
+    assert (min(times), max(times)) == (100_000_000, 180_000_000)
+    events = [event.what for event in lockstep.fault_events]
+    assert any('changed' in event and '/odom to /receiver' in event for event in events)
+    assert "Corrupt('odom', 'header.frame_id', 'set', amount='map', start=0.15)" in lockstep.report()
+
+
+def test_our_controller_drops_odometry_that_is_not_finite_and_goes_on_afterwards(lockstep):
+    x = 'pose.pose.position.x'
+    lockstep.inject(
+        *(Corrupt('odom', x, change, start=0.2, duration=0.2) for change in ('nan', 'negate'))
+    )
+    topics = Topics(lockstep)
+    add_team(lockstep, **QUICK)
+    lockstep.publish('goal_pose', goal(0.3, 0.1))
+    lockstep.run_for(0.2)
+    before = len(topics.commands)
+    lockstep.run_for(0.18)
+    assert len(topics.commands) == before
+    arrives(lockstep, topics)
+    numbers = [(one.linear.x, one.angular.z) for one in topics.commands]
+    assert np.isfinite(numbers).all()
+
+
+def test_a_field_that_does_not_exist_is_reported_when_the_type_is_known(lockstep, robot_at):
+    lockstep.inject(Corrupt('cmd_vel', 'twist.linear.x', 'nan'))
+    with pytest.raises(
+        ValueError, match="geometry_msgs/Twist has no 'twist'; its fields: linear, angular"
+    ):
+        robot_at()

@@ -284,6 +284,9 @@ def test_a_push_is_a_motion_in_the_body_frame(noticed):
     close(after.pose, expected)
     assert (after.twist, after.wheel_angles) == (before.twist, before.wheel_angles)
     assert after.covariance_tuple == before.covariance_tuple
+    # Who reads the start_pose of a push can compute all that follows from it.
+    anew = before.placed(after.pose, after.covariance, SECOND)
+    assert (after.moments == anew.moments) == noticed
     # It drives on from there.
     close(
         after.at(2 * SECOND).true_pose,

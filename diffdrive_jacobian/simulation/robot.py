@@ -363,8 +363,8 @@ class Robot:
         Args:
             displacement: `[dx, dy, dtheta]` in the body frame, shape (3,) (m, m, rad).
             stamp: The time (ns).
-            noticed: Whether the odometry follows, as if corrected by a localisation. Otherwise only the
-                true pose changes, and the model must have a `drift`.
+            noticed: Whether the odometry follows, as if corrected by a localisation, with the covariance
+                that it had. Otherwise only the true pose changes, and the model must have a `drift`.
 
         Raises:
             ValueError: The displacement has another shape or is not finite, the pose overflows, the
@@ -373,14 +373,14 @@ class Robot:
         here = self.at(stamp)
         if here.model.drift is None and not noticed:
             raise ValueError('model must have a drift: without one the odometry is the true pose')
+        x, y, theta = compose(here.true_pose_tuple, displacement).tolist()
+        if noticed:
+            moved = compose(here.pose_tuple, displacement)
+            here = here.placed(moved, here.covariance, here.stamp, odometry_only=True)
         pose, angles, uncertainty, truth = here._present
-        moved: list[tuple[float, float, float]] = []
-        for start in (pose, here.true_pose_tuple):
-            x, y, theta = compose(start, displacement).tolist()
-            moved.append((x, y, theta))
         if truth is not None:
-            truth = truth.moved(moved[1])
-        return here._with((moved[0] if noticed else pose, angles, uncertainty, truth))
+            truth = truth.moved((x, y, theta))
+        return here._with((pose, angles, uncertainty, truth))
 
     def remodelled(self, model: RobotModel, stamp: int, *, wheels_commanded: bool = False) -> Robot:
         """Change the model. Its limits and timeout apply to the current command.
