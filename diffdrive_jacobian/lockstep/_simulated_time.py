@@ -144,7 +144,8 @@ class SimulatedTime:
         # The minimum of integers is exact, also beside infinity.
         passed = int(min(until_next, end - agenda.now))
         agenda.now += passed
-        self._now += passed
+        if not self._executor.clock_pauses:
+            self._now += passed
         self._publish_clock()
 
     def _publish_clock(self) -> None:
