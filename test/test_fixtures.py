@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
 
 import pytest
+from geometry_msgs.msg import Twist
 from inner_sessions import OPTIONS, SETTING, draw_quickly, run_inner
+from nav_msgs.msg import Odometry
 
 from diffdrive_jacobian.reading import read_run
 from diffdrive_jacobian.reading.verification import verify
@@ -182,6 +185,26 @@ def test_each_test_has_a_world_and_robots_of_its_own(run):
             "*TypeError: virtual_robot has no parameter 'colour'; it has *",
         ]
     )
+
+
+def test_a_robot_has_its_pose_by_odometry_and_its_true_one(lockstep, robot_at):
+    robot = robot_at(1.0, 2.0, 0.5, simulate_slip=True, slip_seed=3)
+    assert robot.pose.tolist() == robot.truth.tolist() == [1.0, 2.0, 0.5]
+    odom = lockstep.listen(Odometry, 'odom')
+    command = Twist()
+    command.linear.x = 1.0
+    lockstep.publish('cmd_vel', command)
+    lockstep.run_for(0.4)
+    position = odom[-1].pose.pose.position
+    assert robot.pose[:2].tolist() == [position.x, position.y]
+    assert robot.pose == pytest.approx([1.0 + 0.4 * math.cos(0.5), 2.0 + 0.4 * math.sin(0.5), 0.5])
+    assert math.dist(robot.pose[:2], robot.truth[:2]) > 1e-4
+    # Between two messages, too.
+    lockstep.run_for(0.01)
+    assert math.dist(robot.pose[:2], (1.0, 2.0)) == pytest.approx(0.41)
+    # They are copies.
+    robot.pose[:] = robot.truth[:] = 0.0
+    assert math.dist(robot.pose[:2], (1.0, 2.0)) == pytest.approx(0.41)
 
 
 @pytest.mark.parametrize('capture', ['fd', 'sys', 'no'])
