@@ -38,7 +38,7 @@ class Keeper:
         served.gate, served.gates = gate, self.gates
         self._by_node[served.node] = gate
         if gate.closed:
-            _check_holdable(served.node)
+            check_holdable(served.node)
 
     def dismiss(self, node: Node) -> None:
         """Forget a node that was removed, and what waits for it."""
@@ -80,7 +80,7 @@ class Keeper:
         if node is None:
             return
         if gate.closed:
-            _check_holdable(node)
+            check_holdable(node)
             return
         while gate.waiting and not gate.closed:
             self._executor.handle_all()
@@ -98,7 +98,7 @@ class Keeper:
             gate.serve_next()
 
 
-def _check_holdable(node: Node) -> None:
+def check_holdable(node: Node) -> None:
     """Raise LockstepError if a node has callbacks that cannot be held back."""
     if any(not isinstance(waitable, EventHandler) for waitable in node.waitables):
         name = node.get_fully_qualified_name()

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from rclpy.exceptions import ParameterNotDeclaredException
+from rclpy.exceptions import ParameterUninitializedException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -15,7 +16,7 @@ from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._fault_log import in_seconds
 from diffdrive_jacobian.lockstep._gates import Gate, ResponseDelay
 from diffdrive_jacobian.lockstep._injection_base import InjectionBase, full_name
-from diffdrive_jacobian.ros.rclpy_internals import declared_parameters
+from diffdrive_jacobian.ros.rclpy_internals import PARAMETERS_OF_RCLPY, declared_parameters
 
 
 class NodeInjection(InjectionBase):
@@ -118,15 +119,17 @@ class NodeInjection(InjectionBase):
 
     def _set(self, node: Node, name: str, value: Any) -> Any:
         """Set a parameter. Return its value before; None: the node refused it, or it had none."""
-        try:
-            before = node.get_parameter(name).value
-            result = node.set_parameters_atomically([Parameter(name, value=value)])
-        except ParameterNotDeclaredException as error:
-            known = ', '.join(sorted(declared_parameters(node)))
+        if not node.has_parameter(name):
+            declared = sorted(declared_parameters(node))
+            known = ', '.join(one for one in declared if not one.startswith(PARAMETERS_OF_RCLPY))
             raise LockstepError(
                 f'{self.fault!r}: {node.get_fully_qualified_name()} has no parameter {name!r}; '
-                f'it has {known}'
-            ) from error
+                f'it has {known or "none"}'
+            )
+        before = None
+        with suppress(ParameterUninitializedException):
+            before = node.get_parameter(name).value
+        result = node.set_parameters_atomically([Parameter(name, value=value)])
         if not result.successful:
             self.note(f'{name} = {value!r} is refused: {result.reason}')
             return None
