@@ -297,6 +297,50 @@ def test_a_failure_reports_the_last_messages_once(run, monkeypatch):
     result.stdout.fnmatch_lines(["*raise KeyError('no such wheel')", "E * KeyError: 'no such wheel'"])
 
 
+REQUIRED = """
+    from dataclasses import dataclass
+    from diffdrive_jacobian.testing import properties
+
+    @dataclass(frozen=True, repr=False)
+    class Ends(properties.Property):
+        def watch(self, world):
+            watch = properties.Watch(world)
+            watch.finish = lambda: 'it never ends'
+            return watch
+
+    def test_ends(lockstep, robot_at, recorded_run):
+        robot_at()
+        lockstep.require(Ends())
+        lockstep.run_for(0.1)
+
+    def test_is_finished_by_hand(lockstep):
+        lockstep.require(Ends())
+        with pytest.raises(properties.PropertyViolation, match='it never ends'):
+            lockstep.finish()
+
+    def test_is_closed_by_hand(lockstep):
+        lockstep.require(Ends())
+        lockstep.close()
+
+    def test_fails(lockstep):
+        lockstep.require(Ends())
+        assert 1 == 2
+"""
+
+
+def test_required_properties_are_checked_when_a_test_has_passed(run, monkeypatch):
+    draw_quickly(monkeypatch)
+    result = run(REQUIRED)
+    result.assert_outcomes(failed=2, passed=2)
+    text = result.stdout.str()
+    assert text.count('Ends() is violated at 0.1 s: it never ends\nlast messages, at 1.1 s:\n') == 1
+    # Once, as part of the violation; and of the other test.
+    assert text.count('- lockstep -') == 1
+    assert text.count('- recorded run -') == 1
+    assert 'During handling' not in text
+    assert 'E       assert 1 == 2' in text
+
+
 def test_no_hook_raises(run):
     result = run("""
     import pytest
