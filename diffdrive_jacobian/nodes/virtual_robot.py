@@ -267,7 +267,12 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     @property
     def pose(self) -> NDArray[np.float64]:
-        """`[x, y, theta]` by the odometry now, shape (3,) (m, m, rad)."""
+        """`[x, y, theta]` by the odometry now, shape (3,) (m, m, rad).
+
+        With encoders of few steps: at their last reading, as it was published.
+        """
+        if self._encoders is not None:
+            return np.array(self._encoders.pose)
         robot = self._robot_now()
         return self._initial_pose() if robot is None else robot.pose.copy()
 
