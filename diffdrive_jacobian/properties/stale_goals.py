@@ -21,8 +21,8 @@ class NoStaleGoals(Property):
     count. When the clock of the nodes jumps back, stamps may decrease. Each publisher is checked on its
     own.
 
-    Messages may arrive late or repeatedly (`Reorder`, `Duplicate`). A controller that accepts them drives
-    to where nobody wants it any more.
+    Messages may arrive late or repeatedly (`Reorder`, `Duplicate`). A controller that accepts them
+    drives to where nobody wants it any more.
 
     Attributes:
         topic: Topic of type action_msgs/GoalStatus (default: 'goal_status').
