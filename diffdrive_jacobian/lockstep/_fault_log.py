@@ -88,7 +88,10 @@ class FaultLog:
 
 
 class Hits:
-    """The messages of one subscription that a fault affected, as events of consecutive ones."""
+    """The messages of one subscription that a fault affected, as events of consecutive ones.
+
+    They are numbered from 1, from the injection of the fault.
+    """
 
     def __init__(self, name: str, note: Callable[[str], None]) -> None:
         """Start without messages.
@@ -99,23 +102,31 @@ class Hits:
         """
         self._name = name
         self._note = note
-        self._seen = self._hit = 0
+        self._number = self._during = self._hit = 0
+        # Of the messages that are not noted yet: what happened, first and last number, and time.
         self._kind = ''
-        self._first = self._since = self._last = 0
-        self._number = 0
+        self._first = self._last = self._since = self._until = 0
         self._delays = (0, 0)
 
-    def add(self, now: int, data: bytes, out: list[tuple[int, bytes]]) -> None:
-        """Add a message and what came out instead, at a world time (ns)."""
-        self._seen += 1
+    def add(self, now: int, data: bytes, out: list[tuple[int, bytes]], *, active: bool) -> None:
+        """Add a message.
+
+        Args:
+            now: World time (ns).
+            data: The message.
+            out: What came out instead.
+            active: Whether the fault is active.
+        """
+        self._number += 1
+        self._during += active
         kind = _kind(data, out)
         if kind != self._kind:
             self.flush()
-            self._kind, self._first, self._since = kind, self._seen, now
+            self._kind, self._first, self._since = kind, self._number, now
             self._delays = (0, 0)
         if kind:
             self._hit += 1
-            self._number, self._last = self._seen, now
+            self._last, self._until = self._number, now
             delays = [delay for delay, _ in out if delay > 0]
             least, most = self._delays
             if delays:
@@ -132,9 +143,9 @@ class Hits:
         if not self._kind:
             return ''
         number, when = f'message {self._first}', f'at {in_seconds(self._since)}'
-        if self._number > self._first:
-            number = f'messages {self._first} to {self._number}'
-            when = f'from {in_seconds(self._since)} to {in_seconds(self._last)}'
+        if self._last > self._first:
+            number = f'messages {self._first} to {self._last}'
+            when = f'from {in_seconds(self._since)} to {in_seconds(self._until)}'
         by = ''
         if self._delays[1] > 0:
             least, most = (in_seconds(delay) for delay in self._delays)
@@ -142,8 +153,8 @@ class Hits:
         return f'{number} of {self._name} {self._kind}{by}, {when}'
 
     def total(self) -> str:
-        """Return how many messages were affected."""
-        return f'{self._hit} of {self._seen} messages of {self._name}'
+        """Return how many of the messages during the fault were affected."""
+        return f'{self._hit} of {self._during} messages of {self._name}'
 
 
 def _kind(data: bytes, out: list[tuple[int, bytes]]) -> str:

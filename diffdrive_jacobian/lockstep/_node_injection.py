@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from rclpy.exceptions import ParameterNotDeclaredException
+from rclpy.exceptions import ParameterUninitializedException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -15,11 +16,19 @@ from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._fault_log import in_seconds
 from diffdrive_jacobian.lockstep._gates import Gate, ResponseDelay
 from diffdrive_jacobian.lockstep._injection_base import InjectionBase, full_name
-from diffdrive_jacobian.ros.rclpy_internals import declared_parameters
+from diffdrive_jacobian.ros.rclpy_internals import PARAMETERS_OF_RCLPY, declared_parameters
 
 
 class NodeInjection(InjectionBase):
-    """Holds at gates, deaths, changes of parameters and of the clock."""
+    """Holds at gates, deaths, changes of nodes, of parameters and of the clock."""
+
+    _meet: Callable[[], None] | None = None
+
+    def look(self) -> None:
+        """Check whether there is anything that the fault affects, and change new nodes."""
+        super().look()
+        if self._meet is not None:
+            self._meet()
 
     def _gate(self, node: str) -> Gate:
         """Return the gate of a node, which is expected to be there some time."""
@@ -88,6 +97,34 @@ class NodeInjection(InjectionBase):
         self.at_start(die)
         self.at_end(rise)
 
+    # --- Changes of a node
+
+    def change_node(self, node: str, begin: Callable[[Node], None], end: Callable[[Node], None]) -> None:
+        """Change the node of a name while the fault lasts, also one that is added later.
+
+        Args:
+            node: Name of the node.
+            begin: Called with the node when the fault begins, or when the node is added.
+            end: Called with it when the fault ends, if it is still there.
+        """
+        gate = self._gate(node)
+        changed: Node | None = None
+
+        def meet() -> None:
+            nonlocal changed
+            found = self._world.find(gate.name) if self.active else None
+            if found is not None and found is not changed:
+                changed = found
+                begin(found)
+
+        def leave() -> None:
+            if changed is not None and changed is self._world.find(gate.name):
+                end(changed)
+
+        self._meet = meet
+        self.at_start(meet)
+        self.at_end(leave)
+
     # --- Parameters
 
     def change_parameter(self, node: str, name: str, value: Any) -> None:
@@ -118,15 +155,17 @@ class NodeInjection(InjectionBase):
 
     def _set(self, node: Node, name: str, value: Any) -> Any:
         """Set a parameter. Return its value before; None: the node refused it, or it had none."""
-        try:
-            before = node.get_parameter(name).value
-            result = node.set_parameters_atomically([Parameter(name, value=value)])
-        except ParameterNotDeclaredException as error:
-            known = ', '.join(sorted(declared_parameters(node)))
+        if not node.has_parameter(name):
+            declared = sorted(declared_parameters(node))
+            known = ', '.join(one for one in declared if not one.startswith(PARAMETERS_OF_RCLPY))
             raise LockstepError(
                 f'{self.fault!r}: {node.get_fully_qualified_name()} has no parameter {name!r}; '
-                f'it has {known}'
-            ) from error
+                f'it has {known or "none"}'
+            )
+        before = None
+        with suppress(ParameterUninitializedException):
+            before = node.get_parameter(name).value
+        result = node.set_parameters_atomically([Parameter(name, value=value)])
         if not result.successful:
             self.note(f'{name} = {value!r} is refused: {result.reason}')
             return None

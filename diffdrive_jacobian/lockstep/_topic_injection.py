@@ -111,8 +111,7 @@ class TopicInjection(InjectionBase):
             if keeps_order:
                 out = [(max(delay, earliest - now), data) for delay, data in out]
                 earliest = max([earliest, *(now + delay for delay, _ in out)])
-            if self.active or out != [(0, data)]:
-                hits.add(now, data, out)
+            hits.add(now, data, out, active=self.active)
             return out
 
         return stage

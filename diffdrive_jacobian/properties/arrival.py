@@ -106,8 +106,9 @@ class _ArrivesWatch(Watch):
             return
         for node, goal in list(self._goals.items()):
             if pose.distance(goal.pose) <= self._required.tolerance:
+                # Steps of time may be long: it may have arrived too late.
                 self._check()
-                del self._goals[node]
+                self._goals.pop(node, None)
 
     def check(self) -> str | None:
         """Return that a goal was not reached in time; None: all were."""

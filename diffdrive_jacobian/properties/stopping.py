@@ -26,7 +26,7 @@ class StopsAfterLostOdometry(Property):
 
     The time is what a timer of the node can measure. It does not pass while the clock of the nodes
     stands still or the node is frozen (`Hang`), it starts again where the clock jumps, and it is longer
-    for a node that is slow (`Slow`: by two callbacks) or whose timers jitter (`TimerJitter`).
+    for a node that is slow (`Slow`: by three callbacks) or whose timers jitter (`TimerJitter`).
 
     Attributes:
         within: Longest time (s).

@@ -2,8 +2,9 @@
 
 Names of this package, which are imported on first use:
 
-- `Lockstep`, `LockstepError`: as in the package `lockstep`.
+- `Lockstep`, `LockstepError`, `PropertyViolation`: as in the package `lockstep`.
 - `faults`: the package of the faults that a `Lockstep` injects.
+- `properties`: the package of the properties that a `Lockstep` requires.
 - `explore`, `fault_schedules`, `poses`, ...: all names of the package `exploration`, most of which need
   Hypothesis.
 - `RecordedRun`, `GoldenRun`: types of the fixtures `recorded_run` and `golden_run`.
@@ -17,19 +18,28 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from diffdrive_jacobian import faults
-    from diffdrive_jacobian.lockstep import Lockstep, LockstepError
+    from diffdrive_jacobian import faults, properties
+    from diffdrive_jacobian.lockstep import Lockstep, LockstepError, PropertyViolation
     from diffdrive_jacobian.testing.golden_run import GoldenRun
     from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
-__all__ = ['GoldenRun', 'Lockstep', 'LockstepError', 'RecordedRun', 'faults']
+__all__ = [
+    'GoldenRun',
+    'Lockstep',
+    'LockstepError',
+    'PropertyViolation',
+    'RecordedRun',
+    'faults',
+    'properties',
+]
 
-_PACKAGES = ('faults',)
+_PACKAGES = ('faults', 'properties')
 """Packages beside this one that are names of it, too."""
 _MODULES = {
     'GoldenRun': 'testing.golden_run',
     'Lockstep': 'lockstep',
     'LockstepError': 'lockstep',
+    'PropertyViolation': 'lockstep',
     'RecordedRun': 'testing.recorded_run',
 }
 """The module of each other name."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -108,8 +109,7 @@ class Comparison:
         if not isinstance(value, float):
             return f'is {_shown(value)}, golden {_shown(golden)}'
         apart = abs(value - golden)
-        # False for NaN, and for infinity beside a number.
-        if apart <= self._tolerance * max(1.0, min(abs(value), abs(golden))):
+        if math.isfinite(apart) and apart <= self._tolerance * max(1.0, min(abs(value), abs(golden))):
             return None
         return f'is {value!r}, golden {golden!r}: differs by {apart:.3g}, allowed {self._tolerance:g}'
 
@@ -146,4 +146,6 @@ def _shown(value: Any) -> str:
 
 
 def _seconds(time: int) -> str:
-    return f'{time / NANOSECONDS:.9g} s'
+    seconds, rest = divmod(time, NANOSECONDS)
+    # Exact, also for the time of today.
+    return f'{seconds}.{rest:09}'.rstrip('0').rstrip('.') + ' s'

@@ -11,8 +11,10 @@ leaves the environment as it is.
 
 from __future__ import annotations
 
+import importlib
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,6 +36,10 @@ GOLDEN = 'golden'
 WRITTEN = 'golden run written'
 """Property of the report of a test that wrote its golden run."""
 _CHECKS_FIELDS = pytest.StashKey[bool]()
+_CONTAINED = pytest.StashKey[bool]()
+"""Whether the error of a test contains the last messages."""
+_FIXTURES = pytest.StashKey[dict[str, Any]]()
+"""Fixtures of a test that exist now. Its `funcargs` lack those of a setup that fails."""
 
 
 # --- Options
@@ -114,18 +120,23 @@ def _set_environment(name: str, value: str | None) -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_call(item: pytest.Item) -> None:
-    """Check the golden run of a test that has passed."""
-    golden = _argument(item, 'golden_run')
-    if golden is None:
+    """Check the required properties and the golden run of a test that has passed."""
+    world, golden = _argument(item, 'lockstep'), _argument(item, 'golden_run')
+    if world is None:
         return
+    from diffdrive_jacobian.lockstep import Lockstep, LockstepError
     from diffdrive_jacobian.recording.recording import RecordingError
     from diffdrive_jacobian.testing.golden_run import GoldenRun, GoldenRunError
 
-    if not isinstance(golden, GoldenRun) or golden.checked:
-        return
     try:
-        golden.check()
+        if isinstance(world, Lockstep) and world.is_open:
+            world.finish()
+        if isinstance(golden, GoldenRun) and not golden.checked:
+            golden.check()
         return
+    except LockstepError as error:
+        item.stash[_CONTAINED] = True
+        problem = str(error)
     except (GoldenRunError, RecordingError) as error:
         problem = str(error)
     # Without a traceback, which would show pytest only.
@@ -148,6 +159,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
     contained = call.excinfo is not None and call.excinfo.errisinstance(LockstepError)
+    contained = item.stash.get(_CONTAINED, contained)
     if isinstance(world, Lockstep) and not contained:
         report.sections.append(('lockstep', _or_error(world.report)))
     recorded = _argument(item, 'recorded_run')
@@ -157,7 +169,8 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 
 def _argument(item: pytest.Item, name: str) -> Any:
     """Return a fixture of a test, which it may have through another one; None: it has none."""
-    return getattr(item, 'funcargs', {}).get(name)
+    existing = item.stash.get(_FIXTURES, None) or {}
+    return existing.get(name, getattr(item, 'funcargs', {}).get(name))
 
 
 def _or_error(describe: Callable[[], str]) -> str:
@@ -200,10 +213,17 @@ def lockstep(request: pytest.FixtureRequest) -> Iterator[Lockstep]:
         )
     try:
         from diffdrive_jacobian.lockstep import Lockstep
+
+        with warnings.catch_warnings():
+            # Of lark. rclpy imports it with the first message type, within the test.
+            warnings.simplefilter('ignore', DeprecationWarning)
+            importlib.import_module('rosidl_generator_py')
     except ImportError as error:
         pytest.fail(_remedy(error), pytrace=False)
     with Lockstep(**(marker.kwargs if marker else {})) as world:
+        request.node.stash[_FIXTURES] = {'lockstep': world}
         yield world
+        del request.node.stash[_FIXTURES]
 
 
 def _remedy(error: ImportError) -> str:
@@ -234,13 +254,12 @@ def recorded_run(
     """Record the test. `keep()` writes the bag and a figure. A failure of the test does so, too."""
     from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
-    run = RecordedRun(lockstep, _artifacts(request.config, tmp_path_factory) / _test_name(request))
+    name = artifact_name(request.node.nodeid)
+    run = RecordedRun(lockstep, _artifacts(request.config, tmp_path_factory) / name)
+    # Nothing if another fixture replaces `lockstep`.
+    request.node.stash.get(_FIXTURES, {})['recorded_run'] = run
     yield run
     run.close()
-
-
-def _test_name(request: pytest.FixtureRequest) -> str:
-    return artifact_name(request.node.nodeid)
 
 
 def _artifacts(config: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Path:

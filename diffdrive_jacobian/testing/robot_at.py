@@ -38,4 +38,4 @@ def place_robot(
         overrides = [Parameter(name, value=value) for name, value in values.items()]
         return VirtualRobot(namespace=namespace, parameter_overrides=overrides)
 
-    return world.add(create())
+    return world.create(create)
