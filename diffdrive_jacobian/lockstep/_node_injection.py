@@ -33,6 +33,8 @@ class NodeInjection(InjectionBase):
     def _gate(self, node: str) -> Gate:
         """Return the gate of a node, which is expected to be there some time."""
         name = full_name(node)
+        if name == self._world.node.get_fully_qualified_name():
+            raise LockstepError(f'{self.fault!r} names the node of the test itself')
         self._expect(
             f'no node {name} was seen',
             lambda nodes: any(one.get_fully_qualified_name() == name for one in nodes),
