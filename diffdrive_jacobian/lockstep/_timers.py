@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.timer import Timer
 
 from diffdrive_jacobian.ros.rclpy_internals import RCLError, TimerHandle, timer_handle
+
+Entry = tuple[TimerHandle, Timer, Node]
+"""A timer of a node, with its handle."""
 
 
 class Timers:
@@ -17,16 +20,26 @@ class Timers:
     def __init__(self) -> None:
         """Start without timers."""
         # With their handles, whose methods take a third of the time of those of the timers.
-        self._sim_timers: list[tuple[TimerHandle, Timer]] = []
-        self._wall_timers: list[tuple[TimerHandle, Timer]] = []
+        self._sim_timers: list[Entry] = []
+        self._wall_timers: list[Entry] = []
 
-    def update(self, nodes: Iterable[Node]) -> None:
-        """Find the timers of the nodes."""
-        timers = [(timer_handle(timer), timer) for node in nodes for timer in node.timers]
-        self._sim_timers = [pair for pair in timers if _follows_sim_time(pair[1])]
-        self._wall_timers = [pair for pair in timers if not _follows_sim_time(pair[1])]
+    def update(self, nodes: Iterable[Node], without: Container[Timer] = ()) -> None:
+        """Find the timers of the nodes.
 
-    def due(self) -> tuple[list[tuple[TimerHandle, Timer]], int | None]:
+        Args:
+            nodes: The nodes.
+            without: Timers that do not tick.
+        """
+        timers = [
+            (timer_handle(timer), timer, node)
+            for node in nodes
+            for timer in node.timers
+            if timer not in without
+        ]
+        self._sim_timers = [pair for pair in timers if follows_sim_time(pair[1])]
+        self._wall_timers = [pair for pair in timers if not follows_sim_time(pair[1])]
+
+    def due(self) -> tuple[list[Entry], int | None]:
         """Return the due timers, the most overdue first, and the time until the next one (ns)."""
         due, until_next = [], None
         for pair in self._sim_timers:
@@ -45,6 +58,17 @@ class Timers:
         due.sort(key=lambda item: item[0])
         return [pair for _, pair in due], until_next
 
+    def most_overdue(self, node: Node) -> tuple[int, TimerHandle, Timer] | None:
+        """Return the most overdue timer of a node, and for how long it has been due (ns).
+
+        None: no timer is due.
+        """
+        due, _ = self.due()
+        for handle, timer, owner in due:
+            if owner is node and follows_sim_time(timer):
+                return -(handle.time_until_next_call() or 0), handle, timer
+        return None
+
 
 def is_due(handle: TimerHandle) -> bool:
     """Return whether a timer is due."""
@@ -56,6 +80,7 @@ def is_due(handle: TimerHandle) -> bool:
     return left is not None and left <= 0
 
 
-def _follows_sim_time(timer: Timer) -> bool:
+def follows_sim_time(timer: Timer) -> bool:
+    """Return whether a timer expires by simulated time, not by wall time."""
     clock = timer.clock
     return clock.clock_type == ClockType.ROS_TIME and bool(clock.ros_time_is_active)

@@ -20,7 +20,8 @@ from rosgraph_msgs.msg import Clock
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
 from diffdrive_jacobian.lockstep._guard import Guard
-from diffdrive_jacobian.lockstep._messaging import Messaging, described
+from diffdrive_jacobian.lockstep._messaging import described
+from diffdrive_jacobian.lockstep._requirements import Requirements
 from diffdrive_jacobian.lockstep._simulated_time import checked_nanoseconds
 from diffdrive_jacobian.ros.rclpy_internals import wrap_sleep
 from diffdrive_jacobian.ros.runner import UserError, discovery_off, ros_context
@@ -28,7 +29,7 @@ from diffdrive_jacobian.ros.runner import UserError, discovery_off, ros_context
 N = TypeVar('N', bound=Node)
 
 
-class Lockstep(Messaging):
+class Lockstep(Requirements):
     """Executes nodes in the default context of rclpy, in simulated time.
 
     Nodes are created as usual, after the `Lockstep`, and added to it. `use_sim_time` is true for all of
@@ -109,6 +110,11 @@ class Lockstep(Messaging):
         """Close it."""
         self.close()
 
+    @property
+    def is_open(self) -> bool:
+        """Whether it was not closed."""
+        return Lockstep._open is self
+
     def close(self) -> None:
         """Destroy the nodes and shut rclpy down. Further calls have no effect."""
         if Lockstep._open is self:
@@ -121,8 +127,13 @@ class Lockstep(Messaging):
         for node in nodes:
             node.destroy_node()
 
-    def add(self, node: N) -> N:
+    def add(self, node: N, *, observer: bool = False) -> N:
         """Add a node. It receives the time, and its callbacks that are due are executed.
+
+        Args:
+            node: The node.
+            observer: Whether the node belongs to the test, as a recorder does: only faults that name it
+                affect the messages that it receives.
 
         Returns:
             The node.
@@ -132,6 +143,17 @@ class Lockstep(Messaging):
                 time; or it is no node.
         """
         self._check_open()
+        self._check_new(node)
+        if self._busy:
+            name = node.get_fully_qualified_name()
+            raise LockstepError(f'node {name} cannot be added within a callback')
+        if observer:
+            self._observers.add(node)
+        self._executor.add(node)
+        self._publish_clock()
+        return node
+
+    def _check_new(self, node: Node) -> None:
         if not isinstance(node, Node):
             hint = f'; create one: add({node.__name__}(...))' if isinstance(node, type) else ''
             raise LockstepError(f'add takes a node, got {described(node)}{hint}')
@@ -150,11 +172,6 @@ class Lockstep(Messaging):
         if node.executor is not None:
             raise LockstepError(f'node {name} is in another executor: remove it from there')
         self._check_sim_time(node)
-        if self._busy:
-            raise LockstepError(f'node {name} cannot be added within a callback')
-        self._executor.add(node)
-        self._publish_clock()
-        return node
 
     def remove(self, node: Node) -> None:
         """Remove and destroy a node without stopping it, as if its process was killed.
@@ -165,6 +182,7 @@ class Lockstep(Messaging):
         self._check_open()
         if node is self.node or node not in self._executor.nodes:
             raise LockstepError('the node to remove was not added')
+        self._executor.killed.add(node)
         with self._watched():
             self._executor.remove(node)
             node.destroy_node()
