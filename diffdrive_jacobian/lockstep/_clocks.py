@@ -25,6 +25,10 @@ class Clocks:
         """Start without clocks."""
         self.publisher: Publisher | None = None
         """Publisher of /clock."""
+        self.enabled = True
+        """Whether the time is published."""
+        self.publications = 0
+        """Number of messages on /clock."""
         self._clocks: list[SimulatedClock] = []
         self._message = Clock()
 
@@ -50,4 +54,10 @@ class Clocks:
             clock.set(time)
         if self.publisher is not None and self.publisher.get_subscription_count() > len(self._clocks):
             set_time(self._message.clock, now)
+            self.publish()
+
+    def publish(self) -> None:
+        """Publish the time that was set last, once more."""
+        if self.enabled and self.publisher is not None:
+            self.publications += 1
             self.publisher.publish(self._message)

@@ -9,15 +9,17 @@ times as long.
 from __future__ import annotations
 
 import inspect
+import sys
 from collections import deque
 from collections.abc import Callable, Container, Iterable
 from typing import Any
 
+from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy
+from rclpy.qos import DurabilityPolicy, HistoryPolicy
 from rclpy.subscription import Subscription
 
-from diffdrive_jacobian.ros.rclpy_internals import message_taker, receives_info
+from diffdrive_jacobian.ros.rclpy_internals import message_taker, receives_info, wait_for_message
 
 
 class Deliveries:
@@ -36,6 +38,8 @@ class Deliveries:
             subscription, create_task
         )
         """Creates the reader of a subscription of a node."""
+        self.held: set[str] = set()
+        """Topics whose messages are not polled: they come from other processes, see `_external`."""
         self._readers: dict[Subscription, Reader] = {}
         self._by_topic: dict[str, list[Reader]] = {}
         self._polled: list[Reader] = []
@@ -104,6 +108,8 @@ class Deliveries:
         """
         found = False
         for reader in self._polled:
+            if self.held and reader.topic in self.held:
+                continue
             # As `deliver`, without a call for each.
             taken = reader.take(reader.message_type, reader.raw)
             if taken is not None:
@@ -123,6 +129,7 @@ class Reader:
         '_close',
         '_create_task',
         '_subscription',
+        'depth',
         'latched',
         'message_type',
         'raw',
@@ -134,10 +141,23 @@ class Reader:
         """Keep the subscription alive until `close`."""
         self.topic: str = subscription.topic_name
         self.latched = is_latched(subscription)
+        self.depth = queue_depth(subscription)
         self._subscription = subscription
         self._create_task = create_task
         self.message_type, self.raw = subscription.msg_type, subscription.raw
         self.take, self._close = message_taker(subscription)
+
+    def waits(self, context: Context, timeout: float) -> bool:
+        """Wait until a message from another process can be taken.
+
+        Args:
+            context: The context of the nodes.
+            timeout: Longest wall time (s).
+
+        Returns:
+            Whether there is one.
+        """
+        return wait_for_message(context, self._subscription, timeout)
 
     def deliver(self) -> bool:
         """Take a message and call the callback. Return False if there is none."""
@@ -164,6 +184,12 @@ class Reader:
 
 def _nothing(*_: Any) -> None:
     """Take nothing."""
+
+
+def queue_depth(subscription: Subscription) -> int:
+    """Return the largest number of messages that wait in a subscription."""
+    profile = subscription.qos_profile
+    return sys.maxsize if profile.history == HistoryPolicy.KEEP_ALL else max(profile.depth, 1)
 
 
 def is_latched(endpoint: Any) -> bool:
