@@ -9,47 +9,34 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep._deliveries import Reader
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
-from diffdrive_jacobian.lockstep._external_answers import (
-    WITHIN,
-    Answers,
-    AnswersDue,
-    Every,
-    Expectation,
-    Idle,
-    TicksDue,
-)
+from diffdrive_jacobian.lockstep._external_answers import Expectation, Idle
 from diffdrive_jacobian.lockstep._external_discovery import UNTIMED, Discovery
+from diffdrive_jacobian.lockstep._external_expectations import Due, Expectations
 from diffdrive_jacobian.lockstep._external_graph import ExternalGraph
 from diffdrive_jacobian.lockstep._external_probe import ROUNDS, Probe, Repeated
 from diffdrive_jacobian.lockstep._external_process import ExternalProcess, end_all
 from diffdrive_jacobian.lockstep._external_topic import ExternalTopic
+from diffdrive_jacobian.lockstep._external_waiting import Waiting
 from diffdrive_jacobian.lockstep._report import Traffic
 from diffdrive_jacobian.time_units import NANOSECONDS
 
-CLOCK_PERIOD = 0.1
-"""Period at which the time is published again while answers are awaited (s). A message may be lost."""
-NAP = 0.0001
-"""Period at which an answer is looked for (s)."""
-SLOW_NAP = 0.002
-"""The same after `CLOCK_PERIOD` (s)."""
 DISCOVERY_PERIOD = 0.01
 """Period at which the graph is queried during discovery (s)."""
 ARRIVAL = 2.0
 """Longest time between the arrival of a message at two subscriptions of this process (s)."""
+MIN_CONFIRMATION = 1.0
+"""Shortest time for the responses of nodes that have been discovered (s)."""
 REPETITION = 0.2
 """Period at which a request is repeated during discovery (s): a response may be lost then."""
 UNCONFIRMED = 0.5
 """Time for which nodes without parameter services are given to discover those of the world (s)."""
-Due = AnswersDue | TicksDue
-"""Messages that are due."""
 
 
 class External:
@@ -61,6 +48,7 @@ class External:
         executor: QuiescentExecutor,
         traffic: Traffic,
         watched: Callable[[], AbstractContextManager[None]],
+        report: Callable[[], str],
         now: Callable[[], int],
     ) -> None:
         """Start without expectations.
@@ -70,21 +58,20 @@ class External:
             executor: Executes its nodes.
             traffic: Counts their messages.
             watched: Returns a context in which callbacks may be executed.
+            report: Returns the last messages of all topics as text.
             now: Returns the simulated time (ns).
         """
         self._node = node
         self._executor = executor
         self._traffic = traffic
-        self._watched = watched
         self._now = now
         self.graph = ExternalGraph(node)
-        self.processes: list[ExternalProcess] = []
-        """The processes that were started."""
+        self.waiting = Waiting(node, executor, watched, report, self._awaits)
+        """Waits for other processes."""
         self.began = False
         """Whether the external nodes have received the time."""
         self._complete = False
-        self._expected: list[tuple[Due, ExternalProcess | None]] = []
-        self._probes: list[tuple[Probe, ExternalProcess | None]] = []
+        self._expectations = Expectations(node)
         self._topics: dict[str, ExternalTopic] = {}
         self._endpoints: frozenset[object] = frozenset()
         self._sent: tuple[int, ...] = ()
@@ -99,30 +86,25 @@ class External:
         Raises:
             ValueError: One of them is no `Answers`, `Every` or `Idle`.
         """
-        resolve = self._node.resolve_topic_name
-        for one in expected:
-            if isinstance(one, Answers):
-                due: Due = AnswersDue(one, resolve(one.topic), resolve(one.to))
-                self._expected.append((due, process))
-            elif isinstance(one, Every):
-                self._expected.append((TicksDue(one, resolve(one.topic)), process))
-            elif isinstance(one, Idle):
-                self._probes.append((Probe(self._node, one), process))
-            else:
-                raise ValueError(f'external must consist of Answers, Every and Idle, got {one!r}')
+        self._expectations.add(expected, process)
         self._complete = False
 
     def _forget_ended(self) -> None:
         """Await nothing more from processes that the test has ended."""
-        self._expected = [pair for pair in self._expected if not _has_ended(pair[1])]
-        self._probes = [pair for pair in self._probes if not _has_ended(pair[1])]
-        awaited = {one.topic for one, _ in self._expected}
-        for topic in [topic for topic in self._topics if topic not in awaited]:
+        for name in self._expectations.forget_ended() & self._topics.keys():
+            if left := self._expectations.due(name):
+                self._restart(self._topics[name], left)
+                continue
             # Nothing is due, so what still comes is delivered as it comes.
-            known = self._topics.pop(topic)
-            self._executor.unserved.discard(known.subscription)
-            known.close()
-        self._executor.deliveries.held = set(self._topics) if self.began else set()
+            topic = self._topics.pop(name)
+            self._executor.deliveries.held.discard(name)
+            self._executor.unserved.discard(topic.subscription)
+            topic.close()
+
+    def _restart(self, topic: ExternalTopic, expected: Iterable[Due]) -> None:
+        topic.restart()
+        for one in expected:
+            one.restart(self._published)
 
     # --- Discovery
 
@@ -133,51 +115,63 @@ class External:
     def connect(self, timeout: float) -> None:
         """Wait until the declared nodes are discovered, and have discovered the nodes of the world.
 
+        They do not receive the time before `begin`.
+
         Args:
             timeout: Longest wall time (s).
 
         Raises:
             LockstepError: They are not in time, a process has ended, or the nodes do not fit.
         """
+        self._executor.clocks.enabled = False
         self._forget_ended()
         begin = time.monotonic()
-        complete_but_time: float | None = None
+        only_untimed: float | None = None
         while True:
-            self._check_processes()
+            self.waiting.check_processes()
             self._count_published_topics()
             missing, untimed = self._discovery().missing(*self._awaited())
             if not (missing or untimed):
                 break
             waited = time.monotonic() - begin
-            complete_but_time = None if missing else (complete_but_time or waited)
-            if waited > timeout or (complete_but_time and waited - complete_but_time > UNTIMED):
+            only_untimed = None if missing else only_untimed or waited
+            if waited > timeout or (only_untimed and waited - only_untimed > UNTIMED):
                 raise LockstepError(self._not_discovered(waited, [*missing, *untimed]))
-            self._serve()
+            self.waiting.serve()
             time.sleep(DISCOVERY_PERIOD)
-        self._confirm(max(timeout - (time.monotonic() - begin), 1.0))
+        self.confirm(max(timeout - (time.monotonic() - begin), MIN_CONFIRMATION))
         self._endpoints = self._discovery().endpoints()
         self._complete = True
 
     def begin(self) -> None:
-        """Start to count, and let external nodes receive the time."""
+        """Start to count what is due from nodes that are new, and let them receive the time.
+
+        Callbacks are called with what external nodes have published before.
+        """
+        for name, topic in self._topics.items():
+            for reader in self._executor.deliveries.readers_of(name):
+                while reader.deliver():
+                    pass
+            expected = self._expectations.due(name)
+            if not all(one.started for one in expected):
+                self._restart(topic, expected)
         self.began = True
-        for topic in self._topics.values():
-            topic.restart()
-        for one, _ in self._expected:
-            one.restart(self._published)
-        self._executor.deliveries.held = set(self._topics)
+        self._executor.deliveries.held.update(self._topics)
         self._executor.clocks.enabled = True
         self._executor.clocks.publish()
 
+    def _awaits(self, process: ExternalProcess) -> bool:
+        return self._expectations.include(process)
+
     def _awaited(self) -> tuple[list[Due], list[Probe]]:
-        return [one for one, _ in self._expected], [probe for probe, _ in self._probes]
+        return self._expectations.due(), self._expectations.probes()
 
     def _discovery(self) -> Discovery:
         return Discovery(self.graph, self._executor.nodes)
 
     def _count_published_topics(self) -> None:
         """Subscribe to the declared topics that have an external publisher."""
-        for one, _ in self._expected:
+        for one in self._expectations.due():
             infos = self.graph.publishers(one.topic)
             if infos and one.topic not in self._topics:
                 topic = ExternalTopic(self._node, one.topic, infos, self._traffic)
@@ -185,19 +179,25 @@ class External:
                 self._topics[one.topic] = topic
 
     def _not_discovered(self, waited: float, missing: Sequence[str]) -> str:
-        return '\n  '.join(
-            [
-                f'external nodes not discovered within {waited:.3g} s of wall time: {"; ".join(missing)}',
-                f'topics of external nodes: {", ".join(self.graph.published_topics()) or "none"}',
-                *self.describe(),
-            ]
-        )
+        topics = ', '.join(self.graph.published_topics()) or 'none'
+        lines = [
+            f'not within {waited:.3g} s of wall time: {"; ".join(missing)}',
+            f'topics that external nodes publish: {topics}',
+            *self.waiting.describe(),
+        ]
+        return '\n  '.join(lines)
 
-    def _confirm(self, timeout: float) -> None:
-        """Wait until the external nodes have discovered the world.
+    def confirm(self, timeout: float) -> None:
+        """Wait until the external nodes have discovered the world, and received the time.
 
         They discover endpoints in the order of their creation. So one that responds to a new client
         knows all that were created before.
+
+        Args:
+            timeout: Longest wall time for each node (s).
+
+        Raises:
+            LockstepError: A node does not respond in time, or a process has ended.
         """
         services = {name for name, _ in self._node.get_service_names_and_types()}
         nodes = self._discovery().awaited_nodes(*self._awaited())
@@ -205,8 +205,9 @@ class External:
         try:
             known = [probe for probe in probes if probe.service in services]
             for probe in known:
-                self._wait_for(probe.ready, timeout, probe.unready)
-                self._wait_for(Repeated(probe, REPETITION).answered, timeout, probe.no_response)
+                self.waiting.until(probe.ready, timeout, probe.unready)
+                self.waiting.until(Repeated(probe, REPETITION).answered, timeout, probe.no_response)
+                self.waiting.ask(probe, ROUNDS - 1)
             if len(known) < len(probes):
                 # Without parameter services.
                 time.sleep(UNCONFIRMED)
@@ -228,9 +229,9 @@ class External:
         if not self.began:
             return False
         self._forget_ended()
-        self._check_processes()
+        self.waiting.check_processes()
         if late := self._outstanding():
-            self._wait_for(
+            self.waiting.until(
                 lambda: not self._outstanding(), max(one.within for one in late), self._no_answer
             )
         asked = self._ask_idle()
@@ -251,12 +252,14 @@ class External:
     def until_next(self) -> int | None:
         """Return the time until the next timer of an external node expires (ns); None: unknown."""
         now = self._now()
-        expiries = [expiry - now for one, _ in self._expected if (expiry := one.next_time()) is not None]
+        expiries = [
+            expiry - now for one in self._expectations.due() if (expiry := one.next_time()) is not None
+        ]
         return max(min(expiries), 1) if expiries and self.began else None
 
     def jumped(self) -> None:
         """Note that the time has jumped."""
-        for one, _ in self._expected:
+        for one in self._expectations.due():
             one.jumped(self._now())
 
     def _deliver(self, reader: Reader) -> None:
@@ -275,10 +278,10 @@ class External:
             LockstepError: More was received than is due.
         """
         now, found = self._now(), []
-        for one, _ in self._expected:
+        for one in self._expectations.due():
             one.update(now, self._published)
         for topic in self._topics.values():
-            those = [one for one, _ in self._expected if one.topic == topic.topic_name]
+            those = self._expectations.due(topic.topic_name)
             left = sum(one.due for one in those) - topic.count()
             if left < 0:
                 raise LockstepError(self._surplus(topic, -left))
@@ -297,7 +300,8 @@ class External:
         Returns:
             Whether they were asked.
         """
-        if not self._probes:
+        probes = self._expectations.probes()
+        if not probes:
             return False
         sent = (
             self._executor.clocks.publications,
@@ -307,75 +311,9 @@ class External:
         if sent == self._sent:
             return False
         self._sent = sent
-        for probe, _ in self._probes:
-            self._ask(probe, ROUNDS)
+        for probe in probes:
+            self.waiting.ask(probe, ROUNDS)
         return True
-
-    def _ask(self, probe: Probe, rounds: int) -> None:
-        for _ in range(rounds):
-            response = probe.ask()
-            self._wait_for(
-                response.done,
-                probe.within,
-                probe.no_response,
-            )
-
-    # --- Waiting
-
-    def _wait_for(
-        self, condition: Callable[[], object], timeout: float, failure: Callable[[], str]
-    ) -> None:
-        """Wait for a condition.
-
-        Raises:
-            LockstepError: It is not true within `timeout` s of wall time, or a process has ended.
-        """
-        begin = time.monotonic()
-        repeated = begin
-        while not condition():
-            now = time.monotonic()
-            if now - begin > timeout:
-                raise LockstepError('\n  '.join([failure(), *self.describe()]))
-            if now - repeated > CLOCK_PERIOD:
-                repeated = now
-                self._check_processes()
-                self._executor.clocks.publish()
-            self._serve()
-            time.sleep(NAP if now - begin < CLOCK_PERIOD else SLOW_NAP)
-
-    def wait_for(
-        self, condition: Callable[[], object], timeout: float, failure: Callable[[], str]
-    ) -> None:
-        """Wait for a condition, as for an answer.
-
-        Args:
-            condition: The condition.
-            timeout: Longest wall time (s).
-            failure: Returns the message of the error.
-
-        Raises:
-            LockstepError: It is not true in time, or a process has ended.
-        """
-        self._wait_for(condition, timeout, failure)
-
-    def wait_for_subscription(self, publisher: Publisher) -> None:
-        """Wait until a publisher has a subscription. If none comes, return after a while."""
-        with suppress(LockstepError):
-            self._wait_for(publisher.get_subscription_count, WITHIN, lambda: '')
-
-    def wait_for_service(self, name: str) -> None:
-        """Wait until a service is discovered. If none is, return after a while."""
-
-        def discovered() -> bool:
-            return any(name == other for other, _ in self._node.get_service_names_and_types())
-
-        with suppress(LockstepError):
-            self._wait_for(discovered, WITHIN, lambda: '')
-
-    def _serve(self) -> None:
-        """Process requests and responses. Messages wait until everything has been received."""
-        with self._watched():
-            self._executor.serve()
 
     # --- Failures
 
@@ -396,28 +334,8 @@ class External:
             f"{topic.count()} received: see `count` and `when`, or declare Idle('NODE') instead"
         )
 
-    def _check_processes(self) -> None:
-        """Check that no process has failed.
-
-        Raises:
-            LockstepError: One has, or it has ended while answers of it are awaited.
-        """
-        for process in self.processes:
-            if process.ended_by_test or (code := process.returncode) is None:
-                continue
-            if code or any(owner is process for _, owner in (*self._expected, *self._probes)):
-                raise LockstepError(process.describe())
-
-    def describe(self) -> list[str]:
-        """Return the states of the processes."""
-        return [process.describe() for process in self.processes]
-
     def close(self) -> None:
         """End the processes."""
-        end_all(self.processes)
+        end_all(self.waiting.processes)
         for topic in self._topics.values():
             topic.close()
-
-
-def _has_ended(process: ExternalProcess | None) -> bool:
-    return process is not None and process.ended_by_test

@@ -136,6 +136,8 @@ class AnswersDue:
         self.topic = topic
         self.question = question
         self.within = declared.within
+        self.started = False
+        """Whether the node has been discovered."""
         self.due = 0
         self._count = declared.count
         self._when = declared.when
@@ -147,6 +149,7 @@ class AnswersDue:
         Args:
             published: Returns the number of messages that were published on a topic.
         """
+        self.started = True
         self.due = 0
         self._asked = published(self.question)
 
@@ -157,6 +160,8 @@ class AnswersDue:
             now: Simulated time (ns).
             published: Returns the number of messages that were published on a topic.
         """
+        if not self.started:
+            return
         number = published(self.question)
         new, self._asked = number - self._asked, number
         if new and (self._when is None or self._when()):
@@ -182,6 +187,8 @@ class TicksDue:
         self.topic = topic
         self.question = ''
         self.within = declared.within
+        self.started = False
+        """Whether the node has been discovered."""
         self.due = 0
         # rclpy and rclcpp truncate.
         self._period = int(declared.period * NANOSECONDS)
@@ -191,10 +198,12 @@ class TicksDue:
 
     def restart(self, published: Callable[[str], int]) -> None:
         """Start with none again. Nothing expires before the node has received the time."""
+        self.started = True
+        self.due = 0
 
     def update(self, now: int, published: Callable[[str], int]) -> None:
         """Count the expiries up to a time (ns)."""
-        while self._next <= now:
+        while self.started and self._next <= now:
             self._last = now
             self._next += self._period
             if self._next < now:
@@ -205,7 +214,7 @@ class TicksDue:
 
     def next_time(self) -> int | None:
         """Return the time of the next expiry (ns)."""
-        return self._next
+        return self._next if self.started else None
 
     def jumped(self, now: int) -> None:
         """Note that the time has jumped to `now` (ns)."""

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from rclpy.node import Node
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
-from diffdrive_jacobian.lockstep._external_answers import AnswersDue, TicksDue
-from diffdrive_jacobian.lockstep._external_graph import CLOCK, ExternalGraph, node_name
+from diffdrive_jacobian.lockstep._external_expectations import Due
+from diffdrive_jacobian.lockstep._external_graph import CLOCK, UNKNOWN, ExternalGraph, node_name
 from diffdrive_jacobian.lockstep._external_probe import Probe
 from diffdrive_jacobian.lockstep._report import OMITTED
 
@@ -34,16 +34,12 @@ class Discovery:
             if endpoint.topic_name not in OMITTED
         )
 
-    def awaited_nodes(
-        self, expected: Sequence[AnswersDue | TicksDue], probes: Sequence[Probe]
-    ) -> set[str]:
+    def awaited_nodes(self, expected: Sequence[Due], probes: Sequence[Probe]) -> set[str]:
         """Return the names of the external nodes from which something is awaited."""
         infos = [info for one in expected for info in self._graph.publishers(one.topic)]
         return {node_name(info) for info in infos} | {probe.name for probe in probes}
 
-    def missing(
-        self, expected: Sequence[AnswersDue | TicksDue], probes: Sequence[Probe]
-    ) -> tuple[list[str], list[str]]:
+    def missing(self, expected: Sequence[Due], probes: Sequence[Probe]) -> tuple[list[str], list[str]]:
         """Return what is missing of the nodes, and which of them are not subscribed to /clock.
 
         Raises:
@@ -61,9 +57,12 @@ class Discovery:
         ]
         return list(dict.fromkeys(found)), untimed
 
-    def _missing_topics(self, one: AnswersDue | TicksDue) -> Iterator[str]:
-        if not self._graph.publishers(one.topic):
+    def _missing_topics(self, one: Due) -> Iterator[str]:
+        publishers = self._graph.publishers(one.topic)
+        if not publishers:
             yield f'no external node publishes {one.topic}'
+        if any(info.node_name == UNKNOWN for info in publishers):
+            yield f'the name of the node that publishes {one.topic} is not known'
         if one.question and not self._graph.subscriptions(one.question):
             yield f'no external node is subscribed to {one.question}'
 

@@ -17,6 +17,8 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 CLOCK = '/clock'
+UNKNOWN = '_NODE_NAME_UNKNOWN_'
+"""Name of a node whose endpoints have been discovered before its name."""
 PARTICIPANT = 12
 """Number of bytes at the start of a GID that are those of the participant."""
 

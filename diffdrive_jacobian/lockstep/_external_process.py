@@ -31,23 +31,28 @@ _numbers = itertools.count()
 def free_domain() -> int:
     """Return a ROS domain that no process on this machine uses.
 
+    Workers of pytest-xdist choose from different domains.
+
     Raises:
         LockstepError: There is none.
     """
-    worker = os.environ.get('PYTEST_XDIST_WORKER', '') + str(os.getpid())
-    first = zlib.crc32(worker.encode()) + next(_numbers)
-    for number in range(len(DOMAINS)):
-        domain = DOMAINS[(first + number) % len(DOMAINS)]
+    worker = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
+    workers = int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', '1'))
+    domains = DOMAINS[worker % len(DOMAINS) :: workers]
+    # Other programs on this machine begin elsewhere.
+    first = zlib.crc32(str(os.getpid()).encode()) + next(_numbers)
+    for number in range(len(domains)):
+        domain = domains[(first + number) % len(domains)]
         if all(map(_is_free, _ports(domain))):
             return domain
     raise LockstepError(
-        f'all ROS domains from {DOMAINS[0]} to {DOMAINS[-1]} are in use on this machine: '
-        'choose one by domain_id='
+        f'{len(domains)} ROS domains from {domains[0]} to {domains[-1]} are all in use on this machine: '
+        'give domain_id='
     )
 
 
 def _ports(domain: int) -> tuple[int, int]:
-    """Return the UDP ports for discovery of a domain: multicast, and unicast of its first participant."""
+    """Return the UDP ports for discovery: multicast, and unicast of the first participant."""
     multicast = 7400 + 250 * domain
     return multicast, multicast + 10
 

@@ -69,6 +69,7 @@ class ExternalTopic:
     def restart(self) -> None:
         """Count from zero."""
         self._not_counted += self.count()
+        self.delivered = 0
 
     def close(self) -> None:
         """Destroy the subscription."""

@@ -49,7 +49,7 @@ class Messaging(SimulatedTime):
         self.connect()
         subscriptions = publisher.get_subscription_count()
         if subscriptions == 0 and self._external is not None and not self._busy:
-            self._external.wait_for_subscription(publisher)
+            self._external.waiting.for_subscription(publisher)
             self.connect()
             subscriptions = publisher.get_subscription_count()
         if subscriptions == 0:
@@ -133,7 +133,7 @@ class Messaging(SimulatedTime):
         self.connect()
         external = None if self._is_served(name) else self._external
         if external is not None:
-            external.wait_for_service(name)
+            external.waiting.for_service(name)
         services = dict(self.node.get_service_names_and_types())
         wanted = _type_name(service_type, 'srv')
         if wanted not in services.get(name, []):
@@ -146,10 +146,10 @@ class Messaging(SimulatedTime):
         client = self.node.create_client(service_type, name)
         try:
             if external is not None:
-                external.wait_for(client.service_is_ready, timeout, lambda: f'{name} is not ready')
+                external.waiting.until(client.service_is_ready, timeout, lambda: f'{name} is not ready')
             future = client.call_async(request or service_type.Request())
             if external is not None:
-                external.wait_for(future.done, timeout, lambda: f'no response of {name}')
+                external.waiting.until(future.done, timeout, lambda: f'no response of {name}')
             self.run_until(future.done, timeout, f'a response of {name}')
             return future.result()
         finally:

@@ -55,7 +55,7 @@ class Processes(Messaging):
         directory = tempfile.TemporaryDirectory(prefix='lockstep')
         self._directory = Path(self._closing.enter_context(directory))
         self._external = External(
-            self.node, self._executor, self._traffic, self._watched, lambda: self._now
+            self.node, self._executor, self._traffic, self._watched, self.report, lambda: self._now
         )
         self._closing.callback(self._external.close)
         self._external.declare(external)
@@ -115,7 +115,7 @@ class Processes(Messaging):
             directory,
             None if cwd is None else os.fspath(cwd),
         )
-        external.processes.append(process)
+        external.waiting.processes.append(process)
         external.declare(answers, process)
         return process
 

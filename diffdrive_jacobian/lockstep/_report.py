@@ -162,7 +162,7 @@ class Traffic:
                 if topic not in active and topic not in OMITTED:
                     subscribers.setdefault(topic, []).append(node.get_fully_qualified_name())
         lines += [
-            f'  {topic}: no message; subscribed by {", ".join(names)}'
+            f'  {topic}: no message; subscribed by {", ".join(dict.fromkeys(names))}'
             for topic, names in sorted(subscribers.items())
         ]
         if missing := _not_served(nodes, others):

@@ -148,6 +148,9 @@ class SimulatedTime:
         if self._external is not None:
             self._external.jumped()
         self._publish_clock()
+        if self._external is not None:
+            self._external.confirm(CONNECTION)
+            self._await_others()
 
     def _advance(self, end: float) -> None:
         """Advance to the next timer or action, but not beyond an end of world time (ns)."""
@@ -203,9 +206,9 @@ class SimulatedTime:
             # Recorders subscribe to topics that were discovered.
             self._on_discovery()
             self.settle()
-        if not external.began:
+        with self._watched():
             external.begin()
-            self.settle()
+        self.settle()
 
     def _on_discovery(self) -> None:
         """Note that topics may have been discovered."""
@@ -234,7 +237,7 @@ class SimulatedTime:
         """Return the last messages of all topics as text."""
         if self._external is None:
             return self._traffic.describe(self._executor.nodes)
-        lines = self._external.describe()
+        lines = self._external.waiting.describe()
         others = self._external.graph.nodes()
         return '\n  '.join([self._traffic.describe(self._executor.nodes, others), *lines])
 
