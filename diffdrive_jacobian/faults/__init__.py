@@ -1,8 +1,7 @@
 """Faults that a `Lockstep` injects: of topics, nodes, and the world around them.
 
-from diffdrive_jacobian.testing import faults
-
-world.inject(faults.Loss('odom', probability=0.5, start=2.0, duration=1.0))
+With `from diffdrive_jacobian.testing import faults`, a test calls
+`lockstep.inject(faults.Loss('odom', probability=0.5, start=2.0, duration=1.0))`.
 """
 
 from diffdrive_jacobian.faults.fault import Fault, Filter, TopicFault

@@ -21,9 +21,9 @@ Filter = Callable[[int, bytes], Iterable[tuple[int, bytes]]]
 """What a topic fault does with a message.
 
 Receives the world time (ns since the start of the `Lockstep`) and the serialized message, while the
-fault lasts. Returns the messages that arrive instead, each with its delay (ns): `[]` loses it, `[(0, data)]`
-leaves it as it is. An attribute `observe(now, data)`, if there is one, is called with each message
-before the fault begins and after it has ended.
+fault lasts. Returns the messages that arrive instead, each with its delay (ns): `[]` loses it,
+`[(0, data)]` leaves it as it is. An attribute `observe(now, data)`, if there is one, is called with each
+message before the fault begins and after it has ended.
 """
 
 
@@ -58,7 +58,7 @@ class Fault(ABC):
     def __repr__(self) -> str:
         """Return the expression that makes this fault."""
         shown = []
-        for one in sorted(fields(self), key=lambda one: one.kw_only):
+        for one in sorted(fields(self), key=lambda one: bool(one.kw_only)):
             value = getattr(self, one.name)
             if one.default is MISSING:
                 shown.append(literal(value))
@@ -88,7 +88,7 @@ class Fault(ABC):
             ValueError: It is not.
         """
         value = getattr(self, name)
-        valid = isinstance(value, numbers.Real) and not isinstance(value, bool)
+        valid = not isinstance(value, bool) and isinstance(value, numbers.Real)
         if valid:
             value = float(value)
             valid = low < value <= high if above else low <= value <= high
@@ -105,7 +105,7 @@ class Fault(ABC):
             ValueError: It is not.
         """
         value = getattr(self, name)
-        if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
+        if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < 1:
             raise ValueError(
                 f'{type(self).__name__}: {name} must be an integer of at least 1, got {value!r}'
             )

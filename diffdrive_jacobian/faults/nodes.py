@@ -39,8 +39,7 @@ class Kill(NodeFault):
 
     def install(self, injection: Injection) -> None:
         """Let the node be killed."""
-        injection.at_start(lambda: injection.kill(self.node))
-        injection.at_end(lambda: injection.revive(self.node))
+        injection.kill(self.node)
 
 
 @dataclass(frozen=True, repr=False)
@@ -63,7 +62,7 @@ class Slow(NodeFault):
 
     What a callback publishes or responds leaves `seconds` after it began. Until then the node is busy:
     what arrives waits in its queues, of which a full one loses the oldest. Then comes whatever has
-    waited longest, a message, a request or a timer. The callback itself reads the clock of its beginning.
+    waited longest, a message, a request or a timer. The callback reads the clock of its beginning.
 
     Attributes:
         seconds: Duration of each callback (s).

@@ -25,17 +25,16 @@ from diffdrive_jacobian.ros.rclpy_internals import message_taker, receives_info,
 class Deliveries:
     """Subscriptions that may have messages, in the order in which these were published."""
 
-    def __init__(self, create_task: Callable[..., Any]) -> None:
+    def __init__(self, create_task: Callable[[Node], Callable[..., Any]]) -> None:
         """Start without subscriptions.
 
         Args:
-            create_task: Called with each coroutine that a callback returns.
+            create_task: Returns the function for the coroutines that callbacks of a node return.
         """
         self.pending: deque[Reader | None] = deque()
         """One entry for each message and subscription. None: a request or a response of a service."""
-        self.create_task = create_task
-        self.new_reader: Callable[[Subscription, Node], Reader] = lambda subscription, _: Reader(
-            subscription, create_task
+        self.new_reader: Callable[[Subscription, Node], Reader] = lambda subscription, node: Reader(
+            subscription, create_task(node)
         )
         """Creates the reader of a subscription of a node."""
         self.held: set[str] = set()
@@ -89,6 +88,10 @@ class Deliveries:
         for readers in self._by_topic.values():
             readers[:] = [replaced[reader] for reader in readers]
 
+    def readers(self) -> list[Reader]:
+        """Return all readers."""
+        return list(self._readers.values())
+
     def drop_destroyed(self, nodes: Iterable[Node]) -> None:
         """Deliver nothing more to subscriptions that the nodes do not have any more."""
         present = {subscription for node in nodes for subscription in node.subscriptions}
@@ -128,11 +131,11 @@ class Reader:
     __slots__ = (
         '_close',
         '_create_task',
-        '_subscription',
         'depth',
         'latched',
         'message_type',
         'raw',
+        'subscription',
         'take',
         'topic',
     )
@@ -142,7 +145,7 @@ class Reader:
         self.topic: str = subscription.topic_name
         self.latched = is_latched(subscription)
         self.depth = queue_depth(subscription)
-        self._subscription = subscription
+        self.subscription = subscription
         self._create_task = create_task
         self.message_type, self.raw = subscription.msg_type, subscription.raw
         self.take, self._close = message_taker(subscription)
@@ -157,7 +160,11 @@ class Reader:
         Returns:
             Whether there is one.
         """
-        return wait_for_message(context, self._subscription, timeout)
+        return wait_for_message(context, self.subscription, timeout)
+
+    def accept(self) -> None:
+        """Take exactly one message, and call the callback."""
+        self.deliver()
 
     def deliver(self) -> bool:
         """Take a message and call the callback. Return False if there is none."""
@@ -170,7 +177,7 @@ class Reader:
     def call(self, taken: tuple[Any, dict[str, Any]]) -> None:
         """Call the callback with a message that was taken, and its info."""
         # The callback is looked up for each message, because it may be replaced.
-        subscription = self._subscription
+        subscription = self.subscription
         callback = subscription.callback
         result = callback(*taken) if receives_info(subscription) else callback(taken[0])
         if result is not None and inspect.iscoroutine(result):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -11,9 +11,10 @@ from std_msgs.msg import String
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._fault_log import TOPIC, FaultEvent, FaultLog
-from diffdrive_jacobian.lockstep._injection import Injectable, Injections, check_faults, full_name
+from diffdrive_jacobian.lockstep._injection import Injectable, Injections, check_injectable
+from diffdrive_jacobian.lockstep._injection_base import World, full_name
+from diffdrive_jacobian.lockstep._keeper import Keeper
 from diffdrive_jacobian.lockstep._messaging import Messaging, described
-from diffdrive_jacobian.time_units import NANOSECONDS
 
 N = TypeVar('N', bound=Node)
 
@@ -25,11 +26,20 @@ class Disturbed(Messaging):
         """Start at a time (ns)."""
         super().__init__(start)
         self._factories: dict[str, Callable[[], Node]] = {}
+        self._observers: set[Node] = set()
         self._log = FaultLog(lambda: (self.world_time, self.now))
         self._injections: Injections | None = None
 
-    def add(self, node: N) -> N:
+    def add(self, node: N, *, observer: bool = False) -> N:
         """Add a node."""
+        raise NotImplementedError
+
+    def _check_new(self, node: Node) -> None:
+        """Raise LockstepError if a node cannot be added."""
+        raise NotImplementedError
+
+    def on_new_topics(self, callback: Callable[[], None]) -> None:
+        """Call a function whenever a node is added, or has created or destroyed an entity."""
         raise NotImplementedError
 
     def create(self, factory: Callable[[], N]) -> N:
@@ -71,34 +81,82 @@ class Disturbed(Messaging):
             seed: Seed of their random numbers.
 
         Raises:
-            LockstepError: An argument is no fault, or a fault is over already.
+            LockstepError: An argument is no fault, or a fault is over already, or affects what nodes in
+                other processes receive.
         """
         self._check_open()
         if not isinstance(seed, int) or isinstance(seed, bool):
             raise LockstepError(f'seed must be an integer, got {seed!r}')
-        check_faults(faults)
-        now = self.world_time / NANOSECONDS
-        for fault in faults:
-            if fault.start + fault.duration <= now:
-                raise LockstepError(
-                    f'{fault!r} is over: {now:g} s have passed since the start of the Lockstep'
-                )
+        check_injectable(faults, self.world_time)
         self.settle()
         if self._injections is None:
-            self._injections = Injections(self._executor, self._log, self.node)
-            publisher = self.node.create_publisher(String, TOPIC, QoSProfile(depth=1000))
-            self._log.publish = publisher.publish
+            self._log.publisher = self.node.create_publisher(String, TOPIC, QoSProfile(depth=1000))
             # Recorders subscribe.
             self.settle()
+            self._injections = Injections(self._world(), self._traffic)
+            self.on_new_topics(self._injections.look)
         for fault in faults:
+            self._check_receivers(fault)
             self._injections.add(fault, seed)
-        self._injections.enable()
         self.settle()
+
+    def _on_discovery(self) -> None:
+        """Check that no fault affects what the discovered nodes receive."""
+        for one in self._injections.all if self._injections is not None else ():
+            self._check_receivers(one.fault)
+
+    def _check_receivers(self, fault: Any) -> None:
+        """Raise LockstepError if a fault affects the messages to a node in another process."""
+        topic = getattr(fault, 'topic', '')
+        if self._external is None or not topic or getattr(fault, 'at_publisher', False):
+            return
+        name = self.node.resolve_topic_name(topic)
+        others = self._external.graph.subscribed_nodes(name)
+        if fault.node:
+            others &= {full_name(fault.node)}
+        if others:
+            raise LockstepError(
+                f'{fault!r} cannot affect {", ".join(sorted(others))}: messages to other processes are '
+                'not intercepted; give node= with the name of a node of this world'
+            )
+
+    def _world(self) -> World:
+        self._observers.add(self.node)
+        return World(
+            executor=self._executor,
+            keeper=Keeper(self._executor),
+            node=self.node,
+            log=self._log,
+            observers=self._observers,
+            shift_clock=self._shift_clock,
+            restartable=self._factories.__contains__,
+            restart=self._restart,
+        )
+
+    def _shift_clock(self, duration: int) -> int:
+        """Let the clock of the nodes jump by a time (ns). Return by how much it did."""
+        before = self._now
+        self._now = max(1, before + duration)
+        self._executor.clocks.set(self._now)
+        return self._now - before
+
+    def _restart(self, name: str) -> None:
+        """Make the node of a name again."""
+        node = self._factories[name]()
+        self._check_new(node)
+        self._executor.add(node)
+        if not self._executor.clock_pauses:
+            self._executor.clocks.set(self._now)
 
     @property
     def fault_events(self) -> list[FaultEvent]:
         """What the injected faults did so far."""
-        return self._log.events
+        return self._injections.events() if self._injections is not None else []
+
+    def report(self) -> str:
+        """Return the last messages of all topics, and what faults did, as text."""
+        text = super().report()
+        return f'{text}\n{self._injections.describe()}' if self._injections is not None else text
 
     def check_faults(self) -> None:
         """Check that every injected fault met something that it could affect.

@@ -27,6 +27,7 @@ from diffdrive_jacobian.lockstep._clocks import Clocks
 from diffdrive_jacobian.lockstep._deliveries import Deliveries, is_latched
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._facade import Facade
+from diffdrive_jacobian.lockstep._keeper import Keeper
 from diffdrive_jacobian.lockstep._served import Served
 from diffdrive_jacobian.lockstep._tasks import Tasks
 from diffdrive_jacobian.lockstep._timers import Timers, is_due
@@ -61,21 +62,24 @@ class QuiescentExecutor:
         self._events = events
         self._on_registered = on_registered
         self._served: dict[Node, Served] = {}
-        self._facade = Facade(self._note_change, self.create_task)
         self._changed = False
         self._has_actions = False
         self.isolated = True
         """Whether there are no messages from other processes."""
         self.unserved: set[Subscription] = set()
         """Subscriptions whose messages are not taken."""
-        self._tasks = Tasks()
+        self.tasks = Tasks()
         self.agenda = Agenda()
         """What happens at later times."""
-        self.deliveries = Deliveries(self.create_task)
+        self.deliveries = Deliveries(self.task_creator)
         """The messages that wait."""
         self._restore_calls = wrap_calls(self._noting)
         self.clocks = Clocks()
-        self._timers = Timers()
+        self.clock_pauses = 0
+        """Number of faults because of which the clocks of the nodes stand."""
+        self.timers = Timers()
+        self.keeper: Keeper | None = None
+        """Keeper of the gates of the nodes. None: they are always open."""
 
     def _noting(self, send: Callable[..., Any]) -> Callable[..., Any]:
         """Return a method that sends a request or a response, and takes its place among the messages."""
@@ -97,11 +101,22 @@ class QuiescentExecutor:
 
     def add(self, node: Node) -> None:
         """Add a node."""
-        self._served[node] = Served(node, self.create_task)
-        node.executor = self._facade
-        self._events.add_node(self._served[node])
+        create_task = self.task_creator(node)
+        # The node itself keeps a weak reference only.
+        facade = Facade(self._note_change, create_task)
+        served = self._served[node] = Served(node, create_task, facade)
+        if self.keeper is not None:
+            self.keeper.admit(served)
+        node.executor = facade
+        self._events.add_node(served)
         self.clocks.find(self._served)
         self._changed = True
+
+    def use(self, keeper: Keeper) -> None:
+        """Let a keeper keep the gates of the nodes."""
+        self.keeper = keeper
+        for served in self._served.values():
+            keeper.admit(served)
 
     def remove(self, node: Node) -> None:
         """Remove a node, after it has processed what was sent to it."""
@@ -112,24 +127,29 @@ class QuiescentExecutor:
         self._note_change()
         self.settle()
 
+    def kill(self, node: Node) -> None:
+        """Remove and destroy a node at once. Nothing that was sent to it is processed."""
+        self.tasks.cancel(node)
+        self._forget(node)
+        node.destroy_node()
+        self._note_change()
+
     def _forget(self, node: Node) -> None:
         served = self._served.pop(node)
-        self._release(node)
+        if self.keeper is not None:
+            self.keeper.dismiss(node)
+        _release(served)
         self._events.remove_node(served)
 
     def close(self) -> None:
         """Remove all nodes and shut down."""
         self._restore_calls()
-        self._tasks.cancel()
-        for node in self.nodes:
-            self._release(node)
+        self.tasks.cancel()
+        for served in self._served.values():
+            _release(served)
         self._served.clear()
         self.deliveries.close()
         self._events.shutdown()
-
-    def _release(self, node: Node) -> None:
-        self._facade.released = node
-        node.executor = None
 
     # --- Work
 
@@ -140,7 +160,7 @@ class QuiescentExecutor:
             Time until the next timer in simulated time expires, or the next action is due (ns); None:
             there is none.
         """
-        self._handle_all()
+        self.handle_all()
         return self._call_timers()[1]
 
     def catch_up(self) -> int | None:
@@ -150,14 +170,15 @@ class QuiescentExecutor:
         created, and no timer is due.
         """
         if not self._has_work():
-            due, until_next = self._timers.due()
+            due, until_next = self.timers.due()
             if not due:
                 return self._sooner(until_next)
         return self.settle()
 
     def advance(self, now: int) -> int | None:
         """Set the clocks of the nodes to a time (ns), and settle."""
-        self.clocks.set(now)
+        if not self.clock_pauses:
+            self.clocks.set(now)
         if not self._has_work():
             called, until_next = self._call_timers()
             if called:
@@ -169,13 +190,15 @@ class QuiescentExecutor:
         return bool(
             self.deliveries.pending
             or self._changed
-            or self._tasks
+            or self.tasks
             or self._has_actions
             or not self.isolated
         )
 
     def _sooner(self, until_next: int | None) -> int | None:
         """Return the time until the next timer or action (ns); None: there is none."""
+        if self.clock_pauses:
+            until_next = None
         until_action = self.agenda.until_next()
         if until_action is None or until_next is None:
             return until_action if until_next is None else until_next
@@ -192,26 +215,37 @@ class QuiescentExecutor:
             while (action := self.agenda.pop_due()) is not None:
                 called = True
                 action()
-                self._handle_all()
-            due, until_next = self._timers.due()
+                self.handle_all()
+            due, until_next = self.timers.due()
             if not due:
                 return called, self._sooner(until_next)
-            for handle, timer in due:
-                if is_due(handle):
+            keeper = self.keeper
+            for handle, timer, node in due:
+                if is_due(handle) and (keeper is None or keeper.may_tick(node, timer)):
                     called = True
-                    self._call(handle, timer)
-                    self._handle_all()
+                    self.call_timer(handle, timer, node)
+                    self.handle_all()
 
-    def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
-        """Schedule a function or a coroutine for the current time. Return its future."""
-        return self._tasks.create(callback, args, kwargs, self._facade)
+    def task_creator(self, node: Node) -> Callable[..., Task]:
+        """Return a function that schedules functions and coroutines of a node for the current time."""
 
-    def _handle_all(self) -> None:
+        def create_task(callback: Any, *args: Any, **kwargs: Any) -> Task:
+            return self.tasks.create(node, callback, args, kwargs, node.executor)
+
+        return create_task
+
+    def handle_all(self) -> None:
         """Process messages, service calls and tasks until none is left that can continue."""
         while True:
             self._drain()
-            if not (self._register_changed() or (self._tasks and self._tasks.run())):
+            if not (self._register_changed() or self._run_tasks()):
                 return
+
+    def _run_tasks(self) -> bool:
+        """Continue the tasks. Return whether any made progress."""
+        return bool(
+            self.tasks and self.tasks.run(self.keeper.closed if self.keeper is not None else None)
+        )
 
     def serve(self) -> None:
         """Process requests and responses. Messages wait."""
@@ -244,11 +278,13 @@ class QuiescentExecutor:
             events += 1
         return events > 1
 
-    def _call(self, handle: TimerHandle, timer: Timer) -> None:
+    def call_timer(self, handle: TimerHandle, timer: Timer, node: Node) -> None:
+        """Let a timer tick."""
         handle.call_timer()
-        result = timer.callback()
+        keeper = self.keeper
+        result = timer.callback() if keeper is None else keeper.run(node, timer.callback)
         if inspect.iscoroutine(result):
-            self.create_task(result)
+            self.task_creator(node)(result)
 
     # --- Entities
 
@@ -306,11 +342,23 @@ class QuiescentExecutor:
             for node in self._served
             for waitable in node.waitables
         )
-        self._timers.update(self._served)
+        self.update_timers()
+
+    def update_timers(self) -> None:
+        """Find the timers that may tick."""
+        if self.keeper is None:
+            self.timers.update(self._served)
+        else:
+            self.keeper.update_timers()
 
 
 def _nothing() -> None:
     """Do nothing, as a task."""
+
+
+def _release(served: Served) -> None:
+    served.facade.released = True
+    served.node.executor = None
 
 
 def _is_destroyed(node: Node) -> bool:

@@ -31,6 +31,8 @@ DISCOVERY_PERIOD = 0.01
 """Period at which the graph is queried during discovery (s)."""
 ARRIVAL = 2.0
 """Longest time between the arrival of a message at two subscriptions of this process (s)."""
+JUMP_CONFIRMATION = 5.0
+"""Longest time for the responses of nodes after a jump back (s)."""
 MIN_CONFIRMATION = 1.0
 """Shortest time for the responses of nodes that have been discovered (s)."""
 REPETITION = 0.2
@@ -74,6 +76,7 @@ class External:
         self._expectations = Expectations(node)
         self._topics: dict[str, ExternalTopic] = {}
         self._endpoints: frozenset[object] = frozenset()
+        self._before = 0
         self._sent: tuple[int, ...] = ()
         executor.isolated = False
         executor.clocks.enabled = False
@@ -150,8 +153,8 @@ class External:
         """
         for name, topic in self._topics.items():
             for reader in self._executor.deliveries.readers_of(name):
-                while reader.deliver():
-                    pass
+                while reader.waits(self._node.context, 0.0):
+                    reader.accept()
             expected = self._expectations.due(name)
             if not all(one.started for one in expected):
                 self._restart(topic, expected)
@@ -230,6 +233,11 @@ class External:
             return False
         self._forget_ended()
         self.waiting.check_processes()
+        now, before = self._now(), self._before
+        self._before = now
+        if now < before:
+            # Nodes that receive two times at once would not notice the jump.
+            self.confirm(JUMP_CONFIRMATION)
         if late := self._outstanding():
             self.waiting.until(
                 lambda: not self._outstanding(), max(one.within for one in late), self._no_answer
@@ -245,6 +253,9 @@ class External:
             if new:
                 self._traffic.note_external(topic.topic_name, topic.msg_type, new, topic.last)
             for reader in self._executor.deliveries.readers_of(topic.topic_name):
+                if reader.subscription not in self._endpoints:
+                    # It was created at this time.
+                    continue
                 # A shorter queue has lost the first ones.
                 for _ in range(min(new, reader.depth)):
                     self._deliver(reader)
@@ -255,12 +266,7 @@ class External:
         expiries = [
             expiry - now for one in self._expectations.due() if (expiry := one.next_time()) is not None
         ]
-        return max(min(expiries), 1) if expiries and self.began else None
-
-    def jumped(self) -> None:
-        """Note that the time has jumped."""
-        for one in self._expectations.due():
-            one.jumped(self._now())
+        return max(min(expiries), 1) if expiries and not self._executor.clock_pauses else None
 
     def _deliver(self, reader: Reader) -> None:
         # Fast DDS passes a message to one subscription of a process after the other.
@@ -269,7 +275,7 @@ class External:
                 f'a message on {reader.topic} has not reached all its subscriptions: it was lost, as '
                 'best effort allows'
             )
-        reader.deliver()
+        reader.accept()
 
     def _outstanding(self) -> list[Due]:
         """Return what is due and has not been received.

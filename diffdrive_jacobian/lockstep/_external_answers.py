@@ -171,9 +171,6 @@ class AnswersDue:
         """Return None: the next time is not known."""
         return None
 
-    def jumped(self, now: int) -> None:
-        """Do nothing: answers do not depend on the time."""
-
     def describe(self, now: int) -> str:
         """Return what is due."""
         return f'answer to message {self._asked} on {self.question}, at {now / NANOSECONDS:g} s'
@@ -202,7 +199,10 @@ class TicksDue:
         self.due = 0
 
     def update(self, now: int, published: Callable[[str], int]) -> None:
-        """Count the expiries up to a time (ns)."""
+        """Count the expiries up to a time (ns), which may have jumped."""
+        if now < self._last:
+            # A timer restarts when time jumps back behind its last expiry.
+            self._last, self._next = now, now + self._period
         while self.started and self._next <= now:
             self._last = now
             self._next += self._period
@@ -215,12 +215,6 @@ class TicksDue:
     def next_time(self) -> int | None:
         """Return the time of the next expiry (ns)."""
         return self._next if self.started else None
-
-    def jumped(self, now: int) -> None:
-        """Note that the time has jumped to `now` (ns)."""
-        if now < self._last:
-            # A timer restarts when time jumps back behind its last expiry.
-            self._last, self._next = now, now + self._period
 
     def describe(self, now: int) -> str:
         """Return what is due."""

@@ -64,6 +64,10 @@ class ExternalGraph:
             for info in (*self.publishers(name), *self.subscriptions(name))
         }
 
+    def subscribed_nodes(self, topic: str) -> set[str]:
+        """Return the names of the external nodes that are subscribed to a topic."""
+        return {node_name(info) for info in self.subscriptions(topic)}
+
     def unmatched_publisher(self, publisher: Publisher) -> Iterator[str]:
         """Yield what a publisher of the world still lacks."""
         topic = publisher.topic_name

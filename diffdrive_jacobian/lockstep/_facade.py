@@ -1,4 +1,4 @@
-"""The executor that the nodes in lockstep see."""
+"""The executor that a node in lockstep sees."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from diffdrive_jacobian.lockstep._errors import LockstepError
 
 
 class Facade:
-    """The executor of the nodes, as they see it."""
+    """The executor of a node, as the node sees it."""
 
     def __init__(self, changed: Callable[[], None], create_task: Callable[..., Task]) -> None:
         self._changed = changed
         self._create_task = create_task
-        self.released: Node | None = None
+        self.released = False
+        """Whether lockstep is about to remove the node."""
 
     def add_node(self, node: Node) -> bool:
         """Accept a node. It was added before its `executor` is set."""
@@ -29,7 +30,7 @@ class Facade:
         Raises:
             LockstepError: Another executor is about to add the node.
         """
-        if node is not self.released:
+        if not self.released:
             raise LockstepError(
                 f'node {node.get_fully_qualified_name()} is in lockstep and cannot be spun by another '
                 'executor'

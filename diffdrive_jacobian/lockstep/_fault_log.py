@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -14,7 +16,7 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 TOPIC = '/fault_events'
 """Topic of the events."""
 MAX_EVENTS = 200
-"""Largest number of events of one fault. Afterwards only its end is noted, with the total."""
+"""Largest number of events of one fault. Later ones are omitted, except its end with the totals."""
 MAX_REPORTED = 20
 """Number of events at the end of a report."""
 
@@ -37,10 +39,10 @@ class FaultEvent:
 
     def __str__(self) -> str:
         """Return the event as one line."""
-        return f'{self.time_ns / NANOSECONDS:g} s: {self.fault!r} {self.what}'
+        return f'{in_seconds(self.time_ns)}: {self.fault!r} {self.what}'
 
     def message(self) -> String:
-        """Return the event as a message with a JSON object: time, fault, what."""
+        """Return the event as a message: a JSON object with time (s), fault and what."""
         fields = {'time': self.time_ns / NANOSECONDS, 'fault': repr(self.fault), 'what': self.what}
         return String(data=json.dumps(fields))
 
@@ -55,14 +57,117 @@ class FaultLog:
             times: Returns the world time and the time of the clock of the nodes (ns).
         """
         self._times = times
+        self._counts: Counter[int] = Counter()
         self.events: list[FaultEvent] = []
-        self.publish: Callable[[String], None] | None = None
-        """Publishes an event."""
+        self.publisher: Publisher | None = None
+        """Publishes the events."""
 
-    def add(self, fault: Any, what: str) -> None:
-        """Add an event."""
-        world, clock = self._times()
-        event = FaultEvent(world, fault, what, clock)
+    def add(self, position: int, fault: Any, what: str, *, last: bool = False) -> None:
+        """Add an event.
+
+        Args:
+            position: Number of the fault.
+            fault: The fault.
+            what: What it did.
+            last: Whether it is the end of the fault, which is never omitted.
+        """
+        self._counts[position] += 1
+        if self._counts[position] > MAX_EVENTS and not last:
+            return
+        if self._counts[position] == MAX_EVENTS:
+            what += ' (further events of this fault are omitted)'
+        event = self.event(fault, what)
         self.events.append(event)
-        if self.publish is not None:
-            self.publish(event.message())
+        if self.publisher is not None:
+            self.publisher.publish(event.message())
+
+    def event(self, fault: Any, what: str) -> FaultEvent:
+        """Return an event of the current time."""
+        world, clock = self._times()
+        return FaultEvent(world, fault, what, clock)
+
+
+class Hits:
+    """The messages of one subscription that a fault affected, as events of consecutive ones.
+
+    They are numbered from 1, from the injection of the fault.
+    """
+
+    def __init__(self, name: str, note: Callable[[str], None]) -> None:
+        """Start without messages.
+
+        Args:
+            name: Name of the topic and of the node.
+            note: Adds an event.
+        """
+        self._name = name
+        self._note = note
+        self._number = self._during = self._hit = 0
+        # Of the messages that are not noted yet: what happened, first and last number, and time.
+        self._kind = ''
+        self._first = self._last = self._since = self._until = 0
+        self._delays = (0, 0)
+
+    def add(self, now: int, data: bytes, out: list[tuple[int, bytes]], *, active: bool) -> None:
+        """Add a message.
+
+        Args:
+            now: World time (ns).
+            data: The message.
+            out: What came out instead.
+            active: Whether the fault is active.
+        """
+        self._number += 1
+        self._during += active
+        kind = _kind(data, out)
+        if kind != self._kind:
+            self.flush()
+            self._kind, self._first, self._since = kind, self._number, now
+            self._delays = (0, 0)
+        if kind:
+            self._hit += 1
+            self._last, self._until = self._number, now
+            delays = [delay for delay, _ in out if delay > 0]
+            least, most = self._delays
+            if delays:
+                self._delays = min([*delays, *([least] if most else [])]), max([*delays, most])
+
+    def flush(self) -> None:
+        """Note the messages since the last event."""
+        if text := self.open():
+            self._note(text)
+        self._kind = ''
+
+    def open(self) -> str:
+        """Return what has not been noted yet; empty: nothing."""
+        if not self._kind:
+            return ''
+        number, when = f'message {self._first}', f'at {in_seconds(self._since)}'
+        if self._last > self._first:
+            number = f'messages {self._first} to {self._last}'
+            when = f'from {in_seconds(self._since)} to {in_seconds(self._until)}'
+        by = ''
+        if self._delays[1] > 0:
+            least, most = (in_seconds(delay) for delay in self._delays)
+            by = f' by {least}' if least == most else f' by {least} to {most}'
+        return f'{number} of {self._name} {self._kind}{by}, {when}'
+
+    def total(self) -> str:
+        """Return how many of the messages during the fault were affected."""
+        return f'{self._hit} of {self._during} messages of {self._name}'
+
+
+def _kind(data: bytes, out: list[tuple[int, bytes]]) -> str:
+    """Return what was done to a message; empty: nothing."""
+    if not out:
+        return 'lost'
+    changed = ' and changed' if any(other != data for _, other in out) else ''
+    late = any(delay > 0 for delay, _ in out)
+    if len(out) > 1:
+        return f'arrives {len(out)} times{changed}'
+    return f'delayed{changed}' if late else changed.removeprefix(' and ')
+
+
+def in_seconds(time: int) -> str:
+    """Return a time (ns) in seconds, in as many digits as it has."""
+    return f'{time / NANOSECONDS:.9f}'.rstrip('0').rstrip('.') + ' s'

@@ -12,7 +12,8 @@ from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
 from diffdrive_jacobian.lockstep._agenda import Agenda
-from diffdrive_jacobian.lockstep._deliveries import Deliveries, Reader
+from diffdrive_jacobian.lockstep._deliveries import Reader
+from diffdrive_jacobian.lockstep._gates import Gate, depth_of
 
 Stage = Callable[[bytes], Iterable[tuple[int, bytes]]]
 """Receives a serialized message, returns those that leave the stage instead, with their delays (ns)."""
@@ -24,17 +25,34 @@ class GatedReader(Reader):
     A stage receives each message at the simulated time at which it has left the one before.
     """
 
-    __slots__ = ('_agenda', '_deliveries', '_ready', '_take_next', 'node', 'stages')
+    __slots__ = ('_agenda', '_depth', '_gate', '_pending', '_ready', '_take_next', 'node', 'stages')
 
     def __init__(
-        self, subscription: Subscription, node: Node, agenda: Agenda, deliveries: Deliveries
+        self,
+        subscription: Subscription,
+        node: Node,
+        gate: Gate,
+        create_task: Callable[..., Any],
+        agenda: Agenda,
+        pending: deque[Reader | None],
     ) -> None:
-        """Keep the subscription of a node alive until `close`."""
-        super().__init__(subscription, deliveries.create_task)
+        """Keep the subscription alive until `close`.
+
+        Args:
+            subscription: The subscription.
+            node: Its node.
+            gate: The gate of the node.
+            create_task: Called with each coroutine that the callback returns.
+            agenda: What happens later.
+            pending: The entries of messages that wait.
+        """
+        super().__init__(subscription, create_task)
         self.node = node
         self.stages: list[Stage] = []
+        self._gate = gate
+        self._depth = depth_of(subscription.qos_profile)
         self._agenda = agenda
-        self._deliveries = deliveries
+        self._pending = pending
         self._ready: deque[tuple[Any, dict[str, Any]]] = deque()
         self._take_next = self.take
         self.take = self._take
@@ -49,8 +67,21 @@ class GatedReader(Reader):
                 return None
             self._pass(0, *taken)
             # The message itself has its entry among those that wait.
-            self._deliveries.pending.extendleft([self] * (len(self._ready) - 1))
+            self._pending.extendleft([self] * (len(self._ready) - 1))
         return self._ready.popleft()
+
+    def accept(self) -> None:
+        """Take exactly one message, and let it pass the stages."""
+        if not self.stages:
+            self.deliver()
+        elif (taken := self._take_next(self.message_type, True)) is not None:
+            before = len(self._ready)
+            self._pass(0, *taken)
+            self._pending.extend([self] * (len(self._ready) - before))
+
+    def call(self, taken: tuple[Any, dict[str, Any]]) -> None:
+        """Call the callback with a message, or let it wait at the gate of the node."""
+        self._gate.enter(self, self.topic, self._depth, partial(super().call, taken))
 
     def _pass(self, first: int, data: bytes, info: dict[str, Any]) -> None:
         """Pass a message through the stages from `first` on."""
@@ -68,4 +99,4 @@ class GatedReader(Reader):
         """Continue with a message that was delayed."""
         before = len(self._ready)
         self._pass(first, data, info)
-        self._deliveries.pending.extend([self] * (len(self._ready) - before))
+        self._pending.extend([self] * (len(self._ready) - before))

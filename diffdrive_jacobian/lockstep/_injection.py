@@ -1,39 +1,33 @@
-"""The hooks of a world for faults, which are defined elsewhere (`diffdrive_jacobian.faults`)."""
+"""The faults of a world. The faults themselves are defined in `diffdrive_jacobian.faults`."""
 
 from __future__ import annotations
 
-import math
-import random
-from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Iterable
+from functools import partial
+from typing import Any, Protocol
 
 from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.serialization import serialize_message
 from rclpy.subscription import Subscription
 
-from diffdrive_jacobian.lockstep._agenda import Agenda
 from diffdrive_jacobian.lockstep._errors import LockstepError
-from diffdrive_jacobian.lockstep._fault_log import FaultLog
+from diffdrive_jacobian.lockstep._fault_log import MAX_REPORTED, FaultEvent, in_seconds
 from diffdrive_jacobian.lockstep._gated_reader import GatedReader, Stage
-from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
+from diffdrive_jacobian.lockstep._gates import send_unless_destroyed
+from diffdrive_jacobian.lockstep._injection_base import Timed, World
+from diffdrive_jacobian.lockstep._node_injection import NodeInjection
+from diffdrive_jacobian.lockstep._report import Traffic
+from diffdrive_jacobian.lockstep._topic_injection import TopicInjection
+from diffdrive_jacobian.time_units import NANOSECONDS
 
-if TYPE_CHECKING:
-    from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
 
-Filter = Callable[[int, bytes], Iterable[tuple[int, bytes]]]
-Begin = Callable[[random.Random, type], Filter]
+class Injection(TopicInjection, NodeInjection):
+    """What one fault does to a world. A fault calls these methods in its method `install`."""
 
 
-class Injectable(Protocol):
+class Injectable(Timed, Protocol):
     """A fault."""
-
-    @property
-    def start(self) -> float:
-        """World time at which it begins (s)."""
-
-    @property
-    def duration(self) -> float:
-        """How long it lasts (s)."""
 
     def install(self, injection: Injection) -> None:
         """Let it happen."""
@@ -42,181 +36,122 @@ class Injectable(Protocol):
 class Injections:
     """All faults of a world."""
 
-    def __init__(self, executor: QuiescentExecutor, log: FaultLog, node: Node) -> None:
-        """Start without faults.
-
-        Args:
-            executor: Executes the nodes.
-            log: Keeps the events.
-            node: Node of the test, which resolves names.
-        """
-        self.executor = executor
-        self.agenda: Agenda = executor.agenda
-        self.log = log
-        self.node = node
-        self.observers: set[Node] = {node}
-        """Nodes that are affected only by faults that name them."""
+    def __init__(self, world: World, traffic: Traffic) -> None:
+        """Start without faults, and open all gates."""
+        self._world = world
+        self._traffic = traffic
+        self._stages: dict[Publisher, list[Stage]] = {}
         self.all: list[Injection] = []
+        """In the order of injection."""
+        executor, keeper = world.executor, world.keeper
+        executor.use(keeper)
+        executor.deliveries.new_reader = self._reader
+        executor.deliveries.replace(executor.nodes)
+        traffic.intercept = self._intercept
 
     def add(self, fault: Injectable, seed: int) -> None:
         """Inject a fault."""
-        injection = Injection(self, fault, len(self.all), seed)
-        self.all.append(injection)
+        injection = Injection(self._world, fault, len(self.all), seed)
         fault.install(injection)
+        self.all.append(injection)
+        for reader in self._world.executor.deliveries.readers():
+            if isinstance(reader, GatedReader):
+                injection.filter_reader(reader)
+        for publisher, stages in self._stages.items():
+            if (stage := injection.publisher_stage(self._owner(publisher), publisher)) is not None:
+                stages.append(stage)
 
-    def enable(self) -> None:
-        """Serve the subscriptions so that messages can be intercepted."""
-        deliveries = self.executor.deliveries
-
-        def create(subscription: Subscription, node: Node) -> GatedReader:
-            reader = GatedReader(subscription, node, self.agenda, deliveries)
-            for injection in self.all:
-                injection.match(reader)
-            return reader
-
-        deliveries.new_reader = create
-        deliveries.replace(self.executor.nodes)
+    def look(self) -> None:
+        """Check which faults have met what they affect."""
+        for injection in self.all:
+            injection.look()
 
     def ineffective(self) -> list[str]:
         """Return descriptions of the faults that met nothing that they could affect."""
-        return [text for injection in self.all if (text := injection.unmatched())]
+        return [text for injection in self.all if (text := injection.ineffective())]
 
+    def events(self) -> list[FaultEvent]:
+        """Return all events, also of the latest messages, of which there may be more."""
+        log = self._world.log
+        return [
+            *log.events,
+            *(log.event(one.fault, text) for one in self.all for text in one.unfinished()),
+        ]
 
-class Injection:
-    """What one fault does to the world.
+    def describe(self) -> str:
+        """Return the faults and their latest events as text."""
+        events = self.events()
+        hidden = max(0, len(events) - MAX_REPORTED)
+        return '\n'.join(
+            [
+                f'faults, {in_seconds(self._world.executor.agenda.now)} after the start:',
+                *(f'  {one.fault!r}: {one.state()}' for one in self.all),
+                f'events of faults{f", without the first {hidden}" if hidden else ""}:',
+                *(f'  {event}' for event in events[hidden:]),
+            ]
+        )
 
-    A fault calls these methods in `install`. Actions happen when the fault begins and ends.
-    """
+    # --- In
 
-    def __init__(self, injections: Injections, fault: Injectable, position: int, seed: int) -> None:
-        """Schedule the beginning and the end of the fault."""
-        self._injections = injections
-        self._fault = fault
-        self._seed = f'{seed}/{position}/{fault!r}'
-        self._agenda = injections.agenda
-        self.active = False
-        """Whether the fault has begun and has not ended."""
-        self._begun: Counter[str] = Counter()
-        self._filter: Callable[[GatedReader], None] | None = None
-        self._missing: str | None = None
-        self._on_start: list[Callable[[], None]] = []
-        self._on_end: list[Callable[[], None]] = []
-        self._agenda.at(nanoseconds(fault.start), self._start)
-        if math.isfinite(fault.duration):
-            self._agenda.at(nanoseconds(fault.start) + nanoseconds(fault.duration), self._end)
+    def _reader(self, subscription: Subscription, node: Node) -> GatedReader:
+        reader = self._world.keeper.reader(subscription, node)
+        for injection in self.all:
+            injection.filter_reader(reader)
+        return reader
 
-    # --- Time
+    # --- Out
 
-    def at_start(self, action: Callable[[], None]) -> None:
-        """Call a function when the fault begins."""
-        self._on_start.append(action)
+    def _intercept(self, publisher: Publisher, message: Any) -> bool:
+        """Send a message of a node later, or another one. Return False if it can be sent now."""
+        if publisher is self._world.log.publisher:
+            return False
+        gate = self._world.keeper.gates.running()
+        if gate is None and not self._stages_of(publisher):
+            return False
+        data = message if isinstance(message, bytes) else serialize_message(message)
+        if gate is not None:
+            gate.leave(partial(self._pass, publisher, 0, data))
+        else:
+            self._pass(publisher, 0, data)
+        return True
 
-    def at_end(self, action: Callable[[], None]) -> None:
-        """Call a function when the fault ends."""
-        self._on_end.append(action)
+    def _stages_of(self, publisher: Publisher) -> list[Stage]:
+        if publisher not in self._stages:
+            owner = self._owner(publisher)
+            if owner is None:
+                # Of a node that has not been added yet.
+                return []
+            found = [injection.publisher_stage(owner, publisher) for injection in self.all]
+            self._stages[publisher] = [stage for stage in found if stage is not None]
+        return self._stages[publisher]
 
-    def note(self, what: str) -> None:
-        """Add an event."""
-        self._injections.log.add(self._fault, what)
+    def _owner(self, publisher: Publisher) -> Node | None:
+        nodes = self._world.executor.nodes
+        return next((node for node in nodes if publisher in node.publishers), None)
 
-    def _start(self) -> None:
-        self.active = True
-        self.note('begins')
-        for action in self._on_start:
-            action()
-
-    def _end(self) -> None:
-        self.active = False
-        for action in self._on_end:
-            action()
-        self.note('ends')
-
-    def rng(self, key: str) -> random.Random:
-        """Return a generator of random numbers. Each call with the same key returns another one."""
-        self._begun[key] += 1
-        return random.Random(f'{self._seed}/{key}/{self._begun[key]}')
-
-    def unmatched(self) -> str | None:
-        """Return why the fault affects nothing; None: it has met what it could affect."""
-        return f'{self._fault!r}: {self._missing}' if self._missing else None
-
-    # --- Topics
-
-    def filter_topic(
-        self,
-        topic: str,
-        node: str,
-        begin: Begin,
-        *,
-        keeps_order: bool = False,
-        at_publisher: bool = False,
-    ) -> None:
-        """Let the messages of a topic pass through a filter.
-
-        Args:
-            topic: Name of the topic.
-            node: Name of the node whose subscriptions are filtered; empty: all but observers.
-            begin: Returns the filter of a subscription.
-            keeps_order: Whether a message never overtakes an earlier one.
-            at_publisher: Whether messages are filtered when they are published, once for all.
-        """
-        name = self._injections.node.resolve_topic_name(topic)
-        owner = node and full_name(node)
-        of = f' of {owner}' if owner else ''
-        self._missing = f'no subscription{of} of {name} was seen'
-
-        def match(reader: GatedReader) -> None:
-            if reader.topic != name:
-                return
-            if reader.node.get_fully_qualified_name() != owner and (
-                owner or reader.node in self._injections.observers
-            ):
-                return
-            self._missing = None
-            reader.stages.append(self._stage(reader, begin, keeps_order))
-
-        self._filter = match
-
-    def match(self, reader: GatedReader) -> None:
-        """Filter the messages of a subscription if they are those of the fault."""
-        if self._filter is not None:
-            self._filter(reader)
-
-    def _stage(self, reader: GatedReader, begin: Begin, keeps_order: bool) -> Stage:
-        rng = self.rng(f'{reader.node.get_fully_qualified_name()} {reader.topic}')
-        change = begin(rng, reader.message_type)
-        observe = getattr(change, 'observe', None)
-        agenda, earliest = self._agenda, 0
-
-        def stage(data: bytes) -> Sequence[tuple[int, bytes]]:
-            nonlocal earliest
-            now = agenda.now
-            if self.active:
-                out = list(change(now, data))
+    def _pass(self, publisher: Publisher, first: int, data: bytes) -> None:
+        """Pass a message through the stages of its publisher from `first` on, and send it."""
+        stages, agenda = self._stages_of(publisher), self._world.executor.agenda
+        if first == len(stages):
+            send_unless_destroyed(self._traffic.publish_now, publisher, data)
+            return
+        for delay, out in stages[first](data):
+            if delay > 0:
+                agenda.at(agenda.now + delay, partial(self._pass, publisher, first + 1, out))
             else:
-                out = [(0, data)]
-                if observe is not None:
-                    observe(now, data)
-            if keeps_order:
-                out = [(max(delay, earliest - now), data) for delay, data in out]
-                earliest = max([earliest, *(now + delay for delay, _ in out)])
-            return out
-
-        return stage
+                self._pass(publisher, first + 1, out)
 
 
-def full_name(node: str) -> str:
-    """Return the fully qualified name of a node: 'robot' is '/robot'."""
-    return node if node.startswith('/') else f'/{node}'
+def check_injectable(faults: Iterable[Any], now: int) -> None:
+    """Check the arguments of `inject`.
 
-
-def described_time(time: int) -> str:
-    """Return a time (ns) in seconds."""
-    return f'{time / NANOSECONDS:g} s'
-
-
-def check_faults(faults: Iterable[Any]) -> None:
-    """Raise LockstepError if one of the arguments of `inject` is no fault."""
+    Raises:
+        LockstepError: One is no fault, or over at the world time `now` (ns).
+    """
     for fault in faults:
-        if not callable(getattr(fault, 'install', None)) or isinstance(fault, type):
+        if isinstance(fault, type) or not callable(getattr(fault, 'install', None)):
             raise LockstepError(f'inject takes faults, got {fault!r}')
+        if fault.start + fault.duration <= now / NANOSECONDS:
+            raise LockstepError(
+                f'{fault!r} is over: {now / NANOSECONDS:g} s have passed since the start'
+            )

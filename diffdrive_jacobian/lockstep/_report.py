@@ -65,15 +65,19 @@ class Traffic:
         self._numbers = count(1)
         self._deliveries: Deliveries | None = None
         self._restore: Callable[[], None] | None = None
+        self.intercept: Callable[[Publisher, Any], bool] | None = None
+        """Called with each message. It returns whether it sends the message itself."""
 
     def start(self, deliveries: Deliveries) -> None:
         """Start counting."""
-        records, now, numbers = self._records, self._now, self._numbers
+        traffic, records, now, numbers = self, self._records, self._now, self._numbers
         self._deliveries = deliveries
         extend = deliveries.pending.extend
 
         def counting(publish: Callable[..., None]) -> Callable[..., None]:
             def counted(self: Publisher, msg: Any) -> None:
+                if (intercept := traffic.intercept) is not None and intercept(self, msg):
+                    return
                 publish(self, msg)
                 record = records.get(self)
                 if record is None:
@@ -87,6 +91,14 @@ class Traffic:
             return counted
 
         self._restore = wrap_publish(counting)
+
+    def publish_now(self, publisher: Publisher, message: Any) -> None:
+        """Publish a message that is not intercepted."""
+        intercept, self.intercept = self.intercept, None
+        try:
+            publisher.publish(message)
+        finally:
+            self.intercept = intercept
 
     def last(self, topic: str) -> Any:
         """Return the last message of a topic as it was received; None: there is none."""

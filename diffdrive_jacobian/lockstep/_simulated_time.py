@@ -145,21 +145,18 @@ class SimulatedTime:
         self.connect()
         self.settle()
         self._now = now
-        if self._external is not None:
-            self._external.jumped()
         self._publish_clock()
-        if self._external is not None:
-            self._external.confirm(CONNECTION)
-            self._await_others()
 
     def _advance(self, end: float) -> None:
         """Advance to the next timer or action, but not beyond an end of world time (ns)."""
+        self.connect()
         until_next = math.inf if self._until_next is None else self._until_next
         agenda = self._executor.agenda
         # The minimum of integers is exact, also beside infinity.
         passed = int(min(until_next, end - agenda.now))
         agenda.now += passed
-        self._now += passed
+        if not self._executor.clock_pauses:
+            self._now += passed
         self._publish_clock()
 
     def _publish_clock(self) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from typing import Any
 
+from rclpy.node import Node
 from rclpy.task import Task
 
 from diffdrive_jacobian.ros.rclpy_internals import new_task
@@ -21,18 +23,21 @@ class Tasks:
         """Return the number of tasks that are not done."""
         return len(self._tasks)
 
-    def create(self, callback: Any, args: Any, kwargs: Any, executor: Any) -> Task:
-        """Add a function or a coroutine. Return its future."""
+    def create(self, owner: Node | None, callback: Any, args: Any, kwargs: Any, executor: Any) -> Task:
+        """Add a function or a coroutine of a node. Return its future."""
         if _is_async(callback):
             callback, args, kwargs = callback(*args, **kwargs), (), {}
-        task = _Task(callback, new_task(callback, args, kwargs, executor))
+        task = _Task(callback, new_task(callback, args, kwargs, executor), owner)
         self._tasks.append(task)
         return task.future
 
-    def run(self) -> bool:
+    def run(self, frozen: Callable[[Node], bool] | None = None) -> bool:
         """Continue each task once. Return whether any made progress.
 
         It is not known what a coroutine waits for, so it is continued and may wait again.
+
+        Args:
+            frozen: Returns whether a node is frozen: its tasks are not continued.
         """
         progress = False
         tasks, self._tasks = self._tasks, []
@@ -40,6 +45,9 @@ class Tasks:
         try:
             while tasks:
                 task = tasks.pop(0)
+                if frozen is not None and task.owner is not None and frozen(task.owner):
+                    waiting.append(task)
+                    continue
                 progress |= task.proceed()
                 if (error := task.future.exception()) is not None:
                     raise error
@@ -49,17 +57,20 @@ class Tasks:
             self._tasks = [*waiting, *tasks, *self._tasks]
         return progress
 
-    def cancel(self) -> None:
-        """Cancel all."""
+    def cancel(self, owner: Node | None = None) -> None:
+        """Cancel all, or those of a node."""
         for task in self._tasks:
-            task.future.cancel()
+            if owner is None or task.owner is owner:
+                task.future.cancel()
+        self._tasks = [task for task in self._tasks if not task.future.cancelled()]
 
 
 class _Task:
     """A task and the point at which its coroutine waits."""
 
-    def __init__(self, handler: Any, future: Task) -> None:
+    def __init__(self, handler: Any, future: Task, owner: Node | None) -> None:
         self.future = future
+        self.owner = owner
         self._handler = handler
         # A reference is kept so that no later object has the same identity.
         self._waits_for: Any = self

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.timer import Timer
 
 from diffdrive_jacobian.ros.rclpy_internals import RCLError, TimerHandle, timer_handle
+
+Entry = tuple[TimerHandle, Timer, Node]
+"""A timer of a node, with its handle."""
 
 
 class Timers:
@@ -17,16 +20,26 @@ class Timers:
     def __init__(self) -> None:
         """Start without timers."""
         # With their handles, whose methods take a third of the time of those of the timers.
-        self._sim_timers: list[tuple[TimerHandle, Timer]] = []
-        self._wall_timers: list[tuple[TimerHandle, Timer]] = []
+        self._sim_timers: list[Entry] = []
+        self._wall_timers: list[Entry] = []
 
-    def update(self, nodes: Iterable[Node]) -> None:
-        """Find the timers of the nodes."""
-        timers = [(timer_handle(timer), timer) for node in nodes for timer in node.timers]
+    def update(self, nodes: Iterable[Node], without: Container[Timer] = ()) -> None:
+        """Find the timers of the nodes.
+
+        Args:
+            nodes: The nodes.
+            without: Timers that do not tick.
+        """
+        timers = [
+            (timer_handle(timer), timer, node)
+            for node in nodes
+            for timer in node.timers
+            if timer not in without
+        ]
         self._sim_timers = [pair for pair in timers if _follows_sim_time(pair[1])]
         self._wall_timers = [pair for pair in timers if not _follows_sim_time(pair[1])]
 
-    def due(self) -> tuple[list[tuple[TimerHandle, Timer]], int | None]:
+    def due(self) -> tuple[list[Entry], int | None]:
         """Return the due timers, the most overdue first, and the time until the next one (ns)."""
         due, until_next = [], None
         for pair in self._sim_timers:
@@ -44,6 +57,17 @@ class Timers:
         # Sorting is stable: timers that are due at the same time stay in the order of their creation.
         due.sort(key=lambda item: item[0])
         return [pair for _, pair in due], until_next
+
+    def most_overdue(self, node: Node) -> tuple[int, TimerHandle, Timer] | None:
+        """Return the most overdue timer of a node, and for how long it has been due (ns).
+
+        None: no timer is due.
+        """
+        due, _ = self.due()
+        for handle, timer, owner in due:
+            if owner is node:
+                return -(handle.time_until_next_call() or 0), handle, timer
+        return None
 
 
 def is_due(handle: TimerHandle) -> bool:

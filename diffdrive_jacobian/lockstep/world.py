@@ -141,8 +141,13 @@ class Lockstep(Disturbed, Processes):
         for node in nodes:
             node.destroy_node()
 
-    def add(self, node: N) -> N:
+    def add(self, node: N, *, observer: bool = False) -> N:
         """Add a node. It receives the time, and its callbacks that are due are executed.
+
+        Args:
+            node: The node.
+            observer: Whether the node belongs to the test, as a recorder does: only faults that name it
+                affect the messages that it receives.
 
         Returns:
             The node.
@@ -152,6 +157,17 @@ class Lockstep(Disturbed, Processes):
                 time; or it is no node.
         """
         self._check_open()
+        self._check_new(node)
+        if self._busy:
+            name = node.get_fully_qualified_name()
+            raise LockstepError(f'node {name} cannot be added within a callback')
+        if observer:
+            self._observers.add(node)
+        self._executor.add(node)
+        self._publish_clock()
+        return node
+
+    def _check_new(self, node: Node) -> None:
         if not isinstance(node, Node):
             hint = f'; create one: add({node.__name__}(...))' if isinstance(node, type) else ''
             raise LockstepError(f'add takes a node, got {described(node)}{hint}')
@@ -170,11 +186,6 @@ class Lockstep(Disturbed, Processes):
         if node.executor is not None:
             raise LockstepError(f'node {name} is in another executor: remove it from there')
         self._check_sim_time(node)
-        if self._busy:
-            raise LockstepError(f'node {name} cannot be added within a callback')
-        self._executor.add(node)
-        self._publish_clock()
-        return node
 
     def remove(self, node: Node) -> None:
         """Remove and destroy a node without stopping it, as if its process was killed.
@@ -232,6 +243,7 @@ class Lockstep(Disturbed, Processes):
         wrap_sleep(node.get_clock(), refusing)
 
     def _on_discovery(self) -> None:
+        super()._on_discovery()
         for callback in self._on_new:
             callback()
 

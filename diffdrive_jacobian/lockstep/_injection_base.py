@@ -1,0 +1,169 @@
+"""What every fault needs of a world: its time, its random numbers and its events."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+from rclpy.node import Node
+
+from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
+from diffdrive_jacobian.lockstep._fault_log import FaultLog, Hits
+from diffdrive_jacobian.lockstep._gates import Gate
+from diffdrive_jacobian.lockstep._keeper import Keeper
+from diffdrive_jacobian.time_units import nanoseconds
+
+
+class Timed(Protocol):
+    """A fault, as far as its time is concerned."""
+
+    @property
+    def start(self) -> float:
+        """World time at which it begins (s)."""
+
+    @property
+    def duration(self) -> float:
+        """How long it lasts (s)."""
+
+
+@dataclass(frozen=True)
+class World:
+    """What faults do with a world.
+
+    Attributes:
+        executor: Executes the nodes.
+        keeper: Keeps the gates of the nodes.
+        node: Node of the test, which resolves names.
+        log: Keeps the events.
+        observers: Nodes that are affected only by faults that name them.
+        shift_clock: Lets the clock of the nodes jump by a time (ns). Returns by how much it did.
+        restartable: Returns whether the node of a name can be made again.
+        restart: Makes the node of a name again.
+    """
+
+    executor: QuiescentExecutor
+    keeper: Keeper
+    node: Node
+    log: FaultLog
+    observers: set[Node]
+    shift_clock: Callable[[int], int]
+    restartable: Callable[[str], bool]
+    restart: Callable[[str], None]
+
+    def find(self, name: str) -> Node | None:
+        """Return the node that has a fully qualified name now; None: there is none."""
+        nodes = self.executor.nodes
+        return next((node for node in nodes if node.get_fully_qualified_name() == name), None)
+
+    def gate(self, name: str) -> Gate:
+        """Return the gate of the node with a fully qualified name."""
+        return self.keeper.gates.of(name)
+
+
+class InjectionBase:
+    """Time, random numbers and events of one fault."""
+
+    def __init__(self, world: World, fault: Timed, position: int, seed: int) -> None:
+        """Schedule the beginning and the end of the fault."""
+        self._world = world
+        self.fault = fault
+        self._position = position
+        self._seed = f'{seed}/{position}/{fault!r}'
+        self._agenda = world.executor.agenda
+        self.active = False
+        """Whether the fault has begun and has not ended."""
+        self.ended = False
+        """Whether it has ended."""
+        self._generators: Counter[str] = Counter()
+        self._missing: str | None = None
+        self._is_there: Callable[[Iterable[Node]], bool] = any
+        self._on_start: list[Callable[[], None]] = []
+        self._on_end: list[Callable[[], None]] = []
+        self._hits: list[Hits] = []
+        self._agenda.at(nanoseconds(fault.start), self._start)
+        if math.isfinite(fault.duration):
+            self._agenda.at(nanoseconds(fault.start) + nanoseconds(fault.duration), self._end)
+
+    # --- Time
+
+    def at_start(self, action: Callable[[], None]) -> None:
+        """Call a function when the fault begins."""
+        self._on_start.append(action)
+
+    def at_end(self, action: Callable[[], None]) -> None:
+        """Call a function when the fault ends."""
+        self._on_end.append(action)
+
+    def _start(self) -> None:
+        self.active = True
+        self.note('begins')
+        for action in self._on_start:
+            action()
+
+    def _end(self) -> None:
+        self.active, self.ended = False, True
+        for action in self._on_end:
+            action()
+        for hits in self._hits:
+            hits.flush()
+        totals = self.totals()
+        what = f'ends: {totals}' if totals else 'ends'
+        self._world.log.add(self._position, self.fault, what, last=True)
+
+    # --- Random numbers
+
+    def rng(self, key: str) -> random.Random:
+        """Return a generator of random numbers. Each call with the same key returns another one."""
+        self._generators[key] += 1
+        return random.Random(f'{self._seed}/{key}/{self._generators[key]}')
+
+    # --- Events
+
+    def note(self, what: str) -> None:
+        """Add an event."""
+        self._world.log.add(self._position, self.fault, what)
+
+    def totals(self) -> str:
+        """Return how many messages were affected so far; empty: the fault affects no messages."""
+        return ', '.join(hits.total() for hits in self._hits)
+
+    def state(self) -> str:
+        """Return whether the fault is active, and what it did so far."""
+        state = 'active' if self.active else 'ended' if self.ended else 'not begun'
+        details = self._missing if self._missing else self.totals()
+        return f'{state}, {details}' if details else state
+
+    def unfinished(self) -> list[str]:
+        """Return what the fault did to the latest messages, as far as there is no event of it yet."""
+        return [text for hits in self._hits if (text := hits.open())]
+
+    # --- What the fault affects
+
+    def _expect(self, missing: str, look: Callable[[Iterable[Node]], bool]) -> None:
+        """Expect something that the fault affects.
+
+        Args:
+            missing: What to report if it never appears.
+            look: Returns whether it is there, among nodes.
+        """
+        self._missing = missing
+        self._is_there = look
+        self.look()
+
+    def look(self) -> None:
+        """Check whether there is anything that the fault affects."""
+        if self._missing is not None and self._is_there(self._world.executor.nodes):
+            self._missing = None
+
+    def ineffective(self) -> str | None:
+        """Return why the fault affects nothing; None: it has met what it could affect."""
+        return f'{self.fault!r}: {self._missing}' if self._missing else None
+
+
+def full_name(node: str) -> str:
+    """Return the fully qualified name of a node: 'robot' is '/robot'."""
+    return node if node.startswith('/') else f'/{node}'

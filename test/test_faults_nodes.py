@@ -1,0 +1,284 @@
+"""Faults of nodes: what of them is executed, and when."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from types import SimpleNamespace
+
+import pytest
+from faults_nodes import LATCHED, Relay, Sink, Source, whats
+from rclpy.node import Node
+from std_msgs.msg import Int64
+from std_srvs.srv import Trigger
+
+from diffdrive_jacobian.lockstep._keeper import check_holdable
+from diffdrive_jacobian.testing import LockstepError, faults
+
+
+@pytest.fixture
+def relay(lockstep):
+    """A relay between source and sink, which have not sent and received anything yet."""
+    source = lockstep.create(Source)
+    relay = lockstep.create(Relay)
+    relay.sink = lockstep.create(lambda: Sink(topic='relayed'))
+    relay.source = source
+    relay.ticks.clear()
+    return relay
+
+
+# --- Killed
+
+
+def test_a_killed_node_stops_at_once_and_is_made_again(lockstep, relay):
+    lockstep.inject(faults.Kill('relay', start=0.35, duration=0.3))
+    lockstep.run_for(1.0)
+    again = lockstep.find('relay')
+    assert again is not relay
+    assert relay.numbers == [1, 2, 3]
+    assert relay.ticks == [100.0, 200.0, 300.0]
+    assert again.numbers == [7, 8, 9, 10]
+    # Timers that are created before the first /clock tick at multiples of their period.
+    assert again.ticks == [650.0, 700.0, 800.0, 900.0, 1000.0]
+    assert relay.sink.numbers == [1, 2, 3, 7, 8, 9, 10]
+    assert whats(lockstep) == [
+        'begins',
+        '/relay is killed',
+        '/relay is started again',
+        'ends',
+    ]
+    with pytest.raises(Exception, match='destruction'):
+        relay.publisher.publish(Int64())
+
+
+def test_others_see_in_the_graph_that_a_node_is_gone(lockstep, relay):
+    lockstep.inject(faults.Kill('/relay', start=0.2))
+    seen = []
+    lockstep.node.create_timer(0.1, lambda: seen.append(relay.source.publisher.get_subscription_count()))
+    lockstep.run_for(0.4)
+    assert seen == [1, 0, 0, 0]
+    with pytest.raises(LockstepError, match='there is no node /relay; nodes: /lockstep, /source, /sink'):
+        lockstep.find('relay')
+
+
+def test_latched_messages_of_a_killed_node_are_gone(lockstep):
+    lockstep.create(lambda: Source(profile=LATCHED))
+    lockstep.inject(faults.Kill('source', start=0.25))
+    lockstep.run_for(0.3)
+    assert lockstep.add(Sink(profile=LATCHED)).received == []
+
+
+def test_a_node_that_is_killed_twice_rises_when_both_faults_are_over(lockstep, relay):
+    lockstep.inject(
+        faults.Kill('relay', start=0.15, duration=0.4), faults.Kill('relay', start=0.35, duration=0.4)
+    )
+    lockstep.run_for(1.0)
+    assert lockstep.find('relay').numbers == [8, 9, 10]
+    assert [what for what in whats(lockstep) if 'not there' in what] == ['the node is not there']
+
+
+def test_a_node_without_a_factory_cannot_be_made_again(lockstep):
+    lockstep.add(Relay())
+    lockstep.inject(faults.Kill('relay', start=0.1, duration=0.1))
+    with pytest.raises(LockstepError, match='cannot start /relay again: create it with'):
+        lockstep.run_for(1.0)
+
+
+def test_tasks_of_a_killed_node_end(lockstep):
+    done = []
+
+    class Waiter(Node):
+        def __init__(self):
+            super().__init__('waiter')
+            self.client = self.create_client(Trigger, 'ask')
+            self.create_subscription(Int64, 'count', self.on_message, 10)
+
+        async def on_message(self, message):
+            done.append(message.data)
+            await self.client.call_async(Trigger.Request())
+            done.append('answered')
+
+    lockstep.create(Relay)
+    lockstep.create(Waiter)
+    lockstep.inject(faults.LateService('ask', 0.5), faults.Kill('waiter', start=0.2))
+    lockstep.publish('count', Int64(data=5))
+    lockstep.run_for(1.0)
+    assert done == [5]
+
+
+# --- Frozen
+
+
+def test_a_frozen_node_continues_with_what_waits(lockstep, relay):
+    lockstep.inject(faults.Hang('relay', start=0.25, duration=0.3))
+    lockstep.run_for(1.0)
+    assert relay.received == [
+        *[(1, 100.0), (2, 200.0)],
+        *[(3, 550.0), (4, 550.0), (5, 550.0)],
+        *[(number, 100.0 * number) for number in range(6, 11)],
+    ]
+    assert relay.ticks == [100.0, 200.0, 550.0, 600.0, 700.0, 800.0, 900.0, 1000.0]
+    assert relay.sink.received == relay.received
+    assert '3 messages and requests wait' in whats(lockstep)
+
+
+def test_the_queues_of_a_frozen_node_lose_the_oldest(lockstep):
+    relay = lockstep.create(lambda: Relay(profile=2))
+    lockstep.create(Source)
+    relay.received.clear()
+    lockstep.inject(faults.Hang('relay', start=0.05, duration=0.5))
+    lockstep.run_for(0.7)
+    assert relay.received == [(4, 550.0), (5, 550.0), (6, 600.0), (7, 700.0)]
+    assert '2 messages and requests wait, lost from full queues: 3 of /count' in whats(lockstep)
+
+
+def test_a_frozen_node_responds_late(lockstep, relay):
+    lockstep.inject(faults.Hang('relay', start=0.1, duration=0.4))
+    lockstep.run_for(0.2)
+    assert lockstep.call(Trigger, 'ask').success
+    assert relay.calls == [500.0]
+
+
+def test_a_frozen_node_receives_responses_and_continues_its_tasks_late(lockstep):
+    order = []
+    asking = lockstep.create(lambda: Node('asking'))
+    client = asking.create_client(Trigger, 'ask')
+
+    async def ask(_):
+        future = client.call_async(Trigger.Request())
+        future.add_done_callback(lambda _: order.append(('done', lockstep.elapsed)))
+        await future
+        order.append(('answered', lockstep.elapsed))
+
+    asking.create_subscription(Int64, 'count', ask, 10)
+    relay = lockstep.create(Relay)
+    lockstep.inject(faults.LateService('ask', 0.2), faults.Hang('asking', start=0.1, duration=0.4))
+    lockstep.publish('count', Int64())
+    lockstep.run_for(1.0)
+    assert relay.calls == [0.0]
+    assert order == [('done', 0.5), ('answered', 0.5)]
+
+
+def test_two_holds_of_a_node_add_up(lockstep, relay):
+    lockstep.inject(
+        faults.Hang('relay', start=0.15, duration=0.3), faults.Hang('relay', start=0.3, duration=0.45)
+    )
+    lockstep.run_for(0.9)
+    assert relay.received[2:] == [*((number, 750.0) for number in range(3, 8)), (8, 800.0), (9, 900.0)]
+
+
+def test_a_delayed_message_waits_in_the_queue_of_a_frozen_node(lockstep, relay):
+    lockstep.inject(
+        faults.Delay('count', 0.25, node='relay', duration=0.15),
+        faults.Hang('relay', start=0.3, duration=0.25),
+    )
+    lockstep.run_for(0.6)
+    assert relay.received == [*((number, 550.0) for number in range(1, 6)), (6, 600.0)]
+
+
+def test_a_node_with_an_action_cannot_be_frozen():
+    """No package with actions is installed here."""
+    node = SimpleNamespace(waitables=[object()], get_fully_qualified_name=lambda: '/node')
+    with pytest.raises(LockstepError, match='/node has an action, which cannot be frozen or slow'):
+        check_holdable(node)
+
+
+# --- Slow
+
+
+def test_what_a_slow_node_publishes_leaves_late_and_what_arrives_waits(lockstep, relay):
+    for timer in relay.timers:
+        timer.cancel()
+    lockstep.inject(faults.Slow('relay', 0.15, start=0.05, duration=0.6))
+    lockstep.run_for(1.5)
+    assert relay.received == [
+        *[(1, 100.0), (2, 250.0), (3, 400.0), (4, 550.0)],
+        *[(5, 700.0), (6, 700.0), (7, 700.0)],
+        *[(number, 100.0 * number) for number in range(8, 16)],
+    ]
+    assert relay.sink.received == [
+        *[(1, 250.0), (2, 400.0), (3, 550.0), (4, 700.0)],
+        *[(5, 700.0), (6, 700.0), (7, 700.0)],
+        *[(number, 100.0 * number) for number in range(8, 16)],
+    ]
+
+
+def test_a_slow_node_does_what_has_waited_longest(lockstep, relay):
+    """Messages and ticks are due together. The message comes first, the tick is older than the next."""
+    lockstep.inject(faults.Slow('relay', 0.06))
+    lockstep.run_for(0.5)
+    assert relay.received == [(1, 100.0), (2, 220.0), (3, 340.0), (4, 460.0)]
+    assert relay.ticks == [160.0, 280.0, 400.0]
+
+
+def test_a_slow_node_loses_messages_from_a_full_queue(lockstep):
+    relay = lockstep.create(lambda: Relay(profile=1, period=99.0))
+    lockstep.create(Source)
+    relay.received.clear()
+    lockstep.inject(faults.Slow('relay', 0.25, start=0.05))
+    lockstep.run_for(1.0)
+    assert relay.received == [(1, 100.0), (3, 350.0), (5, 600.0), (8, 850.0)]
+
+
+def test_a_slow_service_responds_late_and_serves_one_after_the_other(lockstep):
+    relay = lockstep.create(lambda: Relay(period=99.0))
+    client, answers = lockstep.node.create_client(Trigger, 'ask'), []
+    lockstep.inject(faults.Slow('relay', 0.2))
+    for _ in range(2):
+        client.call_async(Trigger.Request()).add_done_callback(
+            lambda _: answers.append(lockstep.elapsed)
+        )
+    lockstep.run_for(1.0)
+    assert relay.calls == [0.0, 200.0]
+    assert answers == [0.2, 0.4]
+
+
+# --- Timers
+
+
+def test_ticks_come_late_by_a_random_time_but_not_more_and_more(lockstep, relay):
+    lockstep.inject(faults.TimerJitter('relay', 0.03, start=0.15, duration=0.7), seed=3)
+    lockstep.run_for(1.1)
+    late = [tick - 100.0 * (number + 1) for number, tick in enumerate(relay.ticks)]
+    assert len(late) == 11
+    assert late[0] == 0.0
+    assert all(0.0 < one <= 30.0 for one in late[1:8])
+    assert len(set(late[1:8])) == 7
+    assert late[8:] == pytest.approx([0.0] * 3)
+
+
+def test_a_tick_later_than_a_period_replaces_those_between(lockstep, relay):
+    lockstep.inject(faults.TimerJitter('relay', 0.5), seed=1)
+    lockstep.run_for(5.0)
+    gaps = [after - before for before, after in pairwise(relay.ticks)]
+    assert 10 < len(relay.ticks) < 40
+    assert max(gaps) < 700.0
+
+
+# --- Parameters
+
+
+def test_a_parameter_is_changed_and_changed_back(lockstep, relay):
+    values = []
+    lockstep.node.create_timer(0.1, lambda: values.append(relay.get_parameter('gain').value))
+    lockstep.inject(faults.ParameterChange('relay', 'gain', 3.0, start=0.15, duration=0.2))
+    lockstep.run_for(0.5)
+    assert values == [1.0, 3.0, 3.0, 1.0, 1.0]
+    assert whats(lockstep) == ['begins', 'gain is 3.0, was 1.0', 'gain is 1.0, was 3.0', 'ends']
+
+
+def test_a_refused_value_is_an_event_and_an_unknown_parameter_an_error(lockstep, relay):
+    lockstep.inject(faults.ParameterChange('relay', 'gain', 'high'))
+    assert whats(lockstep)[1].startswith("gain = 'high' is refused: ")
+    assert relay.get_parameter('gain').value == 1.0
+    with pytest.raises(LockstepError, match="/relay has no parameter 'kp'; it has gain"):
+        lockstep.inject(faults.ParameterChange('relay', 'kp', 1.0))
+
+
+def test_node_faults_that_met_no_node_are_errors(lockstep):
+    lockstep.inject(
+        faults.Kill('a'), faults.Hang('b'), faults.Slow('/c/d', 1.0), faults.TimerJitter('e', 1.0)
+    )
+    with pytest.raises(LockstepError) as caught:
+        lockstep.check_faults()
+    for name in ('/a', '/b', '/c/d', '/e'):
+        assert f'no node {name} was seen' in str(caught.value)

@@ -1,0 +1,320 @@
+"""Faults of the clock and of services, faults as values, and the same run each time."""
+
+from __future__ import annotations
+
+import pickle
+import random
+import subprocess
+import sys
+from dataclasses import FrozenInstanceError, dataclass, fields
+from hashlib import sha256
+from pathlib import Path
+
+import pytest
+from faults_nodes import Relay, Sink, Source, whats
+from geometry_msgs.msg import PoseStamped
+from std_msgs.msg import Int64
+from std_srvs.srv import Trigger
+
+from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.testing import LockstepError, faults
+
+INF = float('inf')
+
+
+# --- Clock
+
+
+def test_the_clock_jumps_there_and_back_while_world_time_goes_on(lockstep):
+    source, sink = lockstep.create(Source), lockstep.create(Sink)
+    sink.received.clear()
+    lockstep.inject(faults.TimeJump(5.0, start=0.35, duration=0.3))
+    lockstep.run_for(1.0)
+    assert lockstep.world_time == 1_000_000_000
+    assert lockstep.elapsed == 1.0
+    assert sink.received[:4] == [(1, 100.0), (2, 200.0), (3, 300.0), (4, 5350.0)]
+    assert sink.received[4:7] == [(5, 5400.0), (6, 5500.0), (7, 5600.0)]
+    assert source.number > 7
+    assert 'the clock has jumped by 5 s' in whats(lockstep)
+    assert 'the clock has jumped by -5 s' in whats(lockstep)
+
+
+def test_run_for_and_run_until_count_world_time(lockstep):
+    lockstep.inject(faults.TimeJump(-0.5, start=0.4), faults.ClockPause(start=0.6, duration=0.2))
+    lockstep.run_for(1.0)
+    assert (lockstep.world_time, lockstep.now) == (1_000_000_000, 1_300_000_000)
+    with pytest.raises(LockstepError, match='not within'):
+        lockstep.run_until(lambda: False, timeout=0.5)
+    assert lockstep.world_time == 1_500_000_000
+
+
+def test_the_clock_does_not_go_below_one_nanosecond(lockstep):
+    lockstep.inject(faults.TimeJump(-9.0, start=0.5, duration=0.25))
+    lockstep.run_for(0.6)
+    assert lockstep.now == 100_000_001
+    lockstep.run_for(0.4)
+    assert lockstep.now == 2_000_000_000
+
+
+def test_a_clock_that_stands_stops_timers_but_not_messages(lockstep):
+    source, sink = lockstep.create(Source), lockstep.create(Sink)
+    sink.received.clear()
+    lockstep.inject(
+        faults.Delay('count', 0.25, start=0.25, duration=0.1),
+        faults.ClockPause(start=0.35, duration=0.4),
+    )
+    arrived = []
+    lockstep.run_until(lambda: arrived.append(lockstep.world_time) or len(sink.received) == 3, 0.6)
+    assert arrived[-1] == 550_000_000
+    assert sink.received[-1] == (3, 350.0)
+    assert source.number == 4
+    lockstep.run_for(0.45)
+    assert sink.received[3:] == [(4, 400.0), (5, 500.0), (6, 600.0)]
+    assert lockstep.now == 1_600_000_000
+
+
+def test_step_goes_to_the_next_event_of_a_fault(lockstep):
+    lockstep.inject(faults.ClockPause(start=0.3, duration=0.1))
+    lockstep.step()
+    lockstep.step()
+    assert lockstep.world_time == 400_000_000
+    with pytest.raises(LockstepError, match='no timer is running'):
+        lockstep.step()
+
+
+# --- Services
+
+
+def test_a_service_responds_late_or_never(lockstep):
+    relay = lockstep.create(Relay)
+    lockstep.inject(
+        faults.LateService('ask', 0.3, duration=0.5),
+        faults.LateService('/ask', 0.2, duration=0.5),
+        faults.LateService('ask', INF, start=1.0),
+    )
+    lockstep.call(Trigger, 'ask')
+    assert lockstep.elapsed == 0.5
+    assert relay.calls == [0.0]
+    lockstep.call(Trigger, 'ask')
+    assert lockstep.elapsed == 0.5
+    lockstep.run_for(0.5)
+    with pytest.raises(LockstepError, match='not within 10 s of simulated time: a response of /ask'):
+        lockstep.call(Trigger, 'ask')
+    assert relay.calls == [0.0, 500.0, 1000.0]
+    assert 'a response is 0.3 s late' in whats(lockstep)
+    assert 'a response is never sent' in whats(lockstep)
+
+
+def test_a_service_that_does_not_exist_is_named(lockstep):
+    lockstep.inject(faults.LateService('aks', 1.0))
+    with pytest.raises(LockstepError, match=r"LateService\('aks', 1.0\): no service /aks was seen"):
+        lockstep.check_faults()
+
+
+def test_the_response_of_a_service_that_is_gone_is_lost(lockstep):
+    lockstep.create(Relay)
+    client = lockstep.node.create_client(Trigger, 'ask')
+    lockstep.inject(faults.LateService('ask', 0.3), faults.Kill('relay', start=0.2))
+    future = client.call_async(Trigger.Request())
+    lockstep.run_for(1.0)
+    assert not future.done()
+
+
+# --- Faults of publishers
+
+
+@dataclass(frozen=True, repr=False)
+class Doubled(faults.TopicFault):
+    """Messages arrive twice as large, and late."""
+
+    late: int = 0
+    at_publisher = True
+
+    def begin(self, rng, message_type):
+        assert message_type is Int64
+        return lambda now, data: [
+            (self.late, data[:4] + (2 * int.from_bytes(data[4:], 'little')).to_bytes(8, 'little'))
+        ]
+
+
+def test_a_fault_of_a_publisher_is_seen_by_everybody(lockstep):
+    heard = lockstep.listen(Int64, 'count')
+    sinks = [lockstep.add(Sink(name)) for name in 'ab']
+    lockstep.add(Source())
+    lockstep.inject(
+        Doubled('count', node='source'), Doubled('count', node='source', late=50_000_000, start=0.15)
+    )
+    lockstep.run_for(0.4)
+    expected = [(0, 0.0), (2, 100.0), (8, 250.0), (12, 350.0)]
+    assert sinks[0].received == sinks[1].received == expected
+    assert [message.data for message in heard] == [0, 2, 8, 12]
+    assert lockstep.last('count').data == 12
+    assert whats(lockstep)[2].startswith('messages 1 to 4 of /count from /source changed')
+    lockstep.inject(Doubled('count', node='sauce'))
+    with pytest.raises(LockstepError, match='no publisher of /sauce of /count was seen'):
+        lockstep.check_faults()
+
+
+# --- As values
+
+ALL = [
+    faults.Loss('odom', probability=0.5, start=2, duration=1),
+    faults.Loss('odom', 0.5, 3, node='go_to_goal'),
+    faults.Delay('odom', 0.2, spread=0.1, growth=0.01),
+    faults.Reorder('odom', 0.5, 0.1),
+    faults.Duplicate('odom'),
+    faults.RateLimit('odom', 10),
+    faults.Stale('odom', start=1.5),
+    faults.Kill('virtual_robot', start=1.0, duration=2.0),
+    faults.Hang('virtual_robot'),
+    faults.Slow('virtual_robot', 0.01),
+    faults.TimerJitter('virtual_robot', 0.005),
+    faults.TimeJump(-5.0),
+    faults.ClockPause(duration=2.0),
+    faults.LateService('reset', INF),
+    faults.ParameterChange('go_to_goal', 'kp', 2.0),
+    faults.ParameterChange('go_to_goal', 'names', ['a']),
+]
+
+
+@pytest.mark.parametrize('fault', ALL, ids=repr)
+def test_faults_are_values(fault):
+    same = eval(repr(fault), vars(faults))
+    assert same == fault == pickle.loads(pickle.dumps(fault))
+    assert hash(same) == hash(fault)
+    assert repr(same) == repr(fault)
+    assert fault.__doc__
+    for one in fields(fault):
+        with pytest.raises(FrozenInstanceError):
+            setattr(fault, one.name, 1)
+
+
+def test_the_expression_of_a_fault_is_short():
+    assert repr(ALL[0]) == "Loss('odom', probability=0.5, start=2.0, duration=1.0)"
+    assert repr(ALL[13]) == "LateService('reset', float('inf'))"
+    assert repr(ALL[15]) == "ParameterChange('go_to_goal', 'names', ('a',))"
+
+
+@pytest.mark.parametrize(
+    ('make', 'words'),
+    [
+        (lambda: faults.Loss(''), "topic must be a string that is not empty, got ''"),
+        (lambda: faults.Loss('a', node=3), 'node must be a string, got 3'),
+        (lambda: faults.Loss('a', probability=1.5), 'probability must be between 0 and 1, got 1.5'),
+        (lambda: faults.Loss('a', probability='x'), "probability must be between 0 and 1, got 'x'"),
+        (lambda: faults.Loss('a', burst=0), 'burst must be an integer of at least 1, got 0'),
+        (lambda: faults.Loss('a', burst=True), 'burst must be an integer of at least 1, got True'),
+        (lambda: faults.Loss('a', start=-1), 'start must be a number of at least 0, got -1'),
+        (lambda: faults.Loss('a', start=INF), 'start must be a number of at least 0, got inf'),
+        (
+            lambda: faults.Loss('a', duration=0.0),
+            'duration must be a number above 0, or infinite, got 0',
+        ),
+        (lambda: faults.Delay('a', float('nan')), 'seconds must be a number of at least 0, got nan'),
+        (lambda: faults.Reorder('a', 0.5, 0.0), 'seconds must be a number above 0, got 0.0'),
+        (lambda: faults.Duplicate('a', copies=1.5), 'copies must be an integer of at least 1, got 1.5'),
+        (lambda: faults.RateLimit('a', 0), 'rate must be a number above 0, got 0'),
+        (lambda: faults.Slow('a', -1.0), 'seconds must be a number above 0, got -1.0'),
+        (lambda: faults.TimeJump(0.0), 'seconds must not be zero, got 0.0'),
+        (lambda: faults.TimeJump(INF), 'seconds must be a finite number, got inf'),
+        (lambda: faults.LateService('a', 0.0), 'seconds must be a number above 0, or infinite, got 0.0'),
+        (lambda: faults.ParameterChange('a', 'b', None), 'value must be a bool, int, float, str, or a'),
+        (lambda: faults.ParameterChange('a', 'b', [1, 'x']), r"got \[1, 'x'\]"),
+    ],
+)
+def test_invalid_values_are_named(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+# --- The same each time
+
+
+def schedule(seed):
+    """Return a random schedule of faults of all kinds for robot, bridge and controller."""
+    rng = random.Random(seed)
+    topics = ('odom', 'cmd_vel', 'joint_command', 'goal_pose')
+    nodes = ('virtual_robot', 'go_to_goal', 'wheel_bridge')
+
+    def times():
+        return {'start': rng.uniform(0.0, 1.5), 'duration': rng.choice([0.2, 0.5, 1.0])}
+
+    def one():
+        topic, node = rng.choice(topics), rng.choice(nodes)
+        return rng.choice(
+            [
+                lambda: faults.Loss(topic, probability=0.3, burst=2, **times()),
+                lambda: faults.Delay(topic, 0.03, spread=0.1, growth=0.1, **times()),
+                lambda: faults.Reorder(topic, 0.3, 0.05, **times()),
+                lambda: faults.Duplicate(topic, probability=0.5, seconds=0.01, **times()),
+                lambda: faults.RateLimit(topic, 20.0, **times()),
+                lambda: faults.Stale(topic, **times()),
+                lambda: faults.Kill(node, **times()),
+                lambda: faults.Hang(node, **times()),
+                lambda: faults.Slow(node, 0.015, **times()),
+                lambda: faults.TimerJitter(node, 0.01, **times()),
+                lambda: faults.TimeJump(rng.uniform(-2.0, 2.0), **times()),
+                lambda: faults.ClockPause(**times()),
+                lambda: faults.LateService('reset', 0.3, **times()),
+                lambda: faults.ParameterChange('virtual_robot', 'publish_rate', 20.0, **times()),
+            ]
+        )()
+
+    return [one() for _ in range(5)]
+
+
+def drive(seed, seconds=2.0):
+    """Return the hash of all messages of a drive of our three nodes under a random schedule."""
+    from lockstep_nodes import QUICK, make
+
+    from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+    from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+    from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+
+    digest = sha256()
+    with Lockstep(['--ros-args', '--log-level', 'fatal']) as world:
+        world.create(lambda: make(VirtualRobot, command_interface='wheels'))
+        world.create(lambda: make(WheelBridge))
+        world.create(lambda: make(GoToGoal, **QUICK))
+
+        def listen():
+            for topic, types in world.node.get_topic_names_and_types():
+                if topic in known or not world.node.get_publishers_info_by_topic(topic):
+                    continue
+                known.add(topic)
+                package, _, name = types[0].split('/')
+                module = __import__(f'{package}.msg', fromlist=[name])
+                world.node.create_subscription(
+                    getattr(module, name),
+                    topic,
+                    lambda message, topic=topic: digest.update(f'{topic} {message}'.encode()),
+                    1000,
+                )
+
+        known = {'/clock', '/rosout'}
+        world.inject(*schedule(seed), seed=seed)
+        listen()
+        goal = PoseStamped()
+        goal.pose.position.x, goal.pose.orientation.w = 0.5, 1.0
+        world.publish('goal_pose', goal)
+        world.run_for(seconds)
+        digest.update(str([str(event) for event in world.fault_events]).encode())
+        digest.update(str(world.now).encode())
+        return digest.hexdigest(), len(world.fault_events)
+
+
+def test_twenty_random_schedules_are_the_same_each_time_also_in_another_process():
+    first = [drive(seed) for seed in range(20)]
+    assert len({digest for digest, _ in first}) == 20
+    assert all(count > 3 for _, count in first)
+    program = 'import test_faults_world as t; print(*[t.drive(seed)[0] for seed in range(20)])'
+    run = subprocess.run(
+        [sys.executable, '-c', program],
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    assert run.stdout.split() == [digest for digest, _ in first]
+    assert [drive(seed) for seed in (3, 1)] == [first[3], first[1]]
