@@ -19,6 +19,7 @@ from processes import PROGRAM
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
+from diffdrive_jacobian.faults import Loss
 from diffdrive_jacobian.lockstep import Answers, Every, Idle, Lockstep, LockstepError
 from diffdrive_jacobian.lockstep import _external_process as external_process
 from diffdrive_jacobian.lockstep._external_answers import AnswersDue, TicksDue
@@ -205,6 +206,34 @@ def test_only_questions_under_a_condition_are_answered(world_of):
         ask()
 
 
+def test_faults_affect_the_nodes_of_the_world_only(world_of):
+    world = world_of(Answers('echo/cmd_vel', to='echo/odom'))
+    robot = Node('robot')
+    received = []
+    robot.create_subscription(
+        TwistStamped, 'echo/cmd_vel', lambda m: received.append(m.twist.linear.x), 10
+    )
+    world.add(robot)
+    commands = world.listen(TwistStamped, 'echo/cmd_vel')
+    world.inject(Loss('echo/cmd_vel', node='robot', start=1.0, duration=1.0))
+    for number in range(30):
+        world.publish('echo/odom', odometry(float(number)))
+        world.run_for(0.1)
+    assert len(commands) == 30
+    assert received == [*map(float, range(10)), *map(float, range(20, 30))]
+    with pytest.raises(
+        LockstepError, match=r"Loss\('echo/odom'\) cannot affect /echo: messages to other"
+    ):
+        world.inject(Loss('echo/odom'))
+
+
+def test_a_fault_of_a_topic_that_turns_out_to_be_external_is_refused(world_of):
+    world = world_of(Answers('echo/cmd_vel', to='echo/odom'))
+    world.inject(Loss('echo/odom'))
+    with pytest.raises(LockstepError, match=r"Loss\('echo/odom'\) cannot affect /echo"):
+        world.connect()
+
+
 # --- What goes wrong
 
 
@@ -287,7 +316,7 @@ def test_a_process_and_its_children_are_ended_with_the_world():
         until_says_hi(stubborn)
         assert 'is running' in world.report()
         assert stubborn.stop(timeout=0.1) == -signal.SIGKILL
-        command = 'trap "echo bye; exit 7" INT; echo hi; sleep 60'
+        command = 'trap "echo bye; exit 7" INT; echo hi; while :; do sleep 0.05; done'
         polite = world.start('sh', '-c', command, use_sim_time=False)
         until_says_hi(polite)
         forgotten = world.start('sleep', '60', use_sim_time=False)
