@@ -12,6 +12,7 @@ from functools import partial
 from itertools import count
 from pathlib import Path
 
+import forked
 import numpy as np
 import pytest
 from lockstep_nodes import ABORTED, SUCCEEDED, Controller, Topics, arrives, change, make
@@ -104,14 +105,7 @@ def run(site, program, *arguments):
     code = (
         f'import sys\nfrom diffdrive_jacobian.tools.entry_points import {program}\nsys.exit({program}())'
     )
-    return subprocess.run(
-        [sys.executable, '-c', code, *map(str, arguments)],
-        cwd=site.parent,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+    return forked.run(code, arguments, cwd=site.parent, env=environment, timeout=120)
 
 
 # --- An installed package

@@ -40,7 +40,7 @@ def test_nodes_exit_0_on_a_signal(world):
 
 def test_nodes_exit_0_on_signals_that_do_not_cease(world):
     # From the start of the imports to the last moment of the interpreter.
-    children = [world.start(name) for name in NODES]
+    children = [world.start(name, fresh=True) for name in NODES]
     for child in children:
         child.until_catches(signal.SIGHUP)
     deadline = time.monotonic() + 10.0
