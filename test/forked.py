@@ -1,10 +1,10 @@
 """Child processes without the cost of imports: forks of a server that has imported the packages.
 
 A new Python process that imports rclpy, NumPy and rosbags uses half a second of CPU before it does
-anything. A server imports them once and forks for each program. It runs no thread and initializes no ROS.
-A child is a process like any other: it has its own process id, arguments, environment, working
-directory, streams, signals and exit code, and its interpreter exits as usual. Only its imports are done
-already. Tests of the start itself use `subprocess`.
+anything. A server imports them once and forks for each program. It runs no thread and initializes no
+ROS. A child is a process like any other: it has its own process id, arguments, environment, working
+directory, streams, signals and exit code, and its interpreter exits as usual. Only its imports are
+done already. Tests of the start itself use `subprocess`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from pathlib import Path
 
 PACKAGE = 'diffdrive_jacobian'
 LIBRARIES = (
-    *('numpy', 'matplotlib.figure', 'matplotlib.backends.backend_agg', 'mcap.reader', 'rich.progress'),
+    *('numpy', 'matplotlib.figure', 'matplotlib.backends.backend_agg', 'rich.progress'),
     *('rosbags.rosbag2', 'rosbags.typesys', 'ruamel.yaml', 'apsw', 'lz4.frame', 'unittest.mock'),
 )
 """What programs without ROS import."""
@@ -52,7 +52,7 @@ serve(int(sys.argv[2]), sys.argv[3:])
 
 
 def serve(descriptor: int, modules: list[str]) -> None:
-    """Import modules, fork for each request from a socket until it is closed, run programs in the forks."""
+    """Import modules and fork for each request from a socket, until it is closed."""
     # Ctrl-C ends the tests, which close the socket.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     connection = socket.socket(fileno=descriptor)
@@ -107,7 +107,9 @@ class _SharedModules:
         """Keep what is imported now."""
         gc.collect()
         gc.freeze()
-        modules = {name: module for name, module in sys.modules.items() if name not in ('sys', 'builtins')}
+        modules = {
+            name: module for name, module in sys.modules.items() if name not in ('sys', 'builtins')
+        }
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(modules))
         self._removed.update(dict.fromkeys(modules))
 
@@ -245,7 +247,7 @@ class Popen:
         """
         self.args = [sys.executable, '-c', code, *map(str, arguments)]
         self.returncode = None
-        streams, self._opened = [], []
+        self._opened = []
         null = os.open(os.devnull, os.O_RDONLY)
         self.stdout, out = self._output(stdout, 1)
         self.stderr, error = self._output(stderr, 2)
@@ -295,10 +297,21 @@ class Popen:
         self.send_signal(signal.SIGKILL)
 
 
-def run(code, arguments=(), *, timeout=None, **kwargs):
-    """Run a program to its end, as `subprocess.run([python, '-c', CODE, ...], capture_output=True)`."""
+def run(code, arguments=(), *, stdout=None, timeout=None, **kwargs):
+    """Run a program to its end; return what it printed, as `subprocess.run` with `capture_output=True`.
+
+    Args:
+        code: Text of the program.
+        arguments: Its arguments.
+        stdout: A file for its standard output, which is not returned then.
+        timeout: Time after which it is killed (s).
+        kwargs: As for `Popen`.
+
+    Raises:
+        subprocess.TimeoutExpired: It was killed.
+    """
     with tempfile.TemporaryFile('w+') as out, tempfile.TemporaryFile('w+') as error:
-        child = Popen(code, arguments, stdout=out, stderr=error, **kwargs)
+        child = Popen(code, arguments, stdout=stdout or out, stderr=error, **kwargs)
         try:
             child.wait(timeout)
         except subprocess.TimeoutExpired:
