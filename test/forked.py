@@ -14,11 +14,12 @@ import ctypes
 import gc
 import importlib
 import io
+import marshal
 import os
-import pickle
 import pkgutil
 import re
 import select
+import shlex
 import signal
 import socket
 import subprocess
@@ -36,7 +37,7 @@ LIBRARIES = (
     *('rosbags.rosbag2', 'rosbags.typesys', 'ruamel.yaml', 'apsw', 'lz4.frame', 'unittest.mock'),
 )
 """What programs without ROS import."""
-EVERYTHING = (*LIBRARIES, 'rclpy.executors', 'rclpy.node', PACKAGE)
+EVERYTHING = (*LIBRARIES, 'pytest', 'rclpy.executors', 'rclpy.node', PACKAGE)
 """What all programs import. A package is imported with its modules, and the messages are loaded."""
 LARGEST = 1 << 20
 """Size of the largest request (bytes)."""
@@ -44,50 +45,73 @@ SERVER = """
 import sys
 sys.path.append(sys.argv[1])
 from forked import serve
-serve(int(sys.argv[2]), sys.argv[3:])
+serve(int(sys.argv[2]), int(sys.argv[3]), sys.argv[4:])
 """
 
 
 # --- In the server
 
 
-def serve(descriptor: int, modules: list[str]) -> None:
-    """Import modules and fork for each request from a socket, until it is closed."""
+def serve(descriptor: int, listening: int, modules: list[str]) -> None:
+    """Import modules and fork for each request. End when a connection is closed.
+
+    Args:
+        descriptor: The connection to who has started this process.
+        listening: The socket at which commands connect, see `make_commands`.
+        modules: Names of what is to be imported.
+    """
     # Ctrl-C ends the tests, which close the socket.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    connection = socket.socket(fileno=descriptor)
+    starter = socket.socket(fileno=descriptor)
+    listener = socket.socket(fileno=listening)
     shared = _SharedModules()
     for name in modules:
         _import(name)
     assert threading.active_count() == 1, 'a process that runs threads cannot be forked'
     tracing = _Tracing()
     shared.keep()
+    children: dict[socket.socket, set[int]] = {starter: set()}
     while True:
-        data, received, _, _ = socket.recv_fds(connection, LARGEST, 3)
-        if not data:
-            return
-        request = pickle.loads(data)
-        if isinstance(request, int):
-            connection.send(pickle.dumps(os.waitstatus_to_exitcode(os.waitpid(request, 0)[1])))
-            continue
-        # Signals that come before the child is ready for them wait.
-        signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
-        with warnings.catch_warnings():
-            warnings.simplefilter('ignore', DeprecationWarning)
-            tracing.before_fork()
-            pid = os.fork()
-            tracing.after_fork(child=pid == 0)
-        if pid == 0:
-            break
-        signal.pthread_sigmask(signal.SIG_SETMASK, ())
-        for each in received:
-            os.close(each)
-        connection.send(pickle.dumps(pid))
-    connection.close()
-    for target, source in enumerate(received):
-        os.dup2(source, target)
-        os.close(source)
-    _run(*request)
+        for ready in select.select([listener, *children], [], [])[0]:
+            if ready is listener:
+                children[listener.accept()[0]] = set()
+                continue
+            data, received, _, _ = socket.recv_fds(ready, LARGEST, 3)
+            if not data:
+                ready.close()
+                if ready is starter:
+                    return
+                # The command was killed.
+                for pid in children.pop(ready):
+                    os.kill(pid, signal.SIGKILL)
+                    os.waitpid(pid, 0)
+                continue
+            request = marshal.loads(data)
+            if isinstance(request, int):
+                code = os.waitstatus_to_exitcode(os.waitpid(request, 0)[1])
+                children[ready].discard(request)
+                ready.send(marshal.dumps(code))
+                continue
+            # Signals that come before the child is ready for them wait.
+            signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+            with warnings.catch_warnings():
+                warnings.simplefilter('ignore', DeprecationWarning)
+                tracing.before_fork()
+                pid = os.fork()
+                tracing.after_fork(child=pid == 0)
+            if pid == 0:
+                for each in (listener, *children):
+                    each.close()
+                for target, source in enumerate(received):
+                    os.dup2(source, target)
+                    os.close(source)
+                _run(*request)
+                return
+            signal.pthread_sigmask(signal.SIG_SETMASK, ())
+            for each in received:
+                os.close(each)
+            children[ready].add(pid)
+            ready.send(marshal.dumps(pid))
 
 
 class _SharedModules:
@@ -159,8 +183,15 @@ def _import(name: str) -> None:
                 check_for_type_support(each)
 
 
-def _run(code: str, arguments: list[str], directory: str, environment: dict[str, str]) -> None:
-    """Run a program, as `python -c CODE ARGUMENTS` does."""
+def _run(code: str, argv: list[str], directory: str, environment: dict[str, str]) -> None:
+    """Run a program, as `python -c CODE ARGUMENTS` does, or `python FILE ARGUMENTS`.
+
+    Args:
+        code: Text of the program.
+        argv: `-c` or the name of its file, and its arguments.
+        directory: Its working directory.
+        environment: Its environment variables.
+    """
     for number, name in enumerate(('stdin', 'stdout', 'stderr')):
         stream = _text_stream(number, unbuffered=bool(environment.get('PYTHONUNBUFFERED')))
         setattr(sys, name, stream)
@@ -168,13 +199,14 @@ def _run(code: str, arguments: list[str], directory: str, environment: dict[str,
     os.chdir(directory)
     os.environ.clear()
     os.environ.update(environment)
-    sys.argv[:] = ['-c', *arguments]
-    sys.path[1:1] = filter(None, environment.get('PYTHONPATH', '').split(os.pathsep))
+    sys.argv[:] = argv
+    own = '' if argv[0] == '-c' else os.path.dirname(os.path.abspath(argv[0]))
+    sys.path[:1] = [own, *filter(None, environment.get('PYTHONPATH', '').split(os.pathsep))]
     sys.path_importer_cache.clear()
     main = sys.modules['__main__'] = types.ModuleType('__main__')
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
-    exec(compile(code, '<string>', 'exec'), vars(main))
+    exec(compile(code, '<string>' if argv[0] == '-c' else argv[0], 'exec'), vars(main))
 
 
 def _text_stream(descriptor: int, *, unbuffered: bool) -> io.TextIOWrapper:
@@ -198,29 +230,37 @@ class _Server:
     def __init__(self, modules: tuple[str, ...]) -> None:
         """Start it."""
         self._lock = threading.Lock()
+        self._folder = tempfile.TemporaryDirectory()
+        self.path = os.path.join(self._folder.name, 'socket')
         self._connection, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        listener.bind(self.path)
+        listener.listen(100)
+        passed = [theirs.fileno(), listener.fileno()]
         self._process = subprocess.Popen(
-            [sys.executable, '-c', SERVER, str(Path(__file__).parent), str(theirs.fileno()), *modules],
+            [sys.executable, '-c', SERVER, str(Path(__file__).parent), *map(str, passed), *modules],
             stdin=subprocess.DEVNULL,
-            pass_fds=[theirs.fileno()],
+            pass_fds=passed,
             # NumPy starts a thread for every core otherwise.
             env={**os.environ, 'OPENBLAS_NUM_THREADS': '1', 'ROS_PYTHON_CHECK_FIELDS': '1'},
         )
+        listener.close()
         theirs.close()
         atexit.register(self._close)
 
     def ask(self, request: object, descriptors: tuple[int, ...] = ()) -> int:
         """Send a request; return the answer."""
         with self._lock:
-            socket.send_fds(self._connection, [pickle.dumps(request)], descriptors)
+            socket.send_fds(self._connection, [marshal.dumps(request)], descriptors)
             answer = self._connection.recv(LARGEST)
         assert answer, 'the server of forks has ended'
-        number: int = pickle.loads(answer)
+        number: int = marshal.loads(answer)
         return number
 
     def _close(self) -> None:
         self._connection.close()
         self._process.wait()
+        self._folder.cleanup()
 
 
 @lru_cache
@@ -245,14 +285,15 @@ class Popen:
             stdout: A file, a descriptor or `subprocess.PIPE` (default: that of this process).
             stderr: The same.
         """
-        self.args = [sys.executable, '-c', code, *map(str, arguments)]
+        argv = ['-c', *map(str, arguments)]
+        self.args = [sys.executable, '-c', code, *argv[1:]]
         self.returncode = None
         self._opened = []
         null = os.open(os.devnull, os.O_RDONLY)
         self.stdout, out = self._output(stdout, 1)
         self.stderr, error = self._output(stderr, 2)
         self._server = _server(modules, os.getpid())
-        request = (code, self.args[3:], os.fspath(cwd or os.getcwd()), dict(env or os.environ))
+        request = (code, argv, os.fspath(cwd or os.getcwd()), dict(env or os.environ))
         self.pid = self._server.ask(request, (null, out, error))
         for each in (null, *self._opened):
             os.close(each)
@@ -321,3 +362,25 @@ def run(code, arguments=(), *, stdout=None, timeout=None, **kwargs):
         for file in (out, error):
             file.seek(0)
         return subprocess.CompletedProcess(child.args, child.returncode, out.read(), error.read())
+
+
+def make_commands(folder, scripts):
+    """Make commands that run Python scripts in forks of the server; return the folder.
+
+    A command is a small process of its own, which passes its arguments, streams and signals on, and ends
+    as the script does.
+
+    Args:
+        folder: Where to make them.
+        scripts: Files of the scripts. A command has the name of its script. `-c` makes the command
+            `python_c`, whose first argument is a program.
+    """
+    folder.mkdir()
+    server = _server(EVERYTHING, os.getpid())
+    client = Path(__file__).with_name('forked_command.py')
+    for script in scripts:
+        path = folder / ('python_c' if script == '-c' else Path(script).name)
+        words = (sys.executable, '-IS', client, server.path, script)
+        path.write_text(f'#!/bin/sh\nexec {shlex.join(map(str, words))} "$@"\n')
+        path.chmod(0o755)
+    return folder
