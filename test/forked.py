@@ -28,8 +28,10 @@ import tempfile
 import threading
 import types
 import warnings
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
+from typing import TextIO
 
 PACKAGE = 'diffdrive_jacobian'
 LIBRARIES = (
@@ -45,6 +47,7 @@ SERVER = """
 import sys
 sys.path.append(sys.argv[1])
 from forked import serve
+sys.path.pop()
 serve(int(sys.argv[2]), int(sys.argv[3]), sys.argv[4:])
 """
 
@@ -193,31 +196,44 @@ def _run(code: str, argv: list[str], directory: str, environment: dict[str, str]
         environment: Its environment variables.
     """
     for number, name in enumerate(('stdin', 'stdout', 'stderr')):
-        stream = _text_stream(number, unbuffered=bool(environment.get('PYTHONUNBUFFERED')))
+        unbuffered = bool(environment.get('PYTHONUNBUFFERED'))
+        stream = _text_stream(getattr(sys, name), number, unbuffered=unbuffered)
         setattr(sys, name, stream)
         setattr(sys, f'__{name}__', stream)
+    inherited = _python_path(os.environ, os.getcwd())
     os.chdir(directory)
-    os.environ.clear()
-    os.environ.update(environment)
     sys.argv[:] = argv
     own = '' if argv[0] == '-c' else os.path.dirname(os.path.abspath(argv[0]))
-    sys.path[:1] = [own, *filter(None, environment.get('PYTHONPATH', '').split(os.pathsep))]
+    added = _python_path(environment, directory)
+    sys.path[:] = [own, *added, *(path for path in sys.path[1:] if path not in inherited)]
     sys.path_importer_cache.clear()
+    os.environ.clear()
+    os.environ.update(environment)
     main = sys.modules['__main__'] = types.ModuleType('__main__')
+    if argv[0] != '-c':
+        main.__file__ = argv[0]
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
     exec(compile(code, '<string>' if argv[0] == '-c' else argv[0], 'exec'), vars(main))
 
 
-def _text_stream(descriptor: int, *, unbuffered: bool) -> io.TextIOWrapper:
+def _python_path(environment: Mapping[str, str], directory: str) -> list[str]:
+    """Return the directories that the variable PYTHONPATH adds to the path of modules."""
+    paths = environment.get('PYTHONPATH', '')
+    # An empty entry is the working directory.
+    entries = paths.split(os.pathsep) if paths else []
+    return [os.path.abspath(os.path.join(directory, entry)) for entry in entries]
+
+
+def _text_stream(original: TextIO, descriptor: int, *, unbuffered: bool) -> io.TextIOWrapper:
     """Return a standard stream as the interpreter opens it."""
-    output, error = descriptor > 0, descriptor == 2
-    mode, buffering = 'wb' if output else 'rb', 0 if output and unbuffered else -1
+    mode, buffering = 'wb' if descriptor else 'rb', 0 if descriptor and unbuffered else -1
     return io.TextIOWrapper(
         open(descriptor, mode, buffering, closefd=False),
-        errors='backslashreplace' if error else 'strict',
-        line_buffering=error or os.isatty(descriptor),
-        write_through=output and unbuffered,
+        encoding=original.encoding,
+        errors=original.errors,
+        line_buffering=not unbuffered and (descriptor == 2 or os.isatty(descriptor)),
+        write_through=unbuffered,
     )
 
 
