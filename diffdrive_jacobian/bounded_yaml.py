@@ -116,7 +116,8 @@ class _Expansion:
 
     @staticmethod
     def _check_scalar(event: ScalarEvent) -> None:
-        # Numbers take time that grows with the square of their digits.
-        may_be_number = event.style is None and event.value[:1] in tuple('+-.0123456789')
+        # Numbers take time that grows with the square of their digits. The style of a scalar without
+        # quotes is None, or '' from the parser in C.
+        may_be_number = not event.style and event.value[:1] in tuple('+-.0123456789')
         if (may_be_number or event.tag is not None) and len(event.value) > MAX_NUMBER:
             raise TooLargeError(f'a YAML number has more than {MAX_NUMBER} characters')

@@ -4,7 +4,8 @@
     python test/pages.py outputs [PAGE ...]    run pages and write the outputs that they quote
 
 A page is run from top to bottom in one empty directory. A `python` block is a program and a `bash` block
-a script. A block of any language whose first line is `# NAME.EXTENSION` is a file. HTML comments before
+a script. Programs of this package run in forks, see `forked`.
+A block of any language whose first line is `# NAME.EXTENSION` is a file. HTML comments before
 a block say what differs:
 
     <!-- test: skip, REASON -->          is not run; only the options of our tools in it are checked
@@ -33,6 +34,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+import forked
 from domains import domain_id
 
 from diffdrive_jacobian.parameters.declaration import NodeParameters, specifications
@@ -41,6 +43,7 @@ from diffdrive_jacobian.parameters.nodes import (
     VirtualRobotParameters,
     WheelBridgeParameters,
 )
+from diffdrive_jacobian.tools.entry_points import NODES, tools
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {
@@ -102,13 +105,21 @@ def blocks(text: str) -> list[Block]:
 class Session:
     """A page that is run in a directory."""
 
-    def __init__(self, directory: Path) -> None:
-        """Run in an empty directory, in a ROS domain that other sessions are unlikely to have."""
+    def __init__(self, directory: Path, commands: Path) -> None:
+        """Run in a ROS domain that other sessions are unlikely to have.
+
+        Args:
+            directory: An empty directory.
+            commands: Where to make the commands of this package.
+        """
         self._directory = directory
         (directory / 'config').symlink_to(ROOT / 'config')
+        scripts = Path(sysconfig.get_path('scripts'))
+        ours = [scripts / name for name in ('pytest', *NODES, *tools())]
+        self._commands = forked.make_commands(commands, ['-c', *ours])
         self._environment = {
             **os.environ,
-            'PATH': os.pathsep.join([sysconfig.get_path('scripts'), os.environ['PATH']]),
+            'PATH': os.pathsep.join([str(commands), str(scripts), os.environ['PATH']]),
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
             'ROS_DOMAIN_ID': str(domain_id()),
             'PYTHONUNBUFFERED': '1',
@@ -131,7 +142,7 @@ class Session:
         beside = [one.strip() for one in block.notes.get('beside', '').split(';') if one.strip()]
         command = ['bash', '-euo', 'pipefail', '-c', block.notes.get('instead', block.code)]
         if block.language == 'python':
-            command = [sys.executable, '-c', block.code]
+            command = [str(self._commands / 'python_c'), block.code]
         elif 'processes' in block.notes:
             *beside, last = [line for line in block.code.splitlines() if not line.startswith('#')]
             command = ['bash', '-c', f'exec {last}']
@@ -273,12 +284,14 @@ def refreshed(quoted: Block, printed: str) -> str:
 
 def run_page(text: str, directory: Path) -> list[tuple[Block, str]]:
     """Run the blocks of a page; return the quoted outputs with what was printed."""
-    session, printed, outputs = Session(directory), '', []
-    for block in blocks(text):
-        if 'output' in block.notes:
-            outputs.append((block, printed))
-        elif is_run(block):
-            printed = session.run(block)
+    printed, outputs = '', []
+    with tempfile.TemporaryDirectory() as folder:
+        session = Session(directory, Path(folder) / 'commands')
+        for block in blocks(text):
+            if 'output' in block.notes:
+                outputs.append((block, printed))
+            elif is_run(block):
+                printed = session.run(block)
     return outputs
 
 

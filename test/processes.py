@@ -14,6 +14,7 @@ from contextlib import ExitStack, contextmanager
 from functools import cached_property
 from unittest import mock
 
+import forked
 from conftest import PATIENCE, Harness
 from domains import domain_id
 
@@ -33,19 +34,20 @@ _numbers = itertools.count()
 class Child:
     """A running entry point; what it prints goes into files, so that no pipe can fill up."""
 
-    def __init__(self, name, arguments, directory, stdout=None):
+    def __init__(self, name, arguments, directory, stdout=None, *, fresh=False):
         self.command = ' '.join([name, *arguments])
         number = next(_numbers)
         self._out, self._err = (directory / f'{number}_{name}.{end}' for end in ('out', 'err'))
         with self._out.open('wb') as out, self._err.open('wb') as err:
-            self._process = subprocess.Popen(
-                [sys.executable, '-c', PROGRAM.format(name), *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=out if stdout is None else stdout,
-                stderr=err,
-                # Children choose their own profiles: this file may be that of another installation.
-                env={name: value for name, value in os.environ.items() if name != VARIABLE},
-            )
+            streams = {'stdout': out if stdout is None else stdout, 'stderr': err}
+            # Children choose their own profiles: this file may be that of another installation.
+            streams['env'] = {name: value for name, value in os.environ.items() if name != VARIABLE}
+            program = PROGRAM.format(name)
+            if fresh:
+                command = [sys.executable, '-c', program, *arguments]
+                self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, **streams)
+            else:
+                self._process = forked.Popen(program, arguments, **streams)
         self._limit = threading.Timer(LIMIT, self._process.kill)
         self._limit.daemon = True
         self._limit.start()
@@ -117,9 +119,17 @@ class World:
         self._children = []
         self._stack = ExitStack()
 
-    def start(self, name, *arguments, stdout=None):
-        """Start an entry point; its stdout can be given, and is not seen then."""
-        child = Child(name, arguments, self._directory, stdout)
+    def start(self, name, *arguments, stdout=None, fresh=False):
+        """Start an entry point.
+
+        Args:
+            name: Its name.
+            arguments: Its arguments.
+            stdout: Its standard output, which is not seen then.
+            fresh: Whether it is a new interpreter that has yet to import everything. Otherwise it is
+                forked, see `forked`.
+        """
+        child = Child(name, arguments, self._directory, stdout, fresh=fresh)
         self._children.append(child)
         return child
 

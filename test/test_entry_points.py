@@ -6,6 +6,7 @@ import importlib
 import re
 import subprocess
 import sys
+import sysconfig
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -68,6 +69,15 @@ def test_an_error_of_the_system_names_the_tool(tool):
     )
     assert (ended.returncode, ended.stdout) == (1, '')
     assert ended.stderr == f'{tool}: error: the disk is full\n'
+
+
+@pytest.mark.parametrize('tool', TOOLS)
+def test_an_installed_command_starts(tool):
+    """As a new process, with its imports. Other tests fork processes that have imported them."""
+    command = Path(sysconfig.get_path('scripts'), tool)
+    ended = subprocess.run([command, '--bogus'], capture_output=True, text=True, timeout=60)
+    assert (ended.returncode, ended.stdout) == (2, '')
+    assert ended.stderr.splitlines()[-1].startswith(f'{tool}: error: ')
 
 
 def test_the_programs_are_the_nodes_and_the_modules_with_a_main():

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
+import forked
 import pytest
 from nav_msgs.msg import Odometry
 from processes import open_world
@@ -37,7 +35,7 @@ def test_a_flooded_robot_answers_and_stops_when_the_flood_ends(world):
     odometry = world.harness.listen(Odometry, 'odom')
     world.harness.until(lambda: odometry, 'the robot is heard')
     # Two processes, so that there are more messages than can be handled also on a busy machine.
-    floods = [subprocess.Popen([sys.executable, '-c', FLOOD]) for _ in range(2)]
+    floods = [forked.Popen(FLOOD) for _ in range(2)]
     try:
         robot.until_says('arrive faster than they are handled')
         assert world.harness.call(Trigger, 'reset_odometry').success

@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 import sqlite3
 import textwrap
+from functools import partial
 from urllib.parse import quote
 
 import pytest
@@ -27,8 +28,10 @@ from hostile_bags import (
     zstd_zeros,
 )
 from rosbags.rosbag2 import CompressionMode
+from ruamel.yaml import YAML
 from test_recover import make_messages, read_bag, recover, write_bag
 
+from diffdrive_jacobian import bounded_yaml
 from diffdrive_jacobian.bags import limits
 from diffdrive_jacobian.bags.bag_reader import find_damage
 from diffdrive_jacobian.bags.bounded_reader import BoundedReader, _SqliteReader
@@ -326,6 +329,14 @@ def test_aliases_in_the_profiles_of_a_topic(tmp_path):
     refused(path, 'stands for more than 200000 values')
 
 
+@pytest.fixture(params=[False, True], ids=['parser in C', 'parser in Python'])
+def parser(request, monkeypatch):
+    """Load YAML by the parser that is there if ruamel.yaml.clib is, and by the other one."""
+    monkeypatch.setattr(bounded_yaml, 'YAML', partial(YAML, pure=request.param))
+    bounded_yaml._check_text.cache_clear()
+
+
+@pytest.mark.usefixtures('parser')
 def test_a_few_aliases_are_read():
     assert load_yaml('a: &x [1, 2]\nb: *x\nc: {<<: &y {d: *x}, e: *y}\n') == {
         'a': [1, 2],
@@ -334,6 +345,7 @@ def test_a_few_aliases_are_read():
     }
 
 
+@pytest.mark.usefixtures('parser')
 @pytest.mark.parametrize(
     ('text', 'match'),
     [

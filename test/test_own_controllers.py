@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 import os
 import re
-import subprocess
-import sys
 from dataclasses import fields, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
 
+import forked
 import numpy as np
 import pytest
 from lockstep_nodes import ABORTED, SUCCEEDED, Controller, Topics, arrives, change, make
@@ -104,14 +103,7 @@ def run(site, program, *arguments):
     code = (
         f'import sys\nfrom diffdrive_jacobian.tools.entry_points import {program}\nsys.exit({program}())'
     )
-    return subprocess.run(
-        [sys.executable, '-c', code, *map(str, arguments)],
-        cwd=site.parent,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+    return forked.run(code, arguments, cwd=site.parent, env=environment, timeout=120)
 
 
 # --- An installed package
@@ -487,10 +479,14 @@ def blocks(language):
 
 def test_the_example_is_given_in_python(pytester):
     pytester.makepyfile(**blocks('python'))
-    pytester.runpytest_subprocess('test_my_law.py').assert_outcomes(passed=1)
-    ended = pytester.runpython('sweep_my_law.py')
-    assert ended.ret == 0
-    ended.stdout.fnmatch_lines(['fastest: kp *', '[[]* *[]]'])
+    kwargs = {'cwd': pytester.path, 'env': {**os.environ, 'PYTHONPATH': str(pytester.path)}}
+    session = 'import sys, pytest\nsys.exit(pytest.main(sys.argv[1:]))'
+    ended = forked.run(session, ['test_my_law.py'], **kwargs)
+    assert ended.returncode == 0
+    assert re.search(r'^=+ 1 passed in', ended.stdout, re.MULTILINE)
+    ended = forked.run((pytester.path / 'sweep_my_law.py').read_text(), **kwargs)
+    assert ended.returncode == 0
+    assert re.search(r'fastest: kp .*\n\[.* .*\]', ended.stdout)
     assert (pytester.path / 'my_law.png').read_bytes().startswith(b'\x89PNG')
 
 

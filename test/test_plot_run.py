@@ -6,11 +6,11 @@ import csv
 import math
 import os
 import shutil
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 
+import forked
 import numpy as np
 import pytest
 from processes import PROGRAM
@@ -621,12 +621,11 @@ def test_a_file_that_cannot_be_finished_is_taken_away(bag, tmp_path, capsys, mon
 def test_output_that_cannot_be_written_is_not_blamed_on_the_picture(bag, tmp_path, unbuffered):
     picture = tmp_path / 'a.png'
     with open('/dev/full', 'w') as full:
-        done = subprocess.run(
-            [sys.executable, '-c', PROGRAM.format('plot_run'), bag, '-o', picture],
+        done = forked.run(
+            PROGRAM.format('plot_run'),
+            (bag, '-o', picture),
             env={**os.environ, 'PYTHONUNBUFFERED': unbuffered},
             stdout=full,
-            stderr=subprocess.PIPE,
-            text=True,
         )
     error = 'plot_run: error: the standard output cannot be written: No space left on device\n'
     assert (done.returncode, done.stderr) == (1, error)

@@ -40,7 +40,7 @@ def test_nodes_exit_0_on_a_signal(world):
 
 def test_nodes_exit_0_on_signals_that_do_not_cease(world):
     # From the start of the imports to the last moment of the interpreter.
-    children = [world.start(name) for name in NODES]
+    children = [world.start(name, fresh=True) for name in NODES]
     for child in children:
         child.until_catches(signal.SIGHUP)
     deadline = time.monotonic() + 10.0
@@ -170,7 +170,8 @@ def test_another_reader_of_goals_is_no_controller(world):
 
 
 def test_send_goal_reports_a_missing_controller(world):
-    sender = world.run('send_goal', '-1', '-1e-1', '--wait', '1', '--ros-args', '-r', '__ns:=/here')
+    arguments = ('-1', '-1e-1', '--wait', '1', '--ros-args', '-r', '__ns:=/here')
+    sender = world.start('send_goal', *arguments, fresh=True)
     assert sender.exit() == 1
     assert sender.last_line.startswith(
         'not sent within 1 s: no node is subscribed to /here/goal_pose and'

@@ -180,7 +180,7 @@ def test_a_signal_in_a_burst_leaves_a_valid_bag(world, bag, number):
 
 
 def test_a_signal_at_the_start_leaves_an_empty_bag(world, bag):
-    recorder = world.start('record_run', '-o', str(bag))
+    recorder = world.start('record_run', '-o', str(bag), fresh=True)
     recorder.until_catches(signal.SIGTERM)
     recorder.signal(signal.SIGTERM)
     assert recorder.exit() == 0

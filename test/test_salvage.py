@@ -9,6 +9,7 @@ import subprocess
 import sys
 import zlib
 
+import forked
 import lz4.frame
 import pytest
 from rosbags.rosbag2 import CompressionMode
@@ -218,13 +219,14 @@ write_bag(sys.argv[1], sys.argv[2], messages, told=lambda count: print(count, fl
 @pytest.mark.parametrize('killed_at', [5_000, 9_700, 19_900])
 def test_a_killed_writer(tmp_path, capsys, storage, killed_at):
     path = tmp_path / 'run'
-    command = [sys.executable, '-c', WRITER, str(path), storage, __file__.rsplit('/', 1)[0]]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
+    arguments = (path, storage, __file__.rsplit('/', 1)[0])
+    child = forked.Popen(WRITER, arguments, stdout=subprocess.PIPE)
+    with child.stdout:
         for line in child.stdout:
             if int(line) >= killed_at:
                 break
-        child.send_signal(signal.SIGKILL)
-    assert child.returncode == -signal.SIGKILL
+        child.kill()
+    assert child.wait() == -signal.SIGKILL
     before = contents(path)
     code, _, err = recover(capsys, path)
     assert (code, err) == (0, '')

@@ -650,7 +650,8 @@ def test_a_signal_while_it_draws_ends_it(folder, monkeypatch):
 
 def test_ctrl_c_ends_the_process(folder):
     with open_world(folder.parent) as world:
-        child = world.start('sweep_gains', '--grid', '100', '--rate', '200', '--kv', '0.001', '0.01')
+        arguments = ('--grid', '100', '--rate', '200', '--kv', '0.001', '0.01')
+        child = world.start('sweep_gains', *arguments, fresh=True)
         # Python itself catches SIGINT from the first.
         child.until_catches(signal.SIGHUP)
         child.signal(signal.SIGINT)

@@ -163,7 +163,7 @@ def test_drive_to_exits_130_on_a_signal(world):
 
 def test_drive_to_exits_130_on_signals_that_do_not_cease(world):
     children = [
-        world.start('drive_to', '--no-record', *FAR),
+        world.start('drive_to', '--no-record', *FAR, fresh=True),
         world.start('drive_to', '--no-record', *FAR),
     ]
     children[0].until_catches(signal.SIGHUP)

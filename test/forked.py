@@ -1,0 +1,402 @@
+"""Child processes without the cost of imports: forks of a server that has imported the packages.
+
+A new Python process that imports rclpy, NumPy and rosbags uses half a second of CPU before it does
+anything. A server imports them once and forks for each program. It runs no thread and initializes no
+ROS. A child is a process like any other: it has its own process id, arguments, environment, working
+directory, streams, signals and exit code, and its interpreter exits as usual. Only its imports are
+done already. Tests of the start itself use `subprocess`.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import gc
+import importlib
+import io
+import marshal
+import os
+import pkgutil
+import re
+import select
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import types
+import warnings
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import TextIO
+
+PACKAGE = 'diffdrive_jacobian'
+LIBRARIES = (
+    *('numpy', 'matplotlib.figure', 'matplotlib.backends.backend_agg', 'rich.progress'),
+    *('rosbags.rosbag2', 'rosbags.typesys', 'ruamel.yaml', 'apsw', 'lz4.frame', 'unittest.mock'),
+)
+"""What programs without ROS import."""
+EVERYTHING = (*LIBRARIES, 'pytest', 'rclpy.executors', 'rclpy.node', PACKAGE)
+"""What all programs import. A package is imported with its modules, and the messages are loaded."""
+LARGEST = 1 << 20
+"""Size of the largest request (bytes)."""
+SERVER = """
+import sys
+sys.path.append(sys.argv[1])
+from forked import serve
+sys.path.pop()
+serve(int(sys.argv[2]), int(sys.argv[3]), sys.argv[4:])
+"""
+
+
+# --- In the server
+
+
+def serve(descriptor: int, listening: int, modules: list[str]) -> None:
+    """Import modules and fork for each request. End when a connection is closed.
+
+    Args:
+        descriptor: The connection to who has started this process.
+        listening: The socket at which commands connect, see `make_commands`.
+        modules: Names of what is to be imported.
+    """
+    # Ctrl-C ends the tests, which close the socket.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    starter = socket.socket(fileno=descriptor)
+    listener = socket.socket(fileno=listening)
+    shared = _SharedModules()
+    for name in modules:
+        _import(name)
+    assert threading.active_count() == 1, 'a process that runs threads cannot be forked'
+    tracing = _Tracing()
+    shared.keep()
+    children: dict[socket.socket, set[int]] = {starter: set()}
+    while True:
+        for ready in select.select([listener, *children], [], [])[0]:
+            if ready is listener:
+                children[listener.accept()[0]] = set()
+                continue
+            data, received, _, _ = socket.recv_fds(ready, LARGEST, 3)
+            if not data:
+                ready.close()
+                if ready is starter:
+                    return
+                # The command was killed.
+                for pid in children.pop(ready):
+                    os.kill(pid, signal.SIGKILL)
+                    os.waitpid(pid, 0)
+                continue
+            request = marshal.loads(data)
+            if isinstance(request, int):
+                code = os.waitstatus_to_exitcode(os.waitpid(request, 0)[1])
+                children[ready].discard(request)
+                ready.send(marshal.dumps(code))
+                continue
+            # Signals that come before the child is ready for them wait.
+            signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+            with warnings.catch_warnings():
+                warnings.simplefilter('ignore', DeprecationWarning)
+                tracing.before_fork()
+                pid = os.fork()
+                tracing.after_fork(child=pid == 0)
+            if pid == 0:
+                for each in (listener, *children):
+                    each.close()
+                for target, source in enumerate(received):
+                    os.dup2(source, target)
+                    os.close(source)
+                _run(*request)
+                return
+            signal.pthread_sigmask(signal.SIG_SETMASK, ())
+            for each in received:
+                os.close(each)
+            children[ready].add(pid)
+            ready.send(marshal.dumps(pid))
+
+
+class _SharedModules:
+    """Keeps children from touching what was imported for them when they exit.
+
+    To clear it, in memory that is shared until then, would take longer than all else. What they have
+    imported and created themselves is cleared as usual.
+    """
+
+    def __init__(self) -> None:
+        """Prepare that, before modules are imported whose functions are to be called at the exit."""
+        self._removed: dict[str, None] = {}
+        # The interpreter does the same as it exits, and clears the modules that it finds there.
+        atexit.register(sys.modules.update, self._removed)
+
+    def keep(self) -> None:
+        """Keep what is imported now."""
+        gc.collect()
+        gc.freeze()
+        modules = {
+            name: module for name, module in sys.modules.items() if name not in ('sys', 'builtins')
+        }
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(modules))
+        self._removed.update(dict.fromkeys(modules))
+
+
+class _Tracing:
+    """The library of LTTng, which rclpy loads and which starts two threads of its own.
+
+    It has to know of a fork: when a child exits, the library ends threads that the child does not have.
+    """
+
+    def __init__(self) -> None:
+        """Find the library in this process, if it is there."""
+        maps = Path('/proc/self/maps').read_text()
+        found = re.search(r'/\S*/liblttng-ust[-\da-f]*\.so\S*', maps)
+        self._library = ctypes.CDLL(found[0]) if found else None
+        self._signals = ctypes.create_string_buffer(128)
+
+    def before_fork(self) -> None:
+        """Prepare the library."""
+        self._call('before_fork')
+
+    def after_fork(self, *, child: bool) -> None:
+        """Continue in one of the two processes. The child starts the threads of its own."""
+        self._call('after_fork_child' if child else 'after_fork_parent')
+
+    def _call(self, name: str) -> None:
+        if self._library is None:
+            return
+        # Newer libraries have another prefix.
+        prefix = 'lttng_ust_' if hasattr(self._library, f'lttng_ust_{name}') else 'ust_'
+        getattr(self._library, prefix + name)(self._signals)
+
+
+def _import(name: str) -> None:
+    module = importlib.import_module(name)
+    if name != PACKAGE:
+        return
+    for each in pkgutil.walk_packages(module.__path__, f'{name}.'):
+        # The fixtures of pytest are not part of any program.
+        if not each.name.startswith(f'{name}.testing'):
+            importlib.import_module(each.name)
+    from rclpy.type_support import check_for_type_support
+
+    for package in [name for name in sys.modules if name.endswith('_msgs.msg')]:
+        for each in vars(sys.modules[package]).values():
+            if isinstance(each, type):
+                check_for_type_support(each)
+
+
+def _run(code: str, argv: list[str], directory: str, environment: dict[str, str]) -> None:
+    """Run a program, as `python -c CODE ARGUMENTS` does, or `python FILE ARGUMENTS`.
+
+    Args:
+        code: Text of the program.
+        argv: `-c` or the name of its file, and its arguments.
+        directory: Its working directory.
+        environment: Its environment variables.
+    """
+    for number, name in enumerate(('stdin', 'stdout', 'stderr')):
+        unbuffered = bool(environment.get('PYTHONUNBUFFERED'))
+        stream = _text_stream(getattr(sys, name), number, unbuffered=unbuffered)
+        setattr(sys, name, stream)
+        setattr(sys, f'__{name}__', stream)
+    inherited = _python_path(os.environ, os.getcwd())
+    os.chdir(directory)
+    sys.argv[:] = argv
+    own = '' if argv[0] == '-c' else os.path.dirname(os.path.abspath(argv[0]))
+    added = _python_path(environment, directory)
+    sys.path[:] = [own, *added, *(path for path in sys.path[1:] if path not in inherited)]
+    sys.path_importer_cache.clear()
+    os.environ.clear()
+    os.environ.update(environment)
+    main = sys.modules['__main__'] = types.ModuleType('__main__')
+    if argv[0] != '-c':
+        main.__file__ = argv[0]
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
+    exec(compile(code, '<string>' if argv[0] == '-c' else argv[0], 'exec'), vars(main))
+
+
+def _python_path(environment: Mapping[str, str], directory: str) -> list[str]:
+    """Return the directories that the variable PYTHONPATH adds to the path of modules."""
+    paths = environment.get('PYTHONPATH', '')
+    # An empty entry is the working directory.
+    entries = paths.split(os.pathsep) if paths else []
+    return [os.path.abspath(os.path.join(directory, entry)) for entry in entries]
+
+
+def _text_stream(original: TextIO, descriptor: int, *, unbuffered: bool) -> io.TextIOWrapper:
+    """Return a standard stream as the interpreter opens it."""
+    mode, buffering = 'wb' if descriptor else 'rb', 0 if descriptor and unbuffered else -1
+    return io.TextIOWrapper(
+        open(descriptor, mode, buffering, closefd=False),
+        encoding=original.encoding,
+        errors=original.errors,
+        line_buffering=not unbuffered and (descriptor == 2 or os.isatty(descriptor)),
+        write_through=unbuffered,
+    )
+
+
+# --- In the tests
+
+
+class _Server:
+    """A process that forks children. Threads may share it."""
+
+    def __init__(self, modules: tuple[str, ...]) -> None:
+        """Start it."""
+        self._lock = threading.Lock()
+        self._folder = tempfile.TemporaryDirectory()
+        self.path = os.path.join(self._folder.name, 'socket')
+        self._connection, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        listener.bind(self.path)
+        listener.listen(100)
+        passed = [theirs.fileno(), listener.fileno()]
+        self._process = subprocess.Popen(
+            [sys.executable, '-c', SERVER, str(Path(__file__).parent), *map(str, passed), *modules],
+            stdin=subprocess.DEVNULL,
+            pass_fds=passed,
+            # NumPy starts a thread for every core otherwise.
+            env={**os.environ, 'OPENBLAS_NUM_THREADS': '1', 'ROS_PYTHON_CHECK_FIELDS': '1'},
+        )
+        listener.close()
+        theirs.close()
+        atexit.register(self._close)
+
+    def ask(self, request: object, descriptors: tuple[int, ...] = ()) -> int:
+        """Send a request; return the answer."""
+        with self._lock:
+            socket.send_fds(self._connection, [marshal.dumps(request)], descriptors)
+            answer = self._connection.recv(LARGEST)
+        assert answer, 'the server of forks has ended'
+        number: int = marshal.loads(answer)
+        return number
+
+    def _close(self) -> None:
+        self._connection.close()
+        self._process.wait()
+        self._folder.cleanup()
+
+
+@lru_cache
+def _server(modules: tuple[str, ...], process: int) -> _Server:
+    return _Server(modules)
+
+
+class Popen:
+    """A program in a fork of the server; used like `subprocess.Popen`."""
+
+    def __init__(
+        self, code, arguments=(), *, modules=EVERYTHING, cwd=None, env=None, stdout=None, stderr=None
+    ):
+        """Run `python -c CODE ARGUMENTS`.
+
+        Args:
+            code: Text of the program.
+            arguments: Arguments of the program.
+            modules: Modules that the server has imported.
+            cwd: Its working directory (default: that of this process).
+            env: Its environment (default: that of this process).
+            stdout: A file, a descriptor or `subprocess.PIPE` (default: that of this process).
+            stderr: The same.
+        """
+        argv = ['-c', *map(str, arguments)]
+        self.args = [sys.executable, '-c', code, *argv[1:]]
+        self.returncode = None
+        self._opened = []
+        null = os.open(os.devnull, os.O_RDONLY)
+        self.stdout, out = self._output(stdout, 1)
+        self.stderr, error = self._output(stderr, 2)
+        self._server = _server(modules, os.getpid())
+        request = (code, argv, os.fspath(cwd or os.getcwd()), dict(env or os.environ))
+        self.pid = self._server.ask(request, (null, out, error))
+        for each in (null, *self._opened):
+            os.close(each)
+        self._pidfd = os.pidfd_open(self.pid)
+
+    def _output(self, stream, default):
+        if stream == subprocess.PIPE:
+            read, write = os.pipe()
+            self._opened.append(write)
+            return open(read), write
+        if stream is None:
+            return None, default
+        return None, stream if isinstance(stream, int) else stream.fileno()
+
+    def poll(self):
+        """Return the exit code, negative if a signal ended it. None: it runs."""
+        try:
+            return self.wait(0.0)
+        except subprocess.TimeoutExpired:
+            return None
+
+    def wait(self, timeout=None):
+        """Wait for its end; return the exit code.
+
+        Raises:
+            subprocess.TimeoutExpired: It runs still.
+        """
+        if self.returncode is None:
+            if not select.select([self._pidfd], [], [], timeout)[0]:
+                raise subprocess.TimeoutExpired(self.args, timeout)
+            self.returncode = self._server.ask(self.pid)
+            os.close(self._pidfd)
+        return self.returncode
+
+    def send_signal(self, number):
+        """Send a signal; nothing happens if it has ended."""
+        if self.poll() is None:
+            signal.pidfd_send_signal(self._pidfd, number)
+
+    def kill(self):
+        """Kill it."""
+        self.send_signal(signal.SIGKILL)
+
+
+def run(code, arguments=(), *, stdout=None, timeout=None, **kwargs):
+    """Run a program to its end; return what it printed, as `subprocess.run` with `capture_output=True`.
+
+    Args:
+        code: Text of the program.
+        arguments: Its arguments.
+        stdout: A file for its standard output, which is not returned then.
+        timeout: Time after which it is killed (s).
+        kwargs: As for `Popen`.
+
+    Raises:
+        subprocess.TimeoutExpired: It was killed.
+    """
+    with tempfile.TemporaryFile('w+') as out, tempfile.TemporaryFile('w+') as error:
+        child = Popen(code, arguments, stdout=stdout or out, stderr=error, **kwargs)
+        try:
+            child.wait(timeout)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+            raise
+        for file in (out, error):
+            file.seek(0)
+        return subprocess.CompletedProcess(child.args, child.returncode, out.read(), error.read())
+
+
+def make_commands(folder, scripts):
+    """Make commands that run Python scripts in forks of the server; return the folder.
+
+    A command is a small process of its own, which passes its arguments, streams and signals on, and ends
+    as the script does.
+
+    Args:
+        folder: Where to make them.
+        scripts: Files of the scripts. A command has the name of its script. `-c` makes the command
+            `python_c`, whose first argument is a program.
+    """
+    folder.mkdir()
+    server = _server(EVERYTHING, os.getpid())
+    client = Path(__file__).with_name('forked_command.py')
+    for script in scripts:
+        path = folder / ('python_c' if script == '-c' else Path(script).name)
+        words = (sys.executable, '-IS', client, server.path, script)
+        path.write_text(f'#!/bin/sh\nexec {shlex.join(map(str, words))} "$@"\n')
+        path.chmod(0o755)
+    return folder

@@ -1,0 +1,56 @@
+"""A command that runs a Python script in a fork of the server, see `forked.make_commands`.
+
+    python -IS forked_command.py SOCKET SCRIPT ARGUMENT ...
+
+This is what a shell starts instead of the script, so it imports as little as possible.
+"""
+
+import marshal
+import os
+import select
+import signal
+import socket
+import sys
+
+FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def main(path, script, *arguments):
+    """Run the script, and end as it does."""
+    caught = []
+    for number in FORWARDED:
+        signal.signal(number, lambda number, _: caught.append(number))
+    wakeup, writer = os.pipe()
+    os.set_blocking(writer, False)
+    signal.set_wakeup_fd(writer)
+    server = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    server.connect(path)
+    if script == '-c':
+        code, *arguments = arguments
+    else:
+        with open(script, encoding='utf-8') as file:
+            code = file.read()
+    request = marshal.dumps((code, [script, *arguments], os.getcwd(), dict(os.environ)))
+    socket.send_fds(server, [request], [0, 1, 2])
+    pid = marshal.loads(server.recv(1000))
+    # As if this process were the program: who reads its output sees its end.
+    null = os.open(os.devnull, os.O_RDWR)
+    for stream in range(3):
+        os.dup2(null, stream)
+    ended = os.pidfd_open(pid)
+    while True:
+        while caught:
+            signal.pidfd_send_signal(ended, caught.pop(0))
+        ready = select.select([ended, wakeup], [], [])[0]
+        if ended in ready:
+            break
+        os.read(wakeup, 100)
+    server.send(marshal.dumps(pid))
+    code = marshal.loads(server.recv(1000))
+    if code < 0:
+        signal.signal(-code, signal.SIG_DFL)
+        os.kill(os.getpid(), -code)
+    os._exit(code)
+
+
+main(*sys.argv[1:])
