@@ -30,7 +30,7 @@ from diffdrive_jacobian.bags.decoding import (
 )
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.parameter_values import changed_parameters
-from diffdrive_jacobian.reading.rows import PARAMETER_EVENTS, ROW_READERS, SERIES_TOPICS
+from diffdrive_jacobian.reading.rows import PARAMETER_EVENTS, ROW_READERS, SERIES_TOPICS, check_goals
 from diffdrive_jacobian.reading.run import COLUMNS, COVARIANCES, Run, Series
 from diffdrive_jacobian.text import printable
 
@@ -94,6 +94,8 @@ def read_run(
                 tally.foreign[connection.topic] += 1
                 continue
             try:
+                if topic == 'goals':
+                    check_goals(data)
                 message = decode(data, kind)
                 if topic == PARAMETER_EVENTS[0]:
                     if namespace in (None, namespace_of(message.node)):
