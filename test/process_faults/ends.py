@@ -18,9 +18,10 @@ from typing import Any, NamedTuple
 from unittest import mock
 
 import processes
+from processes import Child, World
+
 from process_faults.outcome import Outcome, spread, unexpected
 from process_faults.worlds import quiet_world
-from processes import Child, World
 
 LIMIT = 1.0
 """Longest time from a signal to the exit (s)."""
@@ -152,7 +153,11 @@ class Campaign:
         new.parent.mkdir()
         arguments = program.arguments(self.bag, new)
         if program.name not in WITHOUT_ROS:
-            arguments += [*(() if '--ros-args' in arguments else ('--ros-args',)), '-r', f'__ns:={space}']
+            arguments += [
+                *(() if '--ros-args' in arguments else ('--ros-args',)),
+                '-r',
+                f'__ns:={space}',
+            ]
         if program.name == 'send_goal' and not self._serves_goals:
             self._serve_goals()
         traffic = Traffic(self.harness, program, space)

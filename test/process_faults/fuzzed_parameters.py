@@ -1,4 +1,4 @@
-"""Every parameter of every node, set to values that are drawn from its declaration, and to all others."""
+"""Every parameter of every node, set to values that its declaration allows, and to all others."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry
-from process_faults.outcome import Outcome, unexpected
-from process_faults.worlds import quiet_world
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
@@ -26,13 +24,27 @@ from diffdrive_jacobian.parameters.nodes import (
     VirtualRobotParameters,
     WheelBridgeParameters,
 )
+from process_faults.outcome import Outcome, unexpected
+from process_faults.worlds import quiet_world
 
 NODES = {
     'virtual_robot': VirtualRobotParameters,
     'go_to_goal': GoToGoalParameters,
     'wheel_bridge': WheelBridgeParameters,
 }
-TEXTS = ('', 'a', 'twist', 'wheels', 'pose', 'offset_point', 'a' * 256, 'a' * 257, '\x1b[2J', '\n', 'ä\u202e')
+TEXTS = (
+    '',
+    'a',
+    'twist',
+    'wheels',
+    'pose',
+    'offset_point',
+    'a' * 256,
+    'a' * 257,
+    '\x1b[2J',
+    '\n',
+    'ä\u202e',
+)
 NUMBERS = (
     *(0.0, -0.0, 5e-324, 1e-300, 1e-9, 1.0, -1.0, 0.5, 1e6, 1e9, 1.8e308, -1.8e308),
     *(math.nan, math.inf, -math.inf, math.pi, math.tau, -math.tau),
@@ -44,7 +56,9 @@ ATOMIC = 0.3
 
 def candidates(specification: Any, default: Any) -> Iterator[Any]:
     """Yield values from the declaration of a parameter: the limits, beside them, and what is beyond."""
-    bounds = [one for one in (specification.low, specification.high, specification.above) if one is not None]
+    bounds = [
+        one for one in (specification.low, specification.high, specification.above) if one is not None
+    ]
     for bound in bounds:
         if isinstance(default, float):
             yield from (float(bound), math.nextafter(bound, math.inf), math.nextafter(bound, -math.inf))
@@ -134,7 +148,9 @@ class Fuzzer:
         if number == 1:
             (result,) = self._call(self.set, SetParameters.Request(parameters=messages)).results
         else:
-            result = self._call(self.set_all, SetParametersAtomically.Request(parameters=messages)).result
+            result = self._call(
+                self.set_all, SetParametersAtomically.Request(parameters=messages)
+            ).result
         for publisher, message in self._inputs:
             publisher.publish(message)
         self._check(changes, result)
@@ -143,7 +159,9 @@ class Fuzzer:
         given = {name: self._python(value) for name, value in changes.items()}
         what = f'{self.name}: {given!r:.300}'
         allowed = {
-            name: permitted(self.known[name][1], default_of(NODES[self.name], self.known[name][0]), value)
+            name: permitted(
+                self.known[name][1], default_of(NODES[self.name], self.known[name][0]), value
+            )
             for name, value in given.items()
         }
         expected = dict(self.values)

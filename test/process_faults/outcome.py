@@ -5,7 +5,9 @@ from __future__ import annotations
 import re
 from typing import NamedTuple
 
-UNEXPECTED = re.compile(r'Traceback|Segmentation|Fatal|Aborted|terminate called|core dumped|Exception ign')
+UNEXPECTED = re.compile(
+    r'Traceback|Segmentation|Fatal|Aborted|terminate called|core dumped|Exception ign'
+)
 """What no process may print."""
 
 

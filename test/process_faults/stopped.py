@@ -1,8 +1,8 @@
 """Each of the three nodes killed, or stopped and continued, while they drive: who stops, and when.
 
 A robot, a bridge and a controller run in processes of their own and drive to a goal. One of them gets
-SIGKILL, or SIGSTOP and a few seconds later SIGCONT. The others must stop within their timeouts. When it is
-back, the robot must arrive.
+SIGKILL, or SIGSTOP and a few seconds later SIGCONT. The others must stop within their timeouts. When it
+is back, the robot must arrive.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ from typing import Any
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry
-from process_faults.outcome import Outcome, spread, unexpected
-from process_faults.worlds import quiet_world
 from processes import Child, World
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
+
+from process_faults.outcome import Outcome, spread, unexpected
+from process_faults.worlds import quiet_world
 
 TIMEOUT = 0.5
 """Timeout of commands and of odometry (s), the default of the nodes."""
@@ -109,7 +110,7 @@ MUST_STOP = {
 
 
 def disturb(team: Team, name: str, kill: bool, chance: random.Random) -> tuple[list[str], list[float]]:
-    """Disturb one node while it drives; return what broke the promise, and how soon the others stopped."""
+    """Disturb a node while it drives; return what broke the promise, and how soon the others stopped."""
     what = f'{name}, {"SIGKILL" if kill else "SIGSTOP"}'
     team.drive(200.0)
     team.spin(chance.uniform(0.0, 0.6))
