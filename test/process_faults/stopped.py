@@ -28,6 +28,8 @@ TIMEOUT = 0.5
 """Timeout of commands and of odometry (s), the default of the nodes."""
 LATE = 0.3
 """How much later than the timeout a zero may be seen here (s). Other processes use the cores, too."""
+HOLD = 2 * TIMEOUT + LATE
+"""Shortest time for which a node is gone (s)."""
 ARGUMENTS = {
     'virtual_robot': ('--ros-args', '-p', 'command_interface:=wheels'),
     'wheel_bridge': (),
@@ -118,7 +120,7 @@ def disturb(team: Team, name: str, kill: bool, chance: random.Random) -> tuple[l
     node = team.nodes[name]
     node.signal(signal.SIGKILL if kill else signal.SIGSTOP)
     since = time.monotonic()
-    team.spin(2 * TIMEOUT + LATE + chance.uniform(0.3, 1.5))
+    team.spin(HOLD + chance.uniform(0.3, 1.5))
     violations, delays = [], []
     for topic in MUST_STOP[name]:
         delay = team.stopped_after(topic, since)
