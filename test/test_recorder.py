@@ -11,6 +11,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 
 from diffdrive_jacobian.bags.journal import Message
+from diffdrive_jacobian.bags.message_definitions import UnknownTypeError
 from diffdrive_jacobian.recording import recorder
 from diffdrive_jacobian.recording.recorder import Recorder, Selection
 from diffdrive_jacobian.ros.runner import ros_context
@@ -169,6 +170,25 @@ def test_an_invalid_topic_name_of_a_dds_application_is_reported_once(ros, name, 
     reports = capfd.readouterr().err
     assert reports.count('is not recorded') == 1
     assert '\x1b[2J' not in reports
+    assert list(sink.left_out) == [name]
+
+
+def test_a_topic_whose_type_is_not_installed_makes_the_recording_incomplete(ros, monkeypatch):
+    publisher = ros.peer.create_publisher(Twist, 'cmd_vel', 10)
+
+    def message_class(name):
+        raise UnknownTypeError('no Twist')
+
+    monkeypatch.setattr(recorder, 'message_class', message_class)
+    made = ros.add(Recorder, selection=Selection(topics=('cmd_vel',)), sink=(sink := Sink()))
+
+    def left_out():
+        made.discover()
+        return sink.left_out
+
+    ros.until(left_out, 'it is left out')
+    assert sink.left_out == {'/cmd_vel': 'no Twist'}
+    assert publisher.get_subscription_count() == 0
 
 
 @pytest.mark.parametrize('with_info', [True, False])

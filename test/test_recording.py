@@ -320,6 +320,7 @@ def test_a_full_disk_is_raised_by_finish(tmp_path, disk, lossless):
     add_all(recording, *messages(5))
     with pytest.raises(RecordingError, match='aborted: No space left on device') as caught:
         recording.finish()
+    assert str(caught.value).endswith(f'{journal_of(tmp_path / "run")}. 25 messages are missing')
     summary = caught.value.summary
     assert (summary.messages, summary.lost) == (10, {'/cmd_vel': 25})
     assert json.loads(custom_data(tmp_path / 'run')[LOST]) == {'/cmd_vel': 25}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import errno
+import importlib
 import math
 import os
 import signal
@@ -634,6 +635,15 @@ def test_a_signal_ends_it_and_nothing_is_left(folder, capsys, patience):
     assert run(signals=Later(patience)) == 130
     assert capsys.readouterr() == ('', 'sweep_gains: interrupted: nothing was written\n')
     assert left(folder) == []
+
+
+def test_a_signal_during_the_start_ends_it_before_the_sweep(folder, capsys, monkeypatch):
+    monkeypatch.setattr(sweep_gains, 'sweep', lambda *_: pytest.fail('it sweeps'))
+    monkeypatch.setattr(importlib, 'import_module', lambda name: pytest.fail(f'it imports {name}'))
+    signals = Signals()
+    signals.count = 1
+    assert run(signals=signals) == 130
+    assert capsys.readouterr() == ('', 'sweep_gains: interrupted: nothing was written\n')
 
 
 def test_a_signal_while_it_draws_ends_it(folder, monkeypatch):

@@ -37,6 +37,10 @@ class BagError(Exception):
         super().__init__(printable(message, PATH_LIMIT))
 
 
+class ReadingInterruptedError(Exception):
+    """The user does not want the result any more."""
+
+
 class DamagedBagError(BagError):
     """A bag is damaged; the message also names the command that saves what can be read."""
 

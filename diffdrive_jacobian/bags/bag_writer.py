@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 import sqlite3
-import tempfile
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -25,6 +23,7 @@ from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
 from diffdrive_jacobian.bags.limits import MAX_MESSAGE
 from diffdrive_jacobian.bags.metadata import ROOT
 from diffdrive_jacobian.bags.qos import to_rosbags
+from diffdrive_jacobian.bags.scratch import REPLACED, scratch_directory, scratch_prefix
 from diffdrive_jacobian.bags.storage import STORAGES as STORAGES
 from diffdrive_jacobian.bags.storage import BagWriter
 from diffdrive_jacobian.bounded_yaml import MAX_SIZE
@@ -81,7 +80,7 @@ def check_target(target: Path, storage: str, *, replace: bool = False) -> None:
     except UnicodeEncodeError:
         raise OSError(errno.EILSEQ, f'the name of a bag must be UTF-8, got {target.name!a}') from None
     if storage == 'sqlite3':
-        scratch = target.parent.resolve() / (_scratch_prefix(target) + 8 * 'x')
+        scratch = target.parent.resolve() / (scratch_prefix(target) + 8 * 'x')
         length = len(os.fsencode(scratch / target.name / f'{target.name}.db3'))
         if length > MAX_SQLITE_PATH:
             raise OSError(
@@ -89,11 +88,6 @@ def check_target(target: Path, storage: str, *, replace: bool = False) -> None:
                 f'the path is too long for SQLite: at most {MAX_SQLITE_PATH} bytes, got {length} with '
                 'the directory in which the bag is written',
             )
-
-
-def _scratch_prefix(target: Path) -> str:
-    """Return the beginning of the name of the directory in which a bag is written."""
-    return f'.{target.name[:40]}.building-'
 
 
 def _is_nothing_but_a_bag(path: Path) -> bool:
@@ -132,8 +126,7 @@ def build_bag(
     """
     check_target(target, storage, replace=replace)
     channels = {record.id: record for record in records() if isinstance(record, Channel)}
-    scratch = Path(tempfile.mkdtemp(prefix=_scratch_prefix(target), dir=target.parent))
-    try:
+    with scratch_directory(target) as scratch:
         # The directory has the final name, after which rosbags names the files.
         bag = scratch / target.name
         summary, written = _write(records(), channels, bag, storage, compressed)
@@ -145,7 +138,7 @@ def build_bag(
         # Renaming would replace an empty directory that was created meanwhile.
         check_target(target, storage, replace=replace)
         if replace and target.exists():
-            old = scratch / 'replaced'
+            old = scratch / REPLACED
             os.rename(target, old)
             try:
                 os.rename(bag, target)
@@ -155,8 +148,6 @@ def build_bag(
         else:
             os.rename(bag, target)
         _sync(target.parent)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
     return summary
 
 

@@ -134,7 +134,7 @@ class LiveRobot:
         self._on_poses([message], message.header.stamp)
 
     def _on_goals(self, message: Goals) -> None:
-        self._on_poses(message.goals[:MAX_WAYPOINTS], message.header.stamp)
+        self._on_poses(message.goals, message.header.stamp)
 
     def _on_poses(self, poses: Any, stamp: Any) -> None:
         try:

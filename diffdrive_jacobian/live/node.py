@@ -20,6 +20,7 @@ from diffdrive_jacobian.live.session import Session, Snapshot
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.parameter_values import changed_parameters
 from diffdrive_jacobian.parameters.declaration import ParameterError
+from diffdrive_jacobian.ros.serialization import ignoring_invalid
 
 NAME = 'live_page'
 """Name of the node."""
@@ -64,7 +65,8 @@ class LivePage(Node):  # type: ignore[misc]
         self._names = {topic: self.resolve_topic_name(topic).rpartition('/')[2] for topic in TOPICS}
         self._refused: set[str] = set()
         self._discovered = self._worked = -1.0
-        self.create_subscription(ParameterEvent, '/parameter_events', self._on_parameter_event, 10)
+        received = ignoring_invalid(ParameterEvent, self._on_parameter_event)
+        self.create_subscription(ParameterEvent, '/parameter_events', received, 10, raw=True)
         if polled:
             self.create_timer(PERIOD, self.work, clock=Clock(clock_type=ClockType.STEADY_TIME))
 

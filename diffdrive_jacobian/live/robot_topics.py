@@ -21,7 +21,7 @@ from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.ros.rclpy_internals import waiting_messages
-from diffdrive_jacobian.ros.serialization import deserialized
+from diffdrive_jacobian.ros.serialization import MAX_SIZE, deserialized, ignoring_invalid
 from diffdrive_jacobian.ros.topic_errors import explaining_failure, type_name
 
 T = TypeVar('T')
@@ -79,13 +79,13 @@ class Latest:
         self._data = data
 
     def take(self) -> Any | None:
-        """Return the message that was received since the last call. None: none, or it is damaged."""
+        """Return the message that was received since the last call. None: none, or an invalid one."""
         if self._polled:
             # The queue has one place; more than that is a flood, which must not hold up the page.
             for data, _ in islice(waiting_messages(self._subscription), 2):
                 self._data = data
         latest, self._data = self._data, None
-        if latest is None:
+        if latest is None or len(latest) > MAX_SIZE:
             return None
         try:
             return deserialized(latest, self._kind)
@@ -127,11 +127,15 @@ class RobotTopics:
         return f'{self._namespace.rstrip("/")}/{self._names.get(name, name)}'
 
     def listen(self, kind: type[T], topic: str, callback: Callable[[T], None], *, latched: bool) -> None:
-        """Receive every message of a topic."""
+        """Receive every message of a topic, except for what `ignoring_invalid` ignores."""
         with explaining_failure(self._node, kind, self.full(topic)):
             self._subscriptions.append(
                 self._node.create_subscription(
-                    kind, self.full(topic), callback, LATCHED if latched else 10
+                    kind,
+                    self.full(topic),
+                    ignoring_invalid(kind, callback),
+                    LATCHED if latched else 10,
+                    raw=True,
                 )
             )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from rosbags.rosbag2 import Reader
 
 from diffdrive_jacobian.bags.bag_reader import (
     BagError,
+    ReadingInterruptedError,
     messages,
     open_bag,
     recorded_parameters,
@@ -62,6 +64,7 @@ def read_wheels_and_reference(
     wheels: str | None = None,
     reference: str | None = None,
     names: tuple[str, str] | None = None,
+    interrupted: Callable[[], bool] = lambda: False,
 ) -> WheelsAndReference:
     """Read the angles of the wheels and the poses of a reference.
 
@@ -71,8 +74,10 @@ def read_wheels_and_reference(
         reference: Topic of the reference (default: ground_truth, or the only topic of poses).
         names: Joints of the left and the right wheel (default: from the parameters in the bag, or the
             two joints with left and right in their names).
+        interrupted: Is called for each message; once it returns True, reading ends.
 
     Raises:
+        ReadingInterruptedError: `interrupted` returned True.
         BagError: It is not a bag, is damaged, or has not what is needed.
     """
     path = Path(path)
@@ -83,7 +88,7 @@ def read_wheels_and_reference(
             reader, reference, '--reference', REFERENCE, tuple(POSES), any_name=True
         )
         joints, poses = JointRows(), PoseRows()
-        tally = _read(reader, {wheels_topic: joints, poses_topic: poses})
+        tally = _read(reader, {wheels_topic: joints, poses_topic: poses}, interrupted)
     where = printable(path, PATH_LIMIT)
     for topic, count in ((wheels_topic, joints.count), (poses_topic, poses.count)):
         if not count:
@@ -123,7 +128,9 @@ def read_wheels_and_reference(
     )
 
 
-def _read(reader: Reader, sinks: dict[str, JointRows | PoseRows]) -> Counter[tuple[str, str]]:
+def _read(
+    reader: Reader, sinks: dict[str, JointRows | PoseRows], interrupted: Callable[[], bool]
+) -> Counter[tuple[str, str]]:
     """Read the messages of some topics; return how many were skipped, by topic and reason."""
     tally: Counter[tuple[str, str]] = Counter()
     invalid: Counter[str] = Counter()
@@ -136,6 +143,8 @@ def _read(reader: Reader, sinks: dict[str, JointRows | PoseRows]) -> Counter[tup
         if recorded_definition_differs(one.msgtype, type_hashes(one, stored))
     }
     for connection, received, data in messages(reader, connections, invalid):
+        if interrupted():
+            raise ReadingInterruptedError
         topic = connection.topic
         if connection.id in foreign:
             tally[topic, f'were recorded with another definition of {connection.msgtype}'] += 1

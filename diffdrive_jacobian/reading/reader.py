@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from rosbags.rosbag2 import Reader
 from diffdrive_jacobian.bags.bag_reader import (
     BagError,
     DamagedBagError,
+    ReadingInterruptedError,
     base_name,
     messages,
     namespace_of,
@@ -36,6 +37,7 @@ from diffdrive_jacobian.reading.rows import (
     PARAMETER_EVENTS,
     ROW_READERS,
     SERIES_TOPICS,
+    check_goals,
     fault_event,
 )
 from diffdrive_jacobian.reading.run import COLUMNS, COVARIANCES, Run, Series
@@ -44,6 +46,7 @@ from diffdrive_jacobian.text import printable
 __all__ = [
     'BagError',
     'DamagedBagError',
+    'ReadingInterruptedError',
     'Run',
     'Series',
     'base_name',
@@ -57,7 +60,11 @@ WHEELS = ('left_wheel_joint', 'right_wheel_joint')
 
 
 def read_run(
-    path: str | Path, topics: Mapping[str, str] | None = None, *, namespace: str | None = None
+    path: str | Path,
+    topics: Mapping[str, str] | None = None,
+    *,
+    namespace: str | None = None,
+    interrupted: Callable[[], bool] = lambda: False,
 ) -> Run:
     """Read a bag that `record_run` or `ros2 bag record` has written.
 
@@ -70,8 +77,10 @@ def read_run(
             the bag, such as `/robot1/odom`. By default topics are found by their name without namespace.
         namespace: Namespace of the robot, such as `/robot1`, in a bag of several. Only its topics and
             nodes are read, and topics that are given. None: that of the only robot.
+        interrupted: Is called for each message; once it returns True, reading ends.
 
     Raises:
+        ReadingInterruptedError: `interrupted` returned True.
         BagError: It is not a bag, is damaged, has several topics of the same name, or none in the
             namespace.
     """
@@ -96,12 +105,16 @@ def read_run(
             if recorded_definition_differs(one.msgtype, type_hashes(one, stored))
         }
         for connection, received, data in messages(reader, connections, tally.invalid):
+            if interrupted():
+                raise ReadingInterruptedError
             topic, kind = chosen[connection.id], connection.msgtype
             tally.read[connection.topic] += 1
             if connection.id in foreign:
                 tally.foreign[connection.topic] += 1
                 continue
             try:
+                if topic == 'goals':
+                    check_goals(data)
                 message = decode(data, kind)
                 if topic == PARAMETER_EVENTS[0]:
                     if namespace in (None, namespace_of(message.node)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -53,9 +54,25 @@ def _planar(covariance: Any) -> list[float]:
     return [covariance[index] for index in (0, 1, 5, 7, 11, 35)]
 
 
+def check_goals(data: bytes) -> None:
+    """Check the number of poses of a serialized Goals message, which may take seconds to decode.
+
+    Raises:
+        MessageError: They are more than the nodes accept.
+    """
+    order = '<' if data[1:2] == b'\1' else '>'
+    try:
+        # Behind the encapsulation and the stamp: the frame, with its length, and the sequence.
+        (length,) = struct.unpack_from(f'{order}I', data, 12)
+        (count,) = struct.unpack_from(f'{order}I', data, 16 + length + -length % 4)
+    except struct.error:
+        # Decoding it gives the right error.
+        return
+    if count > MAX_WAYPOINTS:
+        raise MessageError(f'goals must contain at most {MAX_WAYPOINTS} poses, got {count}')
+
+
 def _goals(message: Any, _: tuple[str, str]) -> Rows:
-    if len(message.goals) > MAX_WAYPOINTS:
-        raise MessageError(f'goals must contain at most {MAX_WAYPOINTS} poses, got {len(message.goals)}')
     stamp = from_time(message.header.stamp)
     for goal in message.goals:
         yield stamp, from_pose(goal.pose).tolist()

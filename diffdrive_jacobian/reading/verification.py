@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,7 +28,7 @@ from diffdrive_jacobian.reading.ground_truth import (
     placed_as_recorded,
     truth_differences,
 )
-from diffdrive_jacobian.reading.reader import BagError
+from diffdrive_jacobian.reading.reader import BagError, ReadingInterruptedError
 from diffdrive_jacobian.reading.run import Run, Series
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -96,15 +96,22 @@ class _Anchor:
     """Whether its twist is that of a recorded command."""
 
 
-def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verification:
+def verify(
+    run: Run,
+    parameters: Mapping[str, Any] | None = None,
+    *,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> Verification:
     """Simulate a run again and return its differences from the odometry.
 
     Args:
         run: The recorded run.
         parameters: Parameters of the robot, by their ROS names. By default those recorded with the run.
             They are used only if `cmd_vel_out` was not recorded.
+        interrupted: Is called for each odometry message; once it returns True, the simulation ends.
 
     Raises:
+        ReadingInterruptedError: `interrupted` returned True.
         BagError: There is no odometry, there are no commands, no odometry is later than a command, or
             the times of the commands and of the odometry are of different clocks.
         ParameterError: The parameters are not valid parameters of the robot.
@@ -137,6 +144,8 @@ def verify(run: Run, parameters: Mapping[str, Any] | None = None) -> Verificatio
         next((anchor.robot.stamp for anchor in epoch if anchor.is_command), _NEVER) for epoch in anchors
     ]
     for index, epoch in enumerate(epochs):
+        if interrupted():
+            raise ReadingInterruptedError
         found = _nearest(anchors[epoch], run.odometry, index)
         if found is not None:
             last, robot = found

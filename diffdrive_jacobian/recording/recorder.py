@@ -116,7 +116,7 @@ class Recorder(Node):  # type: ignore[misc]
                 publishers = self.get_publishers_info_by_topic(topic)
             except (ValueError, NameValidationException) as error:
                 # A DDS application without ROS can use any name.
-                self._refuse(topic, reason(error))
+                self._leave_out(topic, reason(error))
                 continue
             if not publishers:
                 continue
@@ -172,15 +172,13 @@ class Recorder(Node):  # type: ignore[misc]
     def _subscribe(self, topic: str, publishers: list[Any]) -> None:
         types = sorted({one.topic_type for one in publishers})
         if len(types) > 1:
-            why = f'it has several types: {", ".join(types)}'
-            self._refuse(topic, why)
-            self._sink.set_left_out(topic, why)
+            self._leave_out(topic, f'it has several types: {", ".join(types)}')
             return
         try:
             described = definition(types[0])
             message = message_class(types[0])
         except UnknownTypeError as error:
-            self._refuse(topic, str(error))
+            self._leave_out(topic, str(error))
             return
         channel = Channel(
             id=len(self._channels),
@@ -227,7 +225,7 @@ class Recorder(Node):  # type: ignore[misc]
         try:
             subscription = self._new_subscription(channel, message, profile)
         except (RuntimeError, NameValidationException) as error:
-            self._refuse(channel.topic, reason(error))
+            self._leave_out(channel.topic, reason(error))
             return
         self._subscriptions_by_topic[channel.topic] = subscription
 
@@ -249,8 +247,10 @@ class Recorder(Node):  # type: ignore[misc]
         except UnsupportedEventTypeError:
             return create()
 
-    def _refuse(self, topic: str, why: str) -> None:
+    def _leave_out(self, topic: str, why: str) -> None:
+        """Report once that a topic, or its publishers of one type, are not recorded."""
         self._refused.add(topic)
+        self._sink.set_left_out(topic, why)
         # Other processes choose the names.
         self.get_logger().error(printable(f'{topic} is not recorded: {why}', MAX_REPORT))
 
@@ -265,9 +265,7 @@ class Recorder(Node):  # type: ignore[misc]
     def _note_types(self, channel: Channel, publishers: list[Any]) -> None:
         for other in {one.topic_type for one in publishers} - {channel.type_name}:
             if (mismatch := f'{channel.topic} of {other}') not in self._refused:
-                why = f'{channel.topic} is recorded as {channel.type_name}'
-                self._refuse(mismatch, why)
-                self._sink.set_left_out(mismatch, why)
+                self._leave_out(mismatch, f'{channel.topic} is recorded as {channel.type_name}')
 
     # --- Messages
 

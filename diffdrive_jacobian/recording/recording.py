@@ -32,6 +32,9 @@ from diffdrive_jacobian.text import printable
 MAX_REASON = 500
 """Largest length of the report on a topic that was left out (characters)."""
 
+MAX_LEFT_OUT = 100
+"""Largest number of topics that were left out and are named."""
+
 
 class RecordingError(Exception):
     """A recording is not complete. The message says why, and where the recorded messages are."""
@@ -152,7 +155,11 @@ class Recording:
 
     def set_left_out(self, topic: str, why: str) -> None:
         """Note that a topic, or its publishers of one type, are not recorded. `finish` raises it."""
-        self._left_out[topic] = why
+        if len(self._left_out) < MAX_LEFT_OUT or topic in self._left_out:
+            self._left_out[topic] = why
+        else:
+            # Other processes choose the names, and how many there are.
+            self._left_out['others'] = f'more than {MAX_LEFT_OUT} topics cannot be recorded'
 
     def finish(self) -> Summary:
         """Write the bag, read it back, and remove the journal.
@@ -175,7 +182,7 @@ class Recording:
             why = getattr(error, 'strerror', None) or str(error) or repr(error)
             raise RecordingError(
                 f'{self.bag} cannot be written: {why}. The recorded messages are in {journal}: '
-                f'recover_run {journal} writes the bag from it, where there is space'
+                f'recover_run {journal} writes the bag from it, where there is space{self._missing()}'
             ) from error
         finally:
             self.journal.close()
@@ -183,7 +190,7 @@ class Recording:
         if self.error is not None:
             raise RecordingError(
                 f'the recording was aborted: {self.error.strerror or self.error}. {self.bag} contains '
-                f'the messages recorded before, and so does {journal}',
+                f'the messages recorded before, and so does {journal}{self._missing()}',
                 summary,
             )
         if summary.messages != self._added.total():
@@ -237,6 +244,11 @@ class Recording:
         written = Counter(record.channel for record in records if isinstance(record, Message))
         self._dropped += self._added + self._too_large - written
         self._too_large &= written
+
+    def _missing(self) -> str:
+        """Return how many messages are neither in the journal nor in the bag; '': none that is known."""
+        number = sum(self.lost.values()) - self._too_large.total()
+        return f'. {number} {"message is" if number == 1 else "messages are"} missing' if number else ''
 
     def _describe_losses(self) -> str:
         causes = []

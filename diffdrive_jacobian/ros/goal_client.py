@@ -22,6 +22,7 @@ from diffdrive_jacobian.control import Arrival
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.ros.node import THROTTLE
+from diffdrive_jacobian.ros.serialization import ignoring_invalid
 from diffdrive_jacobian.ros.topic_errors import explaining_failure
 
 SILENCE = 3.0
@@ -98,9 +99,11 @@ class GoalClient(Node):  # type: ignore[misc]
             self._publisher = self.create_publisher(MESSAGES[topic], topic, 10)
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         with explaining_failure(self, GoalStatus, 'goal_status'):
-            self.create_subscription(GoalStatus, 'goal_status', self._on_status, latched)
+            received = ignoring_invalid(GoalStatus, self._on_status)
+            self.create_subscription(GoalStatus, 'goal_status', received, latched, raw=True)
         with explaining_failure(self, Odometry, 'odom'):
-            self.create_subscription(Odometry, 'odom', self._on_odometry, 10)
+            moved = ignoring_invalid(Odometry, self._on_odometry)
+            self.create_subscription(Odometry, 'odom', moved, 10, raw=True)
         # rclpy reports a name that is too long only here.
         self.resolve_service_name('cancel_goal')
         self._cancel = self.create_client(Trigger, 'cancel_goal')

@@ -12,6 +12,7 @@ from rclpy.serialization import deserialize_message
 from diffdrive_jacobian.diagnosis.lasting import Interleaving
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader
 from diffdrive_jacobian.messages.cdr_types import LITTLE_ENDIAN
+from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
 from diffdrive_jacobian.messages.wire import GOALS
 from diffdrive_jacobian.ros.rclpy_internals import with_message_info
 
@@ -20,6 +21,9 @@ T = TypeVar('T')
 MAX_OTHER_ENCAPSULATION = 200_000
 """Longest Goals message in an encapsulation that only rclpy reads (bytes): it creates an object for each
 of its poses, of which 2,000 have this size."""
+MAX_SIZE = 1 << 20
+"""Size of the largest message that clients of our nodes decode (bytes). rclpy would take minutes for a
+Goals message of 1.5 million poses."""
 
 
 def deserialized(data: bytes, message_type: type[T]) -> T:
@@ -33,6 +37,33 @@ def deserialized(data: bytes, message_type: type[T]) -> T:
     except RuntimeError as error:
         raise DecodingError(f'it is not a {message_type.__name__} message') from error
     return message
+
+
+def ignoring_invalid(message_type: type[T], callback: Callable[[T], object]) -> Callable[[bytes], None]:
+    """Return a callback for serialized messages that ignores invalid ones and those beyond `MAX_SIZE`.
+
+    For each message that it cannot decode, the middleware would write several lines to standard error.
+
+    Args:
+        message_type: Type of the messages.
+        callback: Called with each message.
+    """
+
+    def decode(data: bytes) -> None:
+        if len(data) > MAX_SIZE:
+            return
+        try:
+            # Our controller refuses more. rclpy writes a line for each that is longer than its message.
+            if message_type is Goals and goals_header(data)[1] > MAX_WAYPOINTS:
+                return
+            message = deserialized(data, message_type)
+        except DecodingError:
+            return
+        callback(message)
+
+    # Reports name a callback.
+    decode.__qualname__ = getattr(callback, '__qualname__', decode.__qualname__)
+    return decode
 
 
 def reader(

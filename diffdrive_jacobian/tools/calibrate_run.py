@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from diffdrive_jacobian.bags.bag_reader import BagError
+from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
 from diffdrive_jacobian.calibration import Calibration, CalibrationError, Geometry, Given, calibrate
 from diffdrive_jacobian.calibration.description import (
     describe,
@@ -53,6 +53,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                     wheels=options.wheels_topic,
                     reference=options.reference,
                     names=None if options.wheels is None else tuple(options.wheels),
+                    interrupted=lambda: signals.count > 0,
                 )
             )
             for note in read[-1].notes:
@@ -60,6 +61,8 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             if signals.count:
                 return _interrupted()
         nominal = _nominal(options, read)
+    except ReadingInterruptedError:
+        return _interrupted()
     except (BagError, UsageError, ValueError, OSError) as error:
         return _cli.complain(PROGRAM, printable(error, PATH_LIMIT))
     try:

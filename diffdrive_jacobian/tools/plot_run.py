@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from diffdrive_jacobian.bags.bag_reader import BagError
+from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
 from diffdrive_jacobian.plots.output_files import FORMATS, NOT_OVERWRITTEN
 from diffdrive_jacobian.plots.run_figure import draw, names
 from diffdrive_jacobian.plots.run_table import DECIMALS, write_csv
@@ -58,7 +58,14 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         runs: list[Run] = []
         for bag in bags:
             with busy(PROGRAM, f'reading {printable(bag, PATH_LIMIT)}'):
-                runs.append(read_run(bag, dict(options.topics), namespace=options.namespace))
+                runs.append(
+                    read_run(
+                        bag,
+                        dict(options.topics),
+                        namespace=options.namespace,
+                        interrupted=lambda: signals.count > 0,
+                    )
+                )
             # A run without odometry is reported before the others are read.
             trace(runs[-1])
             for note in runs[-1].notes:
@@ -66,6 +73,8 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             if signals.count:
                 return _interrupted()
         return _write(runs, picture, tables, signals, replace=options.force)
+    except ReadingInterruptedError:
+        return _interrupted()
     except (BagError, UsageError) as error:
         return _cli.complain(PROGRAM, printable(error, PATH_LIMIT))
     except ModuleNotFoundError as error:

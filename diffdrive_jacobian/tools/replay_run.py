@@ -119,7 +119,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     own, ros = _cli.split_arguments(arguments)
     if any(VERIFY.startswith(word) and word.startswith('--v') for word in own):
         rest = [word for word in own if not (VERIFY.startswith(word) and word.startswith('--v'))]
-        return verify_run.run_as_option(PROGRAM, VERIFY, [*rest, *ros])
+        return verify_run.run_as_option(PROGRAM, VERIFY, [*rest, *ros], signals)
     parser = _parser()
     options = _cli.parse(parser, own)
     if options.timeout is not None and options.readers is None:

@@ -39,14 +39,15 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     try:
         # Before the sweep, which takes a while.
         picture, numbers = _files(options)
+        _check(signals)
         if picture is not None:
+            # Slow.
             importlib.import_module('matplotlib.figure')
         swept = _sweep(options, signals)
         with busy(PROGRAM, 'drawing'):
             drawn = b'' if picture is None else sweep_figure.draw(swept, extension(picture))
         rows = b'' if numbers is None else table(swept).encode()
-        if signals.count:
-            raise InterruptedByUserError
+        _check(signals)
         if options.output is None and options.csv is None:
             # Other processes that started in the same second may have taken the names meanwhile.
             picture, numbers = _files(options)
@@ -90,14 +91,20 @@ def _sweep(options: argparse.Namespace, signals: Signals) -> Sweep:
         tolerance=options.tolerance,
         robot=_robot(options),
     )
+    _check(signals)
     with Batch('sweeping', setup.loops) as bar:
 
         def progress(done: int) -> None:
-            if signals.count:
-                raise InterruptedByUserError
+            _check(signals)
             bar.show(done)
 
         return sweep(setup, progress)
+
+
+def _check(signals: Signals) -> None:
+    """Raise InterruptedByUserError if a signal was caught."""
+    if signals.count:
+        raise InterruptedByUserError
 
 
 def _robot(options: argparse.Namespace) -> RobotModel:

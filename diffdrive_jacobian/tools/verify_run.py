@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from diffdrive_jacobian.bags.bag_reader import BagError
+from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.file import robot_parameters
@@ -74,29 +75,33 @@ def report(verification: Verification, tolerance: float, yaw_tolerance: float) -
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool and return its exit code."""
     parser = _parser()
-    return _run(parser, parser.parse_args(arguments))
+    return _run(parser, parser.parse_args(arguments), signals)
 
 
-def run_as_option(program: str, option: str, arguments: Sequence[str]) -> int:
+def run_as_option(program: str, option: str, arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool as an option of another one, and return the exit code.
 
     Args:
         program: Name of the other tool.
         option: The option.
         arguments: The other arguments; those that this tool does not have are refused.
+        signals: Counter of the signals.
     """
     parser = _parser(program, option)
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
         parser.error(f'not allowed with {option}: {" ".join(word.strip() for word in unknown)}')
-    return _run(parser, options)
+    return _run(parser, options, signals)
 
 
-def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
+def _run(parser: argparse.ArgumentParser, options: argparse.Namespace, signals: Signals) -> int:
+    def interrupted() -> bool:
+        return signals.count > 0
+
     try:
         parameters = None if options.params_file is None else robot_parameters(options.params_file)
         with busy(parser.prog, f'reading {printable(options.bag, PATH_LIMIT)}'):
-            run = read_run(options.bag, namespace=options.namespace)
+            run = read_run(options.bag, namespace=options.namespace, interrupted=interrupted)
         if parameters is not None and len(run.cmd_vel_out):
             return _cli.complain(
                 parser.prog,
@@ -104,9 +109,12 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
                 'robot applied them',
             )
         with busy(parser.prog, 'simulating the run'):
-            verification = verify(run, parameters)
+            verification = verify(run, parameters, interrupted=interrupted)
     except (UserError, BagError, ParameterError) as error:
         return _cli.complain(parser.prog, error)
+    except ReadingInterruptedError:
+        print(f'{parser.prog}: interrupted', file=sys.stderr)
+        return _cli.INTERRUPTED
     allowed = verification.allowed
     tolerance = allowed if options.tolerance is None else options.tolerance
     yaw_tolerance = allowed if options.yaw_tolerance is None else options.yaw_tolerance
@@ -120,7 +128,8 @@ def _parser(program: str = PROGRAM, option: str = '') -> argparse.ArgumentParser
         usage=' '.join([program, *option.split(), 'BAG [options]']),
         description='Simulate a recorded run again from its commands, and compare the path with the '
         'recorded odometry. Nothing is published, and no ROS is needed. Exit code 0: the robot moves as '
-        'recorded; 1: it does not; 2: wrong arguments, or the bag cannot be read.',
+        'recorded; 1: it does not; 2: wrong arguments, or the bag cannot be read; '
+        '130: interrupted.',
     )
     parser.add_argument('bag', metavar='BAG', type=Path, help='directory of a bag')
     default = f'{EXACT:g} if cmd_vel_out was recorded, else {BY_RECORDING_TIME:g}'

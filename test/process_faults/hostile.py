@@ -1,0 +1,285 @@
+"""Hostile messages at every input of every node that runs as a process.
+
+Messages are damaged in many ways: numbers that are not finite or huge, lengths up to 2^32, bytes
+flipped, cut off or added, other encapsulations, long texts with control characters, random bytes. Each
+is another one. They are published as bytes, a few at a time, so that the node receives most of them.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import struct
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist, TwistStamped
+from nav_msgs.msg import Goals, Odometry
+from rcl_interfaces.srv import GetParameters
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import serialize_message
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+
+from diffdrive_jacobian.ros.rclpy_internals import RCLError
+from process_faults.fuzzed_parameters import finite
+from process_faults.outcome import Outcome, unexpected
+from process_faults.worlds import quiet_world
+
+BURST = 8
+"""Messages at once; the queues of the nodes have room for 10."""
+PAUSE = 0.002
+"""Shortest time between bursts (s)."""
+MEMORY = 5.0
+"""Most that the memory of a node may grow from the first tenth of the messages on (MB)."""
+LINES = 0.02
+"""Most lines that a node may log, per message; and a few always."""
+DOUBLES = (
+    *(math.nan, math.inf, -math.inf, 5e-324, -5e-324, 1.7e308, -1.7e308, 1e9, -1e9, 0.0, -0.0),
+    *(math.pi, 1e-9, 1e-160, 1e160),
+)
+LENGTHS = (0, 1, 2, 255, 65535, 2**31 - 1, 2**31, 2**32 - 1)
+TEXTS = (b'\x1b[2J\x1b]0;x\x07', b'\xff\xfe', b'a' * 5000, b'\n\r\0', '\u202e'.encode(), b'=1+1', b'')
+
+
+class Input(NamedTuple):
+    """An input of a node."""
+
+    node: str
+    topic: str
+    kind: Any
+    arguments: tuple[str, ...] = ()
+
+
+STAMPED = ('-p', 'enable_stamped_cmd_vel:=true')
+SIMULATED = ('-p', 'use_sim_time:=true')
+OUTPUTS = {
+    'virtual_robot': (Odometry, 'odom'),
+    'go_to_goal': (Twist, 'cmd_vel'),
+    'wheel_bridge': (JointState, 'joint_command'),
+}
+INPUTS = (
+    Input('virtual_robot', 'cmd_vel', Twist),
+    Input('virtual_robot', 'cmd_vel', TwistStamped, STAMPED),
+    Input('virtual_robot', 'joint_command', JointState, ('-p', 'command_interface:=wheels')),
+    Input('virtual_robot', 'initialpose', PoseWithCovarianceStamped),
+    Input('virtual_robot', '/clock', Clock, SIMULATED),
+    Input('wheel_bridge', 'cmd_vel', Twist),
+    Input('wheel_bridge', 'cmd_vel', TwistStamped, STAMPED),
+    Input('wheel_bridge', '/clock', Clock, SIMULATED),
+    Input('go_to_goal', 'odom', Odometry),
+    Input('go_to_goal', 'goal_pose', PoseStamped),
+    Input('go_to_goal', 'goals', Goals),
+    Input('go_to_goal', '/clock', Clock, SIMULATED),
+    Input('send_goal', 'goal_status', GoalStatus),
+    Input('send_goal', 'odom', Odometry),
+    Input('watch_run', 'odom', Odometry),
+    Input('watch_run', 'goals', Goals),
+    Input('watch_run', 'goal_status', GoalStatus),
+)
+TOOLS = {'send_goal': (('50', '0'), 'waiting: ', 130), 'watch_run': (('--no-browser',), 'page: ', 0)}
+"""Arguments of programs that are not nodes, what they print when they run, and their exit codes."""
+
+
+def valid(kind: Any) -> Any:
+    """Return a message that every node accepts."""
+    if kind in (Twist, TwistStamped):
+        twist = Twist()
+        twist.linear.x, twist.angular.z = 0.2, 0.3
+        return twist if kind is Twist else TwistStamped(twist=twist)
+    if kind is JointState:
+        return JointState(name=['left_wheel_joint', 'right_wheel_joint'], velocity=[1.0, 2.0])
+    if kind in (Clock, GoalStatus):
+        return kind()
+    if kind is Goals:
+        return Goals(goals=[valid(PoseStamped), valid(PoseStamped)])
+    message = kind()
+    pose = message.pose if kind is PoseStamped else message.pose.pose
+    pose.position.x, pose.orientation.w = 3.0, 1.0
+    if kind is Odometry:
+        message.header.frame_id, message.child_frame_id = 'odom', 'base_link'
+    return message
+
+
+def damaged(chance: random.Random, data: bytes) -> bytes:
+    """Return a message damaged in one or a few ways."""
+    found = bytearray(data)
+    for _ in range(chance.choice((1, 1, 2, 4))):
+        size = len(found)
+        what = chance.randrange(8)
+        if what <= 1 and size >= 12:
+            # Doubles lie at multiples of 8 behind the encapsulation.
+            at = 4 + 8 * chance.randrange((size - 4) // 8)
+            struct.pack_into('<d', found, at, chance.choice(DOUBLES))
+        elif what == 2 and size >= 8:
+            at = 4 * chance.randrange(1, size // 4)
+            struct.pack_into('<I', found, at, chance.choice(LENGTHS))
+        elif what == 3 and size:
+            for _ in range(chance.choice((1, 3, 30))):
+                found[chance.randrange(size)] ^= 1 << chance.randrange(8)
+        elif what == 4:
+            del found[chance.randrange(size + 1) :]
+        elif what == 5:
+            found += chance.randbytes(chance.choice((1, 4, 100, 5000)))
+        elif what == 6 and size >= 4:
+            found[:4] = chance.choice((b'\0\0\0\0', b'\0\1\0\0', b'\0\2\0\0', b'\0\3\0\0', b'\xff' * 4))
+        elif size >= 8:
+            text = chance.choice(TEXTS)
+            at = 4 * chance.randrange(1, size // 4)
+            found[at:at] = struct.pack('<I', len(text) + 1) + text + b'\0'
+    if chance.random() < 0.02:
+        return chance.randbytes(chance.choice((0, 1, 3, 4, 8, 60, 1000)))
+    return bytes(found)
+
+
+def resident(pid: int) -> float:
+    """Return the resident memory of a process (MB)."""
+    return int(Path(f'/proc/{pid}/status').read_text().split('VmRSS:')[1].split()[0]) / 1024.0
+
+
+class Attack:
+    """One input of a running node, and what is heard of the node."""
+
+    def __init__(self, world: Any, one: Input, chance: random.Random) -> None:
+        self.input, self.chance, self.harness = one, chance, world.harness
+        own, ready, self.code = TOOLS.get(one.node, ((), 'subscribed to', 0))
+        # Each has a clock of its own.
+        clock = ('-r', f'/clock:=/{one.node}/clock')
+        arguments = ('--ros-args', '-r', f'__ns:=/{one.node}', *clock, *one.arguments)
+        self.child = world.start(one.node, *own, *arguments)
+        self.child.until_says(ready)
+        self.pid = self.child._process.pid
+        peer = self.harness.peer
+        self.publisher = self._talk(one.kind, one.topic)
+        # It makes watch_run find a robot.
+        self._odometry = self._talk(Odometry, 'odom') if one.node == 'watch_run' else None
+        self.client = peer.create_client(GetParameters, f'/{one.node}/{one.node}/get_parameters')
+        self.heard: list[Any] = []
+        self.infinite: list[str] = []
+        if one.node in OUTPUTS:
+            kind, topic = OUTPUTS[one.node]
+            profile = QoSProfile(depth=1000)
+            peer.create_subscription(kind, f'/{one.node}/{topic}', self._on_output, profile)
+        self.harness.until(self.publisher.get_subscription_count, f'{one.node} reads {one.topic}')
+
+    def _talk(self, kind: Any, topic: str) -> Any:
+        name = topic.lstrip('/')
+        profile = QoSProfile(depth=100)
+        if kind is GoalStatus:
+            profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        return self.harness.peer.create_publisher(kind, f'/{self.input.node}/{name}', profile)
+
+    def _on_output(self, message: Any) -> None:
+        self.heard[:] = [message]
+        if not finite(message):
+            self.infinite.append(str(message)[:300])
+
+    def run(self, count: int) -> tuple[list[str], str]:
+        """Send so many messages; return what broke the promise, and numbers."""
+        name = f'{self.input.node} {self.input.topic} ({self.input.kind.__name__})'
+        data = serialize_message(valid(self.input.kind))
+        first = resident(self.pid)
+        begun, sent = time.monotonic(), 0
+        while sent < count:
+            before, sent = sent, sent + self._burst(data)
+            if before < count // 10 <= sent:
+                first = resident(self.pid)
+            end = time.monotonic() + PAUSE
+            while time.monotonic() < end:
+                self.harness.executor.spin_once(timeout_sec=PAUSE / 2)
+            if not self.child.running:
+                return [f'{name}: the node ended: {self.child.stderr[-300:]!r}'], ''
+        seconds = time.monotonic() - begun
+        violations = []
+        grown = resident(self.pid) - first
+        if grown > MEMORY:
+            violations.append(f'{name}: memory grew by {grown:.1f} MB')
+        said = self.child.stderr
+        if line := unexpected(said):
+            violations.append(f'{name}: printed {line!r}')
+        if (lines := len(said.splitlines())) > 50 + LINES * count:
+            violations.append(f'{name}: {lines} lines were logged')
+        if not said.replace('\n', '').isprintable():
+            violations.append(f'{name}: control characters were logged')
+        if self.infinite:
+            violations.append(f'{name}: published {self.infinite[0]}')
+        if self.input.node in OUTPUTS:
+            try:
+                self._answers()
+                self._works()
+            except AssertionError as error:
+                violations.append(f'{name}: afterwards: {error}')
+        self.child.signal(2)
+        if self.child.exit() != self.code:
+            violations.append(f'{name}: exit code {self.child.exit()}')
+        return violations, f'{sent} in {seconds:.0f} s, {grown:+.1f} MB, {lines} log lines'
+
+    def _burst(self, data: bytes) -> int:
+        """Send a few messages; return how many."""
+        sent = 0
+        for _ in range(BURST):
+            # Fast DDS publishes none that are empty, or longer than a message of the type can be.
+            with suppress(RCLError):
+                self.publisher.publish(damaged(self.chance, data))
+                sent += 1
+        return sent
+
+    def _answers(self) -> None:
+        future = self.client.call_async(GetParameters.Request(names=['use_sim_time']))
+        self.harness.until(future.done, 'a service is answered')
+
+    def _works(self) -> None:
+        """Send valid messages until the node acts on them."""
+        one = self.input
+        wanted: list[tuple[Any, Callable[[], Any]]] = []
+        clock = Clock()
+        if one.arguments == SIMULATED:
+            wanted.append((self.publisher, lambda: clock))
+        if one.node == 'go_to_goal':
+            odometry, goal = valid(Odometry), valid(PoseStamped)
+            odometry.pose.pose.position.x = 0.0
+            wanted += [(self._talk(Odometry, 'odom'), lambda: odometry)]
+            wanted += [(self._talk(PoseStamped, 'goal_pose'), lambda: goal)]
+        else:
+            wheels = one.topic == 'joint_command'
+            kind = TwistStamped if one.arguments == STAMPED else JointState if wheels else Twist
+            wanted += [(self._talk(kind, 'joint_command' if wheels else 'cmd_vel'), lambda: valid(kind))]
+        self.heard.clear()
+        # A clock may be years ahead.
+        seconds = 100
+
+        def acts() -> bool:
+            nonlocal seconds
+            seconds += 1
+            clock.clock.sec = seconds
+            for publisher, make in wanted:
+                publisher.publish(make())
+            return bool(self.heard) and acting(self.heard[-1])
+
+        self.harness.until(acts, 'it acts on valid messages')
+
+
+def acting(message: Any) -> bool:
+    if isinstance(message, JointState):
+        return any(message.velocity)
+    twist = message.twist.twist if isinstance(message, Odometry) else message
+    return bool(twist.linear.x or twist.angular.z)
+
+
+def run(count: int, seed: int = 0, inputs: tuple[Input, ...] = INPUTS) -> Outcome:
+    """Send so many hostile messages to each input."""
+    chance = random.Random(seed)
+    violations: list[str] = []
+    measured = []
+    for one in inputs:
+        with tempfile.TemporaryDirectory(prefix='hostile_') as name, quiet_world(Path(name)) as world:
+            found, numbers = Attack(world, one, chance).run(count)
+        violations += found
+        measured.append(f'{one.node} {one.topic}: {numbers}')
+        print(f'  {measured[-1]}', flush=True)
+    return Outcome(count * len(inputs), violations, f'{len(inputs)} inputs')

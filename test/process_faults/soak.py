@@ -1,0 +1,301 @@
+"""Hours of driving with a fault every few seconds.
+
+Two teams of robot, bridge and controller drive to goals in processes of their own, and the page of
+watch_run observes them. The steady team is stopped, flooded, sent hostile messages, goals, parameters
+and commands of others, but never killed: its memory must stay. The other one is also killed.
+"""
+
+from __future__ import annotations
+
+import random
+import signal
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+from nav_msgs.msg import Goals, Odometry
+from processes import Child, World
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from diffdrive_jacobian.parameters.declaration import default_of, specifications
+from diffdrive_jacobian.ros.rclpy_internals import RCLError
+from process_faults.fuzzed_parameters import NODES, value_of
+from process_faults.hostile import damaged, resident, valid
+from process_faults.outcome import Outcome
+from process_faults.worlds import quiet_world
+
+PERIOD = 3.0
+"""Mean time between two faults (s)."""
+FIRST = 60.0
+"""Time after which the memory counts (s)."""
+MEMORY = 5.0
+"""Most that the memory of a process may grow from then on (MB)."""
+ARGUMENTS = {
+    'virtual_robot': ('-p', 'command_interface:=wheels'),
+    'wheel_bridge': (),
+    'go_to_goal': ('-p', 'kp:=6.0', '-p', 'kv:=1.0', '-p', 'linear.x.max_velocity:=1.0'),
+}
+INPUTS = (
+    ('cmd_vel', Twist),
+    ('joint_command', JointState),
+    ('initialpose', PoseWithCovarianceStamped),
+    ('odom', Odometry),
+    ('goal_pose', PoseStamped),
+    ('goals', Goals),
+)
+EXPECTED = (
+    *('subscribed to ', 'tf2_ros is not installed', 'page: ', 'whoever knows this address'),
+    *('pose set to ', 'goal accepted', 'goal reached', 'goal canceled', 'goal refused', 'goal aborted'),
+    *(' dropped: ', 'the wheels are stopped', 'no command on ', 'no valid odometry on '),
+    *('odometry is received again', 'the goal waits for odometry', 'drives the robot by '),
+    *('arrive faster than they are handled', 'are handled in time again'),
+    *('their poses alternate', 'their commands alternate', 'is subscribed to ', 'publishes '),
+    *('was an int assigned to a float field', 'spirals', 'cannot be reached', 'the gain', 'kp', 'kv'),
+    # The code that rclpy generates for a type writes this itself.
+    'sequence size exceeds remaining buffer',
+)
+"""What the processes may log."""
+
+
+class Team:
+    """Three nodes in a namespace."""
+
+    def __init__(self, world: World, space: str) -> None:
+        self.world, self.space, self.harness = world, space, world.harness
+        peer = self.harness.peer
+        self.nodes: dict[str, Child] = {}
+        self.ended: list[Child] = []
+        for name in ARGUMENTS:
+            self.start(name)
+        self.publishers = {
+            topic: peer.create_publisher(kind, f'{space}/{topic}', 20) for topic, kind in INPUTS
+        }
+        self.odometry: list[Odometry] = []
+        peer.create_subscription(Odometry, f'{space}/odom', self._on_odometry, 10)
+        self.cancel = peer.create_client(Trigger, f'{space}/cancel_goal')
+        self.set = {
+            name: peer.create_client(SetParameters, f'{space}/{name}/set_parameters')
+            for name in ARGUMENTS
+        }
+
+    def _on_odometry(self, message: Odometry) -> None:
+        self.odometry[:] = [message]
+
+    def start(self, name: str) -> None:
+        """Start a node, again if it has ended."""
+        arguments = ('--ros-args', '-r', f'__ns:={self.space}', *ARGUMENTS[name])
+        self.nodes[name] = self.world.start(name, *arguments)
+
+    def send_goal(self, x: float, y: float) -> None:
+        message = PoseStamped()
+        message.pose.position.x, message.pose.position.y, message.pose.orientation.w = x, y, 1.0
+        self.publishers['goal_pose'].publish(message)
+
+    def reset(self) -> None:
+        """Set all parameters that can change to their defaults, or to those of the command line."""
+        given = {'kp': 6.0, 'kv': 1.0, 'linear.x.max_velocity': 1.0}
+        for name, parameters in NODES.items():
+            messages = []
+            for parameter, (field, specification) in specifications(parameters).items():
+                value = given.get(parameter, default_of(parameters, field))
+                if not specification.read_only and isinstance(value, float):
+                    messages.append(
+                        ParameterMessage(
+                            name=parameter, value=ParameterValue(type=3, double_value=value)
+                        )
+                    )
+            # Twice: a limit may be refused while another one is still changed.
+            for _ in range(2):
+                future = self.set[name].call_async(SetParameters.Request(parameters=messages))
+                self.harness.until(future.done, f'parameters of {name}')
+
+    def arrives(self) -> bool:
+        """Return whether the robot reaches a goal near to where it is."""
+        self.harness.until(lambda: self.odometry, 'odometry')
+        start = self.odometry[-1].pose.pose.position
+        x, y = start.x + 0.5, start.y + 0.5
+        begun = sent = 0.0
+
+        def there() -> bool:
+            nonlocal sent
+            if time.monotonic() > sent + 8.0:
+                sent = time.monotonic()
+                self.send_goal(x, y)
+            now = self.odometry[-1]
+            at, speed = now.pose.pose.position, now.twist.twist.linear.x
+            return (at.x - x) ** 2 + (at.y - y) ** 2 < 0.03**2 and speed == 0.0
+
+        begun = time.monotonic()
+        while not there():
+            if time.monotonic() > begun + 40.0:
+                return False
+            self.harness.executor.spin_once(timeout_sec=0.01)
+        return True
+
+
+class Soak:
+    """Two teams, and what happens to them."""
+
+    def __init__(self, world: World, chance: random.Random) -> None:
+        self.world, self.chance, self.harness = world, chance, world.harness
+        self.steady, self.other = Team(world, '/steady'), Team(world, '/other')
+        self.page = world.start('watch_run', '--no-browser')
+        for child in (*self.steady.nodes.values(), *self.other.nodes.values()):
+            child.until_says('subscribed to')
+        self.page.until_says('page: ')
+        self.faults = {
+            one.__name__.strip('_'): one
+            for one in (
+                *(self._stop, self._kill, self._end, self._hostile, self._flood, self._parameter),
+                *(self._goals, self._cancel, self._place, self._drive_by_hand, self._join),
+            )
+        }
+
+    @property
+    def lasting(self) -> dict[str, Child]:
+        """The processes whose memory is measured."""
+        return {**self.steady.nodes, 'watch_run': self.page}
+
+    def memory(self) -> dict[str, float]:
+        return {name: resident(child._process.pid) for name, child in self.lasting.items()}
+
+    def spin(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.harness.executor.spin_once(timeout_sec=0.05)
+
+    # --- Faults
+
+    def _stop(self) -> None:
+        team = self.chance.choice((self.steady, self.other))
+        child = self.chance.choice([*team.nodes.values(), self.page])
+        child.signal(signal.SIGSTOP)
+        self.spin(self.chance.uniform(0.1, 2.5))
+        child.signal(signal.SIGCONT)
+
+    def _restart(self, number: int) -> None:
+        name = self.chance.choice(list(ARGUMENTS))
+        child = self.other.nodes[name]
+        child.signal(number)
+        child.exit()
+        self.other.ended.append(child)
+        self.other.start(name)
+
+    def _kill(self) -> None:
+        self._restart(signal.SIGKILL)
+
+    def _end(self) -> None:
+        self._restart(self.chance.choice((signal.SIGINT, signal.SIGTERM, signal.SIGHUP)))
+
+    def _hostile(self) -> None:
+        topic, kind = self.chance.choice(INPUTS)
+        data = serialize_message(valid(kind))
+        for _ in range(60):
+            for _ in range(10):
+                try:
+                    self.steady.publishers[topic].publish(damaged(self.chance, data))
+                except RCLError:
+                    # It is longer than a message of the type can be.
+                    continue
+            self.spin(0.005)
+
+    def _flood(self) -> None:
+        topic, kind = self.chance.choice(INPUTS)
+        data = serialize_message(valid(kind))
+        end = time.monotonic() + 0.5
+        while time.monotonic() < end:
+            self.steady.publishers[topic].publish(data)
+
+    def _parameter(self) -> None:
+        name = self.chance.choice(list(NODES))
+        known = specifications(NODES[name])
+        parameter = self.chance.choice(list(known))
+        field, specification = known[parameter]
+        value = value_of(self.chance, specification, default_of(NODES[name], field))
+        message = ParameterMessage(name=parameter, value=value)
+        client = self.steady.set[name]
+        client.remove_pending_request(client.call_async(SetParameters.Request(parameters=[message])))
+        self.spin(1.0)
+        self.steady.reset()
+
+    def _goals(self) -> None:
+        for team in (self.steady, self.other):
+            team.send_goal(self.chance.uniform(-3, 3), self.chance.uniform(-3, 3))
+
+    def _cancel(self) -> None:
+        client = self.steady.cancel
+        client.remove_pending_request(client.call_async(Trigger.Request()))
+
+    def _place(self) -> None:
+        message = PoseWithCovarianceStamped()
+        message.pose.pose.position.x, message.pose.pose.orientation.w = self.chance.uniform(-2, 2), 1.0
+        self.steady.publishers['initialpose'].publish(message)
+
+    def _drive_by_hand(self) -> None:
+        end = time.monotonic() + self.chance.uniform(0.1, 1.0)
+        while time.monotonic() < end:
+            self.steady.publishers['cmd_vel'].publish(valid(Twist))
+            self.spin(0.05)
+
+    def _join(self) -> None:
+        peer = self.harness.peer
+        subscription = peer.create_subscription(Odometry, '/steady/odom', lambda _: None, 10)
+        self.spin(self.chance.uniform(0.1, 1.0))
+        peer.destroy_subscription(subscription)
+
+
+def unexpected_lines(child: Child) -> list[str]:
+    """Return the lines that are not expected of a process."""
+    lines = [line for line in (child.stderr + child.stdout).splitlines() if line.strip()]
+    return [one for one in lines if not any(map(one.__contains__, EXPECTED)) or '[ERROR]' in one]
+
+
+def run(count: int, seed: int = 0) -> Outcome:
+    """Drive for so many minutes."""
+    chance = random.Random(seed)
+    violations: list[str] = []
+    life = 60.0 * count + 600.0
+    with tempfile.TemporaryDirectory(prefix='soak_') as name, quiet_world(Path(name), life) as world:
+        made = Soak(world, chance)
+        begun = time.monotonic()
+        first: dict[str, float] = {}
+        most: dict[str, float] = {}
+        faults = 0
+        while (elapsed := time.monotonic() - begun) < 60.0 * count:
+            fault = chance.choice(list(made.faults))
+            made.faults[fault]()
+            faults += 1
+            made.spin(chance.uniform(0.5, 1.5) * PERIOD)
+            memory = made.memory()
+            if elapsed <= FIRST or not first:
+                first = memory
+            most = {name: max(most.get(name, 0.0), now) for name, now in memory.items()}
+            ended = [child.command for child in made.lasting.values() if not child.running]
+            if ended:
+                violations.append(f'{fault}: ended: {ended}')
+                break
+            if faults % 20 == 0:
+                print(f'  {elapsed:.0f} s, {faults} faults, {memory}', file=sys.stderr, flush=True)
+        grown = {name: most[name] - first[name] for name in first}
+        violations += [f'{name}: memory +{by:.1f} MB' for name, by in grown.items() if by > MEMORY]
+        for team in (made.steady, made.other):
+            for child in team.nodes.values():
+                child.until_says('subscribed to')
+            try:
+                team.reset()
+                if not team.arrives():
+                    violations.append(f'{team.space}: no goal is reached at the end')
+            except AssertionError as error:
+                violations.append(f'{team.space}: at the end: {error}')
+        children = [*made.lasting.values(), *made.other.nodes.values(), *made.other.ended]
+        for child in children:
+            violations += [f'{child.command}: {line}' for line in unexpected_lines(child)]
+    grew = ', '.join(f'{name} {by:+.1f}' for name, by in grown.items())
+    return Outcome(faults, violations, f'{count} minutes, memory after the first (MB): {grew}')

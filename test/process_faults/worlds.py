@@ -1,0 +1,27 @@
+"""Worlds of processes for campaigns, which print nothing and let processes live longer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, redirect_stdout
+from io import StringIO
+from pathlib import Path
+from unittest import mock
+
+import processes
+from processes import World, open_world
+
+LIFE = 900.0
+"""How long a process may live (s)."""
+
+
+@contextmanager
+def quiet_world(folder: Path, life: float = LIFE) -> Iterator[World]:
+    """Open a world whose processes may live so long (s). It prints nothing at its end."""
+    with mock.patch.object(processes, 'LIMIT', life), ExitStack() as stack:
+        world = stack.enter_context(open_world(folder))
+        try:
+            yield world
+        finally:
+            with redirect_stdout(StringIO()):
+                stack.close()
