@@ -10,7 +10,8 @@ from faults_nodes import LATCHED, Sink, Source, play, whats
 from rclpy.node import Node
 from std_msgs.msg import Int64, String
 
-from diffdrive_jacobian.testing import LockstepError, faults
+from diffdrive_jacobian.bags.bag_reader import open_bag
+from diffdrive_jacobian.testing import Lockstep, LockstepError, faults
 
 IN_TIME = [(number, 100.0 * number) for number in range(1, 11)]
 
@@ -158,8 +159,6 @@ def test_each_subscription_has_its_own_random_numbers_which_depend_on_nothing_el
     alone = one.numbers
     assert alone != two.numbers
     lockstep.close()
-    from diffdrive_jacobian.testing import Lockstep
-
     with Lockstep() as world:
         later = world.add(Sink('three')), world.add(Sink('one'))
         world.inject(loss, seed=7)
@@ -234,7 +233,8 @@ def test_a_fault_that_met_nothing_is_an_error(lockstep):
     lockstep.add(Sink('snik', topic='cuont'))
     lockstep.add(Sink('other', topic='snik'))
     with pytest.raises(LockstepError, match=r"effect: Loss\('count', node='snik'\): no subscription"):
-        lockstep.check_faults()
+        lockstep.finish()
+    lockstep.close()
 
 
 def test_wrong_arguments_of_inject_are_named(lockstep):
@@ -248,3 +248,14 @@ def test_wrong_arguments_of_inject_are_named(lockstep):
     with pytest.raises(LockstepError, match='is over: 2 s have passed since the start'):
         lockstep.inject(faults.Loss('count', duration=1.5))
     assert lockstep.fault_events == []
+
+
+def test_a_recording_has_what_was_published_and_what_the_faults_did(lockstep, recorded_run):
+    play(lockstep, faults.Loss('count', start=0.15, duration=0.2), seconds=0.5)
+    recorded_run.finish()
+    with open_bag(recorded_run.bag) as bag:
+        times = {}
+        for connection, time, _ in bag.messages():
+            times.setdefault(connection.topic, []).append(time)
+    assert len(times['/count']) == 6
+    assert times['/fault_events'] == [1_150_000_000, 1_350_000_000, 1_350_000_000]
