@@ -28,7 +28,7 @@ class LocalExecutor(ThreadPoolExecutor):
         """
         self._children: set[ChildProcess] = set()
         super().__init__(
-            workers or len(os.sched_getaffinity(0)), initializer=own_children, initargs=(self._children,)
+            workers or cores(), initializer=own_children, initargs=(self._children,)
         )
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
@@ -58,3 +58,12 @@ class SerialExecutor(Executor):
         except Exception as error:
             future.set_exception(error)
         return future
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        # Not on every system.
+        return os.cpu_count() or 1
