@@ -4,6 +4,8 @@ from diffdrive_jacobian.lockstep import Lockstep, LockstepError
 """
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._fault_log import FaultEvent
+from diffdrive_jacobian.lockstep._injection import Injection
 from diffdrive_jacobian.lockstep.world import Lockstep
 
-__all__ = ['Lockstep', 'LockstepError']
+__all__ = ['FaultEvent', 'Injection', 'Lockstep', 'LockstepError']

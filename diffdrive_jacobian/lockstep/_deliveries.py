@@ -31,7 +31,11 @@ class Deliveries:
         """
         self.pending: deque[Reader | None] = deque()
         """One entry for each message and subscription. None: a request or a response of a service."""
-        self._create_task = create_task
+        self.create_task = create_task
+        self.new_reader: Callable[[Subscription, Node], Reader] = lambda subscription, _: Reader(
+            subscription, create_task
+        )
+        """Creates the reader of a subscription of a node."""
         self._readers: dict[Subscription, Reader] = {}
         self._by_topic: dict[str, list[Reader]] = {}
         self._polled: list[Reader] = []
@@ -56,7 +60,7 @@ class Deliveries:
                 if subscription in without:
                     continue
                 reader = known.pop(subscription, None)
-                self._readers[subscription] = reader or Reader(subscription, self._create_task)
+                self._readers[subscription] = reader or self.new_reader(subscription, node)
         for reader in known.values():
             reader.close()
         present = set(self._readers.values())
@@ -67,6 +71,19 @@ class Deliveries:
             self.readers_of(reader.topic).append(reader)
         admitted = set(self._polled)
         return [reader for reader in self._readers.values() if reader not in admitted]
+
+    def replace(self, nodes: Iterable[Node]) -> None:
+        """Let `new_reader` create the readers of all present subscriptions again."""
+        owners = {subscription: node for node in nodes for subscription in node.subscriptions}
+        replaced = {}
+        for subscription, reader in self._readers.items():
+            replaced[reader] = self._readers[subscription] = self.new_reader(
+                subscription, owners[subscription]
+            )
+            reader.close()
+        self._polled = [replaced[reader] for reader in self._polled if reader in replaced]
+        for readers in self._by_topic.values():
+            readers[:] = [replaced[reader] for reader in readers]
 
     def drop_destroyed(self, nodes: Iterable[Node]) -> None:
         """Deliver nothing more to subscriptions that the nodes do not have any more."""

@@ -19,7 +19,7 @@ MAX_SHOWN = 4
 """Number of elements that are shown of an array."""
 MAX_CHECKED = 100
 """Length up to which arrays of zeros are omitted. Longer ones are not searched."""
-OMITTED = ('/clock', '/parameter_events', '/rosout')
+OMITTED = ('/clock', '/fault_events', '/parameter_events', '/rosout')
 """Topics that are not reported."""
 
 

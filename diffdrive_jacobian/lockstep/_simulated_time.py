@@ -46,6 +46,14 @@ class SimulatedTime:
         """Simulated time since the start (s)."""
         return (self._now - self._start) / NANOSECONDS
 
+    @property
+    def world_time(self) -> int:
+        """Time that has passed in the world since the start (ns).
+
+        It always advances. The clock of the nodes, `now`, may jump or stand still.
+        """
+        return self._executor.agenda.now
+
     def settle(self) -> None:
         """Execute all callbacks that are due at the current time."""
         self._check_open()
@@ -68,7 +76,7 @@ class SimulatedTime:
             ValueError: `at_most` is not positive, or too long.
             LockstepError: No timer is running and `at_most` is not given, or time cannot advance.
         """
-        end = math.inf if at_most is None else self._now + checked_nanoseconds('at_most', at_most)
+        end = math.inf if at_most is None else self.world_time + checked_nanoseconds('at_most', at_most)
         self._catch_up()
         if self._until_next is None and at_most is None:
             raise LockstepError('no timer is running, so step needs at_most')
@@ -81,9 +89,9 @@ class SimulatedTime:
             ValueError: `seconds` is not positive, or too long.
             LockstepError: Time cannot advance.
         """
-        end = self._now + checked_nanoseconds('seconds', seconds)
+        end = self.world_time + checked_nanoseconds('seconds', seconds)
         self.settle()
-        while self._now < end:
+        while self.world_time < end:
             self._advance(end)
 
     def run_until(self, condition: Callable[[], object], timeout: float, what: str = '') -> None:
@@ -98,10 +106,10 @@ class SimulatedTime:
             ValueError: `timeout` is not positive, or too long.
             LockstepError: The condition did not become true in time, or time cannot advance.
         """
-        end = self._now + checked_nanoseconds('timeout', timeout)
+        end = self.world_time + checked_nanoseconds('timeout', timeout)
         self.settle()
         while not condition():
-            if self._now >= end:
+            if self.world_time >= end:
                 what = what or _place(condition)
                 raise LockstepError(
                     f'not within {timeout:g} s of simulated time: {what}\n{self.report()}'
@@ -130,10 +138,13 @@ class SimulatedTime:
         self._publish_clock()
 
     def _advance(self, end: float) -> None:
-        """Advance to the next timer, but not beyond an end (ns)."""
+        """Advance to the next timer or action, but not beyond an end of world time (ns)."""
         until_next = math.inf if self._until_next is None else self._until_next
+        agenda = self._executor.agenda
         # The minimum of integers is exact, also beside infinity.
-        self._now = int(min(self._now + until_next, end))
+        passed = int(min(until_next, end - agenda.now))
+        agenda.now += passed
+        self._now += passed
         self._publish_clock()
 
     def _publish_clock(self) -> None:
