@@ -16,8 +16,9 @@ import diffdrive_jacobian
 from diffdrive_jacobian.exploration.digest import MessageDigest
 from diffdrive_jacobian.exploration.scenario import ScenarioName
 from diffdrive_jacobian.faults import Fault
-from diffdrive_jacobian.lockstep import Lockstep
-from diffdrive_jacobian.properties import Property, PropertyViolation, Watch
+from diffdrive_jacobian.lockstep import Lockstep, LockstepError, PropertyViolation
+from diffdrive_jacobian.properties import Property, Watch
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 QUIET = ('--disable-rosout-logs', '--disable-stdout-logs', '--disable-external-lib-logs')
 """ROS arguments of explored worlds. Logs of thousands of worlds help nobody, and take time."""
@@ -75,6 +76,8 @@ class Outcome:
     """Duration in simulated time (s)."""
     rejected: bool = False
     """The scenario called `hypothesis.reject` or `assume`."""
+    complaint: str = ''
+    """A fault or a property that had nothing to act on or to observe."""
     digest: str = ''
     """Hash of all messages, if it was asked for."""
 
@@ -89,26 +92,30 @@ class _Found:
 
     violations: list[Violation] = field(default_factory=list)
     checks: int = 0
+    rejected: bool = False
+    complaint: str = ''
     stopping: bool = False
     """Whether the world was ended because the violation that was looked for was found."""
 
 
-@dataclass(frozen=True)
-class _Collecting(Property):
+class _Collecting:
     """Notes the first violation of a property, and lets the world go on."""
 
-    watched: Property
-    index: int
-    found: _Found = field(compare=False, repr=False)
-    stop: bool = False
-    """Whether a violation ends the world."""
+    def __init__(self, watched: Property, index: int, found: _Found, *, stop: bool) -> None:
+        self.watched, self.index, self.found = watched, index, found
+        self.stop = stop
+        """Whether a violation ends the world."""
 
-    def watch(self, world: Any) -> Watch:
+    def __repr__(self) -> str:
+        """Return that of the property."""
+        return repr(self.watched)
+
+    def watch(self, world: Any) -> _CollectingWatch:
         """Return the watch."""
         return _CollectingWatch(self, self.watched.watch(world), world)
 
 
-class _CollectingWatch(Watch):
+class _CollectingWatch:
     def __init__(self, collecting: _Collecting, watch: Watch, world: Lockstep) -> None:
         self._collecting, self._watch, self._world = collecting, watch, world
         self._open = True
@@ -131,13 +138,18 @@ class _CollectingWatch(Watch):
             Violation(
                 key=repr(watched),
                 name=type(watched).__name__,
-                seconds=self._world.elapsed,
+                seconds=seconds(self._world),
                 text=text[:LONGEST_TEXT],
                 index=self._collecting.index,
             )
         )
         found.stopping = self._collecting.stop
         return text if found.stopping else None
+
+
+def seconds(world: Lockstep) -> float:
+    """Return the world time (s)."""
+    return world.world_time / NANOSECONDS
 
 
 def run(
@@ -170,20 +182,21 @@ def run(
         if only in (None, index)
     ]
     arguments = list(setting.args) or ['--ros-args']
-    with Lockstep([*arguments, '--ros-args', *QUIET]) as world, ambient(during, world):
+    with Lockstep([*arguments, "--ros-args", *QUIET]) as world, ambient(during, world):
         hashed: AbstractContextManager[MessageDigest | None] = (
             MessageDigest(world) if digest else nullcontext()
         )
         with hashed as messages:
             world.inject(*trial.faults, seed=trial.seed)
             world.require(*properties)
-            rejected = _play(world, scenario, trial.case, found)
+            _play(world, scenario, trial.case, found)
             return Outcome(
                 violations=tuple(found.violations),
                 checks=found.checks,
                 events=len(world.fault_events),
-                seconds=world.elapsed,
-                rejected=rejected,
+                seconds=seconds(world),
+                rejected=found.rejected,
+                complaint=found.complaint,
                 digest='' if messages is None else messages.value(),
             )
 
@@ -195,22 +208,36 @@ def ambient(during: Any, world: Lockstep) -> Iterator[None]:
         yield
 
 
-def _play(world: Lockstep, scenario: Any, case: Any, found: _Found) -> bool:
-    """Run the scenario to its end or its failure. Return whether it rejected its case."""
+def _play(world: Lockstep, scenario: Any, case: Any, found: _Found) -> None:
+    """Run the scenario to its end or its failure."""
     try:
         scenario(world, case)
-        world.finish()
     except KeyboardInterrupt:
         raise
     except PropertyViolation:
         if not found.stopping:
             raise
+        return
     except BaseException as error:
         # Without importing Hypothesis, which this process may not need.
         if type(error).__name__ == 'UnsatisfiedAssumption':
-            return True
-        found.violations.append(_of_exception(error, world))
-    return False
+            found.rejected = True
+        else:
+            found.violations.append(_of_exception(error, world))
+        return
+    _finish(world, found)
+
+
+def _finish(world: Lockstep, found: _Found) -> None:
+    """Check the properties at the end, and that faults and properties had something to do with."""
+    try:
+        world.finish()
+        world.check_faults()
+    except PropertyViolation:
+        if not found.stopping:
+            raise
+    except LockstepError as error:
+        found.complaint = str(error).partition('\n')[0]
 
 
 def _of_exception(error: BaseException, world: Lockstep) -> Violation:
@@ -221,7 +248,7 @@ def _of_exception(error: BaseException, world: Lockstep) -> Violation:
     return Violation(
         key=f'no exception: {kind}{place}',
         name=f'NoException{kind}',
-        seconds=world.elapsed,
+        seconds=seconds(world),
         text=text[-LONGEST_TEXT:],
     )
 
