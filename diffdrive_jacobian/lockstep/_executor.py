@@ -68,6 +68,8 @@ class QuiescentExecutor:
         """What happens at later times."""
         self.deliveries = Deliveries(self.create_task)
         """The messages that wait."""
+        self.call_observers: list[Callable[..., None]] = []
+        """Called with each client and its request, and with each service, its response and header."""
         self._restore_calls = wrap_calls(self._noting)
         self.clocks = Clocks()
         self._timers = Timers()
@@ -79,6 +81,8 @@ class QuiescentExecutor:
         def sent(*args: Any, **kwargs: Any) -> Any:
             result = send(*args, **kwargs)
             pending.append(None)
+            for observer in self.call_observers:
+                observer(*args)
             return result
 
         return sent

@@ -24,14 +24,18 @@ class GatedReader(Reader):
     A stage receives each message at the simulated time at which it has left the one before.
     """
 
-    __slots__ = ('_agenda', '_deliveries', '_ready', '_take_next', 'node', 'stages')
+    __slots__ = ('_agenda', '_deliveries', '_ready', '_take_next', 'stages')
 
     def __init__(
         self, subscription: Subscription, node: Node, agenda: Agenda, deliveries: Deliveries
     ) -> None:
         """Keep the subscription of a node alive until `close`."""
-        super().__init__(subscription, deliveries.create_task)
-        self.node = node
+        super().__init__(
+            subscription,
+            deliveries.create_task,
+            node,
+            deliveries.observers_of(subscription.topic_name),
+        )
         self.stages: list[Stage] = []
         self._agenda = agenda
         self._deliveries = deliveries

@@ -9,10 +9,11 @@ from contextlib import contextmanager
 
 from rclpy.executors import ExternalShutdownException
 
-from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._errors import LockstepError, PropertyViolation
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
 from diffdrive_jacobian.lockstep._guard import Guard, Stuck
 from diffdrive_jacobian.lockstep._report import Traffic
+from diffdrive_jacobian.lockstep._requirement import Required, Requirement
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 MAX_SECONDS = 2**31 - 1
@@ -31,6 +32,7 @@ class SimulatedTime:
         self._until_next: int | None = None
         self._busy = False
         self._traffic = Traffic(lambda: self._now)
+        self._watches: list[Required] = []
 
     def _check_open(self) -> None:
         """Raise LockstepError after `close`."""
@@ -59,6 +61,8 @@ class SimulatedTime:
         self._check_open()
         with self._watched():
             self._until_next = self._executor.settle()
+        if self._watches:
+            self._check_requirements()
 
     def _catch_up(self) -> None:
         """Execute what was caused since the last callback."""
@@ -150,6 +154,8 @@ class SimulatedTime:
     def _publish_clock(self) -> None:
         with self._watched():
             self._until_next = self._executor.advance(self._now)
+        if self._watches:
+            self._check_requirements()
 
     @contextmanager
     def _watched(self) -> Iterator[None]:
@@ -170,6 +176,17 @@ class SimulatedTime:
         finally:
             self._guard.disarm()
             self._busy = False
+
+    def _check_requirements(self) -> None:
+        """Check what is required at the current time, when all callbacks have been executed."""
+        for required in self._watches:
+            if (text := required.watch.check()) is not None:
+                self._watches.remove(required)
+                required.end()
+                raise self._violation(required.requirement, text)
+
+    def _violation(self, requirement: Requirement, text: str) -> PropertyViolation:
+        return PropertyViolation(requirement, self.elapsed, text, self.report())
 
     def report(self) -> str:
         """Return the last messages of all topics as text."""
