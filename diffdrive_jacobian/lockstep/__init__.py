@@ -3,7 +3,9 @@
 from diffdrive_jacobian.lockstep import Lockstep, LockstepError
 """
 
-from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._errors import LockstepError, PropertyViolation
+from diffdrive_jacobian.lockstep._fault_log import FaultEvent
+from diffdrive_jacobian.lockstep._injection import Injection
 from diffdrive_jacobian.lockstep.world import Lockstep
 
-__all__ = ['Lockstep', 'LockstepError']
+__all__ = ['FaultEvent', 'Injection', 'Lockstep', 'LockstepError', 'PropertyViolation']

@@ -11,13 +11,16 @@ from __future__ import annotations
 import inspect
 from collections import deque
 from collections.abc import Callable, Container, Iterable
-from typing import Any
+from typing import Any, TypeAlias
 
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy
 from rclpy.subscription import Subscription
 
 from diffdrive_jacobian.ros.rclpy_internals import message_taker, receives_info
+
+Delivered: TypeAlias = Callable[[Node, Any, Any], None]
+"""Receives the node of a subscription, the type of its messages, and a message or its bytes."""
 
 
 class Deliveries:
@@ -31,14 +34,23 @@ class Deliveries:
         """
         self.pending: deque[Reader | None] = deque()
         """One entry for each message and subscription. None: a request or a response of a service."""
-        self._create_task = create_task
+        self.create_task = create_task
+        self.new_reader: Callable[[Subscription, Node], Reader] = lambda subscription, node: Reader(
+            subscription, create_task, node, self.observers_of(subscription.topic_name)
+        )
+        """Creates the reader of a subscription of a node."""
         self._readers: dict[Subscription, Reader] = {}
         self._by_topic: dict[str, list[Reader]] = {}
+        self._observers: dict[str, list[Delivered]] = {}
         self._polled: list[Reader] = []
 
     def readers_of(self, topic: str) -> list[Reader]:
         """Return the subscriptions of a topic. The list stays up to date."""
         return self._by_topic.setdefault(topic, [])
+
+    def observers_of(self, topic: str) -> list[Delivered]:
+        """Return the functions that are called before each message of a topic is received."""
+        return self._observers.setdefault(topic, [])
 
     def update(self, nodes: Iterable[Node], without: Container[Subscription] = ()) -> list[Reader]:
         """Serve the present subscriptions of the nodes.
@@ -56,7 +68,7 @@ class Deliveries:
                 if subscription in without:
                     continue
                 reader = known.pop(subscription, None)
-                self._readers[subscription] = reader or Reader(subscription, self._create_task)
+                self._readers[subscription] = reader or self.new_reader(subscription, node)
         for reader in known.values():
             reader.close()
         present = set(self._readers.values())
@@ -67,6 +79,19 @@ class Deliveries:
             self.readers_of(reader.topic).append(reader)
         admitted = set(self._polled)
         return [reader for reader in self._readers.values() if reader not in admitted]
+
+    def replace(self, nodes: Iterable[Node]) -> None:
+        """Let `new_reader` create the readers of all present subscriptions again."""
+        owners = {subscription: node for node in nodes for subscription in node.subscriptions}
+        replaced = {}
+        for subscription, reader in self._readers.items():
+            replaced[reader] = self._readers[subscription] = self.new_reader(
+                subscription, owners[subscription]
+            )
+            reader.close()
+        self._polled = [replaced[reader] for reader in self._polled if reader in replaced]
+        for readers in self._by_topic.values():
+            readers[:] = [replaced[reader] for reader in readers]
 
     def drop_destroyed(self, nodes: Iterable[Node]) -> None:
         """Deliver nothing more to subscriptions that the nodes do not have any more."""
@@ -108,13 +133,22 @@ class Reader:
         '_subscription',
         'latched',
         'message_type',
+        'node',
+        'observers',
         'raw',
         'take',
         'topic',
     )
 
-    def __init__(self, subscription: Subscription, create_task: Callable[..., Any]) -> None:
+    def __init__(
+        self,
+        subscription: Subscription,
+        create_task: Callable[..., Any],
+        node: Node,
+        observers: list[Delivered],
+    ) -> None:
         """Keep the subscription alive until `close`."""
+        self.node, self.observers = node, observers
         self.topic: str = subscription.topic_name
         self.latched = is_latched(subscription)
         self._subscription = subscription
@@ -132,6 +166,9 @@ class Reader:
 
     def call(self, taken: tuple[Any, dict[str, Any]]) -> None:
         """Call the callback with a message that was taken, and its info."""
+        if self.observers:
+            for observer in self.observers:
+                observer(self.node, self.message_type, taken[0])
         # The callback is looked up for each message, because it may be replaced.
         subscription = self._subscription
         callback = subscription.callback

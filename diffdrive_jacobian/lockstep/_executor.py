@@ -21,6 +21,7 @@ from rclpy.node import Node
 from rclpy.task import Task
 from rclpy.timer import Timer
 
+from diffdrive_jacobian.lockstep._agenda import Agenda
 from diffdrive_jacobian.lockstep._clocks import Clocks
 from diffdrive_jacobian.lockstep._deliveries import Deliveries, is_latched
 from diffdrive_jacobian.lockstep._errors import LockstepError
@@ -63,8 +64,12 @@ class QuiescentExecutor:
         self._changed = False
         self._has_actions = False
         self._tasks = Tasks()
+        self.agenda = Agenda()
+        """What happens at later times."""
         self.deliveries = Deliveries(self.create_task)
         """The messages that wait."""
+        self.call_observers: list[Callable[..., None]] = []
+        """Called with each client and its request, and with each service, its response and header."""
         self._restore_calls = wrap_calls(self._noting)
         self.clocks = Clocks()
         self._timers = Timers()
@@ -76,6 +81,8 @@ class QuiescentExecutor:
         def sent(*args: Any, **kwargs: Any) -> Any:
             result = send(*args, **kwargs)
             pending.append(None)
+            for observer in self.call_observers:
+                observer(*args)
             return result
 
         return sent
@@ -129,7 +136,8 @@ class QuiescentExecutor:
         """Execute all callbacks that are due at the current time, and all that they cause.
 
         Returns:
-            Time until the next timer in simulated time expires (ns); None: there is no such timer.
+            Time until the next timer in simulated time expires, or the next action is due (ns); None:
+            there is none.
         """
         self._handle_all()
         return self._call_timers()[1]
@@ -143,7 +151,7 @@ class QuiescentExecutor:
         if not self._has_work():
             due, until_next = self._timers.due()
             if not due:
-                return until_next
+                return self._sooner(until_next)
         return self.settle()
 
     def advance(self, now: int) -> int | None:
@@ -159,17 +167,28 @@ class QuiescentExecutor:
         """Return whether anything waits to be executed, or may wait without having been noticed."""
         return bool(self.deliveries.pending or self._changed or self._tasks or self._has_actions)
 
+    def _sooner(self, until_next: int | None) -> int | None:
+        """Return the time until the next timer or action (ns); None: there is none."""
+        until_action = self.agenda.until_next()
+        if until_action is None or until_next is None:
+            return until_action if until_next is None else until_next
+        return min(until_action, until_next)
+
     def _call_timers(self) -> tuple[bool, int | None]:
-        """Call the timers that are due, and execute all callbacks that they cause.
+        """Execute the actions and the timers that are due, and all callbacks that they cause.
 
         Returns:
             Whether there were any, and the time until the next timer expires, as of `settle`.
         """
         called = False
         while True:
+            while (action := self.agenda.pop_due()) is not None:
+                called = True
+                action()
+                self._handle_all()
             due, until_next = self._timers.due()
             if not due:
-                return called, until_next
+                return called, self._sooner(until_next)
             for handle, timer in due:
                 if is_due(handle):
                     called = True

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from itertools import count
-from typing import Any
+from typing import Any, TypeAlias
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -19,16 +19,21 @@ MAX_SHOWN = 4
 """Number of elements that are shown of an array."""
 MAX_CHECKED = 100
 """Length up to which arrays of zeros are omitted. Longer ones are not searched."""
-OMITTED = ('/clock', '/parameter_events', '/rosout')
+OMITTED = ('/clock', '/fault_events', '/parameter_events', '/rosout')
 """Topics that are not reported."""
+
+
+Published: TypeAlias = Callable[[Publisher, Any], None]
+"""Receives a publisher and the message or bytes that it has published."""
 
 
 class _Record:
     """Messages of one publisher."""
 
-    __slots__ = ('at', 'count', 'message', 'message_type', 'order', 'readers', 'topic')
+    __slots__ = ('at', 'count', 'message', 'message_type', 'observers', 'order', 'readers', 'topic')
 
-    def __init__(self, publisher: Publisher, deliveries: Deliveries) -> None:
+    def __init__(self, publisher: Publisher, deliveries: Deliveries, observers: list[Published]) -> None:
+        self.observers = observers
         self.topic: str = publisher.topic_name
         self.message_type: Any = publisher.msg_type
         self.readers = deliveries.readers_of(self.topic)
@@ -60,28 +65,37 @@ class Traffic:
         """Start without messages. `now` returns the simulated time (ns)."""
         self._now = now
         self._records: dict[Publisher, _Record] = {}
+        self._observers: dict[str, list[Published]] = {}
         self._restore: Callable[[], None] | None = None
 
     def start(self, deliveries: Deliveries) -> None:
         """Start counting."""
         records, now, numbers = self._records, self._now, count(1)
-        extend = deliveries.pending.extend
+        extend, observers_of = deliveries.pending.extend, self.observers_of
 
         def counting(publish: Callable[..., None]) -> Callable[..., None]:
             def counted(self: Publisher, msg: Any) -> None:
                 publish(self, msg)
                 record = records.get(self)
                 if record is None:
-                    record = records[self] = _Record(self, deliveries)
+                    observers = observers_of(self.topic_name)
+                    record = records[self] = _Record(self, deliveries, observers)
                 record.count += 1
                 record.order = next(numbers)
                 record.at = now()
                 record.message = msg
                 extend(record.readers)
+                if record.observers:
+                    for observer in record.observers:
+                        observer(self, msg)
 
             return counted
 
         self._restore = wrap_publish(counting)
+
+    def observers_of(self, topic: str) -> list[Published]:
+        """Return the functions that are called after each message of a topic is published."""
+        return self._observers.setdefault(topic, [])
 
     def last(self, topic: str) -> Any:
         """Return the last message of a topic as it was received; None: there is none."""

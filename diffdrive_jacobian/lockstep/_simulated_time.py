@@ -9,10 +9,11 @@ from contextlib import contextmanager
 
 from rclpy.executors import ExternalShutdownException
 
-from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._errors import LockstepError, PropertyViolation
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
 from diffdrive_jacobian.lockstep._guard import Guard, Stuck
 from diffdrive_jacobian.lockstep._report import Traffic
+from diffdrive_jacobian.lockstep._requirement import Required, Requirement
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 MAX_SECONDS = 2**31 - 1
@@ -31,6 +32,7 @@ class SimulatedTime:
         self._until_next: int | None = None
         self._busy = False
         self._traffic = Traffic(lambda: self._now)
+        self._watches: list[Required] = []
 
     def _check_open(self) -> None:
         """Raise LockstepError after `close`."""
@@ -46,11 +48,21 @@ class SimulatedTime:
         """Simulated time since the start (s)."""
         return (self._now - self._start) / NANOSECONDS
 
+    @property
+    def world_time(self) -> int:
+        """Time that has passed in the world since the start (ns).
+
+        It always advances. The clock of the nodes, `now`, may jump or stand still.
+        """
+        return self._executor.agenda.now
+
     def settle(self) -> None:
         """Execute all callbacks that are due at the current time."""
         self._check_open()
         with self._watched():
             self._until_next = self._executor.settle()
+        if self._watches:
+            self._check_requirements()
 
     def _catch_up(self) -> None:
         """Execute what was caused since the last callback."""
@@ -68,7 +80,7 @@ class SimulatedTime:
             ValueError: `at_most` is not positive, or too long.
             LockstepError: No timer is running and `at_most` is not given, or time cannot advance.
         """
-        end = math.inf if at_most is None else self._now + checked_nanoseconds('at_most', at_most)
+        end = math.inf if at_most is None else self.world_time + checked_nanoseconds('at_most', at_most)
         self._catch_up()
         if self._until_next is None and at_most is None:
             raise LockstepError('no timer is running, so step needs at_most')
@@ -81,9 +93,9 @@ class SimulatedTime:
             ValueError: `seconds` is not positive, or too long.
             LockstepError: Time cannot advance.
         """
-        end = self._now + checked_nanoseconds('seconds', seconds)
+        end = self.world_time + checked_nanoseconds('seconds', seconds)
         self.settle()
-        while self._now < end:
+        while self.world_time < end:
             self._advance(end)
 
     def run_until(self, condition: Callable[[], object], timeout: float, what: str = '') -> None:
@@ -98,10 +110,10 @@ class SimulatedTime:
             ValueError: `timeout` is not positive, or too long.
             LockstepError: The condition did not become true in time, or time cannot advance.
         """
-        end = self._now + checked_nanoseconds('timeout', timeout)
+        end = self.world_time + checked_nanoseconds('timeout', timeout)
         self.settle()
         while not condition():
-            if self._now >= end:
+            if self.world_time >= end:
                 what = what or _place(condition)
                 raise LockstepError(
                     f'not within {timeout:g} s of simulated time: {what}\n{self.report()}'
@@ -130,15 +142,20 @@ class SimulatedTime:
         self._publish_clock()
 
     def _advance(self, end: float) -> None:
-        """Advance to the next timer, but not beyond an end (ns)."""
+        """Advance to the next timer or action, but not beyond an end of world time (ns)."""
         until_next = math.inf if self._until_next is None else self._until_next
+        agenda = self._executor.agenda
         # The minimum of integers is exact, also beside infinity.
-        self._now = int(min(self._now + until_next, end))
+        passed = int(min(until_next, end - agenda.now))
+        agenda.now += passed
+        self._now += passed
         self._publish_clock()
 
     def _publish_clock(self) -> None:
         with self._watched():
             self._until_next = self._executor.advance(self._now)
+        if self._watches:
+            self._check_requirements()
 
     @contextmanager
     def _watched(self) -> Iterator[None]:
@@ -159,6 +176,17 @@ class SimulatedTime:
         finally:
             self._guard.disarm()
             self._busy = False
+
+    def _check_requirements(self) -> None:
+        """Check what is required at the current time, when all callbacks have been executed."""
+        for required in self._watches:
+            if (text := required.watch.check()) is not None:
+                self._watches.remove(required)
+                required.end()
+                raise self._violation(required.requirement, text)
+
+    def _violation(self, requirement: Requirement, text: str) -> PropertyViolation:
+        return PropertyViolation(requirement, self.elapsed, text, self.report())
 
     def report(self) -> str:
         """Return the last messages of all topics as text."""

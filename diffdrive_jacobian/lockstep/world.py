@@ -17,10 +17,11 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
+from diffdrive_jacobian.lockstep._disturbed import Disturbed
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
 from diffdrive_jacobian.lockstep._guard import Guard
-from diffdrive_jacobian.lockstep._messaging import Messaging, described
+from diffdrive_jacobian.lockstep._messaging import described
 from diffdrive_jacobian.lockstep._simulated_time import checked_nanoseconds
 from diffdrive_jacobian.ros.rclpy_internals import wrap_sleep
 from diffdrive_jacobian.ros.runner import UserError, discovery_off, ros_context
@@ -28,7 +29,7 @@ from diffdrive_jacobian.ros.runner import UserError, discovery_off, ros_context
 N = TypeVar('N', bound=Node)
 
 
-class Lockstep(Messaging):
+class Lockstep(Disturbed):
     """Executes nodes in the default context of rclpy, in simulated time.
 
     Nodes are created as usual, after the `Lockstep`, and added to it. `use_sim_time` is true for all of

@@ -1,8 +1,10 @@
 """Tests of ROS nodes in simulated time: `fixtures` for pytest, and `Lockstep` for other frameworks.
 
-`Lockstep` and `LockstepError` are also names of this package. Their own package is `lockstep`.
+`Lockstep`, `LockstepError` and `faults` are also names of this package. `Lockstep` has its own package
+`lockstep`, and faults theirs, `faults`.
 """
 
+from diffdrive_jacobian import faults
 from diffdrive_jacobian.lockstep import Lockstep, LockstepError
 
-__all__ = ['Lockstep', 'LockstepError']
+__all__ = ['Lockstep', 'LockstepError', 'faults']

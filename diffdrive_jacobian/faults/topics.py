@@ -1,0 +1,203 @@
+"""Faults of topics: messages that are lost, late, out of order, repeated or old."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import ClassVar
+
+from diffdrive_jacobian.faults.fault import Filter, TopicFault
+from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
+
+
+@dataclass(frozen=True, repr=False)
+class Loss(TopicFault):
+    """Messages are lost: the receiver never gets them.
+
+    Attributes:
+        probability: Probability that a message is lost, or that a burst of lost messages begins.
+        burst: Number of messages in a row that are lost each time.
+    """
+
+    probability: float = 1.0
+    burst: int = 1
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        super().__post_init__()
+        self._number('probability', low=0.0, high=1.0)
+        self._count('burst')
+
+    def begin(self, rng: random.Random, message_type: type) -> Filter:
+        """Return the filter of one subscription."""
+        left = 0
+
+        def lose(_: int, data: bytes) -> list[tuple[int, bytes]]:
+            nonlocal left
+            if left == 0 and rng.random() < self.probability:
+                left = self.burst
+            if left == 0:
+                return [(0, data)]
+            left -= 1
+            return []
+
+        return lose
+
+
+@dataclass(frozen=True, repr=False)
+class Delay(TopicFault):
+    """Messages arrive late, in the order in which they were published.
+
+    The delay of a message is `seconds`, plus a random part between 0 and `spread`, plus `growth` for
+    each second since the fault began. A message whose delay would let it overtake an earlier one arrives
+    immediately after that. This holds for the first messages after the fault, too.
+
+    Attributes:
+        seconds: Constant part of the delay (s).
+        spread: Largest random part of the delay (s), uniformly distributed.
+        growth: Growth of the delay (s per s).
+    """
+
+    seconds: float
+    spread: float = 0.0
+    growth: float = 0.0
+
+    keeps_order: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        super().__post_init__()
+        for name in ('seconds', 'spread', 'growth'):
+            self._number(name, low=0.0)
+
+    def begin(self, rng: random.Random, message_type: type) -> Filter:
+        """Return the filter of one subscription."""
+        start = nanoseconds(self.start)
+
+        def delay(now: int, data: bytes) -> list[tuple[int, bytes]]:
+            late = self.seconds + self.spread * rng.random()
+            return [(nanoseconds(late + self.growth * (now - start) / NANOSECONDS), data)]
+
+        return delay
+
+
+@dataclass(frozen=True, repr=False)
+class Reorder(TopicFault):
+    """Some messages are overtaken: they arrive late, after others that were published later.
+
+    Attributes:
+        probability: Probability that a message is held back.
+        seconds: Time for which it is held back (s). If no other message is published meanwhile, it is
+            late, but in order.
+    """
+
+    probability: float
+    seconds: float
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        super().__post_init__()
+        self._number('probability', low=0.0, high=1.0)
+        self._number('seconds', low=0.0, above=True)
+
+    def begin(self, rng: random.Random, message_type: type) -> Filter:
+        """Return the filter of one subscription."""
+        late = nanoseconds(self.seconds)
+
+        def reorder(_: int, data: bytes) -> list[tuple[int, bytes]]:
+            return [(late if rng.random() < self.probability else 0, data)]
+
+        return reorder
+
+
+@dataclass(frozen=True, repr=False)
+class Duplicate(TopicFault):
+    """Some messages arrive several times.
+
+    Attributes:
+        probability: Probability that a message is repeated.
+        copies: Number of times that it arrives beyond the first.
+        seconds: Time between two of its arrivals (s). 0: immediately after each other.
+    """
+
+    probability: float = 1.0
+    copies: int = 1
+    seconds: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        super().__post_init__()
+        self._number('probability', low=0.0, high=1.0)
+        self._number('seconds', low=0.0)
+        self._count('copies')
+
+    def begin(self, rng: random.Random, message_type: type) -> Filter:
+        """Return the filter of one subscription."""
+
+        def duplicate(_: int, data: bytes) -> list[tuple[int, bytes]]:
+            copies = self.copies if rng.random() < self.probability else 0
+            return [(nanoseconds(number * self.seconds), data) for number in range(copies + 1)]
+
+        return duplicate
+
+
+@dataclass(frozen=True, repr=False)
+class RateLimit(TopicFault):
+    """At most `rate` messages per second arrive: one that comes too soon after another is lost.
+
+    A message arrives if at least 1/`rate` s have passed since the last one that did.
+
+    Attributes:
+        rate: Largest rate (Hz).
+    """
+
+    rate: float
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        super().__post_init__()
+        self._number('rate', low=0.0, above=True)
+
+    def begin(self, rng: random.Random, message_type: type) -> Filter:
+        """Return the filter of one subscription."""
+        period = nanoseconds(1.0 / self.rate)
+        last: int | None = None
+
+        def limit(now: int, data: bytes) -> list[tuple[int, bytes]]:
+            nonlocal last
+            if last is not None and now - last < period:
+                return []
+            last = now
+            return [(0, data)]
+
+        return limit
+
+
+@dataclass(frozen=True, repr=False)
+class Stale(TopicFault):
+    """Instead of each message the last one before the fault arrives again, unchanged, stamp included.
+
+    If there was none before, the first message during the fault arrives, and is then repeated.
+    """
+
+    def begin(self, rng: random.Random, message_type: type) -> Filter:
+        """Return the filter of one subscription."""
+        return _Stale()
+
+
+class _Stale:
+    """Repeats the last message."""
+
+    def __init__(self) -> None:
+        self._last: bytes | None = None
+
+    def observe(self, _: int, data: bytes) -> None:
+        """Keep a message that arrives unchanged."""
+        self._last = data
+
+    def __call__(self, _: int, data: bytes) -> Iterable[tuple[int, bytes]]:
+        """Return the message that was kept instead of this one."""
+        if self._last is None:
+            self._last = data
+        return [(0, self._last)]

@@ -1,0 +1,346 @@
+"""Properties that are required of a run: each is violated and kept by nodes of a few lines."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+from action_msgs.msg import GoalStatus
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped, Twist
+from lockstep_nodes import ABORTED, ACCEPTED, CANCELED, EXECUTING, SUCCEEDED
+from nav_msgs.msg import Odometry
+
+from diffdrive_jacobian import properties
+from diffdrive_jacobian.properties import (
+    AccelerationWithin,
+    NeverFasterThan,
+    PropertyViolation,
+    StatusProtocol,
+)
+from diffdrive_jacobian.testing import LockstepError
+
+
+class Sender:
+    """Publishers of a test that need no subscription."""
+
+    def __init__(self, world):
+        self._world = world
+        self._publishers = {}
+
+    def __call__(self, topic, message):
+        key = type(message), topic
+        if key not in self._publishers:
+            self._publishers[key] = self._world.node.create_publisher(*key, 10)
+        self._publishers[key].publish(message)
+
+
+@pytest.fixture
+def send(lockstep):
+    return Sender(lockstep)
+
+
+def twist(v, omega=0.0):
+    message = Twist()
+    message.linear.x, message.angular.z = float(v), float(omega)
+    return message
+
+
+# --- Requiring
+
+
+def test_a_violation_names_property_time_value_limit_and_what_was_before(lockstep, send):
+    lockstep.require(NeverFasterThan(0.5, 2.0))
+    send('cmd_vel', twist(0.25))
+    lockstep.run_for(1.0)
+    send('cmd_vel', twist(0.75, -1.0))
+    with pytest.raises(PropertyViolation) as raised:
+        lockstep.run_for(1.0)
+    violation = raised.value
+    assert str(violation).startswith(
+        'NeverFasterThan(0.5, 2.0) is violated at 1 s: /cmd_vel: v 0.75 m/s, omega -1 rad/s; '
+        'allowed: |v| <= 0.5 m/s, |omega| <= 2 rad/s\nbefore that:\n'
+        '  0 s: /cmd_vel: v 0.25 m/s, omega 0 rad/s'
+    )
+    assert 'last messages, at 2 s:' in str(violation)
+    assert (violation.property, violation.seconds) == (NeverFasterThan(0.5, 2.0), 1.0)
+    assert isinstance(violation, LockstepError)
+    again = pickle.loads(pickle.dumps(violation))
+    assert str(again) == str(violation)
+    assert again.property == violation.property
+
+
+def violated(lockstep, words):
+    """Return the text of the violation that a second of simulated time shows."""
+    with pytest.raises(PropertyViolation, match=words) as raised:
+        lockstep.run_for(1.0)
+    return raised.value.text
+
+
+def test_a_violation_is_raised_once_and_the_other_properties_stay(lockstep, send):
+    lockstep.require(NeverFasterThan(0.5, 2.0), NeverFasterThan(1.0, 2.0))
+    send('cmd_vel', twist(0.75))
+    with pytest.raises(PropertyViolation, match=r'^NeverFasterThan\(0.5, 2.0\)'):
+        lockstep.settle()
+    lockstep.run_for(1.0)
+    send('cmd_vel', twist(1.75))
+    with pytest.raises(PropertyViolation, match=r'^NeverFasterThan\(1.0, 2.0\)'):
+        lockstep.run_for(1.0)
+    lockstep.finish()
+
+
+def test_a_violation_is_seen_in_every_way_of_advancing_time(lockstep, send):
+    lockstep.node.create_timer(0.1, lambda: send('cmd_vel', twist(1.0)))
+    advances = (
+        lockstep.step,
+        lambda: lockstep.run_until(lambda: False, 1.0),
+        lambda: lockstep.run_for(0.1),
+        lambda: lockstep.jump(5.0),
+        lambda: lockstep.jump(-2.0) or lockstep.step(),
+    )
+    for advance in advances:
+        lockstep.require(NeverFasterThan(0.5, 2.0))
+        with pytest.raises(PropertyViolation):
+            advance()
+
+
+@pytest.mark.parametrize(
+    ('argument', 'words'),
+    [
+        (NeverFasterThan, r'got the class NeverFasterThan; create one: NeverFasterThan\(...\)'),
+        (0.5, 'require takes properties, got an object of the class float'),
+    ],
+)
+def test_what_is_no_property_cannot_be_required(lockstep, argument, words):
+    with pytest.raises(LockstepError, match=words):
+        lockstep.require(argument)
+
+
+def test_a_topic_that_nobody_could_publish_on_is_an_error_at_the_end(lockstep, send):
+    lockstep.require(NeverFasterThan(0.5, 2.0, topic='cmd_vell'))
+    send('cmd_vel', twist(0.1))
+    lockstep.run_for(0.1)
+    with pytest.raises(
+        LockstepError,
+        match=r"topic='cmd_vell'\) observes /cmd_vell, for which .* topics: /cmd_vel$",
+    ) as raised:
+        lockstep.finish()
+    assert not isinstance(raised.value, PropertyViolation)
+
+
+def test_nothing_that_a_node_can_notice_is_changed(lockstep):
+    def graph():
+        count = lockstep.node.count_subscribers
+        return [count(topic) for topic in ('cmd_vel', 'odom', 'goal_pose', 'goal_status')]
+
+    before = graph()
+    lockstep.require(*(one for one, _ in VALUES))
+    assert graph() == before
+
+
+VALUES = [
+    (NeverFasterThan(0.5, 2.0), 'NeverFasterThan(0.5, 2.0)'),
+    (
+        NeverFasterThan(0.5, float('inf'), topic='odom', namespace='/one'),
+        "NeverFasterThan(0.5, float('inf'), namespace='/one', topic='odom')",
+    ),
+    (AccelerationWithin(1, 2, slack=0.2), 'AccelerationWithin(1.0, 2.0, slack=0.2)'),
+    (StatusProtocol(goals=['goal_pose']), "StatusProtocol(goals=('goal_pose',))"),
+]
+
+
+@pytest.mark.parametrize(('one', 'expression'), VALUES, ids=lambda value: type(value).__name__)
+def test_properties_are_values(one, expression):
+    assert repr(one) == expression
+    assert eval(expression, vars(properties)) == one
+    assert pickle.loads(pickle.dumps(one)) == one
+    hash(one)
+
+
+@pytest.mark.parametrize(
+    ('create', 'words'),
+    [
+        (lambda: NeverFasterThan(-1.0, 2.0), 'v must be a number of at least 0, got -1.0'),
+        (lambda: NeverFasterThan(1.0, float('nan')), 'omega must be a number of at least 0, got nan'),
+        (lambda: NeverFasterThan('1', 2.0), "v must be a number of at least 0, got '1'"),
+        (
+            lambda: NeverFasterThan(1.0, 2.0, topic=''),
+            "topic must be a string that is not empty, got ''",
+        ),
+        (lambda: StatusProtocol(goals='goal_pose'), "goals must be a tuple of names, got 'goal_pose'"),
+        (lambda: StatusProtocol(namespace=1), 'namespace must be a string, got 1'),
+    ],
+)
+def test_invalid_fields_are_refused(create, words):
+    with pytest.raises(ValueError, match=words):
+        create()
+
+
+# --- Speed
+
+
+@pytest.mark.parametrize(
+    ('v', 'omega', 'allowed'),
+    [
+        (0.5, 2.0, True),
+        (-0.5, -2.0, True),
+        (0.501, 0.0, False),
+        (-0.501, 0.0, False),
+        (0.0, -2.01, False),
+        (float('nan'), 0.0, False),
+        (0.0, float('inf'), False),
+    ],
+)
+def test_never_faster_than(lockstep, send, v, omega, allowed):
+    lockstep.require(NeverFasterThan(0.5, 2.0))
+    send('cmd_vel', twist(v, omega))
+    if allowed:
+        lockstep.run_for(1.0)
+        lockstep.finish()
+    else:
+        assert '/cmd_vel: v ' in violated(lockstep, 'NeverFasterThan')
+
+
+def test_the_speed_of_odometry_in_a_namespace_as_messages_and_as_bytes(lockstep, send, robot_at):
+    lockstep.require(NeverFasterThan(0.25, 1.0, topic='odom', namespace='/one'))
+    robot_at(namespace='/one')
+    lockstep.publish('/one/cmd_vel', twist(0.25))
+    lockstep.run_for(0.1)
+    send('/one/odom', Odometry())
+    lockstep.publish('/one/cmd_vel', twist(0.3))
+    assert violated(lockstep, 'NeverFasterThan').startswith('/one/odom: v 0.3 m/s')
+
+
+def accelerate(lockstep, send, *commands, period=0.1):
+    """Send commands at a period, and finish."""
+    for command in commands:
+        send('cmd_vel', twist(*command))
+        lockstep.run_for(period)
+    lockstep.finish()
+
+
+def test_acceleration_within(lockstep, send):
+    lockstep.require(AccelerationWithin(1.0, 2.0))
+    # The limit, a stop, and a sequence that is early by the slack.
+    accelerate(lockstep, send, (0.1, 0.2), (0.2, 0.4), (0.3, 0.2), (0.0, 0.0), (0.1,), (0.2,), (0.1,))
+
+
+@pytest.mark.parametrize(
+    'commands',
+    [
+        [(0.11,)],
+        [(0.0, 0.21)],
+        [(0.05,), (0.1,), (0.31,)],
+        [(0.1,), (0.2,), (-0.1,)],
+        [(0.1,), (float('nan'),)],
+    ],
+)
+def test_acceleration_exceeded(lockstep, send, commands):
+    lockstep.require(AccelerationWithin(1.0, 2.0))
+    with pytest.raises(PropertyViolation, match=r'changes of 1 m/s and 2 rad/s per second|finite'):
+        accelerate(lockstep, send, *commands)
+
+
+def test_acceleration_twice_the_limit_is_found_even_with_much_slack(lockstep, send):
+    lockstep.require(AccelerationWithin(1.0, 2.0, slack=0.5))
+    ramp = [(0.2 * number,) for number in range(1, 12)]
+    with pytest.raises(PropertyViolation):
+        accelerate(lockstep, send, *ramp)
+    assert 0.3 < lockstep.elapsed < 0.6
+
+
+def test_a_stop_is_an_acceleration_where_it_is_not_allowed(lockstep, send):
+    lockstep.require(AccelerationWithin(1.0, 2.0, stops=False))
+    with pytest.raises(PropertyViolation):
+        accelerate(lockstep, send, (0.1,), (0.2,), (0.3,), (0.0,))
+
+
+# --- Status
+
+
+def status(number, stamp=1, uuid=1):
+    message = GoalStatus(status=number)
+    message.goal_info.stamp.sec = stamp
+    message.goal_info.goal_id.uuid[0] = uuid
+    return message
+
+
+KEPT = [
+    [ACCEPTED],
+    [ACCEPTED, EXECUTING, SUCCEEDED],
+    [ACCEPTED, ACCEPTED, EXECUTING, EXECUTING, ABORTED],
+    [ACCEPTED, CANCELED],
+    [ABORTED],
+    [ACCEPTED, EXECUTING, CANCELED, (ACCEPTED, 2), (EXECUTING, 2), (SUCCEEDED, 2)],
+    [ACCEPTED, EXECUTING, (ABORTED, 2), EXECUTING, SUCCEEDED],
+]
+BROKEN = [
+    ([EXECUTING], 'EXECUTING of the goal with stamp 1.000000000 s .* as its first status; allowed: ACC'),
+    ([ACCEPTED, SUCCEEDED], 'SUCCEEDED of .* after ACCEPTED; allowed: ACCEPTED, EXECUTING, CANCELING'),
+    ([ACCEPTED, EXECUTING, ACCEPTED], 'ACCEPTED of .* after EXECUTING'),
+    (
+        [ACCEPTED, EXECUTING, SUCCEEDED, SUCCEEDED],
+        'SUCCEEDED of .* was SUCCEEDED already; allowed: noth',
+    ),
+    ([ACCEPTED, EXECUTING, SUCCEEDED, CANCELED], 'CANCELED of .* was SUCCEEDED already'),
+    ([ABORTED, ACCEPTED], 'ACCEPTED of .* was ABORTED already'),
+    ([ACCEPTED, (ACCEPTED, 2)], 'while the goal before is ACCEPTED; allowed: after its terminal status'),
+    ([0], '0 of .* as its first status'),
+    ([17], '17 of .* as its first status'),
+]
+
+
+def publish_statuses(lockstep, send, sequence, **kwargs):
+    for one in sequence:
+        number, *stamp = one if isinstance(one, tuple) else (one,)
+        send('goal_status', status(number, *stamp, **kwargs))
+        lockstep.settle()
+    lockstep.finish()
+
+
+def test_status_protocol(lockstep, send):
+    for sequence in KEPT:
+        lockstep.require(StatusProtocol())
+        publish_statuses(lockstep, send, sequence)
+
+
+def test_status_protocol_broken(lockstep, send):
+    for sequence, words in BROKEN:
+        lockstep.require(StatusProtocol())
+        with pytest.raises(PropertyViolation, match=words):
+            publish_statuses(lockstep, send, sequence)
+
+
+def test_a_goal_without_identifier_may_be_accepted_again_when_it_is_received_again(lockstep, send):
+    publisher = lockstep.node.create_publisher(GoalStatus, 'goal_status', 10)
+
+    def answer(goal):
+        for number in (ACCEPTED, EXECUTING, SUCCEEDED):
+            message = status(number, uuid=0)
+            message.goal_info.stamp = goal.header.stamp
+            publisher.publish(message)
+
+    lockstep.node.create_subscription(PoseStamped, 'goal_pose', answer, 10)
+    lockstep.require(StatusProtocol())
+    goal = PoseStamped()
+    goal.header.stamp = Time(sec=3)
+    for _ in range(3):
+        lockstep.publish('goal_pose', goal)
+    with pytest.raises(
+        PropertyViolation, match=r'ACCEPTED of the goal with stamp 3.0+ s, which was SUCC'
+    ):
+        answer(goal) or lockstep.settle()
+
+
+def test_the_controller_of_this_package_keeps_the_status_protocol(lockstep, robot_at, team):
+    lockstep.require(StatusProtocol(), NeverFasterThan(5.0, 30.0))
+    goal = PoseStamped()
+    goal.pose.position.x = 0.1
+    for _ in range(2):
+        lockstep.publish('goal_pose', goal)
+        lockstep.run_for(0.05)
+    lockstep.run_until(lambda: team.statuses[-1] == SUCCEEDED, 10.0)
+    goal.header.frame_id = 'map'
+    lockstep.publish('goal_pose', goal)
+    lockstep.finish()
+    assert team.statuses == [ACCEPTED, EXECUTING, CANCELED, ACCEPTED, EXECUTING, SUCCEEDED, ABORTED]
