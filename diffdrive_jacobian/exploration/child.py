@@ -19,6 +19,13 @@ LENGTH = struct.Struct('>Q')
 MODULE = 'diffdrive_jacobian.exploration.child'
 
 
+class Children(set['ChildProcess']):
+    """The processes of an executor."""
+
+    closed = False
+    """Whether no more may be started."""
+
+
 class ChildDiedError(Exception):
     """The process ended without an answer; the message says how."""
 
@@ -81,9 +88,14 @@ class ChildProcess:
 _of_thread = threading.local()
 
 
-def own_children(children: set[ChildProcess]) -> None:
+def own_children(children: Children) -> None:
     """Keep the process of this thread in a set, as long as it lives."""
     _of_thread.children = children
+
+
+def _children() -> Children:
+    children: Children = _of_thread.__dict__.setdefault('children', Children())
+    return children
 
 
 def call_in_child(function: Any, *args: Any) -> Any:
@@ -95,8 +107,10 @@ def call_in_child(function: Any, *args: Any) -> Any:
     """
     child: ChildProcess | None = getattr(_of_thread, 'child', None)
     if child is None:
+        if _children().closed:
+            raise ChildDiedError('the executor was shut down')
         child = _of_thread.child = ChildProcess()
-        getattr(_of_thread, 'children', set()).add(child)
+        _children().add(child)
     try:
         return child.call(function, *args)
     except ChildDiedError:
@@ -112,7 +126,7 @@ def close_child() -> None:
     """End the process of this thread, if it has one."""
     child = _of_thread.__dict__.pop('child', None)
     if child is not None:
-        getattr(_of_thread, 'children', set()).discard(child)
+        _children().discard(child)
         child.close()
 
 

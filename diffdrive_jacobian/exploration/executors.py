@@ -7,7 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import Any, ParamSpec, TypeVar
 
-from diffdrive_jacobian.exploration.child import ChildProcess, own_children
+from diffdrive_jacobian.exploration.child import Children, own_children
 
 P = ParamSpec('P')
 T = TypeVar('T')
@@ -26,10 +26,8 @@ class LocalExecutor(ThreadPoolExecutor):
         Args:
             workers: Number of processes; None: one for each core that this process may use.
         """
-        self._children: set[ChildProcess] = set()
-        super().__init__(
-            workers or cores(), initializer=own_children, initargs=(self._children,)
-        )
+        self._children = Children()
+        super().__init__(workers or cores(), initializer=own_children, initargs=(self._children,))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes, also those that are running a world if `cancel_futures` is true."""
@@ -41,6 +39,7 @@ class LocalExecutor(ThreadPoolExecutor):
             self._end_children()
 
     def _end_children(self) -> None:
+        self._children.closed = True
         for child in list(self._children):
             child.close()
 
@@ -48,9 +47,7 @@ class LocalExecutor(ThreadPoolExecutor):
 class SerialExecutor(Executor):
     """Executes everything at once in the calling thread: for debuggers, and for exploring in a test."""
 
-    def submit(
-        self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs
-    ) -> Future[T]:
+    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Execute a function and return its finished future."""
         future: Future[Any] = Future()
         try:

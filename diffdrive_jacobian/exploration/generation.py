@@ -17,8 +17,7 @@ from diffdrive_jacobian.exploration.trial import Trial
 
 try:
     import hypothesis
-    from hypothesis import HealthCheck, Phase, Verbosity, settings
-    from hypothesis import strategies as st
+    from hypothesis import HealthCheck, Phase, Verbosity, settings, strategies
     from hypothesis.errors import HypothesisException
 except ModuleNotFoundError as missing:
     if missing.name != 'hypothesis':
@@ -27,6 +26,7 @@ except ModuleNotFoundError as missing:
         "explore and its strategies need hypothesis: pip install 'diffdrive_jacobian[explore]'"
     ) from missing
 
+st = strategies
 MAX_SEED = 2**32 - 1
 
 

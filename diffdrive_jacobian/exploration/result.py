@@ -151,7 +151,9 @@ class Exploration:
             f'{len(self.findings)} violated',
         ]
         if self.findings:
-            lines.append(f'{self.shrink_worlds} more worlds to shrink them in {self.shrink_seconds:.1f} s')
+            lines.append(
+                f'{self.shrink_worlds} more worlds to shrink them in {self.shrink_seconds:.1f} s'
+            )
         if self.rejected:
             lines.append(f'{self.rejected} cases were rejected by the scenario')
         if self.stopped:

@@ -124,9 +124,7 @@ def fault_schedules(
         if not found:
             known_names = ', '.join(one.__name__ for known, _, _ in targets for one in known)
             got = getattr(kind, '__name__', repr(kind))
-            raise ValueError(
-                f'kinds must be among {known_names}, or strategies of faults; got {got}'
-            )
+            raise ValueError(f'kinds must be among {known_names}, or strategies of faults; got {got}')
         fields, field, names = found[0]
         if field and not names:
             raise ValueError(f'{kind.__name__} needs {field}s')

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import math
+import sys
 from collections.abc import Iterable
 from dataclasses import MISSING, fields, is_dataclass
 from typing import Any
@@ -50,8 +51,9 @@ class Source:
         if is_dataclass(value) and not isinstance(value, type):
             return self._dataclass(value)
         raise ExplorationError(
-            'a case must consist of None, bool, int, float, str, bytes, tuples, lists, sets, dicts, enums '
-            f'and dataclasses, so that a test can contain it; got {type(value).__qualname__}: {value!r:.80}'
+            'a case must consist of None, bool, int, float, str, bytes, tuples, lists, sets, dicts, '
+            'enums and dataclasses, so that a test can contain it; '
+            f'got {type(value).__qualname__}: {value!r:.80}'
         )
 
     def _dataclass(self, value: Any) -> str:
@@ -74,7 +76,16 @@ class Source:
         outer = kind.__qualname__.split('.')[0]
         if kind.__module__ == '__main__' or '<locals>' in kind.__qualname__:
             raise ExplorationError(
-                f'the class {kind.__qualname__} must be at the top level of a module that can be imported'
+                f'the class {kind.__qualname__} must be at the top level of a module that other '
+                'processes can import, not of the program itself'
             )
-        self.imports.add((kind.__module__, outer))
+        self.imports.add((_public(kind.__module__, outer), outer))
         return kind.__qualname__
+
+
+def _public(module: str, name: str) -> str:
+    """Return the package of a module of this package if it has the name, too."""
+    package = '.'.join(module.split('.')[:2])
+    if module.startswith('diffdrive_jacobian.') and hasattr(sys.modules.get(package), name):
+        return package
+    return module

@@ -46,14 +46,14 @@ def numbers(low: float, high: float, *, decimals: int = 1) -> st.SearchStrategy[
         # The digits after the point, the finest first, then the integer, then the sign.
         sides = [side for side, room in ((1, last - nearest), (-1, nearest - first)) if room]
         if not sides:
-            return nearest / scale
+            return float(nearest / scale)
         fraction = 0
         for place in range(decimals):
             fraction += draw(st.integers(0, 9)) * 10**place
         room = max(last - nearest, nearest - first)
         steps = draw(st.integers(0, room // scale)) * scale + fraction
         side = draw(st.sampled_from(sides))
-        return min(max(nearest + side * steps, first), last) / scale
+        return float(min(max(nearest + side * steps, first), last) / scale)
 
     return draw_number()
 
@@ -64,7 +64,7 @@ def times(last: float) -> st.SearchStrategy[float]:
 
 
 def angles() -> st.SearchStrategy[float]:
-    """Return a strategy of angles from -pi to pi (rad), in steps of 0.1, and some right at their ends."""
+    """Return a strategy of angles from -pi to pi (rad), in steps of 0.1, and the ends."""
     return st.one_of(numbers(-3.1, 3.1), st.sampled_from(ANGLES))
 
 

@@ -182,7 +182,7 @@ def run(
         if only in (None, index)
     ]
     arguments = list(setting.args) or ['--ros-args']
-    with Lockstep([*arguments, "--ros-args", *QUIET]) as world, ambient(during, world):
+    with Lockstep([*arguments, '--ros-args', *QUIET]) as world, ambient(during, world):
         hashed: AbstractContextManager[MessageDigest | None] = (
             MessageDigest(world) if digest else nullcontext()
         )
@@ -223,7 +223,7 @@ def _play(world: Lockstep, scenario: Any, case: Any, found: _Found) -> None:
         if type(error).__name__ == 'UnsatisfiedAssumption':
             found.rejected = True
         else:
-            found.violations.append(_of_exception(error, world))
+            found.violations.append(of_exception(error, world))
         return
     _finish(world, found)
 
@@ -240,7 +240,7 @@ def _finish(world: Lockstep, found: _Found) -> None:
         found.complaint = str(error).partition('\n')[0]
 
 
-def _of_exception(error: BaseException, world: Lockstep) -> Violation:
+def of_exception(error: BaseException, world: Lockstep) -> Violation:
     """Return an exception of a node or of the scenario as a violation."""
     kind = type(error).__name__
     place = _place(error.__traceback__)

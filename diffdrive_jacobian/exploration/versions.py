@@ -53,5 +53,7 @@ def _processor() -> str:
         lines = Path('/proc/cpuinfo').read_text(errors='replace').splitlines()
     except OSError:
         return 'unknown'
-    flags = next((line.partition(':')[2] for line in lines if line.startswith(('flags', 'Features'))), '')
+    flags = next(
+        (line.partition(':')[2] for line in lines if line.startswith(('flags', 'Features'))), ''
+    )
     return hashlib.sha256(' '.join(sorted(flags.split())).encode()).hexdigest()[:16]

@@ -38,7 +38,7 @@ def run_worlds(data: bytes) -> list[Outcome]:
         data: From `packed`.
 
     Raises:
-        ExplorationError: The scenario cannot be imported, or a fault or property is invalid in its world.
+        ExplorationError: The scenario cannot be imported, or a fault or property is invalid.
     """
     if can_run_here():
         return run_worlds_here(data)

@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +87,7 @@ def explore(
     _check_number('worlds', worlds, 1)
     _check_number('shrink_worlds', shrink_worlds, 0)
     _check_number('seed', seed, 0)
-    if time_limit is not None and not 0.0 < time_limit:
+    if time_limit is not None and not time_limit > 0.0:
         raise ExplorationError(f'time_limit must be positive, got {time_limit!r}')
     if output is not None:
         check_output(Path(output))
@@ -153,7 +153,9 @@ class _Search:
             found_at = time.monotonic()
             for key in self._first:
                 finding = self._shrunk(key, shrink_worlds)
-                findings.append(finding if output is None else write_finding(finding, output, findings))
+                if output is not None:
+                    finding = write_finding(finding, output, findings, seed=self._seed)
+                findings.append(finding)
         except KeyboardInterrupt:
             self._stopped = 'interrupted'
             findings += self._not_shrunk(findings, output)
@@ -249,11 +251,10 @@ class _Search:
         for violation in outcome.violations:
             self._counts[violation.key] += 1
             self._first.setdefault(violation.key, (one, violation))
-        if not self._first or one.block > max(first.block for first, _ in self._first.values()):
-            # Only the outcomes of blocks that will be run again are needed.
-            for block in [block for block in self._known if block < one.block]:
-                if all(first.block != block for first, _ in self._first.values()):
-                    del self._known[block]
+        # Only the outcomes of blocks that will be run again are needed.
+        kept = {one.block, *(first.block for first, _ in self._first.values())}
+        for block in self._known.keys() - kept:
+            del self._known[block]
 
     def _block_of_first(self) -> int:
         return min(one.block for one, _ in self._first.values())
@@ -318,7 +319,9 @@ class _Search:
                 complete=False,
             )
             if output is not None:
-                finding = write_finding(finding, output, [*findings, *rest], record=False)
+                finding = write_finding(
+                    finding, output, [*findings, *rest], seed=self._seed, record_it=False
+                )
             rest.append(finding)
         return rest
 
@@ -392,10 +395,13 @@ def _checked_properties(properties: Sequence[Property]) -> tuple[Property, ...]:
     keys = Counter(map(repr, properties))
     if twice := [key for key, count in keys.items() if count > 1]:
         raise ExplorationError(f'each property can be given once, got {twice[0]} again')
+    for one in properties:
+        # A test will contain it.
+        Source().expression(one)
     return tuple(properties)
 
 
-def _check_number(name: str, value: int, least: int) -> None:
+def _check_number(name: str, value: object, least: int) -> None:
     if not isinstance(value, int) or isinstance(value, bool) or value < least:
         raise ExplorationError(f'{name} must be an integer of at least {least}, got {value!r}')
 
