@@ -66,9 +66,11 @@ setup(
             'ros-unique-identifier-msgs==2.5.0',
         ],
         'doc': ['pdoc>=15'],
+        'explore': ['hypothesis>=6'],
         'live': ['websockets>=15'],
         'plot': ['matplotlib>=3.5'],
         'test': [
+            'distributed',
             'mcap>=1.2',
             'hypothesis>=6',
             'matplotlib>=3.5',
@@ -80,6 +82,8 @@ setup(
     },
     zip_safe=False,
     entry_points={
-        'console_scripts': [f'{name} = {PACKAGE}.tools.entry_points:{name}' for name in COMMANDS]
+        'console_scripts': [f'{name} = {PACKAGE}.tools.entry_points:{name}' for name in COMMANDS],
+        # The name is that of the module, so that `pytest_plugins` with it does not load it twice.
+        'pytest11': [f'{PACKAGE}.testing.fixtures = {PACKAGE}.testing.fixtures'],
     },
 )

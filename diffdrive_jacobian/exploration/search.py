@@ -385,7 +385,7 @@ def _result(future: Future[list[Outcome]]) -> list[Outcome]:
         raise ExplorationError(f'a world could not be run: {type(error).__name__}: {error}') from error
 
 
-def _checked_properties(properties: Sequence[Property]) -> tuple[Property, ...]:
+def _checked_properties(properties: Any) -> tuple[Property, ...]:
     if isinstance(properties, Property):
         raise ExplorationError(f'properties must be a list: [{properties!r}]')
     for one in properties:

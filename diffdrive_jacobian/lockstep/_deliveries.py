@@ -36,7 +36,7 @@ class Deliveries:
         """One entry for each message and subscription. None: a request or a response of a service."""
         self.create_task = create_task
         self.new_reader: Callable[[Subscription, Node], Reader] = lambda subscription, node: Reader(
-            subscription, create_task, node, self.observers_of(subscription.topic_name)
+            subscription, node, self
         )
         """Creates the reader of a subscription of a node."""
         self._readers: dict[Subscription, Reader] = {}
@@ -140,19 +140,14 @@ class Reader:
         'topic',
     )
 
-    def __init__(
-        self,
-        subscription: Subscription,
-        create_task: Callable[..., Any],
-        node: Node,
-        observers: list[Delivered],
-    ) -> None:
-        """Keep the subscription alive until `close`."""
-        self.node, self.observers = node, observers
+    def __init__(self, subscription: Subscription, node: Node, deliveries: Deliveries) -> None:
+        """Keep the subscription of a node alive until `close`."""
+        self.node = node
         self.topic: str = subscription.topic_name
+        self.observers = deliveries.observers_of(self.topic)
         self.latched = is_latched(subscription)
         self._subscription = subscription
-        self._create_task = create_task
+        self._create_task = deliveries.create_task
         self.message_type, self.raw = subscription.msg_type, subscription.raw
         self.take, self._close = message_taker(subscription)
 

@@ -30,12 +30,7 @@ class GatedReader(Reader):
         self, subscription: Subscription, node: Node, agenda: Agenda, deliveries: Deliveries
     ) -> None:
         """Keep the subscription of a node alive until `close`."""
-        super().__init__(
-            subscription,
-            deliveries.create_task,
-            node,
-            deliveries.observers_of(subscription.topic_name),
-        )
+        super().__init__(subscription, node, deliveries)
         self.stages: list[Stage] = []
         self._agenda = agenda
         self._deliveries = deliveries

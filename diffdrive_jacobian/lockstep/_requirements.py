@@ -9,13 +9,16 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.service import Service
 
+from diffdrive_jacobian.lockstep._disturbed import Disturbed
 from diffdrive_jacobian.lockstep._errors import LockstepError
-from diffdrive_jacobian.lockstep._messaging import Messaging, described
+from diffdrive_jacobian.lockstep._injection import Injectable
+from diffdrive_jacobian.lockstep._messaging import described
 from diffdrive_jacobian.lockstep._report import OMITTED
 from diffdrive_jacobian.lockstep._requirement import Required, Requirement
+from diffdrive_jacobian.ros.rclpy_internals import SERVICES_OF_RCLPY
 
 
-class Requirements(Messaging):
+class Requirements(Disturbed):
     """Requiring properties, and observing messages without subscriptions. Base class of `Lockstep`.
 
     The functions that observe are called while a node publishes or receives. They must not raise,
@@ -25,10 +28,19 @@ class Requirements(Messaging):
     def __init__(self, start: int) -> None:
         """Start at a time (ns)."""
         super().__init__(start)
-        self._published_topics: set[str] = set()
-        self._expected: dict[str, Requirement] = {}
+        self.faults: list[Any] = []
+        """The faults that were injected."""
+        self.killed: set[Node] = set()
+        """The nodes that were removed without being stopped."""
+        self._offered: set[str] = set()
+        self._expected: list[tuple[Requirement, tuple[str, ...]]] = []
         self._requiring: Requirement | None = None
         self._observing: list[tuple[list[Any], Any]] = []
+
+    def inject(self, *faults: Injectable, seed: int = 0) -> None:
+        """Let faults happen, as `Disturbed.inject`."""
+        super().inject(*faults, seed=seed)
+        self.faults.extend(faults)
 
     def require(self, *properties: Requirement) -> None:
         """Require properties from now on, at each time step.
@@ -48,8 +60,8 @@ class Requirements(Messaging):
                 hint = f'; create one: {one.__name__}(...)' if isinstance(one, type) else ''
                 raise LockstepError(f'require takes properties, got {described(one)}{hint}')
         if not self._watches and not self._expected:
-            self._note_publishers()
-            self.on_new_topics(self._note_publishers)
+            self._note_offered()
+            self.on_new_topics(self._note_offered)
         for one in properties:
             self._requiring, self._observing = one, []
             try:
@@ -64,18 +76,19 @@ class Requirements(Messaging):
 
         Raises:
             PropertyViolation: A property is violated: something that had to happen has not happened.
-            LockstepError: A property observes a topic on which no node has ever been able to publish.
+            LockstepError: A property observes a topic of which no node has had a publisher, or a service
+                that no node has had. Its name may be misspelt.
         """
         self._check_open()
         self.settle()
         watches, self._watches = self._watches, []
-        expected, self._expected = self._expected, {}
-        for topic, requirement in expected.items():
-            if topic not in self._published_topics:
-                known = ', '.join(sorted(self._published_topics.difference(OMITTED))) or 'none'
+        expected, self._expected = self._expected, []
+        for requirement, names in expected:
+            if self._offered.isdisjoint(names):
+                known = ', '.join(sorted(self._offered.difference(OMITTED))) or 'none'
                 raise LockstepError(
-                    f'{requirement!r} observes {topic}, for which there was no publisher; '
-                    f'topics: {known}'
+                    f'{requirement!r} observes {" and ".join(names)}, which no node has offered; topics '
+                    f'and services: {known}'
                 )
         for required in watches:
             required.end()
@@ -83,18 +96,29 @@ class Requirements(Messaging):
             if (text := required.watch.finish()) is not None:
                 raise self._violation(required.requirement, text)
 
+    @property
+    def nodes(self) -> list[Node]:
+        """The nodes that are there now, with that of the test."""
+        return self._executor.nodes
+
+    def expect(self, *names: str) -> None:
+        """Expect that some node has a publisher of one of these topics, or one of these services.
+
+        Called by properties. `finish` raises an error if none had.
+        """
+        if self._requiring is not None:
+            resolve = self.node.resolve_topic_name
+            self._expected.append((self._requiring, tuple(str(resolve(name)) for name in names)))
+
     def on_published(self, topic: str, observe: Callable[[Publisher, Any], None]) -> str:
         """Call a function with the publisher and the message after each message of a topic is published.
 
         The message is a `bytes` object if serialized bytes were published.
 
         Returns:
-            The full name of the topic. If a property observes it, somebody must have a publisher of it
-            before `finish`.
+            The full name of the topic.
         """
         name = str(self.node.resolve_topic_name(topic))
-        if self._requiring is not None:
-            self._expected.setdefault(name, self._requiring)
         self._observe(self._traffic.observers_of(name), observe)
         return name
 
@@ -111,8 +135,8 @@ class Requirements(Messaging):
         self._observe(self._executor.deliveries.observers_of(name), observe)
         return name
 
-    def on_response(self, service: str, observe: Callable[[Any], None]) -> str:
-        """Call a function with each response of a service, when the service has sent it.
+    def on_response(self, service: str, observe: Callable[[Node | None, Any], None]) -> str:
+        """Call a function with the node and each response of a service, when the service has sent it.
 
         Returns:
             The full name of the service.
@@ -121,7 +145,7 @@ class Requirements(Messaging):
 
         def observe_call(endpoint: Any, message: Any, *_: Any) -> None:
             if isinstance(endpoint, Service) and endpoint.service_name == name:
-                observe(message)
+                observe(self.node_of(endpoint), message)
 
         self._observe(self._executor.call_observers, observe_call)
         return name
@@ -131,10 +155,11 @@ class Requirements(Messaging):
         if self._requiring is not None:
             self._observing.append((observers, observe))
 
-    def node_of(self, publisher: Publisher) -> Node | None:
-        """Return the node that has a publisher; None: it was removed."""
+    def node_of(self, entity: Publisher | Service) -> Node | None:
+        """Return the node that has a publisher or a service; None: it was removed."""
         for node in self._executor.nodes:
-            if any(one is publisher for one in node.publishers):
+            entities = node.publishers if isinstance(entity, Publisher) else node.services
+            if any(one is entity for one in entities):
                 return node
         return None
 
@@ -142,6 +167,17 @@ class Requirements(Messaging):
         """Call a function whenever a node is added, or has created or destroyed an entity."""
         raise NotImplementedError
 
-    def _note_publishers(self) -> None:
+    def _note_offered(self) -> None:
         for node in self._executor.nodes:
-            self._published_topics.update(publisher.topic_name for publisher in node.publishers)
+            self._offered.update(publisher.topic_name for publisher in node.publishers)
+            if node.services:
+                self._offered.update(_services(node))
+
+
+def _services(node: Node) -> set[str]:
+    """Return the names of the services of a node, without those that rclpy provides."""
+    return {
+        service.service_name
+        for service in node.services
+        if service.srv_type.__module__.split('.')[0] + '/' not in SERVICES_OF_RCLPY
+    }

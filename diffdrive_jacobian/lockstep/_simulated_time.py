@@ -186,7 +186,7 @@ class SimulatedTime:
                 raise self._violation(required.requirement, text)
 
     def _violation(self, requirement: Requirement, text: str) -> PropertyViolation:
-        return PropertyViolation(requirement, self.elapsed, text, self.report())
+        return PropertyViolation(requirement, self.world_time / NANOSECONDS, text, self.report())
 
     def report(self) -> str:
         """Return the last messages of all topics as text."""

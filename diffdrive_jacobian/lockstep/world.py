@@ -17,11 +17,11 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
-from diffdrive_jacobian.lockstep._disturbed import Disturbed
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
 from diffdrive_jacobian.lockstep._guard import Guard
 from diffdrive_jacobian.lockstep._messaging import described
+from diffdrive_jacobian.lockstep._requirements import Requirements
 from diffdrive_jacobian.lockstep._simulated_time import checked_nanoseconds
 from diffdrive_jacobian.ros.rclpy_internals import wrap_sleep
 from diffdrive_jacobian.ros.runner import UserError, discovery_off, ros_context
@@ -29,7 +29,7 @@ from diffdrive_jacobian.ros.runner import UserError, discovery_off, ros_context
 N = TypeVar('N', bound=Node)
 
 
-class Lockstep(Disturbed):
+class Lockstep(Requirements):
     """Executes nodes in the default context of rclpy, in simulated time.
 
     Nodes are created as usual, after the `Lockstep`, and added to it. `use_sim_time` is true for all of
@@ -166,6 +166,7 @@ class Lockstep(Disturbed):
         self._check_open()
         if node is self.node or node not in self._executor.nodes:
             raise LockstepError('the node to remove was not added')
+        self.killed.add(node)
         with self._watched():
             self._executor.remove(node)
             node.destroy_node()

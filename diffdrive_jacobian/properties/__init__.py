@@ -12,15 +12,34 @@ own, derive from `Property` and `Watch`.
 """
 
 from diffdrive_jacobian.lockstep import PropertyViolation
+from diffdrive_jacobian.properties.arrival import ArrivesOnceFaultsEnd
 from diffdrive_jacobian.properties.base import Property, Watch
+from diffdrive_jacobian.properties.canceling import NoCommandAfterCancel
+from diffdrive_jacobian.properties.goals import ReachesGoal, Settles
+from diffdrive_jacobian.properties.places import PoseFinite, StaysNear, StaysWithin
 from diffdrive_jacobian.properties.protocol import StatusProtocol
 from diffdrive_jacobian.properties.speed import AccelerationWithin, NeverFasterThan
+from diffdrive_jacobian.properties.stopping import (
+    StopsAfterLastCommand,
+    StopsAfterLostOdometry,
+    StopsOnShutdown,
+)
 
 __all__ = [
     'AccelerationWithin',
+    'ArrivesOnceFaultsEnd',
     'NeverFasterThan',
+    'NoCommandAfterCancel',
+    'PoseFinite',
     'Property',
     'PropertyViolation',
+    'ReachesGoal',
+    'Settles',
     'StatusProtocol',
+    'StaysNear',
+    'StaysWithin',
+    'StopsAfterLastCommand',
+    'StopsAfterLostOdometry',
+    'StopsOnShutdown',
     'Watch',
 ]

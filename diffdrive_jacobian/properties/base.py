@@ -7,9 +7,13 @@ import numbers
 from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import MISSING, dataclass, field, fields
-from typing import Any
 
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+
+from diffdrive_jacobian.faults.fault import literal
 from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 RECENT = 5
 """Number of messages that a violation lists."""
@@ -52,9 +56,9 @@ class Property(ABC):
         for one in sorted(fields(self), key=lambda one: bool(one.kw_only)):
             value = getattr(self, one.name)
             if one.default is MISSING and not one.kw_only:
-                shown.append(_literal(value))
+                shown.append(literal(value))
             elif value != one.default:
-                shown.append(f'{one.name}={_literal(value)}')
+                shown.append(f'{one.name}={literal(value)}')
         return f'{type(self).__name__}({", ".join(shown)})'
 
     def _number(self, name: str, *, infinite: bool = True, zero: bool = True) -> None:
@@ -111,11 +115,12 @@ class Watch:
         self.world = world
         self._recent: deque[str] = deque(maxlen=RECENT)
         self._found: str | None = None
+        self._owners: dict[Publisher, Node | None] = {}
 
     @property
     def seconds(self) -> float:
         """World time since the start of the `Lockstep` (s)."""
-        return self.world.elapsed
+        return self.world.world_time / NANOSECONDS
 
     def check(self) -> str | None:
         """Return what is violated at the current time, after all callbacks; None: nothing."""
@@ -124,6 +129,17 @@ class Watch:
     def finish(self) -> str | None:
         """Return what is violated at the end of the run; None: nothing."""
         return None
+
+    def owner(self, publisher: Publisher) -> Node | None:
+        """Return the node that has a publisher; None: it was removed."""
+        if publisher not in self._owners:
+            self._owners[publisher] = self.world.node_of(publisher)
+        return self._owners[publisher]
+
+    @staticmethod
+    def _is_named(node: Node, name: str) -> bool:
+        """Return whether a node has a name. Each one has the empty name."""
+        return not name or node.get_fully_qualified_name().lstrip('/') == name.lstrip('/')
 
     def note(self, text: str) -> None:
         """Note something that happened, for the description of a violation."""
@@ -137,12 +153,3 @@ class Watch:
     def described(self, text: str) -> str:
         """Return a text with what happened last."""
         return '\n'.join([text, *(['before that:'] if self._recent else []), *self._recent])
-
-
-def _literal(value: Any) -> str:
-    """Return a Python expression for a value. `repr` of an infinite float is none."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return f"float('{value}')"
-    if isinstance(value, tuple):
-        return f'({", ".join(map(_literal, value))}{"," * (len(value) == 1)})'
-    return repr(value)

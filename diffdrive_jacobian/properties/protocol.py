@@ -101,6 +101,7 @@ class _StatusWatch(Watch):
         self._active: dict[Publisher, _Goal] = {}
         self._received: Counter[tuple[Node, _Stamp]] = Counter()
         self._answered: Counter[_Goal] = Counter()
+        world.expect(protocol.resolved(protocol.topic))
         self._topic = world.on_published(protocol.resolved(protocol.topic), self._on_status)
         for goals in protocol.goals:
             world.on_delivered(protocol.resolved(goals), self._on_goal)

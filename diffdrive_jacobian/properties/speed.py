@@ -54,6 +54,7 @@ class _SpeedWatch(Watch):
         self._limit = limit
         self._v, self._omega = limit.v * (1.0 + MARGIN), limit.omega * (1.0 + MARGIN)
         self._read = twist_reader()
+        world.expect(limit.resolved(limit.topic))
         self._topic = world.on_published(limit.resolved(limit.topic), self._on_message)
 
     def _on_message(self, publisher: Publisher, message: Any) -> None:
@@ -117,6 +118,7 @@ class _AccelerationWatch(Watch):
         self._at = self.seconds, world.now
         # What is left of the slack (s): the change that is allowed at once, in seconds of the limit.
         self._left_v = self._left_omega = limit.slack
+        world.expect(limit.resolved(limit.topic))
         self._topic = world.on_published(limit.resolved(limit.topic), self._on_message)
 
     def _on_message(self, publisher: Publisher, message: Any) -> None:

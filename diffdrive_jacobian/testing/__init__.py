@@ -1,20 +1,57 @@
-"""Tests of ROS nodes in simulated time: `fixtures` for pytest, and `Lockstep` for other frameworks.
+"""Tests of ROS nodes in simulated time: a plugin of pytest (`fixtures`), and `Lockstep` for others.
 
-`Lockstep`, `LockstepError` and the package `faults` are also names of this package. So are all names of
-the package `exploration`, which are imported when they are used first: `explore`, `fault_schedules`,
-`poses`, ... They need Hypothesis.
+Names of this package, which are imported on first use:
+
+- `Lockstep`, `LockstepError`: as in the package `lockstep`.
+- `faults`: the package of the faults that a `Lockstep` injects.
+- `explore`, `fault_schedules`, `poses`, ...: all names of the package `exploration`, most of which need
+  Hypothesis.
+- `RecordedRun`, `GoldenRun`: types of the fixtures `recorded_run` and `golden_run`.
+
+pytest loads the plugin in every project, so this module imports neither rclpy nor NumPy by itself.
 """
 
-from typing import Any
+from __future__ import annotations
 
-from diffdrive_jacobian import exploration, faults
-from diffdrive_jacobian.lockstep import Lockstep, LockstepError
+import importlib
+from typing import TYPE_CHECKING, Any
 
-__all__ = ['Lockstep', 'LockstepError', 'faults']
+if TYPE_CHECKING:
+    from diffdrive_jacobian import faults
+    from diffdrive_jacobian.lockstep import Lockstep, LockstepError
+    from diffdrive_jacobian.testing.golden_run import GoldenRun
+    from diffdrive_jacobian.testing.recorded_run import RecordedRun
+
+__all__ = ['GoldenRun', 'Lockstep', 'LockstepError', 'RecordedRun', 'faults']
+
+_PACKAGES = ('faults',)
+"""Packages beside this one that are names of it, too."""
+_MODULES = {
+    'GoldenRun': 'testing.golden_run',
+    'Lockstep': 'lockstep',
+    'LockstepError': 'lockstep',
+    'RecordedRun': 'testing.recorded_run',
+}
+"""The module of each other name."""
 
 
 def __getattr__(name: str) -> Any:
-    """Import a name of `exploration`."""
+    """Return a name of this package.
+
+    Raises:
+        AttributeError: There is no such name.
+        ModuleNotFoundError: ROS is not installed.
+    """
+    if name in _PACKAGES:
+        return importlib.import_module(f'diffdrive_jacobian.{name}')
+    if name in _MODULES:
+        return getattr(importlib.import_module(f'diffdrive_jacobian.{_MODULES[name]}'), name)
+    exploration = importlib.import_module('diffdrive_jacobian.exploration')
     if name in exploration.__all__:
         return getattr(exploration, name)
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+
+
+def __dir__() -> list[str]:
+    """Return the names of the module."""
+    return sorted({*globals(), *__all__})
