@@ -12,14 +12,13 @@ from std_msgs.msg import String
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._fault_log import TOPIC, FaultEvent, FaultLog
 from diffdrive_jacobian.lockstep._injection import Injectable, Injections, check_faults, full_name
-from diffdrive_jacobian.lockstep._messaging import described
-from diffdrive_jacobian.lockstep._requirements import Requirements
+from diffdrive_jacobian.lockstep._messaging import Messaging, described
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 N = TypeVar('N', bound=Node)
 
 
-class Disturbed(Requirements):
+class Disturbed(Messaging):
     """Injection of faults. Base class of `Lockstep`."""
 
     def __init__(self, start: int) -> None:
