@@ -20,7 +20,14 @@ from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.properties import NeverFasterThan, StatusProtocol
+from diffdrive_jacobian.properties import (
+    NeverFasterThan,
+    NoCommandAfterCancel,
+    PoseFinite,
+    StatusProtocol,
+    StopsAfterLastCommand,
+    StopsAfterLostOdometry,
+)
 from diffdrive_jacobian.ros.remote_goal import ANSWER_PATIENCE, Result, send_goal_in
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.testing import fault_schedules, faults, goals, poses, times
@@ -218,7 +225,13 @@ SCENARIOS = {
 
 def properties():
     """Return what must hold in every world."""
+    timer = 0.05
     return [
         NeverFasterThan(MAX_V, MAX_OMEGA, topic='cmd_vel_out'),
+        PoseFinite(),
+        PoseFinite(odom='ground_truth'),
         StatusProtocol(),
+        NoCommandAfterCancel(),
+        StopsAfterLostOdometry(TIMEOUT + timer, node='go_to_goal'),
+        StopsAfterLastCommand(TIMEOUT + 1.0 / RATE + timer, commands='joint_command'),
     ]
