@@ -62,6 +62,7 @@ def add_nodes(world, start):
                 publish_rate=RATE,
                 cmd_vel_timeout=TIMEOUT,
                 simulate_slip=True,
+                slip_seed=1,
                 **pose,
             )
         )
