@@ -34,7 +34,7 @@ class Goal:
 class GoalIdentifiers:
     """The identifiers of the goals of one controller.
 
-    They follow from its name, the time of receipt and their number, so that a run in lockstep is the same
+    They follow from its name, the time of receipt and their number. So runs in lockstep are the same
     each time.
     """
 
