@@ -22,10 +22,8 @@ class Clock:
 
 
 @pytest.fixture
-def clock(monkeypatch):
-    made = Clock()
-    monkeypatch.setattr(liveness, 'time', made)
-    return made
+def clock():
+    return Clock()
 
 
 def answered(ros, watch, clock):
@@ -42,14 +40,14 @@ def answered(ros, watch, clock):
 
 def test_a_controller_without_odometry_answers(ros, clock):
     ros.add(GoToGoal)
-    watch = Liveness(ros.peer, ['/go_to_goal'])
+    watch = Liveness(ros.peer, ['/go_to_goal'], monotonic=clock.monotonic)
     for _ in range(3):
         answered(ros, watch, clock)
 
 
 def test_a_node_that_is_not_served_falls_silent_and_comes_back(ros, clock):
     node = ros.add(GoToGoal)
-    watch = Liveness(ros.peer, ['/go_to_goal'])
+    watch = Liveness(ros.peer, ['/go_to_goal'], monotonic=clock.monotonic)
     answered(ros, watch, clock)
     ros.executor.remove_node(node)
     served = 0
@@ -64,7 +62,7 @@ def test_a_node_that_is_not_served_falls_silent_and_comes_back(ros, clock):
 
 def test_time_in_which_the_asking_process_stands_still_does_not_count(ros, clock):
     node = ros.add(GoToGoal)
-    watch = Liveness(ros.peer, ['/go_to_goal'])
+    watch = Liveness(ros.peer, ['/go_to_goal'], monotonic=clock.monotonic)
     answered(ros, watch, clock)
     ros.executor.remove_node(node)
     before = watch.silence()
@@ -74,7 +72,7 @@ def test_time_in_which_the_asking_process_stands_still_does_not_count(ros, clock
 
 def test_a_node_without_parameter_services_is_never_silent(ros, clock):
     ros.add(GoToGoal, start_parameter_services=False)
-    watch = Liveness(ros.peer, ['/go_to_goal'])
+    watch = Liveness(ros.peer, ['/go_to_goal'], monotonic=clock.monotonic)
     for _ in range(100):
         clock.now += 0.1
         ros.executor.spin_once(timeout_sec=0.0)
@@ -83,7 +81,7 @@ def test_a_node_without_parameter_services_is_never_silent(ros, clock):
 
 def test_requests_without_an_answer_do_not_pile_up(ros, clock):
     node = ros.add(GoToGoal)
-    watch = Liveness(ros.peer, ['/go_to_goal'])
+    watch = Liveness(ros.peer, ['/go_to_goal'], monotonic=clock.monotonic)
     answered(ros, watch, clock)
     ros.executor.remove_node(node)
     for _ in range(200):
@@ -155,7 +153,7 @@ def partial_silence(ros, watch, clock, seconds):
 
 def test_a_duplicate_that_answers_too_is_no_restart(ros, clock):
     ros.add(GoToGoal)
-    watch = Liveness(ros.peer, ['/go_to_goal'])
+    watch = Liveness(ros.peer, ['/go_to_goal'], monotonic=clock.monotonic)
     answered(ros, watch, clock)
     twin = ros.add(GoToGoal)
     service = '/go_to_goal/get_parameters'
@@ -168,7 +166,7 @@ def test_a_duplicate_that_answers_too_is_no_restart(ros, clock):
 
 def test_a_namesake_without_parameter_services_is_no_restart(ros, clock):
     ros.add(GoToGoal)
-    watch = Liveness(ros.peer, ['/go_to_goal'])
+    watch = Liveness(ros.peer, ['/go_to_goal'], monotonic=clock.monotonic)
     ros.add(GoToGoal, start_parameter_services=False)
     answered(ros, watch, clock)
     assert partial_silence(ros, watch, clock, 2 * SILENCE) < 1.0
@@ -176,7 +174,7 @@ def test_a_namesake_without_parameter_services_is_no_restart(ros, clock):
 
 def test_a_successor_that_answers_alone_is_a_restart(ros, clock):
     old = ros.add(GoToGoal)
-    watch = Liveness(ros.peer, ['/go_to_goal'])
+    watch = Liveness(ros.peer, ['/go_to_goal'], monotonic=clock.monotonic)
     answered(ros, watch, clock)
     ros.executor.remove_node(old)
     ros.add(GoToGoal)

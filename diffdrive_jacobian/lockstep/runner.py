@@ -9,6 +9,7 @@ from rclpy.node import Node
 
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.ros.node_runner import NodeRunner
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 
 @contextmanager
@@ -31,8 +32,8 @@ class LockstepRunner(NodeRunner):
         self._world = world
 
     def seconds(self) -> float:
-        """Return the simulated time that has passed (s)."""
-        return self._world.elapsed
+        """Return the world time (s), which advances even when the clock of the nodes jumps."""
+        return self._world.world_time / NANOSECONDS
 
     def settle(self) -> None:
         """Execute the callbacks that are due. No time passes."""

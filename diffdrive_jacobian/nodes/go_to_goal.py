@@ -14,7 +14,7 @@ from diffdrive_jacobian.control import Arrival, Controller, LawError, saturate
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
-from diffdrive_jacobian.nodes.goal import Goal, goal_info, read_goal
+from diffdrive_jacobian.nodes.goal import Goal, GoalIdentifiers, read_goal
 from diffdrive_jacobian.nodes.other_drivers import OtherDrivers
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 from diffdrive_jacobian.ros import serialization
@@ -50,6 +50,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             parameters = GoToGoalParameters.with_controller(controller)
         super().__init__('go_to_goal', parameters, **kwargs)
         self._goal: Goal | None = None
+        self._identifiers = GoalIdentifiers(self.get_fully_qualified_name())
         self._odom_frame = ''
         # Whether the last command makes the robot move: it outlives a goal that is replaced.
         self._driving = False
@@ -85,7 +86,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
     # --- Goals
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
-        info = goal_info(message.header.stamp)
+        info = self._identifiers.info(message.header.stamp, self.now())
         self._warn_of_integers('goal_pose', [message])
         try:
             goal = Goal(info, *read_goal(message.header.frame_id, [message]))
@@ -101,7 +102,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         except MessageError as error:
             self.get_logger().warning(f'goals dropped: {error}', throttle_duration_sec=THROTTLE)
             return
-        info = goal_info(stamp)
+        info = self._identifiers.info(stamp, self.now())
         try:
             if count > MAX_WAYPOINTS:
                 raise MessageError(f'goals must contain at most {MAX_WAYPOINTS} poses, got {count}')

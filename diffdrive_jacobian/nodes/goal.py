@@ -31,9 +31,23 @@ class Goal:
     """Whether the robot is stopped because odometry is missing."""
 
 
-def goal_info(stamp: Time) -> GoalInfo:
-    """Return a new goal identifier with this stamp."""
-    return GoalInfo(goal_id=UUID(uuid=list(uuid.uuid4().bytes)), stamp=stamp)
+class GoalIdentifiers:
+    """The identifiers of the goals of one controller.
+
+    They follow from its name, the time of receipt and their number. So runs in lockstep are the same
+    each time.
+    """
+
+    def __init__(self, controller: str) -> None:
+        """Start without goals. `controller` is the fully qualified name of the node."""
+        self._controller = controller
+        self._count = 0
+
+    def info(self, stamp: Time, now: int) -> GoalInfo:
+        """Return a new identifier, with the stamp of the goal. `now` is the time of receipt (ns)."""
+        self._count += 1
+        identifier = uuid.uuid5(uuid.NAMESPACE_URL, f'{self._controller}/{now}/{self._count}')
+        return GoalInfo(goal_id=UUID(uuid=list(identifier.bytes)), stamp=stamp)
 
 
 def read_goal(frame: str, poses: Sequence[PoseStamped]) -> tuple[str, Waypoints]:

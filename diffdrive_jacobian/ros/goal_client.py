@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -58,6 +58,7 @@ class GoalClient(Node):  # type: ignore[misc]
         topic: Literal['goal_pose', 'goals'] = 'goals',
         frame: str = '',
         readers: int = 1,
+        monotonic: Callable[[], float] = time.monotonic,
         **kwargs: Any,
     ) -> None:
         """Create the publisher, the subscriptions and the client of cancel_goal.
@@ -69,6 +70,7 @@ class GoalClient(Node):  # type: ignore[misc]
             topic: Where they are published. goal_pose takes one goal.
             frame: Frame of the goals. Empty: the frame of the odometry.
             readers: Number of subscriptions that the topic must have before the goals can be sent.
+            monotonic: Returns a time that never goes back (s), in lockstep world time.
             kwargs: Passed on to `rclpy.node.Node`.
 
         Raises:
@@ -88,7 +90,8 @@ class GoalClient(Node):  # type: ignore[misc]
         self.status = GoalStatus.STATUS_UNKNOWN
         self.robot: RobotState | None = None
         """State in the last odometry. None: no odometry was received."""
-        self.seen = time.monotonic()
+        self._monotonic = monotonic
+        self.seen = monotonic()
         """Time of the last odometry, or since when it is expected (s, monotonic)."""
         self._frame = frame
         self._readers = readers
@@ -132,7 +135,7 @@ class GoalClient(Node):  # type: ignore[misc]
         message.header.frame_id = self._frame
         self._message = message
         self._publisher.publish(message)
-        self.seen = time.monotonic()
+        self.seen = self._monotonic()
 
     def send_on_odometry(self) -> None:
         """Publish the goals when the next odometry is received."""
@@ -221,7 +224,7 @@ class GoalClient(Node):  # type: ignore[misc]
             return
         twist = message.twist.twist
         self.robot = RobotState(pose, (twist.linear.x, twist.angular.z) != (0.0, 0.0), stamp)
-        self.seen = time.monotonic()
+        self.seen = self._monotonic()
         if self._send_on_odometry:
             self.send()
 

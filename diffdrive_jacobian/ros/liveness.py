@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -34,18 +34,26 @@ class Liveness:
     `silence` must be called several times a second while the requesting node is spun.
     """
 
-    def __init__(self, node: Node, names: Iterable[str], parameters: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        node: Node,
+        names: Iterable[str],
+        parameters: Sequence[str] = (),
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
         """Create the clients.
 
         Args:
             node: The node that sends the requests.
             names: Fully qualified names of the nodes that are to answer.
             parameters: Names of the parameters that are requested.
+            monotonic: Returns a time that never goes back (s), in lockstep world time.
         """
         self._clients = {
             name: node.create_client(GetParameters, f'{name}/get_parameters') for name in names
         }
         self._node = node
+        self._monotonic = monotonic
         self._answers: dict[str, Counter[int]] = {name: Counter() for name in self._clients}
         self._partial_silence = dict.fromkeys(self._clients, 0.0)
         self._servers = dict.fromkeys(self._clients, 0)
@@ -56,7 +64,7 @@ class Liveness:
         self._pending: deque[tuple[Any, Any]] = deque()
         self._silence = 0.0
         self._answered = False
-        self._updated = time.monotonic()
+        self._updated = monotonic()
         self._requested = -math.inf
         self.values: dict[str, dict[str, Any]] = {}
         """Last values of the parameters, by node and name. Nodes that lack one of them are missing."""
@@ -72,7 +80,7 @@ class Liveness:
         It is 0 until the first answer: a node without the service does not count as silent. Time during
         which this process itself was held up does not count either.
         """
-        now = time.monotonic()
+        now = self._monotonic()
         if self._answered:
             step = min(now - self._updated, LONGEST_STEP)
             self._silence += step

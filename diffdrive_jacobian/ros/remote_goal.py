@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -151,26 +150,72 @@ def send_goal(
         UserError: The ROS arguments are invalid.
         ValueError: `goal` has another shape.
     """
-    goals = np.asarray(goal, dtype=np.float64)[np.newaxis]
     with (
         # The acknowledgement is what is waited for then.
         nullcontext() if follow else fast_heartbeats(),
         ros_context([NAME, *ros_arguments]) as context,
         running(context, isolated=False) as runner,
     ):
-        client = runner.add(
-            lambda: GoalClient(
-                NAME,
-                goals,
-                context,
-                topic='goal_pose',
-                frame=frame,
-                readers=readers,
-                start_parameter_services=False,
-            )
+        return send_goal_in(
+            runner,
+            goal,
+            frame=frame,
+            readers=readers,
+            patience=patience,
+            timeout=timeout,
+            follow=follow,
+            heading_matters=heading_matters,
+            signals=signals,
+            progress=progress,
         )
-        session = _Session(client, runner, signals or Signals(), progress or _Silent())
-        return session.run(patience, timeout, follow=follow, heading_matters=heading_matters)
+
+
+def send_goal_in(
+    runner: NodeRunner,
+    goal: ArrayLike,
+    *,
+    frame: str = '',
+    readers: int = 1,
+    patience: float = PATIENCE,
+    timeout: float = math.inf,
+    follow: bool = True,
+    heading_matters: bool = False,
+    signals: Signals | None = None,
+    progress: RemoteProgress | None = None,
+) -> GoalResult:
+    """Send a goal as `send_goal` does, in a runner that exists: in real time or in lockstep.
+
+    Args:
+        runner: Runs the node, and may run others.
+        goal: As for `send_goal`, as the other arguments.
+        frame: Frame of the goal.
+        readers: Number of subscriptions that goal_pose must have.
+        patience: Longest wait for the controller and for the subscriptions (s).
+        timeout: Time after which the goal is canceled (s).
+        follow: Whether to wait for the end.
+        heading_matters: Whether to report a controller that ignores the heading.
+        signals: Counter of the signals that cancel the goal.
+        progress: Receives the progress.
+
+    Raises:
+        UserError: The node cannot be created.
+        ValueError: `goal` has another shape.
+    """
+    goals = np.asarray(goal, dtype=np.float64)[np.newaxis]
+    client = runner.add(
+        lambda: GoalClient(
+            NAME,
+            goals,
+            runner.context,
+            topic='goal_pose',
+            frame=frame,
+            readers=readers,
+            monotonic=runner.seconds,
+            start_parameter_services=False,
+        )
+    )
+    session = _Session(client, runner, signals or Signals(), progress or _Silent())
+    return session.run(patience, timeout, follow=follow, heading_matters=heading_matters)
 
 
 class _Silent:
@@ -217,7 +262,7 @@ class _Session:
         client.send()
         names = sorted(set(controllers.values()) - {''})
         parameters = HEADING_PARAMETERS if heading_matters else DRIVEN_POINT_PARAMETERS
-        liveness = Liveness(client, names, parameters)
+        liveness = Liveness(client, names, parameters, self._runner.seconds)
         if not follow:
             acknowledged = self._confirmed()
             if heading_matters:
@@ -251,9 +296,9 @@ class _Session:
 
     def _confirmed(self) -> bool:
         """Wait until the goal is acknowledged by every subscription; return whether it is."""
-        deadline = time.monotonic() + ANSWER_PATIENCE
+        deadline = self._runner.seconds() + ANSWER_PATIENCE
         while not self._client.confirmed(CONFIRMATION_PERIOD):
-            if self._signals.count or time.monotonic() > deadline:
+            if self._signals.count or self._runner.seconds() > deadline:
                 return False
             topic = self._client.resolve_topic_name('goal_pose')
             self._progress.waiting(f'not every subscription to {topic} has acknowledged the goal')
@@ -284,13 +329,13 @@ class _Session:
     def _follow(self, liveness: Liveness, controllers: Mapping[bytes, str], timeout: float) -> None:
         """Wait until the goal has ended or the controller is lost, for a time (s) or until a signal."""
         client = self._client
-        queried = time.monotonic()
+        queried = self._runner.seconds()
         reported = False
         present = controllers
 
         def over() -> bool:
             nonlocal queried, reported, present
-            now = time.monotonic()
+            now = self._runner.seconds()
             missing = now - client.seen > ANSWER_PATIENCE
             if missing and not reported:
                 self._progress.no_odometry(client.resolve_topic_name('odom'), ANSWER_PATIENCE)
@@ -343,11 +388,11 @@ class _Session:
         distance = self._distance()
         client.cancel()
         before = signals.count
-        deadline = time.monotonic() + ANSWER_PATIENCE
+        deadline = self._runner.seconds() + ANSWER_PATIENCE
 
         def over() -> bool:
             self._progress.waiting('the controller has not confirmed that it canceled')
-            return client.ended or signals.count > before or time.monotonic() > deadline
+            return client.ended or signals.count > before or self._runner.seconds() > deadline
 
         self._runner.spin(over)
         return self._result(result, distance=distance, canceled=client.ended)
@@ -375,13 +420,13 @@ class _Session:
 
     def _spin(self, seconds: float, until: Callable[[], bool]) -> bool:
         """Spin until a condition is true; return False after a time (s) or a signal."""
-        deadline = time.monotonic() + seconds
+        deadline = self._runner.seconds() + seconds
         reached = False
 
         def over() -> bool:
             nonlocal reached
             reached = until()
-            return reached or self._signals.count > 0 or time.monotonic() > deadline
+            return reached or self._signals.count > 0 or self._runner.seconds() > deadline
 
         self._runner.spin(over)
         return reached
