@@ -114,7 +114,7 @@ class Disturbed(Messaging):
         name = self.node.resolve_topic_name(topic)
         others = self._external.graph.subscribed_nodes(name)
         if fault.node:
-            others &= {full_name(fault.node)}
+            others &= {full_name(fault.node, self.node)}
         if others:
             raise LockstepError(
                 f'{fault!r} cannot affect {", ".join(sorted(others))}: messages to other processes are '
