@@ -212,9 +212,26 @@ CLIENT_CASES = {
 }
 
 
+FIELDS = {
+    'odom': ('pose.pose.position.x', 'pose.pose.orientation.z', 'header.stamp', 'header.frame_id'),
+    'cmd_vel': ('linear.x', 'angular.z'),
+    'joint_command': ('velocity[0]', 'header.stamp'),
+}
+"""Fields of messages that are corrupted."""
+
+
 def schedules(*topics):
     """Return the strategy of faults for a scenario in which these topics have subscriptions, too."""
-    return fault_schedules(topics=(*TOPICS, *topics), max_faults=3, duration=DISTURBED)
+    return fault_schedules(
+        topics=(*TOPICS, *topics),
+        nodes=NODES,
+        services=('cancel_goal',),
+        robots=('virtual_robot',),
+        fields=FIELDS,
+        clock=True,
+        max_faults=4,
+        duration=DISTURBED,
+    )
 
 
 SCENARIOS = {

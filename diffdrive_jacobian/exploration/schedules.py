@@ -102,7 +102,7 @@ WORLD_KINDS: dict[type[Fault], Callable[[], Fields]] = {
     faults.ClockPause: dict,
     faults.TimeJump: lambda: {'seconds': st.one_of(_positive(10.0), numbers(-10.0, -STEP))},
 }
-"""Kinds of faults of the world. They are tried only if they are asked for."""
+"""Kinds of faults of the clock."""
 
 
 def fault_schedules(
@@ -115,6 +115,7 @@ def fault_schedules(
     services: Sequence[str] = (),
     robots: Sequence[str] = (),
     fields: Mapping[str, Sequence[str]] | None = None,
+    clock: bool = False,
     endless: bool = False,
 ) -> st.SearchStrategy[list[Fault]]:
     """Return a strategy of lists of faults, for `explore(faults=...)`.
@@ -123,8 +124,7 @@ def fault_schedules(
         topics: Topics whose messages may be lost, late, repeated, ...
         nodes: Names of nodes that may be killed, frozen, slow, ...
         kinds: Kinds of faults, such as `[faults.Loss, faults.Delay]`, and strategies of faults. None:
-            all kinds of the given topics, nodes, services and robots. `faults.ClockPause` and
-            `faults.TimeJump` must be asked for.
+            all kinds of the given topics, nodes, services and robots.
         max_faults: Largest number of faults.
         duration: Time at which all faults have ended (s). They begin and end in steps of 0.1 s.
         services: Services that may respond late or never.
@@ -133,6 +133,7 @@ def fault_schedules(
         fields: Fields of messages that may be corrupted, by topic: `{'odom': ['pose.pose.position.x',
             'header.stamp', 'header.frame_id']}`. A number becomes NaN, infinite, ...,
             a stamp is shifted, a frame_id replaced. Other fields are taken for numbers.
+        clock: Whether the clock may also jump and stand still, if `kinds` is None.
         endless: Whether faults may also last until the end of the run.
 
     Raises:
@@ -160,8 +161,9 @@ def fault_schedules(
     )
     if kinds is None:
         kinds = [kind for known, _, names in targets if names for kind in known]
+        kinds += WORLD_KINDS if clock else ()
         if not kinds and not fields:
-            raise ValueError('fault_schedules needs topics, nodes, services, robots, fields or kinds')
+            raise ValueError('fault_schedules needs topics, nodes, services, robots, fields, clock or kinds')
     strategies = []
     for kind in kinds:
         if isinstance(kind, st.SearchStrategy):
