@@ -245,7 +245,7 @@ def properties():
     """Return what must hold in every world."""
     timer = 0.05
     return [
-        NeverFasterThan(MAX_V, MAX_OMEGA, topic='cmd_vel_out'),
+        NeverFasterThan(MAX_V, MAX_OMEGA, topic='cmd_vel'),
         PoseFinite(),
         PoseFinite(odom='ground_truth'),
         StatusProtocol(),

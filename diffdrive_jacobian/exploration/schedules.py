@@ -163,7 +163,7 @@ def fault_schedules(
         kinds = [kind for known, _, names in targets if names for kind in known]
         kinds += WORLD_KINDS if clock else ()
         if not kinds and not fields:
-            raise ValueError('fault_schedules needs topics, nodes, services, robots, fields, clock or kinds')
+            raise ValueError('fault_schedules needs topics, nodes, services, robots, fields or kinds')
     strategies = []
     for kind in kinds:
         if isinstance(kind, st.SearchStrategy):
