@@ -50,6 +50,14 @@ def test_a_killed_node_stops_at_once_and_is_made_again(lockstep, relay):
         relay.publisher.publish(Int64())
 
 
+def test_a_node_that_was_created_after_the_fault_began_is_not_killed(lockstep):
+    lockstep.inject(faults.Kill('source', duration=0.2))
+    source = lockstep.create(Source)
+    lockstep.run_for(0.5)
+    assert lockstep.find('source') is source
+    assert whats(lockstep) == ['begins', 'the node is not there', 'ends']
+
+
 def test_others_see_in_the_graph_that_a_node_is_gone(lockstep, relay):
     lockstep.inject(faults.Kill('/relay', start=0.2))
     seen = []

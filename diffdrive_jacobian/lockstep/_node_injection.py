@@ -92,7 +92,8 @@ class NodeInjection(InjectionBase):
 
         def rise() -> None:
             gate.deaths -= 1
-            if gate.deaths == 0 and world.restartable(name):
+            # One that was created after the fault began was not killed.
+            if gate.deaths == 0 and world.restartable(name) and world.find(name) is None:
                 world.restart(name)
                 self.note(f'{name} is started again')
 
