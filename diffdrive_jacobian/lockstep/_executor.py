@@ -273,7 +273,7 @@ class QuiescentExecutor:
         """Let a timer tick."""
         handle.call_timer()
         keeper = self.keeper
-        result = timer.callback() if keeper is None else keeper.run(node, timer.callback)
+        result = timer.callback() if keeper is None else keeper.run(node, timer)
         if inspect.iscoroutine(result):
             self.task_creator(node)(result)
 

@@ -96,6 +96,9 @@ class Gate:
         if not (self.closed or self.waiting):
             self.run(work)
             return
+        if not self.closed:
+            # Others that wait are being served, or an exception has stopped that.
+            self._agenda.at(self._agenda.now, partial(self._changed, self))
         same = [waiting for waiting in self.waiting if waiting.queue is queue]
         if depth is not None and len(same) >= depth:
             self.waiting.remove(same[0])

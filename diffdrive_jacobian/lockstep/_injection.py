@@ -51,9 +51,11 @@ class Injections:
 
     def add(self, fault: Injectable, seed: int) -> None:
         """Inject a fault."""
-        injection = Injection(self._world, fault, len(self.all), seed)
+        same = sum(injection.fault == fault for injection in self.all)
+        injection = Injection(self._world, fault, len(self.all), same, seed)
         fault.install(injection)
         self.all.append(injection)
+        injection.schedule()
         for reader in self._world.executor.deliveries.readers():
             if isinstance(reader, GatedReader):
                 injection.filter_reader(reader)
