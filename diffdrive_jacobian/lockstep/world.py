@@ -110,6 +110,11 @@ class Lockstep(Requirements):
         """Close it."""
         self.close()
 
+    @property
+    def is_open(self) -> bool:
+        """Whether it was not closed."""
+        return Lockstep._open is self
+
     def close(self) -> None:
         """Destroy the nodes and shut rclpy down. Further calls have no effect."""
         if Lockstep._open is self:

@@ -265,12 +265,24 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self.log_event_info('pose set', f'pose set to x {x:.3f}, y {y:.3f}, theta {theta:.3f}')
 
     @property
+    def pose(self) -> NDArray[np.float64]:
+        """`[x, y, theta]` by the odometry now, shape (3,) (m, m, rad).
+
+        With encoders of few steps: at their last reading, as it was published.
+        """
+        if self._encoders is not None:
+            return np.array(self._encoders.pose)
+        robot = self._robot_now()
+        return self._initial_pose() if robot is None else robot.pose.copy()
+
+    @property
     def truth(self) -> NDArray[np.float64]:
         """`[x, y, theta]` where the robot truly is now, shape (3,) (m, m, rad)."""
-        robot = self._robot
-        if robot is None:
-            return self._initial_pose()
-        return robot.at(max(self.now(), self._latest)).true_pose
+        robot = self._robot_now()
+        return self._initial_pose() if robot is None else robot.true_pose.copy()
+
+    def _robot_now(self) -> Robot | None:
+        return None if self._robot is None else self._robot.at(max(self.now(), self._latest))
 
     # --- Parameters
 
