@@ -115,6 +115,11 @@ class Condition:
             pose = encoders.read(robot).pose
             self._place(robot.placed(pose, robot.covariance, now, odometry_only=True))
 
+    @property
+    def counted_pose(self) -> tuple[float, float, float] | None:
+        """`(x, y, theta)` of the odometry when the encoders were last read; None: they are exact."""
+        return None if self._encoders is None else self._encoders.pose
+
     def reported(self, robot: Robot) -> Robot:
         """Read the encoders, and return the robot as they report it."""
         if self._encoders is None:
