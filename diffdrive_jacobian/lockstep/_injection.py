@@ -107,7 +107,7 @@ class Injections:
         """Send a message of a node later, or another one. Return False if it can be sent now."""
         if publisher is self._world.log.publisher:
             return False
-        gate = self._world.keeper.gates.running()
+        gate = self._world.keeper.gates.running
         if gate is None and not self._stages_of(publisher):
             return False
         data = message if isinstance(message, bytes) else serialize_message(message)
