@@ -213,6 +213,7 @@ def test_acceleration_within(lockstep, send):
         [(0.05,), (0.1,), (0.31,)],
         [(0.1,), (0.2,), (-0.1,)],
         [(0.1,), (float('nan'),)],
+        [(0.0,)] * 20 + [(0.11,)],
     ],
 )
 def test_acceleration_exceeded(lockstep, send, commands):
