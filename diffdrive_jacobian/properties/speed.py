@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep import Lockstep
-from diffdrive_jacobian.properties._messages import Twist, twist_reader
+from diffdrive_jacobian.properties._messages import Twist, read_twist
 from diffdrive_jacobian.properties.base import Property, Watch
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -53,12 +53,11 @@ class _SpeedWatch(Watch):
         super().__init__(world)
         self._limit = limit
         self._v, self._omega = limit.v * (1.0 + MARGIN), limit.omega * (1.0 + MARGIN)
-        self._read = twist_reader()
         world.expect(limit.resolved(limit.topic))
         self._topic = world.on_published(limit.resolved(limit.topic), self._on_message)
 
     def _on_message(self, publisher: Publisher, message: Any) -> None:
-        twist = self._read(publisher.msg_type, message)
+        twist = read_twist(publisher.msg_type, message)
         if twist is None:
             self.found(f'{self._topic}: bytes that are no {publisher.msg_type.__name__}')
         elif not (abs(twist.v) <= self._v and abs(twist.omega) <= self._omega):
@@ -66,7 +65,7 @@ class _SpeedWatch(Watch):
                 f'{self._topic}: {twist}; allowed: |v| <= {self._limit.v:g} m/s, '
                 f'|omega| <= {self._limit.omega:g} rad/s'
             )
-        self.note(f'{self._topic}: {twist}')
+        self.note(self._topic, ': ', twist)
 
 
 @dataclass(frozen=True, repr=False)
@@ -113,7 +112,6 @@ class _AccelerationWatch(Watch):
     def __init__(self, limit: AccelerationWithin, world: Lockstep) -> None:
         super().__init__(world)
         self._limit = limit
-        self._read = twist_reader()
         self._start = _Last(Twist(0.0, 0.0), self.seconds, world.now, limit.slack, limit.slack)
         self._last: dict[Publisher, _Last] = {}
         world.expect(limit.resolved(limit.topic))
@@ -121,7 +119,7 @@ class _AccelerationWatch(Watch):
 
     def _on_message(self, publisher: Publisher, message: Any) -> None:
         limit, last = self._limit, self._last.get(publisher, self._start)
-        twist = self._read(publisher.msg_type, message)
+        twist = read_twist(publisher.msg_type, message)
         if twist is None or not math.isfinite(twist.v + twist.omega):
             self.found(f'{self._topic}: {twist or "invalid bytes"}; allowed: finite values')
             return
@@ -137,7 +135,7 @@ class _AccelerationWatch(Watch):
                 )
         left_v, left_omega = min(left_v, limit.slack), min(left_omega, limit.slack)
         self._last[publisher] = _Last(twist, self.seconds, self.world.now, left_v, left_omega)
-        self.note(f'{self._topic}: {twist}')
+        self.note(self._topic, ': ', twist)
 
 
 class _Last(NamedTuple):
