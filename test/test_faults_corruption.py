@@ -365,3 +365,4 @@ def test_a_field_that_does_not_exist_is_reported_when_the_type_is_known(lockstep
         ValueError, match="geometry_msgs/Twist has no 'twist'; its fields: linear, angular"
     ):
         robot_at()
+    lockstep.close()

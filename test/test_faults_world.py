@@ -102,6 +102,7 @@ def test_a_service_that_does_not_exist_is_named(lockstep):
     lockstep.inject(faults.LateService('aks', 1.0))
     with pytest.raises(LockstepError, match=r"LateService\('aks', 1.0\): no service /aks was seen"):
         lockstep.check_faults()
+    lockstep.close()
 
 
 def test_the_response_of_a_service_that_is_gone_is_lost(lockstep):
@@ -146,6 +147,7 @@ def test_a_fault_of_a_publisher_is_seen_by_everybody(lockstep):
     lockstep.inject(Doubled('count', node='sauce'))
     with pytest.raises(LockstepError, match='no publisher of /sauce of /count was seen'):
         lockstep.check_faults()
+    lockstep.close()
 
 
 # --- As values

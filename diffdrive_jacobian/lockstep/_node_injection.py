@@ -32,7 +32,7 @@ class NodeInjection(InjectionBase):
 
     def _gate(self, node: str) -> Gate:
         """Return the gate of a node, which is expected to be there some time."""
-        name = full_name(node)
+        name = full_name(node, self._world.node)
         if name == self._world.node.get_fully_qualified_name():
             raise LockstepError(f'{self.fault!r} names the node of the test itself')
         self._expect(
@@ -75,7 +75,7 @@ class NodeInjection(InjectionBase):
 
     def kill(self, node: str) -> None:
         """Destroy a node when the fault begins, and make it again when it ends."""
-        gate, world, name = self._gate(node), self._world, full_name(node)
+        gate, world, name = self._gate(node), self._world, full_name(node, self._world.node)
 
         def die() -> None:
             gate.deaths += 1

@@ -78,7 +78,8 @@ class Requirements(Disturbed):
                 that no node has had, or a fault met nothing. A name may be misspelt.
         """
         self._check_open()
-        self.settle()
+        if self._watches:
+            self.settle()
         watches, self._watches = self._watches, []
         expected, self._expected = self._expected, []
         left = {id(required.requirement) for required in watches}

@@ -48,7 +48,7 @@ class SimulatedTime:
 
     @property
     def elapsed(self) -> float:
-        """Simulated time since the start (s)."""
+        """Simulated time since the start, by the clock of the nodes (s)."""
         return (self._now - self._start) / NANOSECONDS
 
     @property

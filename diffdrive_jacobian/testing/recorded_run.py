@@ -42,7 +42,7 @@ class RecordedRun:
         self._error: RecordingError | None = None
         self._kept: str | None = None
         recorder = Recorder(Selection(everything=True), self._recording)
-        world.add(recorder)
+        world.add(recorder, observer=True)
         world.on_new_topics(recorder.discover)
         recorder.discover()
 
