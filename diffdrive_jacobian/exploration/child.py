@@ -7,6 +7,7 @@ it, because its input ends then.
 
 from __future__ import annotations
 
+import importlib
 import os
 import pickle
 import struct
@@ -15,6 +16,8 @@ import sys
 import threading
 from typing import IO, Any
 
+serving = False
+"""Whether this is a process that runs worlds."""
 LENGTH = struct.Struct('>Q')
 MODULE = 'diffdrive_jacobian.exploration.child'
 
@@ -153,6 +156,8 @@ def _receive(stream: IO[bytes]) -> bytes:
 
 def _serve() -> None:
     """Execute the functions that come from standard input, until it ends."""
+    # As of the module that others import: this one is __main__.
+    importlib.import_module(MODULE).serving = True  # type: ignore[attr-defined]
     requests = os.fdopen(os.dup(0), 'rb')
     answers = os.fdopen(os.dup(1), 'wb')
     # What nodes print must not mix with the answers.

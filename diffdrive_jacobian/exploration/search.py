@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from diffdrive_jacobian.exploration import child
 from diffdrive_jacobian.exploration.errors import ExplorationError
 from diffdrive_jacobian.exploration.executors import LocalExecutor
 from diffdrive_jacobian.exploration.generation import StopShrinking, generate, shrink, st, trials
@@ -81,6 +82,11 @@ def explore(
         ExplorationError: The exploration cannot be done, for example because the scenario cannot be
             imported by other processes, or one of the properties is none.
     """
+    if child.serving:
+        raise ExplorationError(
+            'explore was called by the module of the scenario when a process imported it: call it under '
+            "if __name__ == '__main__':"
+        )
     setting = Setting(
         scenario=ScenarioName.of(scenario), properties=_checked_properties(properties), args=tuple(args)
     )
