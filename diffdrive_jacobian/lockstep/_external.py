@@ -245,6 +245,16 @@ class External:
         asked = self._ask_idle()
         return asked or any(topic.count() > topic.delivered for topic in self._topics.values())
 
+    def announce(self) -> None:
+        """Publish the time, and wait for what the timers of other processes send.
+
+        They expire before those of the world. Otherwise it would depend on the machine whether the
+        messages of one time reach a node before its timer expires.
+        """
+        if self.began and not self._executor.clock_pauses:
+            self._executor.clocks.announce(self._now())
+            self.await_answers()
+
     def release(self) -> None:
         """Deliver what was received to the nodes of the world, in the order of the declarations."""
         for topic in self._topics.values():

@@ -160,6 +160,8 @@ class SimulatedTime:
         self._publish_clock()
 
     def _publish_clock(self) -> None:
+        if self._external is not None:
+            self._external.announce()
         with self._watched():
             self._until_next = self._executor.advance(self._now)
         self._await_others()
