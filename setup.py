@@ -80,6 +80,8 @@ setup(
     },
     zip_safe=False,
     entry_points={
-        'console_scripts': [f'{name} = {PACKAGE}.tools.entry_points:{name}' for name in COMMANDS]
+        'console_scripts': [f'{name} = {PACKAGE}.tools.entry_points:{name}' for name in COMMANDS],
+        # The name is that of the module, so that `pytest_plugins` with it does not load it twice.
+        'pytest11': [f'{PACKAGE}.testing.fixtures = {PACKAGE}.testing.fixtures'],
     },
 )

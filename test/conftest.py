@@ -14,7 +14,7 @@ os.environ.setdefault('ROS_LOG_DIR', os.path.join(os.environ.get('TMPDIR', '/tmp
 
 import pytest
 
-pytest_plugins = ['diffdrive_jacobian.testing.fixtures', 'pytester']
+pytest_plugins = ['pytester']
 
 LONGEST_FIRST = (
     *(

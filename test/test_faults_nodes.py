@@ -282,3 +282,28 @@ def test_node_faults_that_met_no_node_are_errors(lockstep):
         lockstep.check_faults()
     for name in ('/a', '/b', '/c/d', '/e'):
         assert f'no node {name} was seen' in str(caught.value)
+    lockstep.close()
+
+
+def test_faults_of_the_node_of_the_test_are_refused(lockstep):
+    with pytest.raises(LockstepError, match=r"Kill\('lockstep'\) names the node of the test itself"):
+        lockstep.inject(faults.Kill('lockstep'))
+
+
+def test_what_waits_behind_an_exception_is_processed_later(lockstep):
+    relay = lockstep.create(Relay)
+    lockstep.create(Source)
+    relay.received.clear()
+    publish = relay.publisher.publish
+
+    def failing(message):
+        publish(message)
+        if message.data == 2:
+            raise ValueError('two')
+
+    relay.publisher = SimpleNamespace(publish=failing)
+    lockstep.inject(faults.Hang('relay', start=0.05, duration=0.4))
+    with pytest.raises(ValueError, match='two'):
+        lockstep.run_for(0.7)
+    lockstep.run_for(0.25)
+    assert relay.numbers == [1, 2, 3, 4, 5, 6, 7]

@@ -10,7 +10,8 @@ from faults_nodes import LATCHED, Sink, Source, play, whats
 from rclpy.node import Node
 from std_msgs.msg import Int64, String
 
-from diffdrive_jacobian.testing import LockstepError, faults
+from diffdrive_jacobian.bags.bag_reader import open_bag
+from diffdrive_jacobian.testing import Lockstep, LockstepError, faults
 
 IN_TIME = [(number, 100.0 * number) for number in range(1, 11)]
 
@@ -152,17 +153,15 @@ def test_the_test_itself_and_observers_receive_everything_unless_named(lockstep)
 def test_each_subscription_has_its_own_random_numbers_which_depend_on_nothing_else(lockstep):
     loss = faults.Loss('count', probability=0.5)
     one, two = (lockstep.add(Sink(name)) for name in ('one', 'two'))
-    lockstep.inject(loss, faults.Loss('other'), seed=7)
+    lockstep.inject(loss, seed=7)
     lockstep.add(Source())
     lockstep.run_for(5.0)
     alone = one.numbers
     assert alone != two.numbers
     lockstep.close()
-    from diffdrive_jacobian.testing import Lockstep
-
     with Lockstep() as world:
         later = world.add(Sink('three')), world.add(Sink('one'))
-        world.inject(loss, seed=7)
+        world.inject(faults.Loss('another', node='one'), loss, seed=7)
         world.add(Source())
         world.run_for(5.0)
         assert later[1].numbers == alone
@@ -234,7 +233,8 @@ def test_a_fault_that_met_nothing_is_an_error(lockstep):
     lockstep.add(Sink('snik', topic='cuont'))
     lockstep.add(Sink('other', topic='snik'))
     with pytest.raises(LockstepError, match=r"effect: Loss\('count', node='snik'\): no subscription"):
-        lockstep.check_faults()
+        lockstep.finish()
+    lockstep.close()
 
 
 def test_wrong_arguments_of_inject_are_named(lockstep):
@@ -247,4 +247,39 @@ def test_wrong_arguments_of_inject_are_named(lockstep):
     lockstep.run_for(2.0)
     with pytest.raises(LockstepError, match='is over: 2 s have passed since the start'):
         lockstep.inject(faults.Loss('count', duration=1.5))
+    assert lockstep.fault_events == []
+
+
+def test_a_recording_has_what_was_published_and_what_the_faults_did(lockstep, recorded_run):
+    play(lockstep, faults.Loss('count', start=0.15, duration=0.2), seconds=0.5)
+    recorded_run.finish()
+    with open_bag(recorded_run.bag) as bag:
+        times = {}
+        for connection, time, _ in bag.messages():
+            times.setdefault(connection.topic, []).append(time)
+    assert len(times['/count']) == 6
+    assert times['/fault_events'] == [1_150_000_000, 1_350_000_000, 1_350_000_000]
+
+
+@pytest.mark.lockstep(args=['--ros-args', '-r', '__ns:=/robot1'])
+def test_names_are_in_the_namespace_of_the_test(lockstep):
+    sink = lockstep.create(Sink)
+    lockstep.create(Source)
+    sink.received.clear()
+    lockstep.inject(faults.Loss('count', node='sink', duration=0.35), faults.Kill('source', start=0.75))
+    lockstep.run_for(1.0)
+    assert sink.numbers == [4, 5, 6, 7]
+    assert lockstep.find('sink') is lockstep.find('/robot1/sink') is sink
+
+
+def test_equal_faults_have_different_random_numbers(lockstep):
+    half = faults.Loss('count', probability=0.5)
+    got = play(lockstep, half, half, seconds=10.0)
+    assert 10 < len(got) < 40
+
+
+def test_faults_of_the_clock_topic_are_refused(lockstep):
+    with pytest.raises(LockstepError, match='sets the clocks itself; use TimeJump or ClockPause'):
+        lockstep.inject(faults.Loss('/clock'))
+    lockstep.run_for(0.1)
     assert lockstep.fault_events == []

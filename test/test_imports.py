@@ -20,7 +20,7 @@ LAYERS = (
     *('kinematics', 'control', 'simulation', 'calibration', 'sweeps'),
     *('messages', 'parameters', 'bags'),
     *('recovery', 'reading', 'diagnosis'),
-    *('plots', 'ros', 'nodes', 'recording', 'replay', 'lockstep', 'faults', 'drives'),
+    *('plots', 'ros', 'nodes', 'recording', 'replay', 'lockstep', 'faults', 'properties', 'drives'),
     *('live', 'testing', 'tools'),
 )
 PURE = LAYERS[:4]

@@ -334,3 +334,60 @@ def test_publishing_to_a_node_that_was_not_added_fails(lockstep):
         lockstep.publish('a', Vector3())
     another.destroy_node()
     lockstep.publish('a', Vector3())
+
+
+def test_publishing_to_a_node_that_replaces_one_that_was_added_fails(lockstep):
+    heard = lockstep.listen(Vector3, 'a')
+    added = lockstep.add(Echo('added', 'a', 'b'))
+    lockstep.publish('a', Vector3())
+    lockstep.remove(added)
+    forgotten = Echo('forgotten', 'a', 'b')
+    with pytest.raises(LockstepError, match='/a is subscribed to by /forgotten: created, but not added'):
+        lockstep.publish('a', Vector3())
+    forgotten.destroy_node()
+    lockstep.publish('a', Vector3())
+    assert len(heard) == 2
+
+
+def test_publishing_to_a_second_node_of_the_same_name_fails(lockstep):
+    forgotten = Echo('twin', 'a', 'b')
+    lockstep.add(Echo('twin', 'a', 'b'))
+    words = r'/a is subscribed to by /twin \(a second node of this name\): created, but not added'
+    with pytest.raises(LockstepError, match=words):
+        lockstep.publish('a', Vector3())
+    # The graph loses the name of both.
+    forgotten.destroy_node()
+    lockstep.publish('a', Vector3())
+
+
+@pytest.mark.lockstep(args=['--ros-args', '-r', 'a:=/deep/a', '-r', '/deep/a:=/deeper'])
+def test_publishing_to_a_node_that_was_not_added_fails_when_topics_are_remapped(lockstep):
+    forgotten = Echo('forgotten', 'a', 'b')
+    with pytest.raises(LockstepError, match='/deep/a is subscribed to by /forgotten: created'):
+        lockstep.publish('a', Vector3())
+    lockstep.add(forgotten)
+    heard = lockstep.listen(Vector3, 'b')
+    lockstep.publish('a', Vector3(x=2.0))
+    assert heard == [Vector3(x=2.0)]
+    assert lockstep.last('b') == lockstep.last('a') == Vector3(x=2.0)
+
+
+@pytest.mark.parametrize(
+    ('message', 'described'),
+    [
+        (b'', r'bytes; serialized messages: node.create_publisher\(TYPE, TOPIC, 10\).publish\(BYTES\)$'),
+        (bytearray(), 'bytearray; serialized messages: '),
+        (None, 'NoneType$'),
+        ({'x': 1.0}, 'dict$'),
+        (1.0, 'float$'),
+    ],
+)
+def test_publishing_what_is_no_message_fails(lockstep, message, described):
+    words = f"publish takes a topic and a message, got 'a' and an object of the class {described}"
+    with pytest.raises(LockstepError, match=words):
+        lockstep.publish('a', message)
+
+
+def test_last_takes_the_name_of_a_topic(lockstep):
+    with pytest.raises(LockstepError, match='last takes a topic, got the class Vector3'):
+        lockstep.last(Vector3)

@@ -16,6 +16,7 @@ from io import StringIO
 from pathlib import Path
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag2
+from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from rosbags.rosbag2.metadata import dump_qos_v9
 from ruamel.yaml import YAML
 
@@ -107,7 +108,12 @@ def _is_nothing_but_a_bag(path: Path) -> bool:
 
 
 def build_bag(
-    records: Callable[[], Iterable[Record]], target: Path, storage: str, *, replace: bool = False
+    records: Callable[[], Iterable[Record]],
+    target: Path,
+    storage: str,
+    *,
+    replace: bool = False,
+    compressed: bool = False,
 ) -> Summary:
     """Write records to a new bag, and give it its name after it was read back as readers do.
 
@@ -118,6 +124,7 @@ def build_bag(
         target: The bag's directory.
         storage: `mcap` or `sqlite3`.
         replace: Whether it may replace another bag, which stays until the new one is complete.
+        compressed: Whether the chunks of an MCAP file are compressed by zstd.
 
     Raises:
         FileExistsError: `target` exists, and is not to be replaced or is not a bag.
@@ -129,7 +136,7 @@ def build_bag(
     try:
         # The directory has the final name, after which rosbags names the files.
         bag = scratch / target.name
-        summary, written = _write(records(), channels, bag, storage)
+        summary, written = _write(records(), channels, bag, storage, compressed)
         if _contents(bag) != written:
             raise OSError(errno.EIO, 'what was read back from it is not what was written to it')
         for path in bag.iterdir():
@@ -167,9 +174,11 @@ class Content:
 
 
 def _write(
-    records: Iterable[Record], channels: dict[int, Channel], path: Path, storage: str
+    records: Iterable[Record], channels: dict[int, Channel], path: Path, storage: str, compressed: bool
 ) -> tuple[Summary, Content]:
     writer = BagWriter(path, version=9, storage_plugin=STORAGES[storage])
+    if compressed:
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     content = Content()
     try:
         writer.open()

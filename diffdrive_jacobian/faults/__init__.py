@@ -1,19 +1,34 @@
-"""Faults that a `Lockstep` injects: of topics, nodes, and the world around them.
+"""Faults that a `Lockstep` injects: of topics, nodes, the world around them, and the robot.
 
 With `from diffdrive_jacobian.testing import faults`, a test calls
 `lockstep.inject(faults.Loss('odom', probability=0.5, start=2.0, duration=1.0))`.
 """
 
+from diffdrive_jacobian.faults.corruption import Corrupt
 from diffdrive_jacobian.faults.fault import Fault, Filter, TopicFault
 from diffdrive_jacobian.faults.nodes import Hang, Kill, NodeFault, Slow, TimerJitter
+from diffdrive_jacobian.faults.robot import (
+    ActuatorLag,
+    DeadWheel,
+    EncoderSteps,
+    Push,
+    RobotFault,
+    SaturatedWheel,
+    Slip,
+    WrongGeometry,
+)
 from diffdrive_jacobian.faults.topics import Delay, Duplicate, Loss, RateLimit, Reorder, Stale
 from diffdrive_jacobian.faults.world import ClockPause, LateService, ParameterChange, TimeJump
 from diffdrive_jacobian.lockstep import FaultEvent
 
 __all__ = [
+    'ActuatorLag',
     'ClockPause',
+    'Corrupt',
+    'DeadWheel',
     'Delay',
     'Duplicate',
+    'EncoderSteps',
     'Fault',
     'FaultEvent',
     'Filter',
@@ -23,11 +38,16 @@ __all__ = [
     'Loss',
     'NodeFault',
     'ParameterChange',
+    'Push',
     'RateLimit',
     'Reorder',
+    'RobotFault',
+    'SaturatedWheel',
+    'Slip',
     'Slow',
     'Stale',
     'TimeJump',
     'TimerJitter',
     'TopicFault',
+    'WrongGeometry',
 ]

@@ -1,6 +1,7 @@
 """Faults of nodes: killed, frozen, slow, with timers that jitter.
 
-Names of nodes are fully qualified; a missing slash at the beginning is added: 'robot' is '/robot'.
+The name of a node without a slash at the beginning is taken to be in the namespace of the test, which is
+`/` by default.
 """
 
 from __future__ import annotations
@@ -63,6 +64,8 @@ class Slow(NodeFault):
     What a callback publishes or responds leaves `seconds` after it began. Until then the node is busy:
     what arrives waits in its queues, of which a full one loses the oldest. Then comes whatever has
     waited longest, a message, a request or a timer. The callback reads the clock of its beginning.
+    Its requests to services leave at once, and what a coroutine does after its first `await` takes no
+    time. The same holds for timers on wall time.
 
     Attributes:
         seconds: Duration of each callback (s).

@@ -12,7 +12,7 @@ import inspect
 import sys
 from collections import deque
 from collections.abc import Callable, Container, Iterable
-from typing import Any
+from typing import Any, TypeAlias
 
 from rclpy.context import Context
 from rclpy.node import Node
@@ -20,6 +20,9 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy
 from rclpy.subscription import Subscription
 
 from diffdrive_jacobian.ros.rclpy_internals import message_taker, receives_info, wait_for_message
+
+Delivered: TypeAlias = Callable[[Node, Any, Any], None]
+"""Receives the node of a subscription, the type of its messages, and a message or its bytes."""
 
 
 class Deliveries:
@@ -41,11 +44,16 @@ class Deliveries:
         """Topics whose messages are not polled: they come from other processes, see `_external`."""
         self._readers: dict[Subscription, Reader] = {}
         self._by_topic: dict[str, list[Reader]] = {}
+        self._observers: dict[str, list[Delivered]] = {}
         self._polled: list[Reader] = []
 
     def readers_of(self, topic: str) -> list[Reader]:
         """Return the subscriptions of a topic. The list stays up to date."""
         return self._by_topic.setdefault(topic, [])
+
+    def observers_of(self, topic: str) -> list[Delivered]:
+        """Return the functions that are called before each message of a topic is received."""
+        return self._observers.setdefault(topic, [])
 
     def update(self, nodes: Iterable[Node], without: Container[Subscription] = ()) -> list[Reader]:
         """Serve the present subscriptions of the nodes.
@@ -63,7 +71,7 @@ class Deliveries:
                 if subscription in without:
                     continue
                 reader = known.pop(subscription, None)
-                self._readers[subscription] = reader or self.new_reader(subscription, node)
+                self._readers[subscription] = reader or self._create(subscription, node)
         for reader in known.values():
             reader.close()
         present = set(self._readers.values())
@@ -75,12 +83,17 @@ class Deliveries:
         admitted = set(self._polled)
         return [reader for reader in self._readers.values() if reader not in admitted]
 
+    def _create(self, subscription: Subscription, node: Node) -> Reader:
+        reader = self.new_reader(subscription, node)
+        reader.owner, reader.observers = node, self.observers_of(reader.topic)
+        return reader
+
     def replace(self, nodes: Iterable[Node]) -> None:
         """Let `new_reader` create the readers of all present subscriptions again."""
         owners = {subscription: node for node in nodes for subscription in node.subscriptions}
         replaced = {}
         for subscription, reader in self._readers.items():
-            replaced[reader] = self._readers[subscription] = self.new_reader(
+            replaced[reader] = self._readers[subscription] = self._create(
                 subscription, owners[subscription]
             )
             reader.close()
@@ -134,6 +147,8 @@ class Reader:
         'depth',
         'latched',
         'message_type',
+        'observers',
+        'owner',
         'raw',
         'subscription',
         'take',
@@ -143,6 +158,8 @@ class Reader:
     def __init__(self, subscription: Subscription, create_task: Callable[..., Any]) -> None:
         """Keep the subscription alive until `close`."""
         self.topic: str = subscription.topic_name
+        self.owner: Node | None = None
+        self.observers: list[Delivered] = []
         self.latched = is_latched(subscription)
         self.depth = queue_depth(subscription)
         self.subscription = subscription
@@ -176,6 +193,9 @@ class Reader:
 
     def call(self, taken: tuple[Any, dict[str, Any]]) -> None:
         """Call the callback with a message that was taken, and its info."""
+        if self.observers:
+            for observer in self.observers:
+                observer(self.owner, self.message_type, taken[0])
         # The callback is looked up for each message, because it may be replaced.
         subscription = self.subscription
         callback = subscription.callback

@@ -66,15 +66,16 @@ class Disturbed(Messaging):
         """
         self._check_open()
         nodes = {node.get_fully_qualified_name(): node for node in self._executor.nodes}
-        if full_name(name) not in nodes:
-            raise LockstepError(f'there is no node {full_name(name)}; nodes: {", ".join(nodes)}')
-        return nodes[full_name(name)]
+        full = full_name(name, self.node)
+        if full not in nodes:
+            raise LockstepError(f'there is no node {full}; nodes: {", ".join(nodes)}')
+        return nodes[full]
 
     def inject(self, *faults: Injectable, seed: int = 0) -> None:
         """Let faults happen. Their times count from the start of this `Lockstep`.
 
-        Faults of one topic affect a message in the order in which they were injected. Random numbers of
-        a fault depend on `seed`, the fault and its position alone.
+        Faults of one topic affect a message in the order in which they were injected. The random numbers
+        of a fault depend on `seed` and the fault alone, not on other faults, unless they are equal.
 
         Args:
             faults: The faults, see `diffdrive_jacobian.testing.faults`.
@@ -113,7 +114,7 @@ class Disturbed(Messaging):
         name = self.node.resolve_topic_name(topic)
         others = self._external.graph.subscribed_nodes(name)
         if fault.node:
-            others &= {full_name(fault.node)}
+            others &= {full_name(fault.node, self.node)}
         if others:
             raise LockstepError(
                 f'{fault!r} cannot affect {", ".join(sorted(others))}: messages to other processes are '

@@ -2,9 +2,42 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class LockstepError(Exception):
     """A condition was not met in time, simulated time could not advance, or lockstep was misused.
 
     The first line of the message describes the error. The last messages of all topics may follow.
     """
+
+
+class PropertyViolation(LockstepError):  # noqa: N818
+    """A required property does not hold. Raised by the method that advanced time.
+
+    The message begins with the property, the time, what was observed and what is allowed.
+    """
+
+    def __init__(self, requirement: Any, seconds: float, text: str, report: str = '') -> None:
+        """Describe a violation.
+
+        Args:
+            requirement: The property.
+            seconds: Time since the start of the `Lockstep` (s).
+            text: What was observed, and what is allowed.
+            report: The last messages of all topics.
+        """
+        super().__init__(requirement, seconds, text, report)
+        self.property = requirement
+        """The property that is violated."""
+        self.seconds = seconds
+        """World time since the start of the `Lockstep` (s)."""
+        self.text = text
+        """What was observed, and what is allowed."""
+        self.report = report
+        """The last messages of all topics."""
+
+    def __str__(self) -> str:
+        """Return the message."""
+        first = f'{self.property!r} is violated at {self.seconds:g} s: {self.text}'
+        return f'{first}\n{self.report}' if self.report else first

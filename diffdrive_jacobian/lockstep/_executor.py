@@ -28,7 +28,7 @@ from diffdrive_jacobian.lockstep._deliveries import Deliveries, is_latched
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._facade import Facade
 from diffdrive_jacobian.lockstep._keeper import Keeper
-from diffdrive_jacobian.lockstep._served import Served
+from diffdrive_jacobian.lockstep._served import Responded, Served
 from diffdrive_jacobian.lockstep._tasks import Tasks
 from diffdrive_jacobian.lockstep._timers import Timers, is_due
 from diffdrive_jacobian.ros.rclpy_internals import (
@@ -73,6 +73,10 @@ class QuiescentExecutor:
         """What happens at later times."""
         self.deliveries = Deliveries(self.task_creator)
         """The messages that wait."""
+        self.response_observers: list[Responded] = []
+        """Called with each response that a node gives."""
+        self.killed: set[Node] = set()
+        """The nodes that were removed without being stopped."""
         self._restore_calls = wrap_calls(self._noting)
         self.clocks = Clocks()
         self.clock_pauses = 0
@@ -104,7 +108,8 @@ class QuiescentExecutor:
         create_task = self.task_creator(node)
         # The node itself keeps a weak reference only.
         facade = Facade(self._note_change, create_task)
-        served = self._served[node] = Served(node, create_task, facade)
+        served = Served(node, create_task, facade, self.response_observers)
+        self._served[node] = served
         if self.keeper is not None:
             self.keeper.admit(served)
         node.executor = facade
@@ -129,6 +134,7 @@ class QuiescentExecutor:
 
     def kill(self, node: Node) -> None:
         """Remove and destroy a node at once. Nothing that was sent to it is processed."""
+        self.killed.add(node)
         self.tasks.cancel(node)
         self._forget(node)
         node.destroy_node()
@@ -282,7 +288,7 @@ class QuiescentExecutor:
         """Let a timer tick."""
         handle.call_timer()
         keeper = self.keeper
-        result = timer.callback() if keeper is None else keeper.run(node, timer.callback)
+        result = timer.callback() if keeper is None else keeper.run(node, timer)
         if inspect.iscoroutine(result):
             self.task_creator(node)(result)
 

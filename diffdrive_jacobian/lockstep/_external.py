@@ -163,6 +163,10 @@ class External:
         self._executor.clocks.enabled = True
         self._executor.clocks.publish()
 
+    def topics(self) -> list[str]:
+        """Return the declared topics that have an external publisher."""
+        return list(self._topics)
+
     def _awaits(self, process: ExternalProcess) -> bool:
         return self._expectations.include(process)
 
@@ -258,16 +262,14 @@ class External:
     def release(self) -> None:
         """Deliver what was received to the nodes of the world, in the order of the declarations."""
         for topic in self._topics.values():
-            received = topic.count()
-            new, topic.delivered = received - topic.delivered, received
-            if new:
-                self._traffic.note_external(topic.topic_name, topic.msg_type, new, topic.last)
+            messages = topic.deliver()
+            self._traffic.note_external(topic, messages)
             for reader in self._executor.deliveries.readers_of(topic.topic_name):
                 if reader.subscription not in self._endpoints:
                     # It was created at this time.
                     continue
                 # A shorter queue has lost the first ones.
-                for _ in range(min(new, reader.depth)):
+                for _ in range(min(len(messages), reader.depth)):
                     self._deliver(reader)
 
     def until_next(self) -> int | None:

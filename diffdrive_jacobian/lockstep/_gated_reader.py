@@ -81,7 +81,10 @@ class GatedReader(Reader):
 
     def call(self, taken: tuple[Any, dict[str, Any]]) -> None:
         """Call the callback with a message, or let it wait at the gate of the node."""
-        self._gate.enter(self, self.topic, self._depth, partial(super().call, taken))
+        if self._gate.free:
+            super().call(taken)
+        else:
+            self._gate.enter(self, self.topic, self._depth, partial(super().call, taken))
 
     def _pass(self, first: int, data: bytes, info: dict[str, Any]) -> None:
         """Pass a message through the stages from `first` on."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from typing import Any, NamedTuple
@@ -31,23 +31,21 @@ class Waiting(NamedTuple):
 class Gate:
     """The gate of a node. It stays when the node is killed and made again."""
 
-    def __init__(self, name: str, agenda: Agenda, changed: Callable[[Gate], None]) -> None:
+    def __init__(self, name: str, gates: Gates) -> None:
         """Start open.
 
         Args:
             name: Name of the node.
-            agenda: What happens later.
-            changed: Called when the gate has opened or closed.
+            gates: The gates of all nodes.
         """
         self.name = name
-        self._agenda = agenda
-        self._changed = changed
+        self._gates = gates
+        self._agenda = gates.agenda
+        self._changed = gates.changed
         self.costs: list[int] = []
         """Durations of a callback, to be added (ns)."""
         self.timer_delays: list[Callable[[], int]] = []
         """Functions that return the delay of a tick (ns)."""
-        self.running = False
-        """Whether a callback that takes time is being executed."""
         self.waiting: deque[Waiting] = deque()
         """Callbacks that wait, the oldest first."""
         self.lost: Counter[str] = Counter()
@@ -63,6 +61,11 @@ class Gate:
     def closed(self) -> bool:
         """Whether no callback of the node is executed."""
         return self._busy or self._holds > 0
+
+    @property
+    def free(self) -> bool:
+        """Whether a callback can be executed at once, and takes no time."""
+        return not (self.waiting or self.costs or self._busy or self._holds)
 
     def hold(self) -> None:
         """Freeze the node."""
@@ -96,6 +99,9 @@ class Gate:
         if not (self.closed or self.waiting):
             self.run(work)
             return
+        if not self.closed:
+            # Others that wait are being served, or an exception has stopped that.
+            self._agenda.at(self._agenda.now, partial(self._changed, self))
         same = [waiting for waiting in self.waiting if waiting.queue is queue]
         if depth is not None and len(same) >= depth:
             self.waiting.remove(same[0])
@@ -107,11 +113,11 @@ class Gate:
         duration = sum(self.costs)
         if not duration:
             return work()
-        self.running = True
+        self._gates.running = self
         try:
             return work()
         finally:
-            self.running = False
+            self._gates.running = None
             self._busy = True
             self._agenda.at(self._agenda.now + duration, partial(self._finish, self._life))
             self._changed(self)
@@ -133,7 +139,7 @@ class Gate:
     @property
     def delays_output(self) -> bool:
         """Whether what the node sends now leaves later."""
-        return self.running or self._busy
+        return self._busy or self._gates.running is self
 
     def leave(self, send: Callable[[], None]) -> None:
         """Send something when the time of the callback is over."""
@@ -161,7 +167,9 @@ class Gates:
     def __init__(self, agenda: Agenda, changed: Callable[[Gate], None]) -> None:
         """Start without gates. `changed` is called when one has opened or closed."""
         self.agenda = agenda
-        self._changed = changed
+        self.changed = changed
+        self.running: Gate | None = None
+        """Gate of the node whose callback is being executed and takes time."""
         self._gates: dict[str, Gate] = {}
         self.response_delays: list[ResponseDelay] = []
         """Delays of services, to be added."""
@@ -169,19 +177,11 @@ class Gates:
         """Timers whose tick is delayed."""
         self._delayed: set[Timer] = set()
 
-    def __iter__(self) -> Iterator[Gate]:
-        """Iterate over the gates."""
-        return iter(self._gates.values())
-
     def of(self, name: str) -> Gate:
         """Return the gate of the node with a fully qualified name."""
         if name not in self._gates:
-            self._gates[name] = Gate(name, self.agenda, self._changed)
+            self._gates[name] = Gate(name, self)
         return self._gates[name]
-
-    def running(self) -> Gate | None:
-        """Return the gate of the node whose callback is being executed and takes time."""
-        return next((gate for gate in self if gate.running), None)
 
     def response_delay(self, service: str) -> int | None:
         """Return the delay of a response of a service (ns); None: it is never sent."""
@@ -206,13 +206,13 @@ class Gates:
             return True
         self.suspended.add(timer)
         self.agenda.at(self.agenda.now + delay, partial(self._resume, gate, timer))
-        self._changed(gate)
+        self.changed(gate)
         return False
 
     def _resume(self, gate: Gate, timer: Timer) -> None:
         self.suspended.discard(timer)
         self._delayed.add(timer)
-        self._changed(gate)
+        self.changed(gate)
 
 
 def depth_of(profile: QoSProfile) -> int | None:

@@ -51,9 +51,11 @@ class Injections:
 
     def add(self, fault: Injectable, seed: int) -> None:
         """Inject a fault."""
-        injection = Injection(self._world, fault, len(self.all), seed)
+        same = sum(injection.fault == fault for injection in self.all)
+        injection = Injection(self._world, fault, len(self.all), same, seed)
         fault.install(injection)
         self.all.append(injection)
+        injection.schedule()
         for reader in self._world.executor.deliveries.readers():
             if isinstance(reader, GatedReader):
                 injection.filter_reader(reader)
@@ -105,7 +107,7 @@ class Injections:
         """Send a message of a node later, or another one. Return False if it can be sent now."""
         if publisher is self._world.log.publisher:
             return False
-        gate = self._world.keeper.gates.running()
+        gate = self._world.keeper.gates.running
         if gate is None and not self._stages_of(publisher):
             return False
         data = message if isinstance(message, bytes) else serialize_message(message)

@@ -67,12 +67,21 @@ class World:
 class InjectionBase:
     """Time, random numbers and events of one fault."""
 
-    def __init__(self, world: World, fault: Timed, position: int, seed: int) -> None:
-        """Schedule the beginning and the end of the fault."""
+    def __init__(self, world: World, fault: Timed, position: int, same: int, seed: int) -> None:
+        """Start without effect.
+
+        Args:
+            world: The world.
+            fault: The fault.
+            position: Number of faults that were injected before.
+            same: Number of equal ones among them. Random numbers depend on this, not on `position`, so
+                that they stay the same when another fault is added or left out.
+            seed: Seed of the random numbers.
+        """
         self._world = world
         self.fault = fault
         self._position = position
-        self._seed = f'{seed}/{position}/{fault!r}'
+        self._seed = f'{seed}/{same}/{fault!r}'
         self._agenda = world.executor.agenda
         self.active = False
         """Whether the fault has begun and has not ended."""
@@ -84,11 +93,15 @@ class InjectionBase:
         self._on_start: list[Callable[[], None]] = []
         self._on_end: list[Callable[[], None]] = []
         self._hits: list[Hits] = []
-        self._agenda.at(nanoseconds(fault.start), self._start)
-        if math.isfinite(fault.duration):
-            self._agenda.at(nanoseconds(fault.start) + nanoseconds(fault.duration), self._end)
 
     # --- Time
+
+    def schedule(self) -> None:
+        """Let the fault begin and end at its times."""
+        start, duration = self.fault.start, self.fault.duration
+        self._agenda.at(nanoseconds(start), self._start)
+        if math.isfinite(duration):
+            self._agenda.at(nanoseconds(start) + nanoseconds(duration), self._end)
 
     def at_start(self, action: Callable[[], None]) -> None:
         """Call a function when the fault begins."""
@@ -164,6 +177,6 @@ class InjectionBase:
         return f'{self.fault!r}: {self._missing}' if self._missing else None
 
 
-def full_name(node: str) -> str:
-    """Return the fully qualified name of a node: 'robot' is '/robot'."""
-    return node if node.startswith('/') else f'/{node}'
+def full_name(node: str, base: Node) -> str:
+    """Return the fully qualified name of a node, in the namespace of another one by default."""
+    return node if node.startswith('/') else f'{base.get_namespace().rstrip("/")}/{node}'

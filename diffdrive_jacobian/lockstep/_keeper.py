@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rclpy.event_handler import EventHandler
@@ -13,6 +12,7 @@ from rclpy.timer import Timer
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._gated_reader import GatedReader
 from diffdrive_jacobian.lockstep._gates import Gate, Gates
+from diffdrive_jacobian.lockstep._timers import follows_sim_time
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
@@ -60,13 +60,18 @@ class Keeper:
         """Return whether no callback of a node is executed."""
         return self.gate(node).closed
 
-    def run(self, node: Node, callback: Callable[[], Any]) -> Any:
-        """Execute a callback of a node. Return its result."""
-        return self.gate(node).run(callback)
+    def run(self, node: Node, timer: Timer) -> Any:
+        """Call the callback of a timer of a node. Return its result.
+
+        That of a timer on wall time takes no simulated time, because nobody knows when it comes.
+        """
+        gate = self.gate(node)
+        return gate.run(timer.callback) if follows_sim_time(timer) else timer.callback()
 
     def may_tick(self, node: Node, timer: Timer) -> bool:
         """Return whether a timer that is due ticks now. Otherwise it does later."""
-        return self.gates.may_tick(self.gate(node), timer)
+        gate = self.gate(node)
+        return self.gates.may_tick(gate, timer) if follows_sim_time(timer) else not gate.closed
 
     def update_timers(self) -> None:
         """Find the timers that may tick."""

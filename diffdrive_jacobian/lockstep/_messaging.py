@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -27,19 +28,22 @@ class Messaging(SimulatedTime):
         """Start at a time (ns)."""
         super().__init__(start)
         self._publishers: dict[tuple[type, str], Publisher] = {}
-        self._all_served: dict[Publisher, int] = {}
+        self._all_served: dict[Publisher, tuple[int, int]] = {}
 
     def publish(self, topic: str, message: Any) -> None:
         """Publish a message and execute all callbacks that it causes (within a callback: later).
 
         Raises:
             LockstepError: The topic has no subscription, or another type, or it is subscribed to by a
-                node that was not added.
+                node that was not added. Or the arguments are no topic and no message.
         """
         self._check_open()
-        if not isinstance(topic, str) or isinstance(message, type):
+        if not isinstance(topic, str) or not _is_message(message):
             got = f'{described(topic)} and {described(message)}'
-            raise LockstepError(f'publish takes a topic and a message, got {got}')
+            hint = ''
+            if isinstance(message, (bytes, bytearray, memoryview)):
+                hint = '; serialized messages: node.create_publisher(TYPE, TOPIC, 10).publish(BYTES)'
+            raise LockstepError(f'publish takes a topic and a message, got {got}{hint}')
         key = type(message), topic
         if key not in self._publishers:
             create = self.node.create_publisher
@@ -57,21 +61,46 @@ class Messaging(SimulatedTime):
                 f'{publisher.topic_name} has no subscription of type {_type_name(type(message))}\n'
                 f'{self.report()}'
             )
-        if subscriptions != self._all_served.get(publisher):
-            self._check_all_served(publisher.topic_name)
-            self._all_served[publisher] = subscriptions
+        # Both: a node that was not added may have come in place of one that was removed.
+        counts = subscriptions, len(self._executor.deliveries.readers_of(publisher.topic_name))
+        if counts != self._all_served.get(publisher):
+            self._check_all_served(topic, publisher.topic_name)
+            self._all_served[publisher] = counts
         publisher.publish(message)
         self._settle_unless_busy()
 
-    def _check_all_served(self, topic: str) -> None:
-        """Check that all subscriptions of a topic are those of nodes that were added."""
-        served = {node.get_fully_qualified_name() for node in self._executor.nodes}
-        endpoints = self.node.get_subscriptions_info_by_topic(topic)
-        names = {f'{end.node_namespace.rstrip("/")}/{end.node_name}' for end in endpoints}
-        others = set() if self._external is None else self._external.graph.nodes()
-        if missing := sorted(names - served - others):
+    def _check_all_served(self, given: str, topic: str) -> None:
+        """Check that all subscriptions of a topic are those of nodes that were added.
+
+        Args:
+            given: Name of the topic, before it is remapped.
+            topic: Fully qualified name of the topic.
+        """
+        served = Counter(
+            node.get_fully_qualified_name()
+            for node in self._executor.nodes
+            for subscription in node.subscriptions
+            if subscription.topic_name == topic
+        )
+        # It remaps the name.
+        endpoints = self.node.get_subscriptions_info_by_topic(given)
+        # By number: two nodes can have one name, and the graph loses it when one of them is destroyed.
+        if self._external is not None:
+            endpoints = self._external.graph.own(endpoints)
+        if len(endpoints) <= served.total():
+            return
+        named = Counter(f'{end.node_namespace.rstrip("/")}/{end.node_name}' for end in endpoints)
+        added = {node.get_fully_qualified_name() for node in self._executor.nodes}
+        nodes = self.node.get_node_names_and_namespaces()
+        existing = Counter(f'{space.rstrip("/")}/{name}' for name, space in nodes)
+        # Clients of actions of a node subscribe without a subscription of the node.
+        missing = [name for name in sorted(named - served) if name not in added or existing[name] > 1]
+        if missing:
+            shown = [
+                f'{name} (a second node of this name)' if name in added else name for name in missing
+            ]
             raise LockstepError(
-                f'{topic} is subscribed to by {", ".join(missing)}: created, but not added to lockstep'
+                f'{topic} is subscribed to by {", ".join(shown)}: created, but not added to lockstep'
             )
 
     def last(self, topic: str) -> Any:
@@ -81,6 +110,8 @@ class Messaging(SimulatedTime):
             LockstepError: No message was published on the topic.
         """
         self._check_open()
+        if not isinstance(topic, str):
+            raise LockstepError(f'last takes a topic, got {described(topic)}')
         name = self.node.resolve_topic_name(topic)
         message = self._traffic.last(name)
         if message is None:
@@ -178,6 +209,11 @@ class Messaging(SimulatedTime):
             raise LockstepError(
                 f'{name} is of type {", ".join(types) or "unknown"}, not {_type_name(args[0])}'
             ) from error
+
+
+def _is_message(value: Any) -> bool:
+    """Return whether a value is a message: an object of a generated class."""
+    return not isinstance(value, type) and hasattr(value, 'get_fields_and_field_types')
 
 
 def _type_name(interface: Any, kind: str = 'msg') -> str:

@@ -20,11 +20,21 @@ from diffdrive_jacobian.ros.rclpy_internals import PARAMETERS_OF_RCLPY, declared
 
 
 class NodeInjection(InjectionBase):
-    """Holds at gates, deaths, changes of parameters and of the clock."""
+    """Holds at gates, deaths, changes of nodes, of parameters and of the clock."""
+
+    _meet: Callable[[], None] | None = None
+
+    def look(self) -> None:
+        """Check whether there is anything that the fault affects, and change new nodes."""
+        super().look()
+        if self._meet is not None:
+            self._meet()
 
     def _gate(self, node: str) -> Gate:
         """Return the gate of a node, which is expected to be there some time."""
-        name = full_name(node)
+        name = full_name(node, self._world.node)
+        if name == self._world.node.get_fully_qualified_name():
+            raise LockstepError(f'{self.fault!r} names the node of the test itself')
         self._expect(
             f'no node {name} was seen',
             lambda nodes: any(one.get_fully_qualified_name() == name for one in nodes),
@@ -65,7 +75,7 @@ class NodeInjection(InjectionBase):
 
     def kill(self, node: str) -> None:
         """Destroy a node when the fault begins, and make it again when it ends."""
-        gate, world, name = self._gate(node), self._world, full_name(node)
+        gate, world, name = self._gate(node), self._world, full_name(node, self._world.node)
 
         def die() -> None:
             gate.deaths += 1
@@ -88,6 +98,34 @@ class NodeInjection(InjectionBase):
 
         self.at_start(die)
         self.at_end(rise)
+
+    # --- Changes of a node
+
+    def change_node(self, node: str, begin: Callable[[Node], None], end: Callable[[Node], None]) -> None:
+        """Change the node of a name while the fault lasts, also one that is added later.
+
+        Args:
+            node: Name of the node.
+            begin: Called with the node when the fault begins, or when the node is added.
+            end: Called with it when the fault ends, if it is still there.
+        """
+        gate = self._gate(node)
+        changed: Node | None = None
+
+        def meet() -> None:
+            nonlocal changed
+            found = self._world.find(gate.name) if self.active else None
+            if found is not None and found is not changed:
+                changed = found
+                begin(found)
+
+        def leave() -> None:
+            if changed is not None and changed is self._world.find(gate.name):
+                end(changed)
+
+        self._meet = meet
+        self.at_start(meet)
+        self.at_end(leave)
 
     # --- Parameters
 

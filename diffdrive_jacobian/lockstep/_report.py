@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import count
-from typing import Any
+from typing import Any, Protocol, TypeAlias
 
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
@@ -24,12 +24,29 @@ OMITTED = ('/clock', '/fault_events', '/parameter_events', '/rosout')
 """Topics that are not reported."""
 
 
+Published: TypeAlias = Callable[[Any, Any], None]
+"""Receives a publisher and the message or bytes that it has published.
+
+For messages from other processes an `ExternalSource` takes the place of the publisher.
+"""
+
+
+class ExternalSource(Protocol):
+    """What has messages from other processes, with the attributes of a publisher."""
+
+    topic_name: str
+    msg_type: Any
+
+
 class _Record:
     """Messages of one publisher, or those of other processes on a topic."""
 
-    __slots__ = ('at', 'count', 'message', 'message_type', 'order', 'readers', 'topic')
+    __slots__ = ('at', 'count', 'message', 'message_type', 'observers', 'order', 'readers', 'topic')
 
-    def __init__(self, topic: str, message_type: Any, deliveries: Deliveries) -> None:
+    def __init__(
+        self, topic: str, message_type: Any, deliveries: Deliveries, observers: list[Published]
+    ) -> None:
+        self.observers = observers
         self.topic = topic
         self.message_type = message_type
         self.readers = deliveries.readers_of(self.topic)
@@ -64,6 +81,7 @@ class Traffic:
         self._external: dict[str, _Record] = {}
         self._numbers = count(1)
         self._deliveries: Deliveries | None = None
+        self._observers: dict[str, list[Published]] = {}
         self._restore: Callable[[], None] | None = None
         self.intercept: Callable[[Publisher, Any], bool] | None = None
         """Called with each message. It returns whether it sends the message itself."""
@@ -72,7 +90,7 @@ class Traffic:
         """Start counting."""
         traffic, records, now, numbers = self, self._records, self._now, self._numbers
         self._deliveries = deliveries
-        extend = deliveries.pending.extend
+        extend, observers_of = deliveries.pending.extend, self.observers_of
 
         def counting(publish: Callable[..., None]) -> Callable[..., None]:
             def counted(self: Publisher, msg: Any) -> None:
@@ -81,16 +99,25 @@ class Traffic:
                 publish(self, msg)
                 record = records.get(self)
                 if record is None:
-                    record = records[self] = _Record(self.topic_name, self.msg_type, deliveries)
+                    name = self.topic_name
+                    record = _Record(name, self.msg_type, deliveries, observers_of(name))
+                    records[self] = record
                 record.count += 1
                 record.order = next(numbers)
                 record.at = now()
                 record.message = msg
                 extend(record.readers)
+                if record.observers:
+                    for observer in record.observers:
+                        observer(self, msg)
 
             return counted
 
         self._restore = wrap_publish(counting)
+
+    def observers_of(self, topic: str) -> list[Published]:
+        """Return the functions that are called after each message of a topic is published."""
+        return self._observers.setdefault(topic, [])
 
     def publish_now(self, publisher: Publisher, message: Any) -> None:
         """Publish a message that is not intercepted."""
@@ -102,7 +129,7 @@ class Traffic:
 
     def last(self, topic: str) -> Any:
         """Return the last message of a topic as it was received; None: there is none."""
-        records = [record for record in self._all() if record.topic == topic]
+        records = [record for record in self._all() if record.topic == topic and record.count]
         return max(records, key=lambda record: record.order).received() if records else None
 
     def count(self, topic: str) -> int:
@@ -120,23 +147,26 @@ class Traffic:
             if record.topic not in OMITTED and _subscriptions(publisher) > len(record.readers)
         )
 
-    def note_external(self, topic: str, message_type: Any, number: int, last: bytes) -> None:
-        """Count messages from other processes.
+    def note_external(self, source: ExternalSource, messages: Sequence[bytes]) -> None:
+        """Count messages from other processes on a topic.
 
         Args:
-            topic: Full name of the topic.
-            message_type: Its type.
-            number: Number of messages.
-            last: The last one, serialized.
+            source: The topic, which takes the place of a publisher.
+            messages: The messages, serialized.
         """
         assert self._deliveries is not None, 'start comes first'
-        record = self._external.get(topic)
+        name = source.topic_name
+        record = self._external.get(name)
         if record is None:
-            record = self._external[topic] = _Record(topic, message_type, self._deliveries)
-        record.count += number
-        record.order = next(self._numbers)
-        record.at = self._now()
-        record.message = last
+            record = _Record(name, source.msg_type, self._deliveries, self.observers_of(name))
+            self._external[name] = record
+        for message in messages:
+            record.count += 1
+            record.order = next(self._numbers)
+            record.at = self._now()
+            record.message = message
+            for observer in record.observers:
+                observer(source, message)
 
     def _all(self) -> list[_Record]:
         return [*self._records.values(), *self._external.values()]
@@ -160,7 +190,11 @@ class Traffic:
             (record.topic, names.get(publisher, 'a removed node'), record)
             for publisher, record in self._records.items()
             if record.topic not in OMITTED
-        ] + [(topic, 'other processes', record) for topic, record in self._external.items()]
+        ] + [
+            (topic, 'other processes', record)
+            for topic, record in self._external.items()
+            if record.count
+        ]
         lines = [
             f'  {topic}: {record.count} from {node}, last at {record.at / NANOSECONDS:g} s: '
             f'{brief(record.received())}'

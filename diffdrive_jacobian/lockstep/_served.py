@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 from rclpy.client import Client
 from rclpy.node import Node
@@ -20,14 +20,24 @@ from rclpy.task import Future
 from diffdrive_jacobian.lockstep._facade import Facade
 from diffdrive_jacobian.lockstep._gates import Gate, Gates, depth_of, send_unless_destroyed
 
+Responded: TypeAlias = Callable[[Node, Service, Any], None]
+"""Receives a node, its service, and a response, also one that a fault delays."""
+
 
 class Served:
     """A node for the EventsExecutor, without timers and subscriptions."""
 
     timers = subscriptions = ()
 
-    def __init__(self, node: Node, create_task: Callable[..., Any], facade: Facade) -> None:
+    def __init__(
+        self,
+        node: Node,
+        create_task: Callable[..., Any],
+        facade: Facade,
+        response_observers: list[Responded],
+    ) -> None:
         self.node = node
+        self.response_observers = response_observers
         self.facade = facade
         self.executor: Any = None
         self.services: list[Any] = []
@@ -114,6 +124,8 @@ class _Service:
             send()
 
     def _send_now(self, response: Any, header: Any) -> None:
+        for observe in self._served.response_observers:
+            observe(self._served.node, self._service, response)
         send, gates = self._service.send_response, self._served.gates
         delay = gates.response_delay(self._service.service_name) if gates is not None else 0
         if gates is not None and delay:

@@ -9,11 +9,12 @@ from contextlib import contextmanager
 
 from rclpy.executors import ExternalShutdownException
 
-from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._errors import LockstepError, PropertyViolation
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
 from diffdrive_jacobian.lockstep._external import External
 from diffdrive_jacobian.lockstep._guard import Guard, Stuck
 from diffdrive_jacobian.lockstep._report import Traffic
+from diffdrive_jacobian.lockstep._requirement import Required, Requirement
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 MAX_SECONDS = 2**31 - 1
@@ -35,6 +36,7 @@ class SimulatedTime:
         self._busy = False
         self._external: External | None = None
         self._traffic = Traffic(lambda: self._now)
+        self._watches: list[Required] = []
 
     def _check_open(self) -> None:
         """Raise LockstepError after `close`."""
@@ -47,7 +49,7 @@ class SimulatedTime:
 
     @property
     def elapsed(self) -> float:
-        """Simulated time since the start (s)."""
+        """Simulated time since the start, by the clock of the nodes (s)."""
         return (self._now - self._start) / NANOSECONDS
 
     @property
@@ -64,6 +66,8 @@ class SimulatedTime:
         with self._watched():
             self._until_next = self._executor.settle()
         self._await_others()
+        if self._watches:
+            self._check_requirements()
 
     def _catch_up(self) -> None:
         """Execute what was caused since the last callback."""
@@ -165,6 +169,8 @@ class SimulatedTime:
         with self._watched():
             self._until_next = self._executor.advance(self._now)
         self._await_others()
+        if self._watches:
+            self._check_requirements()
 
     def _await_others(self) -> None:
         """Wait for the messages from other processes that are due, and execute what they cause."""
@@ -231,6 +237,17 @@ class SimulatedTime:
         finally:
             self._guard.disarm()
             self._busy = False
+
+    def _check_requirements(self) -> None:
+        """Check what is required at the current time, when all callbacks have been executed."""
+        for required in self._watches:
+            if (text := required.watch.check()) is not None:
+                self._watches.remove(required)
+                required.end()
+                raise self._violation(required.requirement, text)
+
+    def _violation(self, requirement: Requirement, text: str) -> PropertyViolation:
+        return PropertyViolation(requirement, self.world_time / NANOSECONDS, text, self.report())
 
     def report(self) -> str:
         """Return the last messages of all topics as text."""

@@ -36,8 +36,8 @@ class Timers:
             for timer in node.timers
             if timer not in without
         ]
-        self._sim_timers = [pair for pair in timers if _follows_sim_time(pair[1])]
-        self._wall_timers = [pair for pair in timers if not _follows_sim_time(pair[1])]
+        self._sim_timers = [pair for pair in timers if follows_sim_time(pair[1])]
+        self._wall_timers = [pair for pair in timers if not follows_sim_time(pair[1])]
 
     def due(self) -> tuple[list[Entry], int | None]:
         """Return the due timers, the most overdue first, and the time until the next one (ns)."""
@@ -65,7 +65,7 @@ class Timers:
         """
         due, _ = self.due()
         for handle, timer, owner in due:
-            if owner is node:
+            if owner is node and follows_sim_time(timer):
                 return -(handle.time_until_next_call() or 0), handle, timer
         return None
 
@@ -80,6 +80,7 @@ def is_due(handle: TimerHandle) -> bool:
     return left is not None and left <= 0
 
 
-def _follows_sim_time(timer: Timer) -> bool:
+def follows_sim_time(timer: Timer) -> bool:
+    """Return whether a timer expires by simulated time, not by wall time."""
     clock = timer.clock
     return clock.clock_type == ClockType.ROS_TIME and bool(clock.ros_time_is_active)

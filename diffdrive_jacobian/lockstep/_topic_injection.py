@@ -8,10 +8,13 @@ from typing import Any, NamedTuple
 
 from rclpy.node import Node
 
+from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._fault_log import Hits
 from diffdrive_jacobian.lockstep._gated_reader import GatedReader, Stage
 from diffdrive_jacobian.lockstep._injection_base import InjectionBase, full_name
 
+CLOCK = '/clock'
+"""Topic whose messages lockstep replaces."""
 Filter = Callable[[int, bytes], Iterable[tuple[int, bytes]]]
 """Receives a world time (ns) and a message, returns messages with their delays (ns)."""
 Begin = Callable[[random.Random, type], Filter]
@@ -52,7 +55,11 @@ class TopicInjection(InjectionBase):
             at_publisher: Whether messages are filtered when they are published, once for all.
         """
         name = self._world.node.resolve_topic_name(topic)
-        owner = node and full_name(node)
+        if name == CLOCK:
+            raise LockstepError(
+                f'{self.fault!r}: lockstep sets the clocks itself; use TimeJump or ClockPause'
+            )
+        owner = node and full_name(node, self._world.node)
         self._filtered = _Filtered(name, owner, begin, keeps_order, at_publisher)
         kind, of = 'publisher' if at_publisher else 'subscription', f' of {owner}' if owner else ''
 

@@ -17,13 +17,13 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
-from diffdrive_jacobian.lockstep._disturbed import Disturbed
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
 from diffdrive_jacobian.lockstep._external_answers import Expectation
 from diffdrive_jacobian.lockstep._guard import Guard
 from diffdrive_jacobian.lockstep._messaging import described
 from diffdrive_jacobian.lockstep._processes import Processes
+from diffdrive_jacobian.lockstep._requirements import Requirements
 from diffdrive_jacobian.lockstep._simulated_time import checked_nanoseconds
 from diffdrive_jacobian.ros.fastdds_profiles import withdraw
 from diffdrive_jacobian.ros.rclpy_internals import wrap_sleep
@@ -32,7 +32,7 @@ from diffdrive_jacobian.ros.runner import UserError, environment, ros_context
 N = TypeVar('N', bound=Node)
 
 
-class Lockstep(Disturbed, Processes):
+class Lockstep(Requirements, Processes):
     """Executes nodes in the default context of rclpy, in simulated time.
 
     Nodes are created as usual, after the `Lockstep`, and added to it. `use_sim_time` is true for all of
@@ -129,6 +129,11 @@ class Lockstep(Disturbed, Processes):
         """Close it."""
         self.close()
 
+    @property
+    def is_open(self) -> bool:
+        """Whether it was not closed."""
+        return Lockstep._open is self
+
     def close(self) -> None:
         """Destroy the nodes and shut rclpy down. Further calls have no effect."""
         if Lockstep._open is self:
@@ -196,6 +201,7 @@ class Lockstep(Disturbed, Processes):
         self._check_open()
         if node is self.node or node not in self._executor.nodes:
             raise LockstepError('the node to remove was not added')
+        self._executor.killed.add(node)
         with self._watched():
             self._executor.remove(node)
             node.destroy_node()

@@ -7,6 +7,7 @@ The unicycle model is integrated exactly. The motion depends on the commands and
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -17,9 +18,10 @@ from geometry_msgs.msg import (
     TwistStamped,
 )
 from nav_msgs.msg import Odometry
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from rclpy.clock import JumpHandle, JumpThreshold, TimeJump
 from rclpy.duration import Duration
+from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
@@ -40,7 +42,9 @@ from diffdrive_jacobian.ros.graph_faults import (
 )
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import change_timer_period, log_info
-from diffdrive_jacobian.simulation.robot import Robot
+from diffdrive_jacobian.simulation.encoders import Encoders
+from diffdrive_jacobian.simulation.robot import Robot, RobotModel
+from diffdrive_jacobian.simulation.slip import Drift
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import nanoseconds, seconds
 
@@ -63,13 +67,17 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         super().__init__('virtual_robot', VirtualRobotParameters, **kwargs)
         self._robot: Robot | None = None
         self._latest = 0
+        self._impairments: list[Callable[[RobotModel], RobotModel]] = []
+        self._encoders: Encoders | None = None
         self._configure()
         self._odom = self.advertise(Odometry, 'odom')
         self._joint_states = self.advertise(JointState, 'joint_states')
         self._applied = self.advertise(TwistStamped, 'cmd_vel_out')
         self._start_pose = self.advertise(PoseWithCovarianceStamped, 'start_pose', latched=True)
         drifts = self.parameters.drift() is not None
-        self._ground_truth = self.advertise(Odometry, 'ground_truth') if drifts else None
+        self._ground_truth: Publisher | None = None
+        if drifts:
+            self._ground_truth = self.advertise(Odometry, 'ground_truth')
         self._transforms = self._transform_broadcaster() if self.parameters.enable_odom_tf else None
         source, numbers = 'cmd_vel', Interleaving()
         self._commands = numbers
@@ -112,7 +120,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             self._advance()
 
     def _advance(self) -> tuple[int, Robot] | None:
-        """Apply a timeout or a jump of time that happened since the last call.
+        """Apply timeouts, steps of the lag or a jump of time that happened since the last call.
 
         Returns:
             The current time (ns) and the robot. None: simulated time has not started.
@@ -122,7 +130,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             return None
         robot = self._robot
         if robot is None:
-            robot = Robot(model=self.parameters.model(), stamp=now, pose=self._initial_pose())
+            robot = Robot(model=self._model(), stamp=now, pose=self._initial_pose())
             self._publish_start(robot)
         elif now < self._latest:
             self.log_event_warning(
@@ -133,9 +141,10 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             robot = robot.at(self._latest).restarted(now)
             self._publish_start(robot)
             self._publish_applied(robot)
-        elif (expiry := robot.expiry) is not None and expiry <= now:
-            robot = robot.at(expiry)
-            self._publish_applied(robot)
+        else:
+            while (change := robot.next_change) is not None and change <= now:
+                robot = robot.at(change)
+                self._publish_applied(robot)
         self._robot, self._latest = robot, now
         return now, robot
 
@@ -148,11 +157,14 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         if advanced is None:
             return
         now, robot = advanced
-        state = robot.at(now)
+        truth = state = robot.at(now)
+        if self._encoders is not None:
+            self._encoders = self._encoders.read(state)
+            state = self._encoders.reported(state)
         self._odom.publish(self._serialized_odometry(state, self._period))
         self._joint_states.publish(self._serialized_joints(now, state.wheel_speeds, state.wheel_angles))
         if self._ground_truth is not None:
-            self._ground_truth.publish(self._serialized_truth(state))
+            self._ground_truth.publish(self._serialized_truth(truth))
         if self._transforms is not None:
             messages.set_time(self._odometry.header.stamp, now)
             messages.set_pose(self._odometry.pose.pose, state.pose)
@@ -201,7 +213,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             now, robot = advanced
             twist, stamp = read(*fields)
             timeout = robot.model.command_timeout
-            time = command_time(stamp, now, robot.stamp, timeout)
+            # The steps of a lag are no commands: an older command may come late.
+            time = max(robot.stamp, command_time(stamp, now, robot.changed_at, timeout))
         except MessageError as error:
             self.get_logger().warning(f'command dropped: {error}', throttle_duration_sec=THROTTLE)
             return
@@ -246,17 +259,114 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     def _set_pose(self, robot: Robot) -> None:
         self._robot = robot
+        if self._encoders is not None:
+            self._encoders = self._encoders.read(robot).placed(robot.pose_tuple)
         self._publish_start(robot)
         x, y, theta = robot.pose
         self.log_event_info('pose set', f'pose set to x {x:.3f}, y {y:.3f}, theta {theta:.3f}')
 
     @property
+    def pose(self) -> NDArray[np.float64]:
+        """`[x, y, theta]` by the odometry now, shape (3,) (m, m, rad).
+
+        With encoders of few steps: at their last reading, as it was published.
+        """
+        if self._encoders is not None:
+            return np.array(self._encoders.pose)
+        robot = self._robot_now()
+        return self._initial_pose() if robot is None else robot.pose.copy()
+
+    @property
     def truth(self) -> NDArray[np.float64]:
         """`[x, y, theta]` where the robot truly is now, shape (3,) (m, m, rad)."""
-        robot = self._robot
-        if robot is None:
-            return self._initial_pose()
-        return robot.at(max(self.now(), self._latest)).true_pose
+        robot = self._robot_now()
+        return self._initial_pose() if robot is None else robot.true_pose.copy()
+
+    def _robot_now(self) -> Robot | None:
+        return None if self._robot is None else self._robot.at(max(self.now(), self._latest))
+
+    # --- Faults, for tests
+
+    def impair(self, change: Callable[[RobotModel], RobotModel]) -> Callable[[], None]:
+        """Change the model of the robot beyond its parameters, from now on.
+
+        Args:
+            change: Returns the changed model. Several changes apply in the order of the calls.
+
+        Returns:
+            A function that ends the change. The true pose stays apart from the odometry.
+        """
+        self._impairments.append(change)
+        self._remodel()
+
+        def end() -> None:
+            self._impairments.remove(change)
+            self._remodel()
+
+        return end
+
+    def push(self, displacement: ArrayLike, *, noticed: bool = False) -> None:
+        """Displace the robot now, without turning its wheels.
+
+        Args:
+            displacement: `[dx, dy, dtheta]` in the body frame, shape (3,) (m, m, rad).
+            noticed: Whether the odometry follows, as if corrected by a localisation. Otherwise only
+                `ground_truth` shows it.
+
+        Raises:
+            ValueError: The displacement is invalid.
+            MessageError: Simulated time has not started.
+        """
+        if not noticed:
+            self._publish_truth()
+            self._remodel()
+        advanced = self._advance()
+        if advanced is None:
+            raise MessageError(NO_CLOCK)
+        now, robot = advanced
+        robot = robot.pushed(displacement, now, noticed=noticed)
+        if noticed:
+            self._set_pose(robot)
+        else:
+            self._robot = robot
+
+    def set_encoders(self, per_revolution: int | None) -> None:
+        """Report what encoders of so many increments per turn of a wheel count; None: exact angles.
+
+        The odometry goes on from its present pose. `ground_truth` shows where the robot truly is.
+
+        Raises:
+            ValueError: It is not a positive integer.
+            MessageError: Simulated time has not started.
+        """
+        self._publish_truth()
+        self._remodel()
+        advanced = self._advance()
+        if advanced is None:
+            raise MessageError(NO_CLOCK)
+        now, robot = advanced
+        encoders, robot = self._encoders, robot.at(now)
+        if per_revolution is not None:
+            self._encoders = Encoders.at(robot, per_revolution)
+        elif encoders is not None:
+            self._encoders = None
+            pose = encoders.read(robot).pose
+            self._set_pose(robot.placed(pose, robot.covariance, now, odometry_only=True))
+
+    def _model(self) -> RobotModel:
+        """Return the model with the parameters and the faults."""
+        model = self.parameters.model()
+        for change in self._impairments:
+            model = change(model)
+        if self._ground_truth is not None and model.drift is None:
+            # The true pose is known apart from the odometry from now on.
+            return replace(model, drift=Drift())
+        return model
+
+    def _publish_truth(self) -> None:
+        """Publish the ground truth from now on."""
+        if self._ground_truth is None:
+            self._ground_truth = self.advertise(Odometry, 'ground_truth')
 
     # --- Parameters
 
@@ -266,11 +376,17 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self._configure()
         if parameters.publish_rate != previous.publish_rate:
             change_timer_period(self._timer, nanoseconds(1.0 / parameters.publish_rate))
-        model = self.parameters.model()
+        self._remodel()
+
+    def _remodel(self) -> None:
+        """Continue with the model of the present parameters and faults."""
         advanced = self._advance()
+        model = self._model()
+        if model.drift is not None:
+            self._publish_truth()
         if advanced is not None and model != advanced[1].model:
             now, robot = advanced
-            wheels = parameters.command_interface == 'wheels'
+            wheels = self.parameters.command_interface == 'wheels'
             self._robot = robot.remodelled(model, now, wheels_commanded=wheels)
             if self._robot.twist != robot.twist:
                 self._publish_applied(self._robot)

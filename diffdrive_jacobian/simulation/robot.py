@@ -13,6 +13,9 @@ needs no arrays reads `pose_tuple` and `covariance_tuple`.
 The pose is that of the odometry, computed from the turns of the wheels. The robot is truly there, unless
 its model has a `drift`. `true_pose` is where it truly is.
 
+With `actuators` that lag, the twist also changes between the events, at the end of each step of the lag
+(`next_change`).
+
 Source: doc/mathematics.md, "Motion".
 """
 
@@ -40,7 +43,9 @@ from diffdrive_jacobian.kinematics._checks import (
 )
 from diffdrive_jacobian.kinematics._elementary import components, operand
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
+from diffdrive_jacobian.kinematics.se2 import compose
 from diffdrive_jacobian.simulation._uncertainty import Uncertainty
+from diffdrive_jacobian.simulation.actuators import Actuators, Settling, Speeds
 from diffdrive_jacobian.simulation.exact_moments import Moments, gaussian_moments
 from diffdrive_jacobian.simulation.odometry_noise import covariance_entries, twist_covariance_entries
 from diffdrive_jacobian.simulation.slip import Drift, Truth
@@ -57,8 +62,8 @@ class RobotModel:
 
     Raises:
         ValueError: A length is not positive and finite, the variance or the timeout is negative, the
-            timeout is not an integer, the limits are not those of one robot, or the drift is of
-            another class.
+            timeout is not an integer, the limits are not those of one robot, or the drift or the
+            actuators are of another class.
     """
 
     wheel_radius: float = 0.033
@@ -73,6 +78,8 @@ class RobotModel:
     """k, variance of each wheel's travel per distance travelled (m)."""
     drift: Drift | None = None
     """In what the true motion differs from the odometry; None: in nothing."""
+    actuators: Actuators | None = None
+    """In what the wheel motors differ from ideal ones; None: in nothing."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -83,6 +90,8 @@ class RobotModel:
             raise ValueError(f'limits must be numbers for one robot, got {self.limits}')
         if self.drift is not None:
             instance('drift', self.drift, Drift)
+        if self.actuators is not None:
+            instance('actuators', self.actuators, Actuators)
         timeout = nanoseconds('command_timeout', self.command_timeout)
         if timeout < 0:
             raise ValueError(f'command_timeout must be zero or positive (ns), got {timeout}')
@@ -132,7 +141,7 @@ class Robot:
     command: tuple[float, float] = STANDSTILL
     """The last commanded twist, `(v, omega)`."""
     twist: tuple[float, float] = STANDSTILL
-    """The applied twist: the command after saturation."""
+    """The applied twist: the command after saturation, as the motors follow it."""
     commanded_at: int | None = None
     """Time at which the command took effect (ns); None: it is zero."""
     pose_tuple: tuple[float, float, float] = field(init=False, repr=False)
@@ -140,6 +149,8 @@ class Robot:
     _uncertainty: Uncertainty = field(init=False, repr=False)
     # None: the pose is the true one.
     _truth: Truth | None = field(init=False, repr=False)
+    # None: the wheels have reached their commanded speeds.
+    _settling: Settling | None = field(init=False, repr=False, default=None)
     # The last state that was computed from this one, because often the same one is needed next.
     _ahead: tuple[int, _State] | None = field(init=False, repr=False, default=None)
 
@@ -229,6 +240,21 @@ class Robot:
         return max(self.stamp, self.commanded_at + self.model.command_timeout)
 
     @property
+    def next_change(self) -> int | None:
+        """Next time at which the twist changes without a command, by the timeout or the lag (ns); None:
+        it does not.
+        """
+        expiry, settling = self.expiry, self._settling
+        if settling is None:
+            return expiry
+        return settling.end if expiry is None else min(settling.end, expiry)
+
+    @property
+    def changed_at(self) -> int:
+        """Time of the last command, timeout, placement or change of the model (ns)."""
+        return self.stamp if self._settling is None else self._settling.since
+
+    @property
     def wheel_speeds(self) -> tuple[float, float]:
         """`(omega_R, omega_L)` (rad/s), by the inverse wheel Jacobian."""
         (v, omega), r, L = self.twist, self.model.wheel_radius, self.model.wheel_separation
@@ -270,6 +296,8 @@ class Robot:
             ValueError: The time is earlier than this state, is not an integer, or so late that the
                 motion overflows.
         """
+        if self.model.actuators is not None:
+            return self._changed_until(stamp)
         stamp, state, expired = self._advanced(stamp)
         if expired:
             return _robot(self.model, stamp, state, STANDSTILL, STANDSTILL)
@@ -286,9 +314,13 @@ class Robot:
             ValueError: The command has another shape or is not finite; or as `at`.
         """
         v, omega = _pair('command', command)
-        stamp, state, _ = self._advanced(stamp)
         model = self.model
         twist = saturate(v, omega, model.limits, model.wheel_radius, model.wheel_separation)
+        if model.actuators is not None:
+            here = self._changed_until(stamp)
+            commanded_at = None if v == omega == 0.0 else here.stamp
+            return here._driven(model, here._present, (v, omega), twist, commanded_at)
+        stamp, state, _ = self._advanced(stamp)
         return _robot(model, stamp, state, (v, omega), twist, None if v == omega == 0.0 else stamp)
 
     def placed(
@@ -310,7 +342,45 @@ class Robot:
         placed = Robot(model=self.model, stamp=here.stamp, pose=pose, covariance=covariance)  # type: ignore[arg-type]
         truth = here._truth if odometry_only else placed._truth
         state = placed.pose_tuple, here.wheel_angles, placed._uncertainty, truth
-        return _robot(here.model, here.stamp, state, here.command, here.twist, here.commanded_at)
+        return here._with(state)
+
+    def reported(
+        self, pose: tuple[float, float, float], wheel_angles: Speeds, twist: tuple[float, float]
+    ) -> Robot:
+        """Return this robot as its sensors report it, with the same covariance and the same truth.
+
+        Args:
+            pose: `(x, y, theta)` of the odometry, finite (m, m, rad).
+            wheel_angles: `(right, left)`, finite (rad).
+            twist: `(v, omega)`, finite (m/s, rad/s).
+        """
+        state = pose, wheel_angles, self._uncertainty, self._truth
+        return _robot(self.model, self.stamp, state, self.command, twist, self.commanded_at)
+
+    def pushed(self, displacement: ArrayLike, stamp: int, *, noticed: bool = False) -> Robot:
+        """Displace the robot without turning its wheels, with the same command.
+
+        Args:
+            displacement: `[dx, dy, dtheta]` in the body frame, shape (3,) (m, m, rad).
+            stamp: The time (ns).
+            noticed: Whether the odometry follows, as if corrected by a localisation, with the covariance
+                that it had. Otherwise only the true pose changes, and the model must have a `drift`.
+
+        Raises:
+            ValueError: The displacement has another shape or is not finite, the pose overflows, the
+                model has no drift; or as `at`.
+        """
+        here = self.at(stamp)
+        if here.model.drift is None and not noticed:
+            raise ValueError('model must have a drift: without one the odometry is the true pose')
+        x, y, theta = compose(here.true_pose_tuple, displacement).tolist()
+        if noticed:
+            moved = compose(here.pose_tuple, displacement)
+            here = here.placed(moved, here.covariance, here.stamp, odometry_only=True)
+        pose, angles, uncertainty, truth = here._present
+        if truth is not None:
+            truth = truth.moved((x, y, theta))
+        return here._with((pose, angles, uncertainty, truth))
 
     def remodelled(self, model: RobotModel, stamp: int, *, wheels_commanded: bool = False) -> Robot:
         """Change the model. Its limits and timeout apply to the current command.
@@ -334,6 +404,8 @@ class Robot:
         else:
             truth = truth.with_drift(model.drift)
         state = pose, angles, uncertainty, truth
+        if model.actuators is not None:
+            return here._driven(model, state, command, limited, here.commanded_at)
         return _robot(model, here.stamp, state, command, limited, here.commanded_at)
 
     def restarted(self, stamp: int) -> Robot:
@@ -350,6 +422,76 @@ class Robot:
     @property
     def _present(self) -> _State:
         return self.pose_tuple, self.wheel_angles, self._uncertainty, self._truth
+
+    def _with(self, state: _State) -> Robot:
+        """Return a robot that was put into another state, with the same motion."""
+        settling = self._settling
+        if settling is not None:
+            settling = settling._replace(since=self.stamp)
+        command, twist = self.command, self.twist
+        return _robot(self.model, self.stamp, state, command, twist, self.commanded_at, settling)
+
+    def _changed_until(self, stamp: int) -> Robot:
+        """Advance as `at` does, with actuators, through the steps of their lag and the timeout."""
+        stamp, robot = nanoseconds('stamp', stamp), self
+        while (change := robot.next_change) is not None and change <= stamp:
+            robot = robot._changed(change)
+        if stamp < robot.stamp:
+            raise ValueError(f'stamp cannot go back from {self.stamp} ns to {stamp} ns')
+        command, twist, commanded_at = robot.command, robot.twist, robot.commanded_at
+        state = robot._state(stamp)
+        return _robot(robot.model, stamp, state, command, twist, commanded_at, robot._settling)
+
+    def _changed(self, stamp: int) -> Robot:
+        """Return the robot at the time of its next change."""
+        model, command, commanded_at = self.model, self.command, self.commanded_at
+        state = self._state(stamp)
+        here = _robot(model, stamp, state, command, self.twist, commanded_at, self._settling)
+        if self.expiry == stamp:
+            return here._driven(model, state, STANDSTILL, STANDSTILL, None)
+        twist = model.limited(command)
+        return here._driven(model, state, command, twist, commanded_at, self.changed_at)
+
+    def _driven(
+        self,
+        model: RobotModel,
+        state: _State,
+        command: tuple[float, float],
+        twist: tuple[float, float],
+        commanded_at: int | None,
+        since: int | None = None,
+    ) -> Robot:
+        """Return the robot in a state, from now on following a command with the actuators of a model.
+
+        Args:
+            model: The model, with actuators.
+            state: The state.
+            command: The command.
+            twist: The twist that it demands, within the limits of the model.
+            commanded_at: Time at which the command took effect (ns).
+            since: Time from which on the command is followed (ns); None: from now on.
+        """
+        actuators = model.actuators
+        assert actuators is not None
+        r, L, stamp = model.wheel_radius, model.wheel_separation, self.stamp
+        demanded: Speeds = body_to_wheel(*twist, r, L)
+        speeds, reached = self._motor_speeds, actuators.limited(demanded)
+        settling = None
+        if actuators.settled(speeds, reached):
+            if reached != demanded:
+                twist = wheel_to_body(*reached, r, L)
+        else:
+            settling = Settling(stamp if since is None else since, stamp, speeds, reached)
+            twist = wheel_to_body(*actuators.mean(settling), r, L)
+        return _robot(model, stamp, state, command, twist, commanded_at, settling)
+
+    @property
+    def _motor_speeds(self) -> Speeds:
+        """The wheel speeds at this time (rad/s). Those of the twist are means over a step of the lag."""
+        actuators = self.model.actuators
+        if self._settling is None or actuators is None:
+            return self.wheel_speeds
+        return actuators.after(self._settling, self.stamp)
 
     def _advanced(self, stamp: int) -> tuple[int, _State, bool]:
         """Return a time (ns), the state at that time, and whether the timeout stopped the robot before.
@@ -401,6 +543,7 @@ def _robot(
     command: tuple[float, float],
     twist: tuple[float, float],
     commanded_at: int | None = None,
+    settling: Settling | None = None,
 ) -> Robot:
     """Return a robot with checked values, without checking them again for every message."""
     robot = object.__new__(Robot)
@@ -414,6 +557,7 @@ def _robot(
     _set(robot, 'command', command)
     _set(robot, 'twist', twist)
     _set(robot, 'commanded_at', commanded_at)
+    _set(robot, '_settling', settling)
     _set(robot, '_ahead', None)
     return robot
 

@@ -136,6 +136,10 @@ class Truth:
         """Return the same pose with another drift."""
         return self if drift == self._drift else Truth(drift, self.pose)
 
+    def moved(self, pose: Pose) -> Truth:
+        """Return the truth of a robot that was put elsewhere. Its slip goes on."""
+        return Truth(self._drift, pose, self._slipped, self._held)
+
     def at_rest(self) -> Truth:
         """Return the same pose of a robot that rests."""
         return self if self._held is None else Truth(self._drift, self.pose)

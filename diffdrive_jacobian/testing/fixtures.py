@@ -1,28 +1,76 @@
-"""Fixtures for pytest: `pytest_plugins = ['diffdrive_jacobian.testing.fixtures']` in a conftest.py.
+"""The plugin of pytest. It is loaded by its entry point, wherever this package is installed.
 
 `lockstep` is a new `Lockstep` for each test. `robot_at(x, y, theta)` adds a virtual robot to it.
-`recorded_run` records the test as a bag and a figure, which are kept if it fails. The marker
-`lockstep(args=..., start=..., patience=...)` passes arguments to `Lockstep`. The report of a failed test
-ends with the last messages of all topics.
+`recorded_run` records the test as a bag and a figure, which are kept if it fails. `golden_run` compares
+the test with a recorded run. The marker `lockstep(args=..., start=..., patience=...)` passes arguments
+to `Lockstep`. The report of a failed test ends with the last messages of all topics.
+
+pytest loads this module in every project. Until a fixture is used it imports neither rclpy nor NumPy and
+leaves the environment as it is.
 """
 
 from __future__ import annotations
 
+import importlib
+import os
+import sys
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
-from rclpy.parameter import Parameter
 
-from diffdrive_jacobian.lockstep import Lockstep, LockstepError
-from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.parameters.declaration import specifications
-from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
-from diffdrive_jacobian.plots.run_figure import draw
-from diffdrive_jacobian.reading import BagError, read_run
-from diffdrive_jacobian.recording.recorder import Recorder, Selection
-from diffdrive_jacobian.recording.recording import Recording, RecordingError
+from diffdrive_jacobian.testing.artifacts import artifact_name, name_beside_the_file
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.lockstep import Lockstep
+    from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+    from diffdrive_jacobian.testing.golden_run import GoldenRun
+    from diffdrive_jacobian.testing.recorded_run import RecordedRun
+
+CHECK_FIELDS = 'ROS_PYTHON_CHECK_FIELDS'
+"""Environment variable that each message module reads when it is imported."""
+GOLDEN = 'golden'
+"""Directory of the golden runs, beside the module of a test."""
+WRITTEN = 'golden run written'
+"""Property of the report of a test that wrote its golden run."""
+_CHECKS_FIELDS = pytest.StashKey[bool]()
+_CONTAINED = pytest.StashKey[bool]()
+"""Whether the error of a test contains the last messages."""
+_FIXTURES = pytest.StashKey[dict[str, Any]]()
+"""Fixtures of a test that exist now. Its `funcargs` lack those of a setup that fails."""
+
+
+# --- Options
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options."""
+    group = parser.getgroup('lockstep', 'ROS nodes in lockstep (diffdrive_jacobian)')
+    group.addoption(
+        '--lockstep-artifacts',
+        metavar='DIR',
+        help='directory of what recorded_run keeps, DIR/TEST/run and DIR/TEST/run.png '
+        '(default: lockstep_artifacts of the configuration file, else --basetemp)',
+    )
+    group.addoption(
+        '--update-golden-runs',
+        action='store_true',
+        help='make runs the golden ones of golden_run, where there is none or they differ',
+    )
+    parser.addini('lockstep_artifacts', 'directory of what recorded_run keeps', default='')
+    parser.addini(
+        'lockstep_check_fields',
+        f'whether rclpy checks the types of message fields, as with {CHECK_FIELDS}=1',
+        type='bool',
+        default=False,
+    )
+
+
+def pytest_load_initial_conftests(early_config: pytest.Config) -> None:
+    """Apply `lockstep_check_fields`, before a conftest.py imports messages."""
+    _check_fields(early_config)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -30,6 +78,69 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         'markers', 'lockstep(args, start, patience): arguments of the Lockstep of this test'
     )
+    # The hook before is not called for a plugin that a conftest.py loads.
+    _check_fields(config)
+
+
+def _check_fields(config: pytest.Config) -> None:
+    """Let message modules check their fields until the end of the session, if the option is set."""
+    if not config.getini('lockstep_check_fields') or config.stash.get(_CHECKS_FIELDS, False):
+        return
+    config.stash[_CHECKS_FIELDS] = True
+    before = os.environ.get(CHECK_FIELDS)
+    os.environ[CHECK_FIELDS] = '1'
+    config.add_cleanup(lambda: _set_environment(CHECK_FIELDS, before))
+    unchecked = sorted(
+        {
+            name.partition('.')[0]
+            for name, module in list(sys.modules.items())
+            # Not getattr, which may import something.
+            if getattr(module, '__dict__', {}).get('ros_python_check_fields', '1') != '1'
+        }
+    )
+    if unchecked:
+        config.issue_config_time_warning(
+            pytest.PytestConfigWarning(
+                'lockstep_check_fields has no effect on message types that were imported before, of '
+                f'{", ".join(unchecked)}: set {CHECK_FIELDS}=1 in the environment of pytest instead'
+            ),
+            stacklevel=2,
+        )
+
+
+def _set_environment(name: str, value: str | None) -> None:
+    if value is None:
+        os.environ.pop(name, None)
+    else:
+        os.environ[name] = value
+
+
+# --- Reports
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_call(item: pytest.Item) -> None:
+    """Check the required properties and the golden run of a test that has passed."""
+    world, golden = _argument(item, 'lockstep'), _argument(item, 'golden_run')
+    if world is None:
+        return
+    from diffdrive_jacobian.lockstep import Lockstep, LockstepError
+    from diffdrive_jacobian.recording.recording import RecordingError
+    from diffdrive_jacobian.testing.golden_run import GoldenRun, GoldenRunError
+
+    try:
+        if isinstance(world, Lockstep) and world.is_open:
+            world.finish()
+        if isinstance(golden, GoldenRun) and not golden.checked:
+            golden.check()
+        return
+    except LockstepError as error:
+        item.stash[_CONTAINED] = True
+        problem = str(error)
+    except (GoldenRunError, RecordingError) as error:
+        problem = str(error)
+    # Without a traceback, which would show pytest only.
+    pytest.fail(problem, pytrace=False)
 
 
 @pytest.hookimpl(hookwrapper=True)
@@ -37,15 +148,29 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     """Add the last messages to the report of a failure that does not contain them itself."""
     outcome: Any = yield
     report = outcome.get_result()
-    world = getattr(item, 'funcargs', {}).get('lockstep')
-    contained = call.excinfo is not None and call.excinfo.errisinstance(LockstepError)
-    if call.when != 'call' or not report.failed:
+    if call.when == 'teardown':
         return
+    golden, world = _argument(item, 'golden_run'), _argument(item, 'lockstep')
+    if getattr(golden, 'written', False):
+        report.user_properties.append((WRITTEN, str(golden.path)))
+    if not report.failed or world is None:
+        return
+    from diffdrive_jacobian.lockstep import Lockstep, LockstepError
+    from diffdrive_jacobian.testing.recorded_run import RecordedRun
+
+    contained = call.excinfo is not None and call.excinfo.errisinstance(LockstepError)
+    contained = item.stash.get(_CONTAINED, contained)
     if isinstance(world, Lockstep) and not contained:
         report.sections.append(('lockstep', _or_error(world.report)))
-    recorded = getattr(item, 'funcargs', {}).get('recorded_run')
+    recorded = _argument(item, 'recorded_run')
     if isinstance(recorded, RecordedRun):
         report.sections.append(('recorded run', _or_error(recorded.keep)))
+
+
+def _argument(item: pytest.Item, name: str) -> Any:
+    """Return a fixture of a test, which it may have through another one; None: it has none."""
+    existing = item.stash.get(_FIXTURES, None) or {}
+    return existing.get(name, getattr(item, 'funcargs', {}).get(name))
 
 
 def _or_error(describe: Callable[[], str]) -> str:
@@ -56,7 +181,26 @@ def _or_error(describe: Callable[[], str]) -> str:
         raise
     except BaseException as error:
         # Also of pytest.fail and pytest.skip, which a timeout of a plugin may raise here.
-        return str(error) if isinstance(error, RecordingError) else f'not available: {error!r}'
+        complete = type(error).__name__ == 'RecordingError'
+        return str(error) if complete else f'not available: {error!r}'
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """List the golden runs that were written."""
+    reports = [one for group in ('passed', 'failed') for one in terminalreporter.stats.get(group, [])]
+    written = [
+        value
+        for report in reports
+        for name, value in getattr(report, 'user_properties', ())
+        if name == WRITTEN and report.when == 'call'
+    ]
+    if written:
+        terminalreporter.section('golden runs')
+        for path in written:
+            terminalreporter.write_line(f'written: {path}')
+
+
+# --- Fixtures
 
 
 @pytest.fixture
@@ -67,82 +211,71 @@ def lockstep(request: pytest.FixtureRequest) -> Iterator[Lockstep]:
         raise TypeError(
             f'the marker lockstep takes args=, start= and patience= only, got {marker.args!r}'
         )
+    try:
+        from diffdrive_jacobian.lockstep import Lockstep
+
+        with warnings.catch_warnings():
+            # Of lark. rclpy imports it with the first message type, within the test.
+            warnings.simplefilter('ignore', DeprecationWarning)
+            importlib.import_module('rosidl_generator_py')
+    except ImportError as error:
+        pytest.fail(_remedy(error), pytrace=False)
     with Lockstep(**(marker.kwargs if marker else {})) as world:
+        request.node.stash[_FIXTURES] = {'lockstep': world}
         yield world
+        del request.node.stash[_FIXTURES]
+
+
+def _remedy(error: ImportError) -> str:
+    return (
+        f'the fixture lockstep needs ROS 2, which cannot be imported: {error}\n'
+        'source the setup file of a ROS 2 Jazzy installation (. /opt/ros/jazzy/setup.bash), or call '
+        "pip install '.[jazzy]' in a clone of diffdrive_jacobian"
+    )
 
 
 @pytest.fixture
 def robot_at(lockstep: Lockstep) -> Callable[..., VirtualRobot]:
     """Return a function that adds a virtual robot with a pose, a namespace and parameters."""
+    from diffdrive_jacobian.testing.robot_at import place_robot
 
     def place(
         x: float = 0.0, y: float = 0.0, theta: float = 0.0, *, namespace: str = '', **parameters: Any
     ) -> VirtualRobot:
-        pose = {'x': float(x), 'y': float(y), 'theta': float(theta)}
-        values = {name.replace('__', '.'): value for name, value in {**pose, **parameters}.items()}
-        known = specifications(VirtualRobotParameters)
-        if unknown := sorted(set(values) - set(known)):
-            raise TypeError(f'virtual_robot has no parameter {unknown[0]!r}; it has {", ".join(known)}')
-        overrides = [Parameter(name, value=value) for name, value in values.items()]
-        return lockstep.add(VirtualRobot(namespace=namespace, parameter_overrides=overrides))
+        return place_robot(lockstep, x, y, theta, namespace, parameters)
 
     return place
 
 
-class RecordedRun:
-    """The recording of a test."""
+@pytest.fixture
+def recorded_run(
+    lockstep: Lockstep, request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[RecordedRun]:
+    """Record the test. `keep()` writes the bag and a figure. A failure of the test does so, too."""
+    from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
-    def __init__(self, world: Lockstep, directory: Path) -> None:
-        """Start to record all topics, into a directory."""
-        self._recording = Recording(directory / 'run', 'mcap', lossless=True)
-        self._finished = False
-        self._error: RecordingError | None = None
-        self._kept: str | None = None
-        recorder = Recorder(Selection(everything=True), self._recording)
-        world.add(recorder)
-        world.on_new_topics(recorder.discover)
-        recorder.discover()
+    name = artifact_name(request.node.nodeid)
+    run = RecordedRun(lockstep, _artifacts(request.config, tmp_path_factory) / name)
+    # Nothing if another fixture replaces `lockstep`.
+    request.node.stash.get(_FIXTURES, {})['recorded_run'] = run
+    yield run
+    run.close()
 
-    def keep(self) -> str:
-        """End the recording and keep it. Return the paths of the bag and of the figure, in two lines.
 
-        The figure needs odometry and matplotlib. Messages after the first call are not recorded. Later
-        calls return or raise the same.
-
-        Raises:
-            RecordingError: The recording is not complete.
-        """
-        if not self._finished:
-            self._finished = True
-            try:
-                self._recording.finish()
-            except RecordingError as error:
-                self._error = error
-        if self._error is not None:
-            raise self._error
-        if self._kept is None:
-            self._kept = self._draw()
-        return self._kept
-
-    def _draw(self) -> str:
-        bag = self._recording.bag
-        picture = bag.with_suffix('.png')
-        try:
-            draw([read_run(bag)], picture)
-        except (BagError, ModuleNotFoundError, OSError) as error:
-            return f'{bag}\nnot drawn: {error}'
-        return f'{bag}\n{picture}'
-
-    def close(self) -> None:
-        """Delete the recording, unless it was kept."""
-        if not self._finished:
-            self._finished = True
-            self._recording.discard()
+def _artifacts(config: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the directory of what recorded_run keeps."""
+    if given := config.getoption('lockstep_artifacts'):
+        return config.invocation_params.dir / str(given)
+    if configured := config.getini('lockstep_artifacts'):
+        return config.rootpath / str(configured)
+    return tmp_path_factory.getbasetemp()
 
 
 @pytest.fixture
-def recorded_run(lockstep: Lockstep, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RecordedRun]:
-    """Record the test. `keep()` writes the bag. A failure of the test does so, too."""
-    run = RecordedRun(lockstep, tmp_path_factory.mktemp('recorded'))
-    yield run
-    run.close()
+def golden_run(recorded_run: RecordedRun, request: pytest.FixtureRequest) -> GoldenRun:
+    """Compare the test with its golden run, when it has passed. `check()` does so with a tolerance."""
+    from diffdrive_jacobian.testing.golden_run import GoldenRun
+
+    test = request.node.nodeid
+    path = request.path.parent / GOLDEN / name_beside_the_file(test)
+    return GoldenRun(recorded_run, path, test, bool(request.config.getoption('update_golden_runs')))

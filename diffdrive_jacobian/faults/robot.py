@@ -1,0 +1,309 @@
+"""Faults of the robot itself: its motors, wheels, encoders, and where it stands.
+
+They change the model of a `VirtualRobot` while it runs. `cmd_vel_out` has the motion of the wheels that
+results. As in a real robot, the encoders see whatever the motors do, and nothing of what happens between
+wheel and ground: `odom` shows the former, and only `ground_truth` the latter.
+
+A fault applies to the robot that has the name, also to one that is created later or again.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+from rclpy.node import Node
+
+from diffdrive_jacobian.faults.fault import Fault
+from diffdrive_jacobian.lockstep import Injection, LockstepError
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.simulation.encoders import MAX_PER_REVOLUTION
+from diffdrive_jacobian.simulation.robot import RobotModel
+from diffdrive_jacobian.simulation.slip import MAX_SEED, Drift
+
+Undo = Callable[[], None]
+"""Ends the effect of a fault on a robot."""
+WHEELS = ('left', 'right')
+
+
+@dataclass(frozen=True, repr=False)
+class RobotFault(Fault):
+    """A fault of a `VirtualRobot`.
+
+    Attributes:
+        robot: Name of its node.
+    """
+
+    robot: str = field(default='virtual_robot', kw_only=True)
+
+    lasting: ClassVar[bool] = True
+    """Whether the fault also applies to a robot that is created again while it lasts."""
+
+    def __post_init__(self) -> None:
+        """Check the fields.
+
+        Raises:
+            ValueError: A value is invalid.
+        """
+        super().__post_init__()
+        self._text('robot')
+
+    @abstractmethod
+    def apply(self, robot: VirtualRobot, injection: Injection) -> Undo | None:
+        """Let the fault begin. Return what ends it; None: nothing does."""
+
+    def install(self, injection: Injection) -> None:
+        """Let the fault happen to the robot, whenever there is one during the fault."""
+        undone: list[tuple[Node, Undo]] = []
+        done = False
+
+        def begin(node: Node) -> None:
+            nonlocal done
+            if not isinstance(node, VirtualRobot):
+                raise LockstepError(
+                    f'{self!r} needs a VirtualRobot, but node {node.get_fully_qualified_name()} is a '
+                    f'{type(node).__name__}'
+                )
+            if self.lasting or not done:
+                done = True
+                undo = self.apply(node, injection)
+                undone[:] = [(node, undo)] if undo is not None else []
+
+        def end(node: Node) -> None:
+            for affected, undo in undone:
+                if affected is node:
+                    undo()
+
+        injection.change_node(self.robot, begin, end)
+
+    def _wheel(self, wheel: str) -> None:
+        """Check the name of a wheel.
+
+        Raises:
+            ValueError: It is another one.
+        """
+        if wheel not in WHEELS:
+            raise ValueError(f"{type(self).__name__}: wheel must be 'left' or 'right', got {wheel!r}")
+
+
+@dataclass(frozen=True, repr=False)
+class DeadWheel(RobotFault):
+    """The motor of a wheel is dead: its wheel stands still at once, whatever is commanded.
+
+    A command to drive straight turns the robot about that wheel. The encoders see it, so `odom` and
+    `joint_states` show the true motion.
+
+    Attributes:
+        wheel: 'left' or 'right'.
+    """
+
+    wheel: str
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        super().__post_init__()
+        self._wheel(self.wheel)
+
+    def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
+        """Stop the wheel."""
+        return robot.impair(_saturating(self.wheel, 0.0))
+
+
+@dataclass(frozen=True, repr=False)
+class SaturatedWheel(RobotFault):
+    """The motor of a wheel is weak: it does not turn its wheel faster than `max_velocity`.
+
+    The robot does not know, so the path bends to the side of that wheel. Its parameter
+    `max_wheel_velocity`, in contrast, slows both wheels down and keeps the curvature. The encoders see
+    it, so `odom` and `joint_states` show the true motion.
+
+    Attributes:
+        wheel: 'left' or 'right'.
+        max_velocity: Largest speed of the wheel (rad/s).
+    """
+
+    wheel: str
+    max_velocity: float
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        super().__post_init__()
+        self._wheel(self.wheel)
+        self._number('max_velocity', low=0.0, above=True)
+
+    def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
+        """Limit the wheel."""
+        return robot.impair(_saturating(self.wheel, self.max_velocity))
+
+
+@dataclass(frozen=True, repr=False)
+class ActuatorLag(RobotFault):
+    """The motors lag: the wheel speeds approach the commanded ones with first order.
+
+    Of a step of the command `1 - exp(-t / seconds)` is reached after the time t. The robot stops as
+    slowly after its timeout. The motion consists of arcs of 20 ms with the mean wheel speeds in them,
+    at whose ends the wheel angles are exact. Each is one message on `cmd_vel_out`. The encoders see the
+    lag, so `odom` and `joint_states` show the true motion. Of several lags the longest one counts.
+
+    Attributes:
+        seconds: Time constant (s).
+    """
+
+    seconds: float
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        super().__post_init__()
+        self._number('seconds', low=0.0, above=True)
+
+    def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
+        """Let the motors lag."""
+
+        def lag(model: RobotModel) -> RobotModel:
+            actuators = model.actuators or Actuators()
+            return replace(model, actuators=replace(actuators, lag=max(actuators.lag, self.seconds)))
+
+        return robot.impair(lag)
+
+
+@dataclass(frozen=True, repr=False)
+class EncoderSteps(RobotFault):
+    """The wheel encoders are coarse: they count whole increments of a turn.
+
+    `odom` is integrated from the counts at each publication, by one exact arc with the distances counted
+    since the one before. `joint_states` and the twist in `odom` are what was counted. The motion itself
+    is unchanged: `ground_truth` shows it. Each wheel is known to one increment, so the heading in `odom`
+    is off by less than `2 r increment / L`. After the fault the odometry goes on from where it is.
+
+    Attributes:
+        per_revolution: Number of increments of a turn of the wheel.
+    """
+
+    per_revolution: int
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        super().__post_init__()
+        self._count('per_revolution')
+        if self.per_revolution > MAX_PER_REVOLUTION:
+            raise ValueError(
+                f'EncoderSteps: per_revolution must be at most {MAX_PER_REVOLUTION}, '
+                f'got {self.per_revolution}'
+            )
+
+    def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
+        """Let the encoders count."""
+        robot.set_encoders(self.per_revolution)
+        return lambda: robot.set_encoders(None)
+
+
+@dataclass(frozen=True, repr=False)
+class Slip(RobotFault):
+    """The wheels slip at random over the ground, as with the parameter `simulate_slip`.
+
+    `odom` and `joint_states` do not notice. `ground_truth` shows where the robot truly is, also after
+    the fault. The parameter `wheel_travel_variance` says how much the wheels slip.
+    """
+
+    def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
+        """Let the wheels slip."""
+        seed = injection.rng('slip').randint(0, MAX_SEED)
+        return robot.impair(lambda model: replace(model, drift=replace(_drift(model), seed=seed)))
+
+
+@dataclass(frozen=True, repr=False)
+class WrongGeometry(RobotFault):
+    """The wheels or their separation differ from what the odometry assumes, or a wheel skids.
+
+    `odom` and `joint_states` do not notice. `ground_truth` shows where the robot truly is, also after
+    the fault. The multipliers are those of the parameters `true_left_wheel_radius_multiplier` and so on,
+    and multiply them. A left wheel that skids, and travels half the distance that it turns, has
+    `left_wheel_radius_multiplier=0.5`.
+
+    Attributes:
+        left_wheel_radius_multiplier: True radius of the left wheel, relative to the assumed one [-].
+        right_wheel_radius_multiplier: True radius of the right wheel [-].
+        wheel_separation_multiplier: True wheel separation [-].
+    """
+
+    left_wheel_radius_multiplier: float = 1.0
+    right_wheel_radius_multiplier: float = 1.0
+    wheel_separation_multiplier: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        super().__post_init__()
+        for name in _MULTIPLIERS:
+            self._number(name, low=0.01, high=100.0)
+
+    def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
+        """Change the true geometry."""
+
+        def differ(model: RobotModel) -> RobotModel:
+            drift = _drift(model)
+            products = {name: getattr(drift, name) * getattr(self, name) for name in _MULTIPLIERS}
+            return replace(model, drift=replace(drift, **products))
+
+        return robot.impair(differ)
+
+
+@dataclass(frozen=True, repr=False)
+class Push(RobotFault):
+    """Somebody pushes the robot, or lifts it elsewhere: its pose is displaced at once, at `start`.
+
+    The displacement is in its own frame: dx forward, dy to the left. The wheels do not turn, so `odom`
+    and `joint_states` do not notice, and `ground_truth` shows it. With `noticed` the odometry is
+    displaced too, as if it was corrected by a localisation, and a new `start_pose` is published. It
+    happens once, whatever the duration.
+
+    Attributes:
+        dx: Displacement forward (m).
+        dy: Displacement to the left (m).
+        dtheta: Turn, counter-clockwise (rad).
+        noticed: Whether the odometry shows it.
+    """
+
+    dx: float = 0.0
+    dy: float = 0.0
+    dtheta: float = 0.0
+    noticed: bool = False
+
+    lasting: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        super().__post_init__()
+        for name in ('dx', 'dy', 'dtheta'):
+            self._number(name)
+        if not isinstance(self.noticed, bool):
+            raise ValueError(f'Push: noticed must be a bool, got {self.noticed!r}')
+
+    def apply(self, robot: VirtualRobot, injection: Injection) -> None:
+        """Displace the robot."""
+        robot.push((self.dx, self.dy, self.dtheta), noticed=self.noticed)
+
+
+_MULTIPLIERS = (
+    'left_wheel_radius_multiplier',
+    'right_wheel_radius_multiplier',
+    'wheel_separation_multiplier',
+)
+
+
+def _drift(model: RobotModel) -> Drift:
+    return model.drift or Drift()
+
+
+def _saturating(wheel: str, speed: float) -> Callable[[RobotModel], RobotModel]:
+    """Return a change of the model that limits the speed of a wheel (rad/s)."""
+    name = f'max_{wheel}_speed'
+
+    def saturate(model: RobotModel) -> RobotModel:
+        actuators = model.actuators or Actuators()
+        limits = {name: min(speed, getattr(actuators, name))}
+        return replace(model, actuators=replace(actuators, **limits))
+
+    return saturate

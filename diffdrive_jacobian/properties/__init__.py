@@ -1,0 +1,45 @@
+"""Properties that must hold in a run of a `Lockstep`, at each time step.
+
+    from diffdrive_jacobian.properties import NeverFasterThan, StatusProtocol
+
+    with Lockstep() as world:
+        world.require(NeverFasterThan(0.5, 2.0), StatusProtocol())
+        ...
+        world.finish()
+
+A violation is raised as a PropertyViolation by the method that advanced time. For properties of your
+own, derive from `Property` and `Watch`.
+"""
+
+from diffdrive_jacobian.lockstep import PropertyViolation
+from diffdrive_jacobian.properties.arrival import ArrivesOnceFaultsEnd
+from diffdrive_jacobian.properties.base import Property, Watch
+from diffdrive_jacobian.properties.canceling import NoCommandAfterCancel
+from diffdrive_jacobian.properties.goals import ReachesGoal, Settles
+from diffdrive_jacobian.properties.places import PoseFinite, StaysNear, StaysWithin
+from diffdrive_jacobian.properties.protocol import StatusProtocol
+from diffdrive_jacobian.properties.speed import AccelerationWithin, NeverFasterThan
+from diffdrive_jacobian.properties.stopping import (
+    StopsAfterLastCommand,
+    StopsAfterLostOdometry,
+    StopsOnShutdown,
+)
+
+__all__ = [
+    'AccelerationWithin',
+    'ArrivesOnceFaultsEnd',
+    'NeverFasterThan',
+    'NoCommandAfterCancel',
+    'PoseFinite',
+    'Property',
+    'PropertyViolation',
+    'ReachesGoal',
+    'Settles',
+    'StatusProtocol',
+    'StaysNear',
+    'StaysWithin',
+    'StopsAfterLastCommand',
+    'StopsAfterLostOdometry',
+    'StopsOnShutdown',
+    'Watch',
+]

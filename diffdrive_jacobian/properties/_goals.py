@@ -1,0 +1,65 @@
+"""Observing goals, cancellations and the pose of the robot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from rclpy.publisher import Publisher
+from rclpy.serialization import deserialize_message
+
+from diffdrive_jacobian.properties._messages import Pose, Twist, planar, pose_reader, twist_reader
+
+STANDING = Twist(0.01, 0.05)
+"""Largest twist of a robot that counts as standing."""
+
+
+class Goal(NamedTuple):
+    """A goal of the robot."""
+
+    pose: Pose
+    seconds: float
+    """World time at which it was sent or received (s)."""
+    stamp: tuple[int, int]
+    """Stamp of its message: sec and nanosec."""
+
+
+def read_goal(message_type: type, message: Any, seconds: float) -> Goal | None:
+    """Return the goal in a PoseStamped, or the last one in a Goals message; None: there is none."""
+    if isinstance(message, bytes):
+        try:
+            message = deserialize_message(message, message_type)
+        except Exception:
+            # rclpy raises several types for bytes that are not a message.
+            return None
+    if hasattr(message, 'goals') and not message.goals:
+        return None
+    pose = message.goals[-1].pose if hasattr(message, 'goals') else message.pose
+    position, orientation = pose.position, pose.orientation
+    stamp = int(message.header.stamp.sec), int(message.header.stamp.nanosec)
+    quaternion = orientation.x, orientation.y, orientation.z, orientation.w
+    return Goal(planar(position.x, position.y, *quaternion), seconds, stamp)
+
+
+class Motion:
+    """The last pose and twist in the odometry of a robot."""
+
+    def __init__(self, changed: Callable[[Pose, Twist], None]) -> None:
+        """Start without odometry. `changed` is called with each pose and its twist."""
+        self.pose: Pose | None = None
+        self.twist: Twist | None = None
+        self._changed = changed
+        self._read_pose, self._read_twist = pose_reader(), twist_reader()
+
+    def on_odometry(self, publisher: Publisher, message: Any) -> None:
+        """Read an Odometry message."""
+        self.pose = self._read_pose(publisher.msg_type, message)
+        self.twist = self._read_twist(publisher.msg_type, message)
+        if self.pose is not None and self.twist is not None:
+            self._changed(self.pose, self.twist)
+
+    @property
+    def stands(self) -> bool:
+        """Whether the robot stands still."""
+        twist = self.twist
+        return twist is not None and (abs(twist.v) <= STANDING.v and abs(twist.omega) <= STANDING.omega)

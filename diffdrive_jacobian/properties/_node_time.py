@@ -1,0 +1,77 @@
+"""The time that a node had to react, which faults of the node and of its clock shorten."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from rclpy.node import Node
+
+from diffdrive_jacobian.faults import nodes as node_faults
+from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.time_units import NANOSECONDS
+
+ROUNDING = 1e-9
+"""Tolerance on times (s)."""
+_AT_ONCE = ('TimeJump', 'Push')
+"""Faults that happen once, when they begin, also if they have no end."""
+
+
+class ReactionTime:
+    """Measures the time that a node had to react to something.
+
+    It is world time, except that it does not pass while the clock of the nodes stands still. Where the
+    clock jumps, a timer that measures a time may start again, so the measurement does too.
+    """
+
+    def __init__(self, world: Lockstep) -> None:
+        """Start to measure."""
+        self._world = world
+        self._world_time, self._clock = world.world_time, world.now
+        self._passed = 0
+        self._jumped = -math.inf
+
+    def now(self) -> float:
+        """Return the time that has passed (s)."""
+        world_time, clock = self._world.world_time, self._world.now
+        by_world, by_clock = world_time - self._world_time, clock - self._clock
+        self._world_time, self._clock = world_time, clock
+        if 0 <= by_clock <= by_world:
+            self._passed += by_clock
+        else:
+            self._passed += by_world
+            self._jumped = self._passed / NANOSECONDS
+        return self._passed / NANOSECONDS
+
+    def since(self, time: float) -> float:
+        """Return how long ago a time was for a timer of a node (s)."""
+        return self.now() - max(time, self._jumped)
+
+
+def delays(world: Lockstep, node: Node, since: float) -> float:
+    """Return by how much faults of a node may have delayed its reaction since a world time (s)."""
+    name, now = node.get_fully_qualified_name(), world.world_time / NANOSECONDS
+    total = 0.0
+    for fault in world.faults:
+        if getattr(fault, 'node', '').lstrip('/') != name.lstrip('/'):
+            continue
+        overlap = min(now, fault.start + fault.duration) - max(since, fault.start)
+        if isinstance(fault, node_faults.Hang):
+            total += max(overlap, 0.0)
+        elif isinstance(fault, node_faults.Slow) and overlap > -2.0 * fault.seconds:
+            # A callback that has begun, then that of the timer.
+            total += 2.0 * fault.seconds
+        elif isinstance(fault, node_faults.TimerJitter) and overlap > -fault.seconds:
+            total += fault.seconds
+    return total
+
+
+def end_of_faults(world: Lockstep) -> float:
+    """Return the world time at which the last fault ends (s); infinite: one of them has no end."""
+    return max(map(_end, world.faults), default=0.0)
+
+
+def _end(fault: Any) -> float:
+    if math.isinf(fault.duration) and type(fault).__name__ in _AT_ONCE:
+        return float(fault.start)
+    return float(fault.start + fault.duration)

@@ -1,0 +1,155 @@
+"""The base classes of all properties."""
+
+from __future__ import annotations
+
+import math
+import numbers
+from abc import ABC, abstractmethod
+from collections import deque
+from dataclasses import MISSING, dataclass, field, fields
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+
+from diffdrive_jacobian.faults.fault import literal
+from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.time_units import NANOSECONDS
+
+RECENT = 5
+"""Number of messages that a violation lists."""
+
+
+@dataclass(frozen=True, repr=False)
+class Property(ABC):
+    """Something that must hold in a run of a `Lockstep`. Required by `Lockstep.require`.
+
+    A property is a value. It can be compared, pickled, and printed as the expression that makes it. What
+    it observes of a run is in the Watch that `watch` returns.
+
+    Attributes:
+        namespace: Namespace of the topics, such as '/robot1' (default: that of the `Lockstep`).
+    """
+
+    namespace: str = field(default='', kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Check the fields.
+
+        Raises:
+            ValueError: A field is invalid.
+        """
+        self._text('namespace', empty=True)
+
+    @abstractmethod
+    def watch(self, world: Lockstep) -> Watch:
+        """Begin to observe a run, and return what observes it."""
+
+    def resolved(self, name: str) -> str:
+        """Return the name of a topic or service with the namespace of this property."""
+        if not self.namespace or name.startswith('/'):
+            return name
+        return f'{self.namespace.rstrip("/")}/{name}'
+
+    def __repr__(self) -> str:
+        """Return the expression that makes this property."""
+        shown = []
+        for one in sorted(fields(self), key=lambda one: bool(one.kw_only)):
+            value = getattr(self, one.name)
+            if one.default is MISSING and not one.kw_only:
+                shown.append(literal(value))
+            elif value != one.default:
+                shown.append(f'{one.name}={literal(value)}')
+        return f'{type(self).__name__}({", ".join(shown)})'
+
+    def _number(self, name: str, *, infinite: bool = True, zero: bool = True) -> None:
+        """Check that a field is a number that is not negative, and make it a float.
+
+        Args:
+            name: Name of the field.
+            infinite: Whether it may be infinite.
+            zero: Whether it may be zero.
+
+        Raises:
+            ValueError: It is not.
+        """
+        value = getattr(self, name)
+        is_number = not isinstance(value, bool) and isinstance(value, numbers.Real)
+        valid = is_number and float(value) >= 0.0
+        if not valid or (math.isinf(value) and not infinite) or (value == 0.0 and not zero):
+            allowed = f'a{"" if infinite else " finite"} number {"of at least" if zero else "above"} 0'
+            raise ValueError(f'{type(self).__name__}: {name} must be {allowed}, got {value!r}')
+        object.__setattr__(self, name, float(value))
+
+    def _text(self, name: str, *, empty: bool = False) -> None:
+        """Check that a field is a string.
+
+        Raises:
+            ValueError: It is not, or it is empty and must not be.
+        """
+        value = getattr(self, name)
+        if not isinstance(value, str) or not (value or empty):
+            kind = 'a string' if empty else 'a string that is not empty'
+            raise ValueError(f'{type(self).__name__}: {name} must be {kind}, got {value!r}')
+
+    def _texts(self, name: str) -> None:
+        """Check that a field is a sequence of strings, and make it a tuple.
+
+        Raises:
+            ValueError: It is not.
+        """
+        value = getattr(self, name)
+        if isinstance(value, str) or not all(isinstance(one, str) and one for one in value):
+            raise ValueError(f'{type(self).__name__}: {name} must be a tuple of names, got {value!r}')
+        object.__setattr__(self, name, tuple(value))
+
+
+class Watch:
+    """What observes one run for one property. Base class.
+
+    What it observes it stores. The methods return violations, which `Lockstep` raises: an exception
+    within an observing function would be raised in the node that publishes.
+    """
+
+    def __init__(self, world: Lockstep) -> None:
+        """Observe a run."""
+        self.world = world
+        self._recent: deque[str] = deque(maxlen=RECENT)
+        self._found: str | None = None
+        self._owners: dict[Publisher, Node | None] = {}
+
+    @property
+    def seconds(self) -> float:
+        """World time since the start of the `Lockstep` (s)."""
+        return self.world.world_time / NANOSECONDS
+
+    def check(self) -> str | None:
+        """Return what is violated at the current time, after all callbacks; None: nothing."""
+        return self._found
+
+    def finish(self) -> str | None:
+        """Return what is violated at the end of the run; None: nothing."""
+        return None
+
+    def owner(self, publisher: Publisher) -> Node | None:
+        """Return the node that has a publisher; None: it was removed."""
+        if publisher not in self._owners:
+            self._owners[publisher] = self.world.node_of(publisher)
+        return self._owners[publisher]
+
+    @staticmethod
+    def _is_named(node: Node, name: str) -> bool:
+        """Return whether a node has a name. Each one has the empty name."""
+        return not name or node.get_fully_qualified_name().lstrip('/') == name.lstrip('/')
+
+    def note(self, text: str) -> None:
+        """Note something that happened, for the description of a violation."""
+        self._recent.append(f'  {self.seconds:.9g} s: {text}')
+
+    def found(self, text: str) -> None:
+        """Note a violation, which `check` will return. Only the first one counts."""
+        if self._found is None:
+            self._found = self.described(text)
+
+    def described(self, text: str) -> str:
+        """Return a text with what happened last."""
+        return '\n'.join([text, *(['before that:'] if self._recent else []), *self._recent])

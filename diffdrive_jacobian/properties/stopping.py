@@ -1,0 +1,285 @@
+"""Stopping: when odometry is lost, when commands are lost, and when a node is shut down."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+
+from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.properties._messages import Twist, twist_reader
+from diffdrive_jacobian.properties._node_time import ROUNDING, ReactionTime, delays
+from diffdrive_jacobian.properties.base import Property, Watch
+
+
+@dataclass(frozen=True, repr=False)
+class StopsAfterLostOdometry(Property):
+    """A controller stops the robot within a time after it has received its last odometry.
+
+    A controller is a node that publishes `commands` and is subscribed to `odom`. What counts is the
+    odometry that it receives, after all faults of the topic, and the command that it has published last,
+    whether or not that arrives: longer than `within` after the last odometry it must be zero. Before its
+    first odometry the time counts from its first command. Nodes that were removed or killed cannot stop
+    anything, and are not checked.
+
+    The time is what a timer of the node can measure. It does not pass while the clock of the nodes
+    stands still or the node is frozen (`Hang`), it starts again where the clock jumps, and it is longer
+    for a node that is slow (`Slow`: by two callbacks) or whose timers jitter (`TimerJitter`).
+
+    Attributes:
+        within: Longest time (s).
+        node: Name of the controller (default: all).
+        odom: Topic of the odometry (default: 'odom').
+        commands: Topic of type Twist or TwistStamped (default: 'cmd_vel').
+    """
+
+    within: float
+    node: str = field(default='', kw_only=True)
+    odom: str = field(default='odom', kw_only=True)
+    commands: str = field(default='cmd_vel', kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        super().__post_init__()
+        self._number('within', infinite=False)
+        self._text('node', empty=True)
+        self._text('odom')
+        self._text('commands')
+
+    def watch(self, world: Lockstep) -> Watch:
+        """Begin to observe a run."""
+        return _LostOdometryWatch(self, world)
+
+
+class _Controller:
+    """A node that publishes commands, and may receive odometry."""
+
+    def __init__(self, node: Node, now: float, seconds: float) -> None:
+        self.node = node
+        self.command = Twist(0.0, 0.0)
+        self.received, self.seconds = now, seconds
+        self.subscribed = False
+
+
+class _LostOdometryWatch(Watch):
+    def __init__(self, required: StopsAfterLostOdometry, world: Lockstep) -> None:
+        super().__init__(world)
+        self._required = required
+        self._read = twist_reader()
+        self._time = ReactionTime(world)
+        self._controllers: dict[Node, _Controller] = {}
+        world.expect(required.resolved(required.commands))
+        self._commands = world.on_published(required.resolved(required.commands), self._on_command)
+        world.expect(required.resolved(required.odom))
+        self._odom = world.on_delivered(required.resolved(required.odom), self._on_odometry)
+
+    def _on_odometry(self, node: Node, _: type, __: Any) -> None:
+        controller = self._controllers.get(node)
+        if controller is None:
+            controller = self._controllers[node] = _Controller(node, self._time.now(), self.seconds)
+        else:
+            # Steps of time may be long: this one may come too late.
+            self._check(controller)
+        controller.received, controller.seconds = self._time.now(), self.seconds
+        controller.subscribed = True
+        if controller.command.v or controller.command.omega:
+            self.note(f'{self._odom} was received by {node.get_fully_qualified_name()}')
+
+    def _on_command(self, publisher: Publisher, message: Any) -> None:
+        node = self.owner(publisher)
+        twist = self._read(publisher.msg_type, message)
+        if node is None or twist is None:
+            return
+        controller = self._controllers.get(node)
+        if controller is None:
+            controller = self._controllers[node] = _Controller(node, self._time.now(), self.seconds)
+        if not controller.subscribed:
+            controller.subscribed = any(one.topic_name == self._odom for one in node.subscriptions)
+        controller.command = twist
+        self.note(f'{self._commands}: {twist}')
+
+    def check(self) -> str | None:
+        """Return that a controller has not stopped in time; None: all have."""
+        for controller in self._controllers.values():
+            if not controller.command.is_zero:
+                self._check(controller)
+        return self._found
+
+    def _check(self, controller: _Controller) -> None:
+        passed, required = self._time.since(controller.received), self._required
+        if controller.command.is_zero or passed <= required.within + ROUNDING:
+            return
+        if controller.node not in self.world.nodes:
+            # It cannot stop anything any more.
+            controller.command = Twist(0.0, 0.0)
+            return
+        if not controller.subscribed or not self._is_named(controller.node, required.node):
+            return
+        allowed = required.within + delays(self.world, controller.node, controller.seconds)
+        if passed > allowed + ROUNDING:
+            name = controller.node.get_fully_qualified_name()
+            self.found(
+                f'the last command of {name} is {controller.command}, {passed:.6g} s after it has '
+                f'received its last message on {self._odom}; allowed: {allowed:g} s'
+            )
+
+
+@dataclass(frozen=True, repr=False)
+class StopsAfterLastCommand(Property):
+    """A robot stands still when it has not received a command for a time.
+
+    A robot is a node that publishes `odom` and is subscribed to `commands`. What counts are the commands
+    that it receives, after all faults of the topic, and the twists that it publishes in its odometry.
+    The time is measured as for `StopsAfterLostOdometry`.
+
+    Attributes:
+        within: Longest time (s).
+        node: Name of the robot (default: all).
+        odom: Topic of the odometry (default: 'odom').
+        commands: Topic of the commands, of any type (default: 'cmd_vel').
+        v: Largest speed that counts as standing (m/s) (default: 0.001).
+        omega: Largest yaw rate that counts as standing (rad/s) (default: 0.001).
+    """
+
+    within: float
+    node: str = field(default='', kw_only=True)
+    odom: str = field(default='odom', kw_only=True)
+    commands: str = field(default='cmd_vel', kw_only=True)
+    v: float = field(default=0.001, kw_only=True)
+    omega: float = field(default=0.001, kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        super().__post_init__()
+        for name in ('within', 'v', 'omega'):
+            self._number(name, infinite=False)
+        self._text('node', empty=True)
+        self._text('odom')
+        self._text('commands')
+
+    def watch(self, world: Lockstep) -> Watch:
+        """Begin to observe a run."""
+        return _LastCommandWatch(self, world)
+
+
+class _LastCommandWatch(Watch):
+    def __init__(self, required: StopsAfterLastCommand, world: Lockstep) -> None:
+        super().__init__(world)
+        self._required = required
+        self._read = twist_reader()
+        self._time = ReactionTime(world)
+        self._received: dict[Node, tuple[float, float]] = {}
+        self._robots: dict[Node, bool] = {}
+        world.expect(required.resolved(required.odom))
+        self._odom = world.on_published(required.resolved(required.odom), self._on_odometry)
+        world.expect(required.resolved(required.commands))
+        self._commands = world.on_delivered(required.resolved(required.commands), self._on_command)
+
+    def _on_command(self, node: Node, _: type, __: Any) -> None:
+        self._received[node] = self._time.now(), self.seconds
+        self.note(f'{self._commands} was received by {node.get_fully_qualified_name()}')
+
+    def _on_odometry(self, publisher: Publisher, message: Any) -> None:
+        now = self._time.now()
+        twist = self._read(publisher.msg_type, message)
+        if twist is None or (
+            abs(twist.v) <= self._required.v and abs(twist.omega) <= self._required.omega
+        ):
+            return
+        node = self.owner(publisher)
+        if node is None or not self._is_robot(node):
+            return
+        received, seconds = self._received.setdefault(node, (now, self.seconds))
+        passed, within = self._time.since(received), self._required.within
+        if passed <= within + ROUNDING:
+            return
+        allowed = within + delays(self.world, node, seconds)
+        if passed > allowed + ROUNDING:
+            self.found(
+                f'{self._odom}: {twist}, {passed:.6g} s after {node.get_fully_qualified_name()} has '
+                f'received its last message on {self._commands}; allowed: {allowed:g} s'
+            )
+
+    def check(self) -> str | None:
+        """Return that a robot has not stopped in time; None: all have."""
+        # Where the clock jumps is noticed only when it is read.
+        self._time.now()
+        return self._found
+
+    def _is_robot(self, node: Node) -> bool:
+        """Return whether a node is a robot that is checked."""
+        if node not in self._robots:
+            self._robots[node] = self._is_named(node, self._required.node) and any(
+                one.topic_name == self._commands for one in node.subscriptions
+            )
+        return self._robots[node]
+
+
+@dataclass(frozen=True, repr=False)
+class StopsOnShutdown(Property):
+    """A node that is shut down leaves with a command of zero.
+
+    When a node has been destroyed (`destroy_node`), the last command that it has published must be zero,
+    if it has published any. Nodes that were killed (`Lockstep.remove`, `Kill`) are not checked: nothing
+    of them runs any more.
+
+    Attributes:
+        node: Name of the node (default: all that publish commands).
+        commands: Topic of type Twist or TwistStamped (default: 'cmd_vel').
+    """
+
+    node: str = field(default='', kw_only=True)
+    commands: str = field(default='cmd_vel', kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        super().__post_init__()
+        self._text('node', empty=True)
+        self._text('commands')
+
+    def watch(self, world: Lockstep) -> Watch:
+        """Begin to observe a run."""
+        return _ShutdownWatch(self, world)
+
+
+class _ShutdownWatch(Watch):
+    def __init__(self, required: StopsOnShutdown, world: Lockstep) -> None:
+        super().__init__(world)
+        self._required = required
+        self._read = twist_reader()
+        self._last: dict[Node, tuple[str, Twist]] = {}
+        world.expect(required.resolved(required.commands))
+        self._commands = world.on_published(required.resolved(required.commands), self._on_command)
+
+    def _on_command(self, publisher: Publisher, message: Any) -> None:
+        node, twist = self.owner(publisher), self._read(publisher.msg_type, message)
+        if node is None or twist is None or node is self.world.node:
+            return
+        if node in self._last:
+            name = self._last[node][0]
+        elif self._is_named(node, self._required.node):
+            name = node.get_fully_qualified_name()
+        else:
+            return
+        self._last[node] = name, twist
+        self.note(f'{self._commands}: {twist}')
+
+    def check(self) -> str | None:
+        """Return that a node has left while the robot moved; None: none has."""
+        if self._last.keys() - self.world.nodes:
+            for node, (name, twist) in list(self._last.items()):
+                if node in self.world.nodes:
+                    continue
+                del self._last[node]
+                if not twist.is_zero and node not in self.world.killed:
+                    self.found(
+                        f'{name} was shut down after the command {twist}; allowed: a command of zero '
+                        'before'
+                    )
+        return self._found
+
+    def finish(self) -> str | None:
+        """As `check`."""
+        return self.check()

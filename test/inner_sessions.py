@@ -1,0 +1,44 @@
+"""Sessions of pytest within a test: as a user of the package has them, in a directory of their own.
+
+They run in this process, which costs a tenth of a process. pytester removes what they import from
+`sys.modules`, so everything with C extensions, and what they share with the tests, is imported before.
+"""
+
+from __future__ import annotations
+
+from textwrap import dedent
+
+import geometry_msgs.msg  # noqa: F401
+import matplotlib.pyplot  # noqa: F401
+import nav_msgs.msg  # noqa: F401
+import rosidl_generator_py  # noqa: F401
+
+import diffdrive_jacobian.nodes.go_to_goal
+import diffdrive_jacobian.testing.golden_run
+import diffdrive_jacobian.testing.robot_at  # noqa: F401
+
+SETTING = """
+    import pytest
+    from geometry_msgs.msg import Twist
+    from nav_msgs.msg import Odometry
+    from diffdrive_jacobian.testing import LockstepError
+"""
+# Hypothesis would be imported for its report of each failure.
+OPTIONS = (
+    *('-p', 'no:hypothesispytest', '-p', 'no:xdist', '-p', 'no:cacheprovider'),
+    *('-W', 'error', '-W', 'ignore::pytest.PytestAssertRewriteWarning'),
+)
+
+
+def draw_quickly(monkeypatch):
+    """Replace the figure of a recorded run, which takes a second, by a file."""
+    monkeypatch.setattr(
+        'diffdrive_jacobian.testing.recorded_run.draw', lambda _, path: path.write_bytes(b'a figure')
+    )
+
+
+def run_inner(pytester, tests, *options, **files):
+    """Run tests, without any conftest.py; gives the result."""
+    name = f'test_{len(list(pytester.path.glob("test_*.py")))}'
+    pytester.makepyfile(**{name: dedent(SETTING) + dedent(tests)}, **files)
+    return pytester.runpytest_inprocess(*OPTIONS, *options, f'{name}.py')
