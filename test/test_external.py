@@ -19,7 +19,7 @@ from processes import PROGRAM
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from diffdrive_jacobian.faults import Loss
+from diffdrive_jacobian.faults import ClockPause, Kill, Loss, TimeJump
 from diffdrive_jacobian.lockstep import Answers, Every, Idle, Lockstep, LockstepError
 from diffdrive_jacobian.lockstep import _external_process as external_process
 from diffdrive_jacobian.lockstep._external_answers import AnswersDue, TicksDue
@@ -30,7 +30,7 @@ SECOND = 1_000_000_000
 SCRIPT = external_nodes.__file__
 GO_TO_GOAL = (sys.executable, '-c', PROGRAM.format('go_to_goal'))
 QUICK = ('--ros-args', '-p', 'kp:=24.0', '-p', 'kv:=12.0')
-_starts = itertools.count(10)
+_starts = itertools.count(100, step=100)
 
 
 def odometry(x=0.0):
@@ -65,7 +65,7 @@ def gallery():
 def world_of(gallery):
     """Return a function that opens a world with declarations in the domain of the gallery.
 
-    Time never goes back, so that the timers of the gallery keep their phases.
+    Each starts later than all before, so that the timers of the gallery keep their phases.
     """
     worlds = []
 
@@ -170,14 +170,14 @@ def test_a_timer_of_another_process_expires_on_time(world_of):
     before = world.now
     world.run_for(0.1)
     assert [stamp(command) - before for command in commands[7:]] == [SECOND // 20, SECOND // 10]
-    world.jump(20.0)
 
 
 def test_a_node_that_is_idle_has_answered_what_it_will(world_of):
     world = world_of(Idle('ticker'), Idle('echo'), Idle('follower'), Idle('mute'))
     names = ('ticker', 'echo', 'follower', 'mute')
     commands = {name: world.listen(TwistStamped, f'{name}/cmd_vel') for name in names}
-    world.run_for(0.001)
+    publisher = world.node.create_publisher(Odometry, 'ticker/odom', 10)
+    world.node.create_timer(external_nodes.PERIOD, lambda: publisher.publish(odometry()))
     numbers = []
     for number in range(20):
         world.publish('mute/odom', odometry())
@@ -185,7 +185,9 @@ def test_a_node_that_is_idle_has_answered_what_it_will(world_of):
         numbers.append([len(commands[name]) for name in names[1:]])
         world.run_for(0.05)
     assert numbers == [[number, number, 0] for number in range(1, 21)]
-    assert len(commands['ticker']) in (20, 21)
+    # At each time its timer expires before the messages of that time arrive.
+    first, *others = [command.twist.linear.x for command in commands['ticker']]
+    assert others == [first + number for number in range(20)]
 
 
 def test_only_questions_under_a_condition_are_answered(world_of):
@@ -232,6 +234,43 @@ def test_a_fault_of_a_topic_that_turns_out_to_be_external_is_refused(world_of):
     world.inject(Loss('echo/odom'))
     with pytest.raises(LockstepError, match=r"Loss\('echo/odom'\) cannot affect /echo"):
         world.connect()
+
+
+def test_the_clock_jumps_and_stands_still_for_external_timers_too(world_of):
+    world = world_of(Every('ticker/cmd_vel', external_nodes.PERIOD), Idle('ticker'))
+    commands = world.listen(TwistStamped, 'ticker/cmd_vel')
+    start = world.now
+    world.inject(
+        TimeJump(-2.0, start=0.22), ClockPause(start=0.4, duration=1.0), TimeJump(5.01, start=1.5)
+    )
+    world.run_for(2.0)
+    ticks = [(stamp(command) - start) / SECOND for command in commands]
+    before = [0.0, 0.05, 0.1, 0.15, 0.2]
+    # The jump back restarts the period. One tick comes at the jump forward, which keeps the phase.
+    back = [-1.73, -1.68, -1.63, -1.58, -1.53]
+    forward = [3.51, *(3.52 + 0.05 * number for number in range(10))]
+    assert ticks == pytest.approx([*before, *back, *forward])
+
+
+def test_a_node_of_the_world_that_is_killed_and_made_again_is_discovered_again(world_of):
+    world = world_of(Answers('echo/cmd_vel', to='echo/odom'))
+    received = []
+
+    def make():
+        robot = Node('robot')
+        robot.create_subscription(
+            TwistStamped, 'echo/cmd_vel', lambda m: received.append(m.twist.linear.x), 10
+        )
+        publisher = robot.create_publisher(Odometry, 'echo/odom', 10)
+        robot.create_timer(0.1, lambda: publisher.publish(odometry(world.elapsed)))
+        return robot
+
+    world.create(make)
+    world.inject(Kill('robot', start=0.45, duration=0.5))
+    world.run_for(1.5)
+    # What is sent at the time at which it is made again may be lost.
+    received = [x for x in received if x != pytest.approx(0.95)]
+    assert received == pytest.approx([0.1, 0.2, 0.3, 0.4, 1.0, 1.1, 1.2, 1.3, 1.4, 1.5])
 
 
 # --- What goes wrong

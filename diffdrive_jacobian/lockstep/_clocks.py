@@ -32,6 +32,7 @@ class Clocks:
         self._clocks: list[SimulatedClock] = []
         self._message = Clock()
         self._now = 0
+        self._announced = 0
 
     def find(self, nodes: Iterable[Node]) -> set[Subscription]:
         """Find the clocks of nodes. Return the subscriptions to /clock that are replaced.
@@ -54,8 +55,15 @@ class Clocks:
         time = Time(nanoseconds=now, clock_type=ClockType.ROS_TIME)
         for clock in self._clocks:
             clock.set(time)
-        if self.publisher is not None and self.publisher.get_subscription_count() > len(self._clocks):
+        if self.publisher is None or now == self._announced:
+            return
+        if self.publisher.get_subscription_count() > len(self._clocks):
             self.publish()
+
+    def announce(self, now: int) -> None:
+        """Publish the time (ns), before the clocks of the nodes are set to it."""
+        self._now = self._announced = now
+        self.publish()
 
     def publish(self) -> None:
         """Publish the time that was set last, once more."""

@@ -163,6 +163,10 @@ class External:
         self._executor.clocks.enabled = True
         self._executor.clocks.publish()
 
+    def topics(self) -> list[str]:
+        """Return the declared topics that have an external publisher."""
+        return list(self._topics)
+
     def _awaits(self, process: ExternalProcess) -> bool:
         return self._expectations.include(process)
 
@@ -245,19 +249,27 @@ class External:
         asked = self._ask_idle()
         return asked or any(topic.count() > topic.delivered for topic in self._topics.values())
 
+    def announce(self) -> None:
+        """Publish the time, and wait for what the timers of other processes send.
+
+        They expire before those of the world. Otherwise it would depend on the machine whether the
+        messages of one time reach a node before its timer expires.
+        """
+        if self.began and not self._executor.clock_pauses:
+            self._executor.clocks.announce(self._now())
+            self.await_answers()
+
     def release(self) -> None:
         """Deliver what was received to the nodes of the world, in the order of the declarations."""
         for topic in self._topics.values():
-            received = topic.count()
-            new, topic.delivered = received - topic.delivered, received
-            if new:
-                self._traffic.note_external(topic.topic_name, topic.msg_type, new, topic.last)
+            messages = topic.deliver()
+            self._traffic.note_external(topic, messages)
             for reader in self._executor.deliveries.readers_of(topic.topic_name):
                 if reader.subscription not in self._endpoints:
                     # It was created at this time.
                     continue
                 # A shorter queue has lost the first ones.
-                for _ in range(min(new, reader.depth)):
+                for _ in range(min(len(messages), reader.depth)):
                     self._deliver(reader)
 
     def until_next(self) -> int | None:

@@ -44,6 +44,10 @@ class ExternalGraph:
         """Return the external subscriptions of a topic."""
         return self._external(self._node.get_subscriptions_info_by_topic(topic))
 
+    def own(self, infos: Iterable[TopicEndpointInfo]) -> list[TopicEndpointInfo]:
+        """Return the endpoints of the world."""
+        return [info for info in infos if bytes(info.endpoint_gid)[:PARTICIPANT] == self._own]
+
     def _external(self, infos: Iterable[TopicEndpointInfo]) -> list[TopicEndpointInfo]:
         return [info for info in infos if bytes(info.endpoint_gid)[:PARTICIPANT] != self._own]
 

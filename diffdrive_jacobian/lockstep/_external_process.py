@@ -182,7 +182,7 @@ class ExternalProcess:
             state = f'{self.command} was ended by {_signal_name(-code)}'
         else:
             state = f'{self.command} has exited with {code}'
-        printed = (self.stderr or self.stdout).splitlines()
+        printed = (self._printed(1) or self._printed(0)).splitlines()
         return '\n    '.join([state, *printed[-SHOWN_LINES:]])
 
 

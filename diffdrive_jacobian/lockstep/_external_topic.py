@@ -54,8 +54,7 @@ class ExternalTopic:
         self._take, self._release = message_taker(self.subscription)
         self._taken = 0
         self._not_counted = -traffic.count(topic)
-        self.last = b''
-        """The last message."""
+        self._messages: list[bytes] = []
         self.delivered = 0
         """Number of those that the nodes of the world have received."""
 
@@ -63,13 +62,22 @@ class ExternalTopic:
         """Return the number of messages from other processes so far."""
         while (taken := self._take(self.msg_type, True)) is not None:
             self._taken += 1
-            self.last = taken[0]
+            self._messages.append(taken[0])
         return self._taken - self._traffic.count(self.topic_name) - self._not_counted
+
+    def deliver(self) -> list[bytes]:
+        """Return the messages since the last call, the oldest first, and count them as delivered."""
+        received = self.count()
+        new, self.delivered = received - self.delivered, received
+        # With messages of the world among them, it is not known which are which.
+        messages, self._messages = self._messages[len(self._messages) - new :], []
+        return messages
 
     def restart(self) -> None:
         """Count from zero."""
         self._not_counted += self.count()
         self.delivered = 0
+        self._messages.clear()
 
     def close(self) -> None:
         """Destroy the subscription."""

@@ -85,6 +85,8 @@ class Messaging(SimulatedTime):
         # It remaps the name.
         endpoints = self.node.get_subscriptions_info_by_topic(given)
         # By number: two nodes can have one name, and the graph loses it when one of them is destroyed.
+        if self._external is not None:
+            endpoints = self._external.graph.own(endpoints)
         if len(endpoints) <= served.total():
             return
         named = Counter(f'{end.node_namespace.rstrip("/")}/{end.node_name}' for end in endpoints)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import count
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
@@ -24,8 +24,18 @@ OMITTED = ('/clock', '/fault_events', '/parameter_events', '/rosout')
 """Topics that are not reported."""
 
 
-Published: TypeAlias = Callable[[Publisher, Any], None]
-"""Receives a publisher and the message or bytes that it has published."""
+Published: TypeAlias = Callable[[Any, Any], None]
+"""Receives a publisher and the message or bytes that it has published.
+
+For messages from other processes an `ExternalSource` takes the place of the publisher.
+"""
+
+
+class ExternalSource(Protocol):
+    """What has messages from other processes, with the attributes of a publisher."""
+
+    topic_name: str
+    msg_type: Any
 
 
 class _Record:
@@ -68,10 +78,10 @@ class Traffic:
         """Start without messages. `now` returns the simulated time (ns)."""
         self._now = now
         self._records: dict[Publisher, _Record] = {}
-        self._observers: dict[str, list[Published]] = {}
         self._external: dict[str, _Record] = {}
         self._numbers = count(1)
         self._deliveries: Deliveries | None = None
+        self._observers: dict[str, list[Published]] = {}
         self._restore: Callable[[], None] | None = None
         self.intercept: Callable[[Publisher, Any], bool] | None = None
         """Called with each message. It returns whether it sends the message itself."""
@@ -89,8 +99,8 @@ class Traffic:
                 publish(self, msg)
                 record = records.get(self)
                 if record is None:
-                    observers = observers_of(self.topic_name)
-                    record = _Record(self.topic_name, self.msg_type, deliveries, observers)
+                    name = self.topic_name
+                    record = _Record(name, self.msg_type, deliveries, observers_of(name))
                     records[self] = record
                 record.count += 1
                 record.order = next(numbers)
@@ -119,7 +129,7 @@ class Traffic:
 
     def last(self, topic: str) -> Any:
         """Return the last message of a topic as it was received; None: there is none."""
-        records = [record for record in self._all() if record.topic == topic]
+        records = [record for record in self._all() if record.topic == topic and record.count]
         return max(records, key=lambda record: record.order).received() if records else None
 
     def count(self, topic: str) -> int:
@@ -137,25 +147,26 @@ class Traffic:
             if record.topic not in OMITTED and _subscriptions(publisher) > len(record.readers)
         )
 
-    def note_external(self, topic: str, message_type: Any, number: int, last: bytes) -> None:
-        """Count messages from other processes.
+    def note_external(self, source: ExternalSource, messages: Sequence[bytes]) -> None:
+        """Count messages from other processes on a topic.
 
         Args:
-            topic: Full name of the topic.
-            message_type: Its type.
-            number: Number of messages.
-            last: The last one, serialized.
+            source: The topic, which takes the place of a publisher.
+            messages: The messages, serialized.
         """
         assert self._deliveries is not None, 'start comes first'
-        record = self._external.get(topic)
+        name = source.topic_name
+        record = self._external.get(name)
         if record is None:
-            observers = self.observers_of(topic)
-            record = _Record(topic, message_type, self._deliveries, observers)
-            self._external[topic] = record
-        record.count += number
-        record.order = next(self._numbers)
-        record.at = self._now()
-        record.message = last
+            record = _Record(name, source.msg_type, self._deliveries, self.observers_of(name))
+            self._external[name] = record
+        for message in messages:
+            record.count += 1
+            record.order = next(self._numbers)
+            record.at = self._now()
+            record.message = message
+            for observer in record.observers:
+                observer(source, message)
 
     def _all(self) -> list[_Record]:
         return [*self._records.values(), *self._external.values()]
@@ -179,7 +190,11 @@ class Traffic:
             (record.topic, names.get(publisher, 'a removed node'), record)
             for publisher, record in self._records.items()
             if record.topic not in OMITTED
-        ] + [(topic, 'other processes', record) for topic, record in self._external.items()]
+        ] + [
+            (topic, 'other processes', record)
+            for topic, record in self._external.items()
+            if record.count
+        ]
         lines = [
             f'  {topic}: {record.count} from {node}, last at {record.at / NANOSECONDS:g} s: '
             f'{brief(record.received())}'

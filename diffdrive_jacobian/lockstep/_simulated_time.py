@@ -174,6 +174,8 @@ class SimulatedTime:
 
     def _publish_clock(self) -> None:
         __tracebackhide__ = True
+        if self._external is not None:
+            self._external.announce()
         with self._watched():
             self._until_next = self._executor.advance(self._now)
         self._await_others()
