@@ -66,9 +66,11 @@ setup(
             'ros-unique-identifier-msgs==2.5.0',
         ],
         'doc': ['pdoc>=15'],
+        'explore': ['hypothesis>=6'],
         'live': ['websockets>=15'],
         'plot': ['matplotlib>=3.5'],
         'test': [
+            'distributed',
             'mcap>=1.2',
             'hypothesis>=6',
             'matplotlib>=3.5',

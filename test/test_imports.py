@@ -20,7 +20,8 @@ LAYERS = (
     *('kinematics', 'control', 'simulation', 'calibration', 'sweeps'),
     *('messages', 'parameters', 'bags'),
     *('recovery', 'reading', 'diagnosis'),
-    *('plots', 'ros', 'nodes', 'recording', 'replay', 'lockstep', 'faults', 'properties', 'drives'),
+    *('plots', 'ros', 'nodes', 'recording', 'replay', 'lockstep', 'faults', 'properties'),
+    *('exploration', 'drives'),
     *('live', 'testing', 'tools'),
 )
 PURE = LAYERS[:4]

@@ -82,10 +82,12 @@ class Requirements(Disturbed):
             self.settle()
         watches, self._watches = self._watches, []
         expected, self._expected = self._expected, []
+        left = {id(required.requirement) for required in watches}
         if self._external is not None:
             self._offered.update(self._external.topics())
         for requirement, names in expected:
-            if self._offered.isdisjoint(names):
+            # One that was violated has observed something, or its absence.
+            if id(requirement) in left and self._offered.isdisjoint(names):
                 known = ', '.join(sorted(self._offered.difference(OMITTED))) or 'none'
                 raise LockstepError(
                     f'{requirement!r} observes {" and ".join(names)}, which no node has offered; topics '

@@ -1,4 +1,7 @@
-"""Simulated time that advances from one timer to the next."""
+"""Simulated time that advances from one timer to the next.
+
+`__tracebackhide__` lets pytest show the line of the test instead of those of this module.
+"""
 
 from __future__ import annotations
 
@@ -62,6 +65,7 @@ class SimulatedTime:
 
     def settle(self) -> None:
         """Execute all callbacks that are due at the current time."""
+        __tracebackhide__ = True
         self._check_open()
         with self._watched():
             self._until_next = self._executor.settle()
@@ -86,6 +90,7 @@ class SimulatedTime:
             ValueError: `at_most` is not positive, or too long.
             LockstepError: No timer is running and `at_most` is not given, or time cannot advance.
         """
+        __tracebackhide__ = True
         end = math.inf if at_most is None else self.world_time + checked_nanoseconds('at_most', at_most)
         self.connect()
         self._catch_up()
@@ -100,6 +105,7 @@ class SimulatedTime:
             ValueError: `seconds` is not positive, or too long.
             LockstepError: Time cannot advance.
         """
+        __tracebackhide__ = True
         end = self.world_time + checked_nanoseconds('seconds', seconds)
         self.connect()
         self.settle()
@@ -118,6 +124,7 @@ class SimulatedTime:
             ValueError: `timeout` is not positive, or too long.
             LockstepError: The condition did not become true in time, or time cannot advance.
         """
+        __tracebackhide__ = True
         end = self.world_time + checked_nanoseconds('timeout', timeout)
         self.connect()
         self.settle()
@@ -139,6 +146,7 @@ class SimulatedTime:
         Raises:
             ValueError: `seconds` is zero or not finite, or the new time is not positive.
         """
+        __tracebackhide__ = True
         if not math.isfinite(seconds) or seconds == 0.0:
             raise ValueError(f'seconds must be finite and not zero, got {seconds!r}')
         now = self._now + round(seconds * NANOSECONDS)
@@ -153,6 +161,7 @@ class SimulatedTime:
 
     def _advance(self, end: float) -> None:
         """Advance to the next timer or action, but not beyond an end of world time (ns)."""
+        __tracebackhide__ = True
         self.connect()
         until_next = math.inf if self._until_next is None else self._until_next
         agenda = self._executor.agenda
@@ -164,6 +173,7 @@ class SimulatedTime:
         self._publish_clock()
 
     def _publish_clock(self) -> None:
+        __tracebackhide__ = True
         if self._external is not None:
             self._external.announce()
         with self._watched():
@@ -240,6 +250,7 @@ class SimulatedTime:
 
     def _check_requirements(self) -> None:
         """Check what is required at the current time, when all callbacks have been executed."""
+        __tracebackhide__ = True
         for required in self._watches:
             if (text := required.watch.check()) is not None:
                 self._watches.remove(required)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from diffdrive_jacobian.plots.fault_marks import draw_faults, fault_legend, fault_spans
 from diffdrive_jacobian.plots.ground_truth import draw_ground_truth, ground_truth_mark
 from diffdrive_jacobian.plots.output_files import FORMATS, create
 from diffdrive_jacobian.plots.style import DPI, styled
@@ -143,6 +144,10 @@ def figure(runs: Sequence[Run]) -> Figure:
         below = drawing.add_subplot(grid[-1, :])
         below.axis('off')
         marks = [*_marks(traces), *(uncertainty_marks() if uncertain else [])]
+        faults = fault_spans(traces[0]) if len(runs) == 1 else []
+        draw_faults(panels.values(), faults)
+        if faults:
+            drawing.legend(handles=fault_legend(faults), loc='outside upper right', ncol=2, fontsize=8.0)
         if any(len(run.ground_truth) for run in runs):
             marks.append(ground_truth_mark(*([GREY] if len(runs) > 1 else [])))
         below.legend(handles=marks, loc='center', ncol=4 if uncertain else 6, borderaxespad=0.0)

@@ -19,6 +19,7 @@ from diffdrive_jacobian.properties.goals import ReachesGoal, Settles
 from diffdrive_jacobian.properties.places import PoseFinite, StaysNear, StaysWithin
 from diffdrive_jacobian.properties.protocol import StatusProtocol
 from diffdrive_jacobian.properties.speed import AccelerationWithin, NeverFasterThan
+from diffdrive_jacobian.properties.stale_goals import NoStaleGoals
 from diffdrive_jacobian.properties.stopping import (
     StopsAfterLastCommand,
     StopsAfterLostOdometry,
@@ -30,6 +31,7 @@ __all__ = [
     'ArrivesOnceFaultsEnd',
     'NeverFasterThan',
     'NoCommandAfterCancel',
+    'NoStaleGoals',
     'PoseFinite',
     'Property',
     'PropertyViolation',

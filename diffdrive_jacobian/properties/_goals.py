@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message
 
-from diffdrive_jacobian.properties._messages import Pose, Twist, planar, pose_reader, twist_reader
+from diffdrive_jacobian.properties._messages import Pose, Twist, planar, read_pose, read_twist
 
 STANDING = Twist(0.01, 0.05)
 """Largest twist of a robot that counts as standing."""
@@ -49,12 +49,11 @@ class Motion:
         self.pose: Pose | None = None
         self.twist: Twist | None = None
         self._changed = changed
-        self._read_pose, self._read_twist = pose_reader(), twist_reader()
 
     def on_odometry(self, publisher: Publisher, message: Any) -> None:
         """Read an Odometry message."""
-        self.pose = self._read_pose(publisher.msg_type, message)
-        self.twist = self._read_twist(publisher.msg_type, message)
+        self.pose = read_pose(publisher.msg_type, message)
+        self.twist = read_twist(publisher.msg_type, message)
         if self.pose is not None and self.twist is not None:
             self._changed(self.pose, self.twist)
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from operator import attrgetter
 from typing import Any, NamedTuple
 
 from rclpy.serialization import deserialize_message
 
+from diffdrive_jacobian.lockstep import LockstepError
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader
 
 _TWISTS = {
@@ -59,58 +61,61 @@ class Twist(NamedTuple):
 
 
 class FieldReader:
-    """Reads fields of messages, which are objects or serialized. Compiled for the first message."""
+    """Reads fields of messages, which are objects or serialized.
+
+    Several properties read the same message one after the other, so the last serialized one is
+    remembered.
+    """
 
     def __init__(self, fields_of: Callable[[type], tuple[str, ...]]) -> None:
         """Start without a type. `fields_of` returns the paths of the fields of a type of messages."""
         self._fields_of = fields_of
-        self._type: type | None = None
-        self._from_bytes: Callable[[bytes], tuple[Any, ...]]
-        self._from_object: Callable[[Any], tuple[Any, ...]]
+        self._readers: dict[type, tuple[Callable[..., Any], Callable[..., Any]]] = {}
+        self._last: tuple[type, bytes, tuple[Any, ...] | None] | None = None
 
     def read(self, message_type: type, message: Any) -> tuple[Any, ...] | None:
         """Return the fields. None: the bytes are not a message of this type."""
-        if message_type is not self._type:
+        last = self._last
+        if last is not None and last[1] is message and last[0] is message_type:
+            return last[2]
+        if message_type not in self._readers:
             fields = self._fields_of(message_type)
-            self._from_object = attrgetter(*fields)
-            self._from_bytes = Reader(message_type, fields, deserialize=deserialize_message)
-            self._type = message_type
-        if isinstance(message, bytes):
-            try:
-                return self._from_bytes(message)
-            except DecodingError:
-                return None
-        return self._from_object(message)
+            reader = Reader(message_type, fields, deserialize=deserialize_message)
+            self._readers[message_type] = reader, attrgetter(*fields)
+        from_bytes, from_object = self._readers[message_type]
+        if not isinstance(message, bytes):
+            return tuple(from_object(message))
+        values: tuple[Any, ...] | None = None
+        with suppress(DecodingError):
+            values = from_bytes(message)
+        self._last = message_type, message, values
+        return values
 
 
-def twist_reader() -> Callable[[type, Any], Twist | None]:
-    """Return a function that returns the twist in a message of a type; None: the bytes are invalid.
+_read_twist = FieldReader(
+    lambda kind: tuple(_prefix(kind, _TWISTS, 'twist') + name for name in ('linear.x', 'angular.z'))
+).read
+_read_pose = FieldReader(lambda kind: tuple(_prefix(kind, _POSES, 'pose') + name for name in _POSE)).read
 
-    It raises TypeError for a type without a twist.
+
+def read_twist(message_type: type, message: Any) -> Twist | None:
+    """Return the twist in a message of a type; None: the bytes are invalid.
+
+    Raises:
+        LockstepError: Messages of this type have no twist.
     """
-    read = FieldReader(
-        lambda kind: tuple(_prefix(kind, _TWISTS, 'twist') + name for name in ('linear.x', 'angular.z'))
-    ).read
-
-    def twist(message_type: type, message: Any) -> Twist | None:
-        fields = read(message_type, message)
-        return None if fields is None else Twist(float(fields[0]), float(fields[1]))
-
-    return twist
+    fields = _read_twist(message_type, message)
+    return None if fields is None else Twist(float(fields[0]), float(fields[1]))
 
 
-def pose_reader() -> Callable[[type, Any], Pose | None]:
-    """Return a function that returns the pose in a message of a type; None: the bytes are invalid.
+def read_pose(message_type: type, message: Any) -> Pose | None:
+    """Return the pose in a message of a type; None: the bytes are invalid.
 
-    It raises TypeError for a type without a pose.
+    Raises:
+        LockstepError: Messages of this type have no pose.
     """
-    read = FieldReader(lambda kind: tuple(_prefix(kind, _POSES, 'pose') + name for name in _POSE)).read
-
-    def pose(message_type: type, message: Any) -> Pose | None:
-        fields = read(message_type, message)
-        return None if fields is None else planar(*fields)
-
-    return pose
+    fields = _read_pose(message_type, message)
+    return None if fields is None else planar(*fields)
 
 
 def planar(x: float, y: float, qx: float, qy: float, qz: float, qw: float) -> Pose:
@@ -121,7 +126,8 @@ def planar(x: float, y: float, qx: float, qy: float, qz: float, qw: float) -> Po
 
 def _prefix(message_type: type, prefixes: dict[str, str], what: str) -> str:
     if message_type.__name__ not in prefixes:
-        raise TypeError(
-            f'a {what} is read from {", ".join(prefixes)}, got a message of type {message_type.__name__}'
+        raise LockstepError(
+            f'a property reads a {what} from messages of type {", ".join(prefixes)}, got one of type '
+            f'{message_type.__name__}: it observes a wrong topic'
         )
     return prefixes[message_type.__name__]

@@ -58,9 +58,9 @@ def delays(world: Lockstep, node: Node, since: float) -> float:
         overlap = min(now, fault.start + fault.duration) - max(since, fault.start)
         if isinstance(fault, node_faults.Hang):
             total += max(overlap, 0.0)
-        elif isinstance(fault, node_faults.Slow) and overlap > -2.0 * fault.seconds:
-            # A callback that has begun, then that of the timer.
-            total += 2.0 * fault.seconds
+        elif isinstance(fault, node_faults.Slow) and overlap > -3.0 * fault.seconds:
+            # A callback that has begun, another one that waits, and that of the timer.
+            total += 3.0 * fault.seconds
         elif isinstance(fault, node_faults.TimerJitter) and overlap > -fault.seconds:
             total += fault.seconds
     return total

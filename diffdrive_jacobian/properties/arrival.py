@@ -80,7 +80,7 @@ class _ArrivesWatch(Watch):
         if goal is None or not publishes or node is self.world.node:
             return
         self._goals[node] = goal
-        self.note(f'{node.get_fully_qualified_name()} received a goal at {goal.pose}')
+        self.note(f'{self.name_of(node)} received a goal at {goal.pose}')
 
     def _on_cancel(self, node: Node, _: Any) -> None:
         if self._goals.pop(node, None) is not None:
@@ -106,8 +106,9 @@ class _ArrivesWatch(Watch):
             return
         for node, goal in list(self._goals.items()):
             if pose.distance(goal.pose) <= self._required.tolerance:
+                # Steps of time may be long: it may have arrived too late.
                 self._check()
-                del self._goals[node]
+                self._goals.pop(node, None)
 
     def check(self) -> str | None:
         """Return that a goal was not reached in time; None: all were."""
@@ -137,7 +138,7 @@ class _ArrivesWatch(Watch):
             f'there was no odometry on {self._odom}'
             if pose is None
             else f'the robot is {pose.distance(goal.pose):.6g} m from the goal of '
-            f'{node.get_fully_qualified_name()} at {goal.pose}: {pose}, {self._motion.twist}'
+            f'{self.name_of(node)} at {goal.pose}: {pose}, {self._motion.twist}'
         )
         return f'{when} {where}; allowed: within {self._required.tolerance:g} m and standing'
 

@@ -113,9 +113,10 @@ class Watch:
     def __init__(self, world: Lockstep) -> None:
         """Observe a run."""
         self.world = world
-        self._recent: deque[str] = deque(maxlen=RECENT)
+        self._recent: deque[tuple[int, tuple[object, ...]]] = deque(maxlen=RECENT)
         self._found: str | None = None
-        self._owners: dict[Publisher, Node | None] = {}
+        self._owners: dict[Publisher, Node] = {}
+        self._names: dict[Node, str] = {}
 
     @property
     def seconds(self) -> float:
@@ -131,19 +132,24 @@ class Watch:
         return None
 
     def owner(self, publisher: Publisher) -> Node | None:
-        """Return the node that has a publisher; None: it was removed."""
-        if publisher not in self._owners:
-            self._owners[publisher] = self.world.node_of(publisher)
-        return self._owners[publisher]
+        """Return the node that has a publisher; None: it was removed, or not added yet."""
+        owner = self._owners.get(publisher)
+        if owner is None and (owner := self.world.node_of(publisher)) is not None:
+            self._owners[publisher] = owner
+        return owner
 
-    @staticmethod
-    def _is_named(node: Node, name: str) -> bool:
-        """Return whether a node has a name. Each one has the empty name."""
-        return not name or node.get_fully_qualified_name().lstrip('/') == name.lstrip('/')
+    def name_of(self, node: Node) -> str:
+        """Return the fully qualified name of a node, also after it was destroyed."""
+        if node not in self._names:
+            self._names[node] = node.get_fully_qualified_name()
+        return self._names[node]
 
-    def note(self, text: str) -> None:
-        """Note something that happened, for the description of a violation."""
-        self._recent.append(f'  {self.seconds:.9g} s: {text}')
+    def note(self, *parts: object) -> None:
+        """Note something that happened, for the description of a violation.
+
+        The text is the parts one after the other. They become text only when it is needed.
+        """
+        self._recent.append((self.world.world_time, parts))
 
     def found(self, text: str) -> None:
         """Note a violation, which `check` will return. Only the first one counts."""
@@ -152,4 +158,7 @@ class Watch:
 
     def described(self, text: str) -> str:
         """Return a text with what happened last."""
-        return '\n'.join([text, *(['before that:'] if self._recent else []), *self._recent])
+        notes = [
+            f'  {time / NANOSECONDS:.9g} s: {"".join(map(str, parts))}' for time, parts in self._recent
+        ]
+        return '\n'.join([text, *(['before that:'] if notes else []), *notes])

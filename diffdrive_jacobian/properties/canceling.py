@@ -9,7 +9,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep import Lockstep
-from diffdrive_jacobian.properties._messages import twist_reader
+from diffdrive_jacobian.properties._messages import read_twist
 from diffdrive_jacobian.properties.base import Property, Watch
 
 
@@ -45,7 +45,6 @@ class NoCommandAfterCancel(Property):
 class _CancelWatch(Watch):
     def __init__(self, required: NoCommandAfterCancel, world: Lockstep) -> None:
         super().__init__(world)
-        self._read = twist_reader()
         self._canceled: dict[Node, float] = {}
         world.expect(required.resolved(required.commands))
         world.expect(required.resolved(required.cancel))
@@ -56,21 +55,21 @@ class _CancelWatch(Watch):
 
     def _on_goal(self, node: Node, _: type, __: Any) -> None:
         self._canceled.pop(node, None)
-        self.note(f'{node.get_fully_qualified_name()} received a goal')
+        self.note(f'{self.name_of(node)} received a goal')
 
     def _on_cancel(self, node: Node, _: Any) -> None:
         self._canceled[node] = self.seconds
-        self.note(f'{node.get_fully_qualified_name()} responded to {self._cancel}')
+        self.note(f'{self.name_of(node)} responded to {self._cancel}')
 
     def _on_command(self, publisher: Publisher, message: Any) -> None:
-        twist = self._read(publisher.msg_type, message)
+        twist = read_twist(publisher.msg_type, message)
         node = self.owner(publisher)
         if node is None or twist is None:
             return
         if node in self._canceled and not twist.is_zero:
             self.found(
                 f'{self._commands}: {twist}, {self.seconds - self._canceled[node]:g} s after '
-                f'{node.get_fully_qualified_name()} has responded to {self._cancel}; allowed: zero, '
+                f'{self.name_of(node)} has responded to {self._cancel}; allowed: zero, '
                 'until it receives another goal'
             )
-        self.note(f'{self._commands}: {twist}')
+        self.note(self._commands, ': ', twist)

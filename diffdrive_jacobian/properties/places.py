@@ -59,7 +59,7 @@ class _PlaceWatch(Watch):
         if (allowed := self._required.violation(pose, twist)) is not None:
             self.found(f'{self._odom}: {pose}, {twist}; allowed: {allowed}')
         elif self._found is None:
-            self.note(f'{self._odom}: {pose}, {twist}')
+            self.note(self._odom, ': ', pose, ', ', twist)
 
 
 @dataclass(frozen=True, repr=False)

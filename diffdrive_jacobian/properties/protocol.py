@@ -122,7 +122,7 @@ class _StatusWatch(Watch):
             f' and identifier {uuid.hex()[:8]}...' if any(uuid) else ''
         )
         self._check(goal, status, name)
-        self.note(f'{self._topic}: {_NAMES.get(status, status)} of {name}')
+        self.note(self._topic, ': ', _NAMES.get(status, status), ' of ', name)
 
     def _check(self, goal: _Goal, status: int, name: str) -> None:
         last = self._last.get(goal)

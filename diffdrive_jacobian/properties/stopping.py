@@ -9,7 +9,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep import Lockstep
-from diffdrive_jacobian.properties._messages import Twist, twist_reader
+from diffdrive_jacobian.properties._messages import Twist, read_twist
 from diffdrive_jacobian.properties._node_time import ROUNDING, ReactionTime, delays
 from diffdrive_jacobian.properties.base import Property, Watch
 
@@ -26,7 +26,7 @@ class StopsAfterLostOdometry(Property):
 
     The time is what a timer of the node can measure. It does not pass while the clock of the nodes
     stands still or the node is frozen (`Hang`), it starts again where the clock jumps, and it is longer
-    for a node that is slow (`Slow`: by two callbacks) or whose timers jitter (`TimerJitter`).
+    for a node that is slow (`Slow`: by three callbacks) or whose timers jitter (`TimerJitter`).
 
     Attributes:
         within: Longest time (s).
@@ -67,7 +67,6 @@ class _LostOdometryWatch(Watch):
     def __init__(self, required: StopsAfterLostOdometry, world: Lockstep) -> None:
         super().__init__(world)
         self._required = required
-        self._read = twist_reader()
         self._time = ReactionTime(world)
         self._controllers: dict[Node, _Controller] = {}
         world.expect(required.resolved(required.commands))
@@ -85,11 +84,11 @@ class _LostOdometryWatch(Watch):
         controller.received, controller.seconds = self._time.now(), self.seconds
         controller.subscribed = True
         if controller.command.v or controller.command.omega:
-            self.note(f'{self._odom} was received by {node.get_fully_qualified_name()}')
+            self.note(self._odom, ' was received by ', self.name_of(node))
 
     def _on_command(self, publisher: Publisher, message: Any) -> None:
         node = self.owner(publisher)
-        twist = self._read(publisher.msg_type, message)
+        twist = read_twist(publisher.msg_type, message)
         if node is None or twist is None:
             return
         controller = self._controllers.get(node)
@@ -98,7 +97,7 @@ class _LostOdometryWatch(Watch):
         if not controller.subscribed:
             controller.subscribed = any(one.topic_name == self._odom for one in node.subscriptions)
         controller.command = twist
-        self.note(f'{self._commands}: {twist}')
+        self.note(self._commands, ': ', twist)
 
     def check(self) -> str | None:
         """Return that a controller has not stopped in time; None: all have."""
@@ -115,11 +114,11 @@ class _LostOdometryWatch(Watch):
             # It cannot stop anything any more.
             controller.command = Twist(0.0, 0.0)
             return
-        if not controller.subscribed or not self._is_named(controller.node, required.node):
+        if not controller.subscribed or not is_named(self.name_of(controller.node), required.node):
             return
         allowed = required.within + delays(self.world, controller.node, controller.seconds)
         if passed > allowed + ROUNDING:
-            name = controller.node.get_fully_qualified_name()
+            name = self.name_of(controller.node)
             self.found(
                 f'the last command of {name} is {controller.command}, {passed:.6g} s after it has '
                 f'received its last message on {self._odom}; allowed: {allowed:g} s'
@@ -168,7 +167,6 @@ class _LastCommandWatch(Watch):
     def __init__(self, required: StopsAfterLastCommand, world: Lockstep) -> None:
         super().__init__(world)
         self._required = required
-        self._read = twist_reader()
         self._time = ReactionTime(world)
         self._received: dict[Node, tuple[float, float]] = {}
         self._robots: dict[Node, bool] = {}
@@ -179,11 +177,11 @@ class _LastCommandWatch(Watch):
 
     def _on_command(self, node: Node, _: type, __: Any) -> None:
         self._received[node] = self._time.now(), self.seconds
-        self.note(f'{self._commands} was received by {node.get_fully_qualified_name()}')
+        self.note(self._commands, ' was received by ', self.name_of(node))
 
     def _on_odometry(self, publisher: Publisher, message: Any) -> None:
         now = self._time.now()
-        twist = self._read(publisher.msg_type, message)
+        twist = read_twist(publisher.msg_type, message)
         if twist is None or (
             abs(twist.v) <= self._required.v and abs(twist.omega) <= self._required.omega
         ):
@@ -198,7 +196,7 @@ class _LastCommandWatch(Watch):
         allowed = within + delays(self.world, node, seconds)
         if passed > allowed + ROUNDING:
             self.found(
-                f'{self._odom}: {twist}, {passed:.6g} s after {node.get_fully_qualified_name()} has '
+                f'{self._odom}: {twist}, {passed:.6g} s after {self.name_of(node)} has '
                 f'received its last message on {self._commands}; allowed: {allowed:g} s'
             )
 
@@ -211,7 +209,7 @@ class _LastCommandWatch(Watch):
     def _is_robot(self, node: Node) -> bool:
         """Return whether a node is a robot that is checked."""
         if node not in self._robots:
-            self._robots[node] = self._is_named(node, self._required.node) and any(
+            self._robots[node] = is_named(self.name_of(node), self._required.node) and any(
                 one.topic_name == self._commands for one in node.subscriptions
             )
         return self._robots[node]
@@ -248,38 +246,37 @@ class _ShutdownWatch(Watch):
     def __init__(self, required: StopsOnShutdown, world: Lockstep) -> None:
         super().__init__(world)
         self._required = required
-        self._read = twist_reader()
-        self._last: dict[Node, tuple[str, Twist]] = {}
+        self._last: dict[Node, Twist] = {}
         world.expect(required.resolved(required.commands))
         self._commands = world.on_published(required.resolved(required.commands), self._on_command)
 
     def _on_command(self, publisher: Publisher, message: Any) -> None:
-        node, twist = self.owner(publisher), self._read(publisher.msg_type, message)
+        node, twist = self.owner(publisher), read_twist(publisher.msg_type, message)
         if node is None or twist is None or node is self.world.node:
             return
-        if node in self._last:
-            name = self._last[node][0]
-        elif self._is_named(node, self._required.node):
-            name = node.get_fully_qualified_name()
-        else:
-            return
-        self._last[node] = name, twist
-        self.note(f'{self._commands}: {twist}')
+        if is_named(self.name_of(node), self._required.node):
+            self._last[node] = twist
+        self.note(self._commands, ': ', twist)
 
     def check(self) -> str | None:
         """Return that a node has left while the robot moved; None: none has."""
         if self._last.keys() - self.world.nodes:
-            for node, (name, twist) in list(self._last.items()):
+            for node, twist in list(self._last.items()):
                 if node in self.world.nodes:
                     continue
                 del self._last[node]
                 if not twist.is_zero and node not in self.world.killed:
                     self.found(
-                        f'{name} was shut down after the command {twist}; allowed: a command of zero '
-                        'before'
+                        f'{self.name_of(node)} was shut down after the command {twist}; allowed: '
+                        'a command of zero before'
                     )
         return self._found
 
     def finish(self) -> str | None:
         """As `check`."""
         return self.check()
+
+
+def is_named(name: str, wanted: str) -> bool:
+    """Return whether the name of a node is the one that is wanted; an empty one: any."""
+    return not wanted or name.lstrip('/') == wanted.lstrip('/')

@@ -30,7 +30,14 @@ from diffdrive_jacobian.bags.decoding import (
 )
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.parameter_values import changed_parameters
-from diffdrive_jacobian.reading.rows import PARAMETER_EVENTS, ROW_READERS, SERIES_TOPICS
+from diffdrive_jacobian.reading.rows import (
+    FAULT_EVENTS,
+    OF_ALL_ROBOTS,
+    PARAMETER_EVENTS,
+    ROW_READERS,
+    SERIES_TOPICS,
+    fault_event,
+)
 from diffdrive_jacobian.reading.run import COLUMNS, COVARIANCES, Run, Series
 from diffdrive_jacobian.text import printable
 
@@ -71,6 +78,7 @@ def read_run(
     path = Path(path)
     rows: dict[str, list[tuple[int, int, list[float]]]] = defaultdict(list)
     events: list[tuple[int, str, dict[str, Any]]] = []
+    fault_events: list[tuple[int, str, str]] = []
     with open_bag(path) as reader:
         parameters = {
             node: values
@@ -99,6 +107,9 @@ def read_run(
                     if namespace in (None, namespace_of(message.node)):
                         events.append((received, message.node, changed_parameters(message)))
                     continue
+                if topic == FAULT_EVENTS[0]:
+                    fault_events.append((received, *fault_event(message)))
+                    continue
                 read = list(ROW_READERS[topic, kind](message, names))
             except UndecodableError:
                 tally.undecodable[connection.topic] += 1
@@ -122,6 +133,7 @@ def read_run(
         start_covariances=covariances['start_pose'],
         parameters=parameters,
         parameter_events=tuple(events),
+        fault_events=tuple(fault_events),
         skipped=dict(tally.skipped),
         notes=notes,
         **series,
@@ -178,11 +190,11 @@ def _choose(reader: Reader, given: dict[str, str], namespace: str | None) -> dic
             namespace has none.
     """
     chosen: dict[int, str] = {}
-    usual = {name for name, _ in ROW_READERS} | {PARAMETER_EVENTS[0]}
+    usual = {name for name, _ in ROW_READERS} | {*OF_ALL_ROBOTS}
     if unknown := sorted(set(given) - usual):
         raise BagError(f'topics must be among {", ".join(sorted(usual))}, got {unknown[0]!r}')
     for name in sorted(usual):
-        types = {kind for topic, kind in (*ROW_READERS, PARAMETER_EVENTS) if topic == name}
+        types = {kind for topic, kind in (*ROW_READERS, PARAMETER_EVENTS, FAULT_EVENTS) if topic == name}
         candidates = [
             connection
             for connection in reader.connections
@@ -190,7 +202,7 @@ def _choose(reader: Reader, given: dict[str, str], namespace: str | None) -> dic
                 connection.topic == given[name]
                 if name in given
                 else base_name(connection.topic) == name
-                and (name == PARAMETER_EVENTS[0] or namespace in (None, namespace_of(connection.topic)))
+                and (name in OF_ALL_ROBOTS or namespace in (None, namespace_of(connection.topic)))
             )
         ]
         matching = [connection for connection in candidates if connection.msgtype in types]
@@ -206,9 +218,9 @@ def _choose(reader: Reader, given: dict[str, str], namespace: str | None) -> dic
                 'namespace (--namespace)'
             )
         chosen.update((connection.id, name) for connection in matching)
-    if namespace is not None and not set(chosen.values()) - {PARAMETER_EVENTS[0]}:
+    if namespace is not None and not set(chosen.values()) - {*OF_ALL_ROBOTS}:
         topics = (one.topic for one in reader.connections)
-        there = {namespace_of(one) for one in topics if base_name(one) in usual - {PARAMETER_EVENTS[0]}}
+        there = {namespace_of(one) for one in topics if base_name(one) in usual - {*OF_ALL_ROBOTS}}
         raise BagError(
             f'{reader.path} has no topics of a run in the namespace {namespace}; it has them in '
             f'{", ".join(sorted(there)) or "none"}'

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -68,6 +69,22 @@ def _joints(message: Any, names: tuple[str, str]) -> Rows:
     yield from_time(message.header.stamp), list(from_joint_state(message, names))
 
 
+def fault_event(message: Any) -> tuple[str, str]:
+    """Return the fault, as Python source, and what it did, of a message of `Lockstep.inject`.
+
+    Raises:
+        MessageError: It is another message.
+    """
+    try:
+        fields = json.loads(message.data)
+        fault, what = fields['fault'], fields['what']
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise MessageError('it must be a JSON object with fault and what') from error
+    if not isinstance(fault, str) or not isinstance(what, str):
+        raise MessageError('fault and what must be strings')
+    return fault, what
+
+
 ROW_READERS: dict[tuple[str, str], Callable[[Any, tuple[str, str]], Rows]] = {
     ('cmd_vel', 'geometry_msgs/msg/Twist'): _twist,
     ('cmd_vel', 'geometry_msgs/msg/TwistStamped'): _twist_stamped,
@@ -84,6 +101,9 @@ ROW_READERS: dict[tuple[str, str], Callable[[Any, tuple[str, str]], Rows]] = {
 """Topic's base name and type to the function that reads a message, given the names of the left and the
 right wheel joint. The functions raise MessageError for messages that the nodes drop."""
 PARAMETER_EVENTS = ('parameter_events', 'rcl_interfaces/msg/ParameterEvent')
+FAULT_EVENTS = ('fault_events', 'std_msgs/msg/String')
+OF_ALL_ROBOTS = (PARAMETER_EVENTS[0], FAULT_EVENTS[0])
+"""Topics that all robots of a bag share."""
 SERIES_TOPICS = {
     'odometry': ('odom',),
     'ground_truth': ('ground_truth',),

@@ -96,6 +96,8 @@ class Run:
     """By the full name of the node, as of the beginning of the run."""
     parameter_events: tuple[tuple[int, str, dict[str, Any]], ...] = ()
     """Later changes: when each was recorded (ns), the node, the new values."""
+    fault_events: tuple[tuple[int, str, str], ...] = ()
+    """What the faults of a lockstep world did: when it was recorded (ns), the fault, what it did."""
     skipped: dict[str, int] = field(default_factory=dict)
     """How many messages of a topic could not be used, by the topic's name in the bag."""
     notes: tuple[str, ...] = ()
@@ -109,6 +111,7 @@ class Run:
         lines += [f'  {name}: {str(one)[7:-1]}' for name, one in series.items() if len(one)]
         lines += [f'  parameters of {", ".join(self.parameters)}'] if self.parameters else []
         lines += [f'  {len(self.parameter_events)} changes of parameters'] * bool(self.parameter_events)
+        lines += [f'  {len(self.fault_events)} events of faults'] * bool(self.fault_events)
         lines += [f'  {note}' for note in self.notes]
         return '\n'.join([*lines, ')'])
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import math
+import pickle
 from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -30,6 +32,8 @@ COLUMNS = (
     *('path_length_mean_m', 'path_length_max_m', 'overshoot_mean_m', 'overshoot_max_m'),
 )
 """Columns of the CSV table."""
+LOOPS_PER_TASK = 4096
+"""Number of loops, at least a row of the grid, in one task of an executor. Fewer take longer each."""
 MIN_GAIN, MAX_GAIN = 1e-3, 100.0
 """Smallest and largest gain; the nodes accept no larger ones (1/s)."""
 MIN_LIMIT = 1e-6
@@ -234,42 +238,82 @@ class Sweep(NamedTuple):
         return row, column
 
 
-def sweep(setup: Setup, progress: Callable[[int], object] | None = None) -> Sweep:
+def sweep(
+    setup: Setup,
+    progress: Callable[[int], object] | None = None,
+    *,
+    executor: Executor | None = None,
+) -> Sweep:
     """Drive the robot to the goal with every pair of gains from every start.
 
     Args:
         setup: Settings of the sweep.
-        progress: Called at every step with the number of loops that are finished. An exception that it
-            raises ends the sweep and is passed on.
+        progress: Called at every step with the number of loops that are finished; with an executor
+            whenever some rows are finished. An exception that it raises ends the sweep and is passed on.
+        executor: Computes some rows of the grid at a time, for example a ProcessPoolExecutor, or
+            `Client.get_executor()` of Dask; None: this thread alone. The result is the same bit for bit.
 
     Raises:
-        ValueError: The law cannot be evaluated for arrays of poses, or outcomes overflow.
+        ValueError: The law cannot be evaluated for arrays of poses, or outcomes overflow, or the
+            controller cannot be sent to another process.
     """
-    controller, arrival = setup.resolved_controller, setup.arrival
-    kp, kv = setup.gains('kp'), setup.gains('kv')
+    if executor is None:
+        outcomes = _drive(setup, slice(None), progress)
+    else:
+        outcomes = _drive_on(executor, setup, progress)
+    return Sweep(setup, setup.gains('kp'), setup.gains('kv'), outcomes)
+
+
+def _drive(setup: Setup, rows: slice, progress: Callable[[int], object] | None = None) -> Outcomes:
+    """Return the outcomes of some rows of the grid, shape (rows, n, starts)."""
+    controller = setup.resolved_controller
     values: dict[str, Any] = {
-        'kp': kp[np.newaxis, :, np.newaxis],
-        'kv': kv[:, np.newaxis, np.newaxis],
+        'kp': setup.gains('kp')[np.newaxis, :, np.newaxis],
+        'kv': setup.gains('kv')[rows, np.newaxis, np.newaxis],
         'offset': setup.offset,
     }
     gains = [values[name] for name in controller.gains]
     starts, goal = setup.poses(), np.zeros(3 if controller.takes_heading else 2)
     _check_law(controller, starts, goal, gains)
-    outcomes = closed_loops(
+    return closed_loops(
         controller,
         starts,
         goal,
         *gains,
         rate=setup.rate,
         duration=setup.duration,
-        arrival=arrival,
+        arrival=setup.arrival,
         turning_gain=values['kp'],
         limits=setup.robot.limits,
         r=setup.robot.wheel_radius,
         L=setup.robot.wheel_separation,
         on_step=progress,
     )
-    return Sweep(setup, kp, kv, outcomes)
+
+
+def _drive_on(executor: Executor, setup: Setup, progress: Callable[[int], object] | None) -> Outcomes:
+    """Return the outcomes of all rows, computed by an executor."""
+    try:
+        pickle.dumps(setup)
+    except Exception as error:
+        raise ValueError(
+            f'controller {setup.resolved_controller.name!r} cannot be sent to another process; give the '
+            f'name of an installed one, or functions at the top level of a module: {error}'
+        ) from error
+    row_loops = setup.grid * setup.starts
+    step = max(1, LOOPS_PER_TASK // row_loops)
+    slices = [slice(begin, begin + step) for begin in range(0, setup.grid, step)]
+    futures = [executor.submit(_drive, setup, rows) for rows in slices]
+    parts: list[Outcomes] = []
+    try:
+        for future in futures:
+            parts.append(future.result())
+            if progress is not None:
+                progress(sum(part.arrived.size for part in parts))
+    finally:
+        for future in futures:
+            future.cancel()
+    return Outcomes._make(np.concatenate(fields) for fields in zip(*parts, strict=True))
 
 
 def _check_law(controller: Controller, starts: Array, goal: Array, gains: list[Any]) -> None:

@@ -6,6 +6,8 @@ Names of this package, which are imported on first use:
 - `Answers`, `Every`, `Idle`: what nodes in other processes send, as in the package `lockstep`.
 - `faults`: the package of the faults that a `Lockstep` injects.
 - `properties`: the package of the properties that a `Lockstep` requires.
+- `explore`, `fault_schedules`, `poses`, ...: all names of the package `exploration`, most of which need
+  Hypothesis.
 - `RecordedRun`, `GoldenRun`: types of the fixtures `recorded_run` and `golden_run`.
 
 pytest loads the plugin in every project, so this module imports neither rclpy nor NumPy by itself.
@@ -68,6 +70,9 @@ def __getattr__(name: str) -> Any:
         return importlib.import_module(f'diffdrive_jacobian.{name}')
     if name in _MODULES:
         return getattr(importlib.import_module(f'diffdrive_jacobian.{_MODULES[name]}'), name)
+    exploration = importlib.import_module('diffdrive_jacobian.exploration')
+    if name in exploration.__all__:
+        return getattr(exploration, name)
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
 
 

@@ -34,6 +34,7 @@ TOPICS = (
     'joint_command',
     'joint_states',
     'parameter_events',
+    'fault_events',
 )
 """Topics whose name in the bag can be given by --topic."""
 

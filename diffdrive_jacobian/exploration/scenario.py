@@ -1,0 +1,118 @@
+"""Scenarios by name, so that other processes and test files find them."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import sys
+import sysconfig
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from diffdrive_jacobian.exploration.errors import ExplorationError
+
+Scenario = Callable[[Any, Any], object]
+"""`scenario(world, case)` creates the nodes in a `Lockstep` and advances its time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScenarioName:
+    """Where a scenario is defined."""
+
+    module: str
+    """Name of its module."""
+    name: str
+    """Name of the function."""
+    root: str | None
+    """Folder that must be on `sys.path` to import the module; None: it is installed."""
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> ScenarioName:
+        """Return where a function is defined.
+
+        Raises:
+            ExplorationError: It is not a function at the top level of a file.
+        """
+        name = getattr(scenario, '__qualname__', None)
+        module = sys.modules.get(getattr(scenario, '__module__', ''))
+        if not inspect.isfunction(scenario) or getattr(module, str(name), None) is not scenario:
+            raise ExplorationError(
+                'scenario must be a function (world, case) at the top level of a module, because other '
+                f'processes import it by its name; got {name or repr(scenario)}'
+            )
+        count = len(inspect.signature(scenario).parameters)
+        if count != 2:
+            raise ExplorationError(
+                f'scenario must take two arguments, (world, case); {name} takes {count}'
+            )
+        file = getattr(module, '__file__', None)
+        if file is None:
+            raise ExplorationError(
+                f'scenario must be defined in a file, because other processes import it; {name} is not'
+            )
+        path, dotted = Path(file).resolve(), scenario.__module__
+        if dotted == '__main__':
+            dotted = getattr(getattr(module, '__spec__', None), 'name', None) or path.stem
+        installed = {Path(sysconfig.get_path(kind)).resolve() for kind in ('purelib', 'platlib')}
+        if any(path.is_relative_to(folder) for folder in installed):
+            return cls(module=dotted, name=str(name), root=None)
+        return cls(module=dotted, name=str(name), root=str(_root(path, dotted)))
+
+    def load(self) -> Scenario:
+        """Import the function.
+
+        Raises:
+            ExplorationError: It cannot be imported.
+        """
+        try:
+            return getattr(self._module(), self.name)  # type: ignore[no-any-return]
+        except (ImportError, AttributeError) as error:
+            where = f' from {self.root}' if self.root else ''
+            raise ExplorationError(
+                f'scenario {self.name} of module {self.module} cannot be imported{where}: {error}'
+            ) from error
+
+    def _module(self) -> ModuleType:
+        if self.root is None:
+            return importlib.import_module(self.module)
+        if self.root not in sys.path:
+            sys.path.insert(0, self.root)
+        file = _file(Path(self.root), self.module)
+        module = importlib.import_module(self.module)
+        if file is None or Path(getattr(module, '__file__', None) or '').resolve() == file:
+            return module
+        # Another module of this name comes first, for example one of the standard library.
+        own = f'_scenario_{self.module}'
+        if own in sys.modules:
+            return sys.modules[own]
+        spec = importlib.util.spec_from_file_location(own, file)
+        if spec is None or spec.loader is None:
+            raise ImportError(f'{file} is no Python module')
+        module = sys.modules[own] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+
+
+def scenario_from(root: str | Path, module: str, name: str) -> Scenario:
+    """Return the function of a module that is found in a folder, which need not be on `sys.path`.
+
+    Raises:
+        ExplorationError: It cannot be imported.
+    """
+    return ScenarioName(module=module, name=name, root=str(Path(root).resolve())).load()
+
+
+def _root(path: Path, module: str) -> Path:
+    """Return the folder from which a file is imported under a dotted name."""
+    depth = module.count('.') + (path.name == '__init__.py')
+    return path.parents[min(depth, len(path.parents) - 1)]
+
+
+def _file(root: Path, module: str) -> Path | None:
+    base = root.joinpath(*module.split('.'))
+    found = [path for path in (base.with_suffix('.py'), base / '__init__.py') if path.is_file()]
+    return found[0].resolve() if found else None

@@ -1,0 +1,83 @@
+"""Goals that are out of date."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from action_msgs.msg import GoalStatus
+from rclpy.publisher import Publisher
+
+from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.properties._messages import FieldReader
+from diffdrive_jacobian.properties.base import Property, Watch
+
+
+@dataclass(frozen=True, repr=False)
+class NoStaleGoals(Property):
+    """A controller accepts no goal that is older than one that it has accepted, and none twice.
+
+    The stamps of the goals that it reports as ACCEPTED must increase. Goals without a stamp do not
+    count. When the clock of the nodes jumps back, stamps may decrease. Each publisher is checked on its
+    own.
+
+    Messages may arrive late or repeatedly (`Reorder`, `Duplicate`). A controller that accepts them
+    drives to where nobody wants it any more.
+
+    Attributes:
+        topic: Topic of type action_msgs/GoalStatus (default: 'goal_status').
+    """
+
+    topic: str = field(default='goal_status', kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        super().__post_init__()
+        self._text('topic')
+
+    def watch(self, world: Lockstep) -> Watch:
+        """Begin to observe a run."""
+        return _StaleGoalWatch(self, world)
+
+
+class _StaleGoalWatch(Watch):
+    def __init__(self, required: NoStaleGoals, world: Lockstep) -> None:
+        super().__init__(world)
+        self._read = FieldReader(
+            lambda _: ('status', 'goal_info.stamp.sec', 'goal_info.stamp.nanosec')
+        ).read
+        self._newest: dict[Publisher, tuple[int, int]] = {}
+        self._clock = world.now
+        world.expect(required.resolved(required.topic))
+        self._topic = world.on_published(required.resolved(required.topic), self._on_status)
+
+    def _on_status(self, publisher: Publisher, message: Any) -> None:
+        fields = self._read(publisher.msg_type, message)
+        if fields is None or fields[0] != GoalStatus.STATUS_ACCEPTED:
+            return
+        self._follow_clock()
+        stamp = int(fields[1]), int(fields[2])
+        newest = self._newest.get(publisher, (0, 0))
+        if stamp == (0, 0):
+            return
+        if stamp <= newest:
+            self.found(
+                f'{self._topic}: ACCEPTED of the goal with stamp {_text(stamp)} s, after one with stamp '
+                f'{_text(newest)} s; allowed: newer stamps'
+            )
+        self._newest[publisher] = stamp
+        self.note(f'{self._topic}: ACCEPTED of the goal with stamp {_text(stamp)} s')
+
+    def check(self) -> str | None:
+        """Return that an old goal was accepted; None: none was."""
+        self._follow_clock()
+        return self._found
+
+    def _follow_clock(self) -> None:
+        if self.world.now < self._clock:
+            self._newest.clear()
+        self._clock = self.world.now
+
+
+def _text(stamp: tuple[int, int]) -> str:
+    return f'{stamp[0]}.{stamp[1]:09d}'

@@ -1,0 +1,99 @@
+"""Scenarios that the tests of the exploration run. Small: a world takes some 30 ms."""
+
+from __future__ import annotations
+
+import os
+from itertools import count
+
+from geometry_msgs.msg import Twist, Vector3
+from rclpy.node import Node
+
+PERIOD = 0.1
+TIMEOUT = None
+"""Age at which the follower ignores the last reading (s): None, which is its defect."""
+
+
+class Sensor(Node):
+    """Publishes a speed ten times a second."""
+
+    def __init__(self, speed):
+        super().__init__('sensor', start_parameter_services=False)
+        self.speed = float(speed)
+        self.publisher = self.create_publisher(Vector3, 'speed', 10)
+        self.create_timer(PERIOD, self.on_timer)
+
+    def on_timer(self):
+        self.publisher.publish(Vector3(x=self.speed))
+
+
+class Follower(Node):
+    """Commands the speed of the last reading plus its age: too fast when readings are lost."""
+
+    def __init__(self, gain=1.0):
+        super().__init__('follower', start_parameter_services=False)
+        self.gain, self.ticks, self.speed = gain, 0, 0.0
+        self.publisher = self.create_publisher(Twist, 'cmd_vel', 10)
+        self.create_subscription(Vector3, 'speed', self.on_speed, 10)
+        self.create_timer(PERIOD, self.on_timer)
+
+    def on_speed(self, message):
+        self.ticks, self.speed = 0, message.x
+
+    def on_timer(self):
+        self.ticks += 1
+        age = PERIOD * self.ticks
+        stale = TIMEOUT is not None and age > TIMEOUT
+        command = Twist()
+        command.linear.x = 0.0 if stale else self.gain * (self.speed + age)
+        self.publisher.publish(command)
+
+
+def follow(world, case):
+    """Run both for two seconds."""
+    case = case or {}
+    world.create(lambda: Sensor(case.get('speed', 0.0)))
+    world.create(Follower)
+    world.run_for(2.0)
+
+
+class Dividing(Follower):
+    """Divides by the speed that it reads."""
+
+    def on_speed(self, message):
+        self.speed = 1.0 / message.x
+
+
+def divide(world, case):
+    """Let a node fail that divides by the speed."""
+    world.create(lambda: Sensor(case['speed']))
+    world.create(Dividing)
+    world.run_for(0.2)
+    assert case['speed'] < 3.0, 'too fast'
+
+
+_calls = count()
+
+
+def changing(world, case):
+    """Depend on the number of worlds that this process has run."""
+    world.create(lambda: Sensor(next(_calls)))
+    world.run_for(0.2)
+    if case['speed'] > 1.0:
+        raise ValueError('fast')
+
+
+def deadly(world, case):
+    """End the process."""
+    if case['speed'] == 2.0:
+        os._exit(3)
+
+
+def loaded(world, case):
+    """Fail if a process that only runs worlds has imported what it does not need."""
+    import sys
+
+    import diffdrive_jacobian.testing
+
+    assert diffdrive_jacobian.testing.Lockstep is type(world)
+    unneeded = {'hypothesis', 'matplotlib', 'pytest'} & set(sys.modules)
+    assert not unneeded, unneeded
