@@ -311,7 +311,7 @@ def run(count: int, seed: int = 0, programs: tuple[str, ...] = ()) -> Outcome:
     """End every program so often."""
     chance = random.Random(seed)
     violations: list[str] = []
-    times, cpus = [], []
+    times, cpus, tried = [], [], 0
     with tempfile.TemporaryDirectory(prefix='ends_') as name, ExitStack() as stack:
         folder = Path(name)
         bag = make_bag(folder)
@@ -327,9 +327,19 @@ def run(count: int, seed: int = 0, programs: tuple[str, ...] = ()) -> Outcome:
                 place = folder / f'world{index}'
                 place.mkdir()
                 campaign = Campaign(stack.enter_context(quiet_world(place)), place, bag, chance)
-            found, ending = campaign.end(program, mode)
+            try:
+                found, ending = campaign.end(program, mode)
+            except AssertionError as error:
+                found = [f'{program.name}, {mode}: {error}']
+            except KeyboardInterrupt:
+                # What was tried until then counts.
+                break
+            else:
+                times.append(ending.seconds)
+                cpus.append(ending.cpu)
+            tried += 1
             violations += found
-            times.append(ending.seconds)
-            cpus.append(ending.cpu)
+            if tried % A_WORLD == 0:
+                print(f'  {tried} of {len(cases)}: {violations}', flush=True)
     measured = f'exit after {spread(times, "s")}; CPU of the exit {spread(cpus, "s")}'
-    return Outcome(len(cases), violations, measured)
+    return Outcome(tried, violations, measured)
