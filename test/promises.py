@@ -3,7 +3,7 @@
     python test/promises.py                          write the page from the results in promises.json
     python test/promises.py run [NAME ...]           try again, store the results, and write the page
     python test/promises.py run [NAME ...] --quick   the same, with few cases each
-    python test/promises.py run soak --count 60      the same, with another number of cases
+    python test/promises.py run soak --count 60      the same, for another number of cases or minutes
 
 All takes about three hours, with `--quick` a few minutes. To add a row, add a `Promise` to PROMISES. Its
 function takes the number of cases and returns an `Outcome`: how many were tried, and what broke it.
@@ -33,6 +33,10 @@ RESULTS = TEST / 'promises.json'
 PAGE = TEST.parent / 'doc' / 'promises.md'
 NICE = 10
 """Priority of the processes: others come first."""
+BAG_TESTS = (
+    *('test_strangers_bags.py', 'test_hostile_bags.py', 'test_mutated_bags.py'),
+    *('test_damaged_bags.py', 'test_special_files.py', 'test_salvage.py'),
+)
 MOST_LISTED = 10
 """Violations that are listed of each promise."""
 HEAD = """# Promises
@@ -62,7 +66,7 @@ class Promise(NamedTuple):
     run: Callable[[int], Outcome]
     """Tries it with a number of cases."""
     full: int
-    """Number of cases."""
+    """Number of cases, as `run` counts them: of each program or input, or minutes of soaking."""
     quick: int
     """Number of cases of a quick run."""
 
@@ -203,7 +207,7 @@ PROMISES = (
         """Tests with bags that are truncated, mutated, compressed bombs, with endless YAML, paths that
         leave the folder, lengths of 2^63, hostile SQLite schemas.""",
         'tests',
-        tests('test_hostile_bags.py', 'test_mutated_bags.py', 'test_damaged_bags.py', 'test_salvage.py'),
+        tests(*BAG_TESTS),
         1,
         1,
     ),

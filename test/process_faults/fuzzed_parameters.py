@@ -295,7 +295,14 @@ def run(count: int, seed: int = 0) -> Outcome:
     with tempfile.TemporaryDirectory(prefix='parameters_') as name, quiet_world(Path(name)) as world:
         fuzzers = [Fuzzer(world, node, chance) for node in NODES]
         for index in range(count):
-            fuzzers[index % len(fuzzers)].change()
+            fuzzer = fuzzers[index % len(fuzzers)]
+            try:
+                fuzzer.change()
+            except AssertionError as error:
+                violations.append(f'{fuzzer.name}, change {index}: {error}, values {fuzzer.values}')
+                break
+            if index % 1000 == 999:
+                print(f'  {index + 1} of {count}', flush=True)
         violations += start_up(world.harness, chance, max(3, count // 10))
         for fuzzer in fuzzers:
             violations += fuzzer.violations

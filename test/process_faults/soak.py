@@ -18,8 +18,8 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import Goals, Odometry
 from processes import Child, World
 from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -105,12 +105,8 @@ class Team:
             messages = []
             for parameter, (field, specification) in specifications(parameters).items():
                 value = given.get(parameter, default_of(parameters, field))
-                if not specification.read_only and isinstance(value, float):
-                    messages.append(
-                        ParameterMessage(
-                            name=parameter, value=ParameterValue(type=3, double_value=value)
-                        )
-                    )
+                if not specification.read_only:
+                    messages.append(Parameter(parameter, value=value).to_parameter_msg())
             # Twice: a limit may be refused while another one is still changed.
             for _ in range(2):
                 future = self.set[name].call_async(SetParameters.Request(parameters=messages))

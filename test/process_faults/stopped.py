@@ -176,5 +176,6 @@ def run(count: int, seed: int = 0) -> Outcome:
             node = list(ARGUMENTS)[index % len(ARGUMENTS)]
             found, measured = disturb(team, node, kill=index // len(ARGUMENTS) % 2 == 0, chance=chance)
             violations += found
+            print(f'  {index + 1} of {count}: {found}', flush=True)
             delays += [one for one in measured if one >= 0.0]
     return Outcome(count, violations, f'the others are still after {spread(delays, "s")}')
