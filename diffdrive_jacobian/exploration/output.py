@@ -7,8 +7,10 @@ import os
 import re
 import shutil
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from diffdrive_jacobian.exploration.child import ChildDiedError, call_in_child
 from diffdrive_jacobian.exploration.errors import ExplorationError
@@ -56,7 +58,12 @@ def check_output(folder: Path) -> None:
 
 
 def write_finding(
-    finding: Finding, output: Path, others: Sequence[Finding], *, seed: int = 0, record_it: bool = True
+    finding: Finding,
+    output: Path,
+    others: Sequence[Finding],
+    *,
+    seed: int = 0,
+    executor: Executor | None = None,
 ) -> Finding:
     """Write a finding into a folder of its own, in the place of one of an earlier exploration.
 
@@ -67,7 +74,8 @@ def write_finding(
         output: Folder of all findings.
         others: Findings that have a folder already.
         seed: Seed of the exploration.
-        record_it: Whether to run the case again and write the bag and the picture.
+        executor: Runs the case again, to write the bag and the picture, on this machine; None: these are
+            not written.
 
     Returns:
         The finding, with its folder.
@@ -75,7 +83,7 @@ def write_finding(
     taken = {other.directory for other in others}
     stem = re.sub(r'\W+', '_', finding.violation.name)
     number, folder = 1, output / stem
-    while folder in taken:
+    while folder in taken or _is_foreign(folder):
         number += 1
         folder = output / f'{stem}_{number}'
     notes = list(finding.notes)
@@ -85,11 +93,16 @@ def write_finding(
         (folder / CASE).write_text(_case(finding, seed))
         name = _snake(folder.name)
         (folder / f'test_{name}.py').write_text(test_source(finding, folder, name, seed))
-        if record_it:
-            notes += _record(finding, folder)
+        if executor is not None:
+            notes += _record(finding, folder, executor)
     except OSError as error:
         notes.append(f'not written: {error}')
     return replace(finding, directory=folder, notes=tuple(notes))
+
+
+def _is_foreign(folder: Path) -> bool:
+    """Return whether a folder has files, and none of an earlier exploration."""
+    return folder.is_dir() and not (folder / CASE).exists() and any(folder.iterdir())
 
 
 def _remove_earlier(folder: Path) -> None:
@@ -99,13 +112,17 @@ def _remove_earlier(folder: Path) -> None:
         file.unlink(missing_ok=True)
 
 
-def _record(finding: Finding, folder: Path) -> list[str]:
+def _record(finding: Finding, folder: Path, executor: Executor) -> list[str]:
     """Record the smallest case. Return notes on what could not be written."""
     arguments = finding.setting, finding.trial, finding.violation.index, str(folder)
     try:
-        return list(record(*arguments) if can_run_here() else call_in_child(record, *arguments))
+        return executor.submit(_record_in_process, *arguments).result()
     except ChildDiedError as error:
         return [f'not recorded: {error}']
+
+
+def _record_in_process(*arguments: Any) -> list[str]:
+    return list(record(*arguments) if can_run_here() else call_in_child(record, *arguments))
 
 
 def _case(finding: Finding, seed: int) -> str:

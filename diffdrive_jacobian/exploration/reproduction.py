@@ -29,7 +29,7 @@ def reproducing(world: Lockstep, case: Path) -> Iterator[None]:
     with MessageDigest(world) as messages:
         try:
             yield
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             if isinstance(error, PropertyViolation):
                 key, time = repr(error.property), seconds(world)
             else:

@@ -10,22 +10,24 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from diffdrive_jacobian.exploration import child
 from diffdrive_jacobian.exploration.errors import ExplorationError
-from diffdrive_jacobian.exploration.executors import LocalExecutor
+from diffdrive_jacobian.exploration.executors import LocalExecutor, SerialExecutor
 from diffdrive_jacobian.exploration.generation import StopShrinking, generate, shrink, st, trials
 from diffdrive_jacobian.exploration.output import check_output, write_finding
 from diffdrive_jacobian.exploration.result import Exploration, Finding
 from diffdrive_jacobian.exploration.scenario import Scenario, ScenarioName
 from diffdrive_jacobian.exploration.source import Source
 from diffdrive_jacobian.exploration.trial import Outcome, Setting, Trial, Violation
-from diffdrive_jacobian.exploration.worker import packed, run_worlds
+from diffdrive_jacobian.exploration.worker import packed, run_world_afresh, run_worlds
 from diffdrive_jacobian.properties import Property
 
 BLOCK = 50
@@ -34,6 +36,8 @@ TASK = 5
 """Number of worlds in one task of the executor."""
 IN_FLIGHT = 64
 """Number of tasks that the executor has at a time. Worlds beyond a stop are run in vain."""
+GRACE = 30.0
+"""Wall time after the time limit for worlds that are running (s)."""
 
 
 def explore(
@@ -67,7 +71,7 @@ def explore(
         seed: Seed of everything that is random.
         stop_at_first: Whether to stop at the first block of worlds (50) with a violation.
         time_limit: Wall time after which no more worlds are started (s); None: no limit. The result then
-            depends on the speed of the machine.
+            depends on the speed of the machine. Worlds that still run 30 s later are given up.
         shrink_worlds: Largest number of worlds that are run to shrink one violation.
         args: ROS arguments of all nodes, as for `Lockstep`.
         executor: Runs the worlds; None: all cores of this machine. Any Executor of `concurrent.futures`
@@ -93,10 +97,12 @@ def explore(
     _check_number('worlds', worlds, 1)
     _check_number('shrink_worlds', shrink_worlds, 0)
     _check_number('seed', seed, 0)
-    if time_limit is not None and not time_limit > 0.0:
+    if time_limit is not None and not (_is_number(time_limit) and time_limit > 0.0):
         raise ExplorationError(f'time_limit must be positive, got {time_limit!r}')
-    if output is not None:
-        check_output(Path(output))
+    # A scenario may change the working directory.
+    folder = None if output is None else Path(output).absolute()
+    if folder is not None:
+        check_output(folder)
     strategy = trials(_case_strategy(cases), _fault_strategy(faults))
     if executor is not None and not callable(getattr(executor, 'submit', None)):
         raise ExplorationError(
@@ -106,7 +112,7 @@ def explore(
     complete = False
     try:
         search = _Search(setting, strategy, seed, worlds, used, time_limit)
-        result = search.run(stop_at_first, shrink_worlds, None if output is None else Path(output))
+        result = search.run(stop_at_first, shrink_worlds, folder)
         complete = not result.stopped
         return result
     finally:
@@ -123,6 +129,10 @@ class _Numbered:
     block: int
     key: str
     trial: Trial
+
+
+class _NotEndedError(BaseException):
+    """Worlds still run, a while after the time limit. Not an Exception, as StopShrinking."""
 
 
 class _Search:
@@ -157,13 +167,18 @@ class _Search:
         try:
             self._explore(stop_at_first)
             found_at = time.monotonic()
-            for key in self._first:
-                finding = self._shrunk(key, shrink_worlds)
-                if output is not None:
-                    finding = write_finding(finding, output, findings, seed=self._seed)
-                findings.append(finding)
-        except KeyboardInterrupt:
-            self._stopped = 'interrupted'
+            # What is written is written here, where the folder is.
+            here = isinstance(self._executor, (LocalExecutor, SerialExecutor))
+            with nullcontext(self._executor) if here else LocalExecutor(1) as recorder:
+                for key in self._first:
+                    finding = self._shrunk(key, shrink_worlds)
+                    if output is not None:
+                        finding = write_finding(
+                            finding, output, findings, seed=self._seed, executor=recorder
+                        )
+                    findings.append(finding)
+        except (KeyboardInterrupt, _NotEndedError) as stop:
+            self._stopped = 'interrupted' if isinstance(stop, KeyboardInterrupt) else str(stop)
             findings += self._not_shrunk(findings, output)
         now = time.monotonic()
         return Exploration(
@@ -199,7 +214,7 @@ class _Search:
                 if not waiting:
                     return
                 task, future = waiting.popleft()
-                for one, outcome in zip(task, _result(future), strict=True):
+                for one, outcome in zip(task, self._result(future), strict=True):
                     if stop_at_first and self._first and one.block > self._block_of_first():
                         self._stopped = 'after the first block with a violation'
                         return
@@ -270,7 +285,7 @@ class _Search:
         first, violation = self._first[key]
         fails = _Fails(self, first, violation, shrink_worlds)
         smallest = shrink(self._strategy, self._seed, first.block, BLOCK, fails)
-        again = [self._run(smallest, violation.index, digest=True) for _ in range(2)]
+        again = [self._run(smallest, violation.index, digest=True, afresh=one) for one in (False, True)]
         violations = [outcome.of(key) for outcome in again]
         same = violations[0] is not None and (again[0].digest, violations[0]) == (
             again[1].digest,
@@ -297,10 +312,35 @@ class _Search:
         """Return whether the time limit is reached."""
         return time.monotonic() >= self._end
 
-    def _run(self, trial: Trial, index: int, *, digest: bool = False) -> Outcome:
+    def _run(self, trial: Trial, index: int, *, digest: bool = False, afresh: bool = False) -> Outcome:
+        """Run a world, in a new process if `afresh`, unless worlds are to run in this thread."""
         data = packed(self._setting, [trial], only=index, digest=digest)
-        (outcome,) = _result(self._executor.submit(run_worlds, data))
+        afresh = afresh and not isinstance(self._executor, SerialExecutor)
+        future = self._executor.submit(run_world_afresh if afresh else run_worlds, data)
+        (outcome,) = self._result(future)
         return outcome
+
+    def _result(self, future: Future[list[Outcome]]) -> list[Outcome]:
+        """Return the result of a task.
+
+        Raises:
+            ExplorationError: The executor failed, or a fault or a property is invalid.
+            _NotEndedError: The task still runs, a while after the time limit.
+        """
+        left = self._end - time.monotonic()
+        try:
+            return future.result(max(0.0, left) + GRACE if math.isfinite(left) else None)
+        except ExplorationError:
+            raise
+        except Exception as error:
+            if isinstance(error, FutureTimeoutError) and not future.done():
+                raise _NotEndedError(
+                    f'time limit of {self._limit:g} s; a world still ran {GRACE:g} s later: does its '
+                    'scenario end?'
+                ) from None
+            raise ExplorationError(
+                f'a world could not be run: {type(error).__name__}: {error}'
+            ) from error
 
     def run_one(self, trial: Trial, index: int) -> Outcome:
         """Run a world with one property."""
@@ -323,9 +363,7 @@ class _Search:
                 complete=False,
             )
             if output is not None:
-                finding = write_finding(
-                    finding, output, [*findings, *rest], seed=self._seed, record_it=False
-                )
+                finding = write_finding(finding, output, [*findings, *rest], seed=self._seed)
             rest.append(finding)
         return rest
 
@@ -375,23 +413,11 @@ def key_of(trial: Trial) -> str:
     return source.expression((trial.case, trial.faults, trial.seed))
 
 
-def _result(future: Future[list[Outcome]]) -> list[Outcome]:
-    """Return the result of a task.
-
-    Raises:
-        ExplorationError: The executor failed, or a fault or a property is invalid.
-    """
-    try:
-        return future.result()
-    except ExplorationError:
-        raise
-    except Exception as error:
-        raise ExplorationError(f'a world could not be run: {type(error).__name__}: {error}') from error
-
-
 def _checked_properties(properties: Any) -> tuple[Property, ...]:
     if isinstance(properties, Property):
         raise ExplorationError(f'properties must be a list: [{properties!r}]')
+    if not isinstance(properties, Iterable):
+        raise ExplorationError(f'properties must be a list, got {properties!r}')
     for one in properties:
         if not isinstance(one, Property):
             hint = '; create one: ' + one.__name__ + '(...)' if isinstance(one, type) else ''
@@ -408,6 +434,10 @@ def _checked_properties(properties: Any) -> tuple[Property, ...]:
 def _check_number(name: str, value: object, least: int) -> None:
     if not isinstance(value, int) or isinstance(value, bool) or value < least:
         raise ExplorationError(f'{name} must be an integer of at least {least}, got {value!r}')
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def _case_strategy(

@@ -9,9 +9,9 @@ from typing import Any
 
 import rclpy
 
-from diffdrive_jacobian.exploration.child import ChildDiedError, call_in_child
+from diffdrive_jacobian.exploration.child import ChildDiedError, call_in_child, call_in_fresh_child
 from diffdrive_jacobian.exploration.errors import ExplorationError
-from diffdrive_jacobian.exploration.trial import Outcome, Setting, Trial, Violation, run
+from diffdrive_jacobian.exploration.trial import DIED, Outcome, Setting, Trial, Violation, run
 
 
 def packed(
@@ -57,11 +57,25 @@ def _one_by_one(data: bytes) -> list[Outcome]:
         try:
             outcomes += call_in_child(run_worlds_here, one)
         except ChildDiedError as error:
-            died = Violation(
-                key=f'no exception: {error}', seconds=0.0, text=str(error), name='NoExceptionProcessDied'
-            )
-            outcomes.append(Outcome(violations=(died,)))
+            outcomes.append(_died(error))
     return outcomes
+
+
+def run_world_afresh(data: bytes) -> list[Outcome]:
+    """Run one world in a new process, where no other has left anything behind.
+
+    Args:
+        data: From `packed`, with one trial.
+    """
+    try:
+        return list(call_in_fresh_child(run_worlds_here, data))
+    except ChildDiedError as error:
+        return [_died(error)]
+
+
+def _died(error: ChildDiedError) -> Outcome:
+    died = Violation(key=f'no exception: {error}', seconds=0.0, text=str(error), name=DIED)
+    return Outcome(violations=(died,))
 
 
 def can_run_here() -> bool:
