@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from diffdrive_jacobian.bags.journal import JOURNAL
 from diffdrive_jacobian.exploration.child import ChildDiedError, call_in_child
 from diffdrive_jacobian.exploration.errors import ExplorationError
 from diffdrive_jacobian.exploration.recorded_world import BAG, PICTURE, record
@@ -108,7 +109,8 @@ def _is_foreign(folder: Path) -> bool:
 def _remove_earlier(folder: Path) -> None:
     """Remove what an earlier exploration has written into a folder."""
     shutil.rmtree(folder / BAG, ignore_errors=True)
-    for file in (folder / PICTURE, folder / CASE):
+    # The journal is there if the process of the recording ended.
+    for file in (folder / PICTURE, folder / CASE, folder / (BAG + JOURNAL)):
         file.unlink(missing_ok=True)
 
 
