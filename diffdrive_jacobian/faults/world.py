@@ -78,6 +78,8 @@ class LateService(Fault):
 class ParameterChange(NodeFault):
     """Somebody changes a parameter of a node, and changes it back after `duration`.
 
+    If another change of it began meanwhile and still lasts, that one remains until its own end.
+
     The node may refuse the value, which is noted in the events. It is an error if it has no such
     parameter.
 
