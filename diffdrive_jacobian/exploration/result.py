@@ -62,7 +62,10 @@ class Finding:
             )
         lines += [f'  {note}' for note in self.notes]
         if self.directory is not None:
-            lines.append(f'  {self.directory}')
+            here = Path.cwd()
+            within = self.directory.is_relative_to(here)
+            shown = self.directory.relative_to(here) if within else self.directory
+            lines.append(f'  {shown}')
         return '\n'.join(lines)
 
 
