@@ -213,6 +213,7 @@ def test_acceleration_within(lockstep, send):
         [(0.05,), (0.1,), (0.31,)],
         [(0.1,), (0.2,), (-0.1,)],
         [(0.1,), (float('nan'),)],
+        [(0.0,)] * 20 + [(0.11,)],
     ],
 )
 def test_acceleration_exceeded(lockstep, send, commands):
@@ -235,7 +236,15 @@ def test_a_stop_is_an_acceleration_where_it_is_not_allowed(lockstep, send):
         accelerate(lockstep, send, (0.1,), (0.2,), (0.3,), (0.0,))
 
 
-# --- Own properties
+def test_a_topic_of_another_type_is_an_error(lockstep, robot_at):
+    lockstep.require(NeverFasterThan(0.5, 2.0, topic='joint_states'))
+    with pytest.raises(
+        LockstepError, match=r'from messages of type Twist, .* got one of type JointState'
+    ):
+        robot_at()
+
+
+# --- The page
 
 
 def test_the_page_has_a_property_of_one_s_own(lockstep, robot_at):
@@ -247,3 +256,10 @@ def test_the_page_has_a_property_of_one_s_own(lockstep, robot_at):
     names = {}
     exec(code, names)
     names['test_a_robot_publishes_odometry'](lockstep, robot_at)
+
+
+def test_the_page_lists_every_property():
+    table = PAGES['doc/lockstep.md'].read_text()
+    base = {'Property', 'PropertyViolation', 'Watch'}
+    missing = [name for name in properties.__all__ if name not in base and f'`{name}(' not in table]
+    assert missing == []

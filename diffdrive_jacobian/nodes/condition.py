@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.ros.node import NO_CLOCK
@@ -121,6 +122,10 @@ class Condition:
             return robot
         self._encoders = self._encoders.read(robot)
         return self._encoders.reported(robot)
+
+    def odometry_pose(self, robot: Robot) -> NDArray[np.float64]:
+        """Return `[x, y, theta]` of the odometry, shape (3,), by the last reading of encoders."""
+        return np.array(robot.pose_tuple if self._encoders is None else self._encoders.pose)
 
     def placed(self, robot: Robot) -> None:
         """Start the odometry again at the pose of the robot."""

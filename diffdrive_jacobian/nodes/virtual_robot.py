@@ -270,10 +270,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
         With encoders of few steps: at their last reading, as it was published.
         """
-        if self._encoders is not None:
-            return np.array(self._encoders.pose)
         robot = self._robot_now()
-        return self._initial_pose() if robot is None else robot.pose.copy()
+        return self._initial_pose() if robot is None else self.condition.odometry_pose(robot)
 
     @property
     def truth(self) -> NDArray[np.float64]:

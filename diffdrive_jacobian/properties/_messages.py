@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from rclpy.serialization import deserialize_message
 
+from diffdrive_jacobian.lockstep import LockstepError
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader
 
 _TWISTS = {
@@ -101,7 +102,7 @@ def read_twist(message_type: type, message: Any) -> Twist | None:
     """Return the twist in a message of a type; None: the bytes are invalid.
 
     Raises:
-        TypeError: Messages of this type have no twist.
+        LockstepError: Messages of this type have no twist.
     """
     fields = _read_twist(message_type, message)
     return None if fields is None else Twist(float(fields[0]), float(fields[1]))
@@ -111,7 +112,7 @@ def read_pose(message_type: type, message: Any) -> Pose | None:
     """Return the pose in a message of a type; None: the bytes are invalid.
 
     Raises:
-        TypeError: Messages of this type have no pose.
+        LockstepError: Messages of this type have no pose.
     """
     fields = _read_pose(message_type, message)
     return None if fields is None else planar(*fields)
@@ -125,7 +126,8 @@ def planar(x: float, y: float, qx: float, qy: float, qz: float, qw: float) -> Po
 
 def _prefix(message_type: type, prefixes: dict[str, str], what: str) -> str:
     if message_type.__name__ not in prefixes:
-        raise TypeError(
-            f'a {what} is read from {", ".join(prefixes)}, got a message of type {message_type.__name__}'
+        raise LockstepError(
+            f'a property reads a {what} from messages of type {", ".join(prefixes)}, got one of type '
+            f'{message_type.__name__}: it observes a wrong topic'
         )
     return prefixes[message_type.__name__]

@@ -72,10 +72,10 @@ class _SpeedWatch(Watch):
 class AccelerationWithin(Property):
     """The twists on a topic change at limited rates: by `v` m/s and `omega` rad/s per second.
 
-    Messages leave and arrive early or late, and clocks jump. So a change of `v * slack` and
-    `omega * slack` is allowed at once, and is then used up: it recovers at the rates of the limits. A
-    sequence of messages violates this property if its changes (added without signs) exceed
-    `v * (t + slack)` within some time t. Time is what the clock of the nodes or world time advances,
+    The changes (added without signs) within any time t must not exceed `v * (t + slack)` and
+    `omega * (t + slack)`. So one message may change by `v * slack`, whatever time has passed since the
+    one before: the motors got that one until then. `slack` must be at least the period of the messages,
+    and more if they may leave late. Time is what the clock of the nodes or world time advances,
     whichever is more. Each publisher is checked on its own, its first message compared with standstill.
     Messages with values that are not finite are violations.
 
@@ -84,7 +84,7 @@ class AccelerationWithin(Property):
         omega: Largest rate of change of angular.z (rad/s^2); infinite: no limit.
         topic: Topic of type Twist, TwistStamped or Odometry, of which the twist counts (default:
             'cmd_vel').
-        slack: Time for which a change may be early (s) (default: 0.1).
+        slack: Time for which changes may be early (s) (default: 0.1).
         stops: Whether a twist of exactly zero is allowed at any time, as when a robot is stopped because
             its odometry is lost (default: True).
     """
@@ -124,16 +124,17 @@ class _AccelerationWatch(Watch):
             self.found(f'{self._topic}: {twist or "invalid bytes"}; allowed: finite values')
             return
         passed = max(self.seconds - last.seconds, (self.world.now - last.now) / NANOSECONDS)
-        left_v, left_omega = last.left_v + passed, last.left_omega + passed
+        left_v = min(last.left_v + passed, limit.slack)
+        left_omega = min(last.left_omega + passed, limit.slack)
         if not (limit.stops and twist.is_zero):
             left_v = _left(left_v, twist.v - last.twist.v, limit.v)
             left_omega = _left(left_omega, twist.omega - last.twist.omega, limit.omega)
             if min(left_v, left_omega) < -MARGIN:
                 self.found(
                     f'{self._topic}: {twist}, after {last.twist} {passed:g} s before; allowed: changes '
-                    f'of {limit.v:g} m/s and {limit.omega:g} rad/s per second'
+                    f'of {limit.v:g} m/s and {limit.omega:g} rad/s per second, early by '
+                    f'{limit.slack:g} s'
                 )
-        left_v, left_omega = min(left_v, limit.slack), min(left_omega, limit.slack)
         self._last[publisher] = _Last(twist, self.seconds, self.world.now, left_v, left_omega)
         self.note(self._topic, ': ', twist)
 
