@@ -20,11 +20,12 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.faults import ClockPause, Kill, Loss, TimeJump
-from diffdrive_jacobian.lockstep import Answers, Every, Idle, Lockstep, LockstepError
+from diffdrive_jacobian.lockstep import Answers, Every, Idle, Lockstep, LockstepError, PropertyViolation
 from diffdrive_jacobian.lockstep import _external_process as external_process
 from diffdrive_jacobian.lockstep._external_answers import AnswersDue, TicksDue
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.properties import NeverFasterThan
 
 SECOND = 1_000_000_000
 SCRIPT = external_nodes.__file__
@@ -271,6 +272,17 @@ def test_a_node_of_the_world_that_is_killed_and_made_again_is_discovered_again(w
     # What it sends at the times at which it is made, before it is discovered, may be lost.
     received = [x for x in received if x not in (0.0, pytest.approx(0.95))]
     assert received == pytest.approx([0.1, 0.2, 0.3, 0.4, 1.0, 1.1, 1.2, 1.3, 1.4, 1.5])
+
+
+@pytest.mark.parametrize('declared', [Answers('echo/cmd_vel', to='echo/odom'), Idle('echo')])
+def test_properties_observe_external_nodes(world_of, declared):
+    world = world_of(declared)
+    world.require(NeverFasterThan(2.5, 1.0, topic='echo/cmd_vel'))
+    for speed in (1.0, 2.0):
+        world.publish('echo/odom', odometry(speed))
+    assert world.last('echo/cmd_vel').twist.linear.x == 2.0
+    with pytest.raises(PropertyViolation, match='NeverFasterThan'):
+        world.publish('echo/odom', odometry(3.0))
 
 
 # --- What goes wrong

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 
 from rclpy.node import Node
 
@@ -145,7 +145,7 @@ class Connection:
                 while reader.waits(self._node.context, 0.0):
                     reader.accept()
             expected = self._expectations.due(name)
-            if not all(one.started for one in expected):
+            if name not in self._executor.deliveries.held or not all(one.started for one in expected):
                 self._restart(topic, expected)
         self.began = True
         self._executor.deliveries.held.update(self._topics)
@@ -153,7 +153,7 @@ class Connection:
         self._executor.clocks.publish()
 
     def topics(self) -> list[str]:
-        """Return the declared topics that have an external publisher."""
+        """Return the topics of external nodes on which messages are counted."""
         return list(self._topics)
 
     def _awaits(self, process: ExternalProcess) -> bool:
@@ -166,13 +166,21 @@ class Connection:
         return Discovery(self.graph, self._executor.nodes)
 
     def _count_published_topics(self) -> None:
-        """Subscribe to the declared topics that have an external publisher."""
+        """Subscribe to the declared topics that have an external publisher, and those of idle nodes."""
         for one in self._expectations.due():
-            infos = self.graph.publishers(one.topic)
-            if infos and one.topic not in self._topics:
-                topic = ExternalTopic(self._node, one.topic, infos, self._traffic)
-                self._executor.unserved.add(topic.subscription)
-                self._topics[one.topic] = topic
+            self._subscribe(one.topic)
+        for probe in self._expectations.probes():
+            for name in self.graph.topics_of(probe.name):
+                with suppress(LockstepError):
+                    # A type that is not installed here has no subscription in the world, either.
+                    self._subscribe(name)
+
+    def _subscribe(self, name: str) -> None:
+        infos = self.graph.publishers(name)
+        if infos and name not in self._topics:
+            topic = ExternalTopic(self._node, name, infos, self._traffic)
+            self._executor.unserved.add(topic.subscription)
+            self._topics[name] = topic
 
     def _not_discovered(self, waited: float, missing: Sequence[str]) -> str:
         topics = ', '.join(self.graph.published_topics()) or 'none'
