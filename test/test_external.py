@@ -322,6 +322,16 @@ def test_topics_that_nobody_has_are_named_with_those_that_are_there(world_of):
         assert text in str(error.value)
 
 
+@pytest.mark.parametrize('declared', [Answers('echo/cmd_vel', to='echo/odom'), Idle('echo')])
+def test_qos_that_does_not_fit_is_named(world_of, declared):
+    world = world_of(declared)
+    world.listen(TwistStamped, 'echo/cmd_vel', latched=True)
+    with pytest.raises(
+        LockstepError, match=r'/lockstep to /echo/cmd_vel .* incompatible QoS: .*transient local, and'
+    ):
+        world.connect(timeout=1.0)
+
+
 def test_another_type_is_named(world_of):
     world = world_of(Answers('echo/cmd_vel', to='echo/odom'))
     world.node.create_subscription(Twist, 'echo/cmd_vel', lambda _: None, 10)

@@ -122,7 +122,7 @@ class Connection:
         while True:
             self.waiting.check_processes()
             self._count_published_topics()
-            missing, untimed = self._discovery().missing(*self._awaited())
+            missing, untimed = self._discovery().missing(*self._awaited(), self._topics)
             if not (missing or untimed):
                 break
             waited = time.monotonic() - begin
