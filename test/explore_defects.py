@@ -25,6 +25,8 @@ from diffdrive_jacobian import faults
 from diffdrive_jacobian.exploration import explore, fault_schedules, numbers, points, poses
 
 RIGHT = 'no defect'
+SHRINK_WORLDS = 200
+"""Most worlds to shrink one violation."""
 KINDS = (
     *(faults.Loss, faults.Delay, faults.Stale, faults.Duplicate, faults.Reorder, faults.RateLimit),
     *(faults.Hang, faults.Kill, faults.Slow, faults.TimerJitter),
@@ -60,13 +62,15 @@ def goal_lists(draw):
 
 def cases(controller):
     """Return the strategies of what happens to a controller."""
-    moments = st.one_of(st.none(), numbers(0.0, LAST_EVENT))
+    moment = numbers(0.0, LAST_EVENT)
+    never = st.none()
     return {
         'controller': st.just(controller),
         'start': poses(1.0),
         'goals': goal_lists(),
-        'cancel': moments,
-        'shutdown': moments,
+        # Most worlds go on to the end: there is more to see in them.
+        'cancel': st.one_of(never, never, moment),
+        'shutdown': st.one_of(never, never, never, never, moment),
     }
 
 
@@ -80,6 +84,7 @@ def explored(name, worlds, seed):
         worlds=worlds,
         seed=seed,
         stop_at_first=name != RIGHT,
+        shrink_worlds=SHRINK_WORLDS,
     )
 
 

@@ -13,6 +13,7 @@ from geometry_msgs.msg import Twist
 from inner_sessions import OPTIONS, SETTING, draw_quickly, run_inner
 from nav_msgs.msg import Odometry
 
+from diffdrive_jacobian.faults import EncoderSteps
 from diffdrive_jacobian.reading import read_run
 from diffdrive_jacobian.reading.verification import verify
 from diffdrive_jacobian.testing.artifacts import MAX_LENGTH, artifact_name, name_beside_the_file
@@ -205,6 +206,20 @@ def test_a_robot_has_its_pose_by_odometry_and_its_true_one(lockstep, robot_at):
     # They are copies.
     robot.pose[:] = robot.truth[:] = 0.0
     assert math.dist(robot.pose[:2], (1.0, 2.0)) == pytest.approx(0.41)
+
+
+def test_the_pose_of_a_robot_is_that_of_its_encoders(lockstep, robot_at):
+    robot = robot_at()
+    lockstep.inject(EncoderSteps(per_revolution=10))
+    odom = lockstep.listen(Odometry, 'odom')
+    command = Twist()
+    command.linear.x = 0.123
+    lockstep.publish('cmd_vel', command)
+    lockstep.run_for(0.4)
+    assert robot.pose[0] == odom[-1].pose.pose.position.x != robot.truth[0]
+    assert abs(robot.pose[0] - robot.truth[0]) < 0.03
+    # Read, and not changed by that.
+    assert robot.pose.tolist() == robot.pose.tolist()
 
 
 @pytest.mark.parametrize('capture', ['fd', 'sys', 'no'])

@@ -486,7 +486,6 @@ def blocks(language):
 
 
 def test_the_example_is_given_in_python(pytester):
-    pytester.makeconftest("pytest_plugins = ['diffdrive_jacobian.testing.fixtures']")
     pytester.makepyfile(**blocks('python'))
     pytester.runpytest_subprocess('test_my_law.py').assert_outcomes(passed=1)
     ended = pytester.runpython('sweep_my_law.py')

@@ -6,6 +6,7 @@ from math import inf, nan
 
 import pytest
 from lockstep_nodes import make
+from nav_msgs.msg import Odometry
 from property_nodes import Scene, Student, goal_at, odometry_at, twist
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
@@ -286,3 +287,26 @@ def test_a_goal_that_is_refused_is_not_due(lockstep, robot_at):
     goal = goal_at(1.0)
     goal.header.frame_id = 'map'
     drive(lockstep, robot_at, seconds=3.0, goal=goal)
+
+
+def test_who_records_goals_need_not_arrive(lockstep, robot_at, recorded_run):
+    """The recorder receives the goal, too, but its goal is not canceled."""
+    lockstep.require(ArrivesOnceFaultsEnd(1.0))
+    robot_at()
+    lockstep.add(make(GoToGoal))
+    lockstep.publish('goal_pose', goal_at(5.0))
+    lockstep.run_for(0.5)
+    lockstep.call(Trigger, 'cancel_goal')
+    lockstep.run_for(1.0)
+    lockstep.finish()
+
+
+def test_the_test_itself_is_no_controller(lockstep, robot_at):
+    lockstep.require(StopsAfterLostOdometry(0.1))
+    robot = robot_at()
+    lockstep.listen(Odometry, 'odom')
+    lockstep.publish('cmd_vel', twist(0.2))
+    lockstep.run_for(0.2)
+    lockstep.remove(robot)
+    lockstep.run_for(0.5)
+    lockstep.finish()

@@ -72,7 +72,8 @@ def shrink(
         seed: Seed of the exploration.
         block: Number of the block.
         count: Size of the block.
-        fails: Returns whether a trial fails. It must return the same for equal trials.
+        fails: Returns whether a trial fails. It must return the same for equal trials. It may raise
+            StopShrinking.
 
     Raises:
         ExplorationError: No trial of the block fails.
@@ -86,10 +87,15 @@ def shrink(
 
     try:
         _run(strategy, seed, block, count, [Phase.generate, Phase.shrink], check)
-    except _FoundError:
+    except (_FoundError, StopShrinking):
         # Hypothesis ends with the smallest one.
-        return smallest[0]
+        if smallest:
+            return smallest[0]
     raise ExplorationError(f'no trial of block {block} failed again')
+
+
+class StopShrinking(BaseException):
+    """Ends shrinking. Not an Exception, which Hypothesis would take for a failure."""
 
 
 class _FoundError(Exception):

@@ -29,7 +29,7 @@ def record(setting: Setting, trial: Trial, only: int, folder: str) -> list[str]:
     def recording(world: Lockstep) -> Iterator[None]:
         writing = Recording(bag, 'mcap', lossless=True)
         recorder = Recorder(Selection(everything=True), writing)
-        world.add(recorder)
+        world.add(recorder, observer=True)
         world.on_new_topics(recorder.discover)
         recorder.discover()
         try:

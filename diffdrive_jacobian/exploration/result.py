@@ -115,8 +115,6 @@ class Exploration:
     """Number of faults in these worlds."""
     checks: int
     """How often a property was checked."""
-    rejected: int = 0
-    """Number of worlds whose case the scenario rejected."""
     stopped: str = ''
     """Why not all worlds ran; empty: they did."""
     notes: tuple[str, ...] = ()
@@ -154,8 +152,6 @@ class Exploration:
             lines.append(
                 f'{self.shrink_worlds} more worlds to shrink them in {self.shrink_seconds:.1f} s'
             )
-        if self.rejected:
-            lines.append(f'{self.rejected} cases were rejected by the scenario')
         if self.stopped:
             lines.append(f'stopped: {self.stopped}')
         lines += [f'note: {note}' for note in self.notes]

@@ -7,7 +7,7 @@ has fewer faults. Then they become certain (probability 1), short and early, at 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from diffdrive_jacobian import faults
@@ -21,10 +21,15 @@ Kind = type[Fault] | st.SearchStrategy[Fault]
 LONGEST = 2.0
 """Longest delay of a message or a response that is tried (s)."""
 CHOICES = 3
-"""Least number of choices of a fault besides start and duration: as many as `Loss` has. Hypothesis prefers
-values of fewer choices, so otherwise a loss would shrink to a fault of another kind."""
+"""Least number of choices of a fault besides start and duration: as many as `Loss` has.
+
+Hypothesis prefers values of fewer choices, so otherwise a loss would shrink to a fault of another kind.
+"""
 SHORT = (0.1, 0.5, 0.2, 0.05, 0.02, 0.01)
 """Durations of callbacks and of jitter that are tried (s)."""
+WHEELS = ('left', 'right')
+NUMBER_CHANGES = ('nan', 'inf', '-inf', 'negate', 'subnormal')
+"""What happens to a number of a corrupted message."""
 RATES = (1.0, 2.0, 5.0, 10.0, 20.0, 0.5)
 """Rates that are tried (Hz)."""
 
@@ -68,6 +73,31 @@ SERVICE_KINDS: dict[type[Fault], Callable[[], Fields]] = {
     faults.LateService: lambda: {'seconds': st.one_of(_positive(5.0), st.just(math.inf))},
 }
 """Kinds of faults of services."""
+ROBOT_KINDS: dict[type[Fault], Callable[[], Fields]] = {
+    faults.Push: lambda: {
+        'noticed': st.booleans(),
+        'dtheta': numbers(-3.0, 3.0),
+        'dy': numbers(-1.0, 1.0),
+        'dx': numbers(-1.0, 1.0),
+    },
+    faults.DeadWheel: lambda: {'wheel': st.sampled_from(WHEELS)},
+    faults.SaturatedWheel: lambda: {
+        'wheel': st.sampled_from(WHEELS),
+        'max_velocity': numbers(0.1, 10.0),
+    },
+    faults.ActuatorLag: lambda: {'seconds': st.sampled_from(SHORT)},
+    faults.EncoderSteps: lambda: {'per_revolution': st.sampled_from((16, 64, 256, 1024))},
+    faults.Slip: dict,
+    faults.WrongGeometry: lambda: dict.fromkeys(
+        (
+            'left_wheel_radius_multiplier',
+            'right_wheel_radius_multiplier',
+            'wheel_separation_multiplier',
+        ),
+        st.sampled_from((1.0, 1.1, 0.9, 1.5, 0.5)),
+    ),
+}
+"""Kinds of faults of a `VirtualRobot`."""
 WORLD_KINDS: dict[type[Fault], Callable[[], Fields]] = {
     faults.ClockPause: dict,
     faults.TimeJump: lambda: {'seconds': st.one_of(_positive(10.0), numbers(-10.0, -STEP))},
@@ -83,6 +113,8 @@ def fault_schedules(
     duration: float = 10.0,
     *,
     services: Sequence[str] = (),
+    robots: Sequence[str] = (),
+    fields: Mapping[str, Sequence[str]] | None = None,
     endless: bool = False,
 ) -> st.SearchStrategy[list[Fault]]:
     """Return a strategy of lists of faults, for `explore(faults=...)`.
@@ -91,17 +123,28 @@ def fault_schedules(
         topics: Topics whose messages may be lost, late, repeated, ...
         nodes: Names of nodes that may be killed, frozen, slow, ...
         kinds: Kinds of faults, such as `[faults.Loss, faults.Delay]`, and strategies of faults. None:
-            all kinds of the given topics, nodes and services. `faults.ClockPause` and `faults.TimeJump`
-            must be asked for.
+            all kinds of the given topics, nodes, services and robots. `faults.ClockPause` and
+            `faults.TimeJump` must be asked for.
         max_faults: Largest number of faults.
         duration: Time at which all faults have ended (s). They begin and end in steps of 0.1 s.
         services: Services that may respond late or never.
+        robots: Names of virtual robots whose wheels, motors and encoders may fail, such as
+            `['virtual_robot']`.
+        fields: Fields of messages that may be corrupted, by topic: `{'odom': ['pose.pose.position.x',
+            'header.stamp', 'header.frame_id']}`. A number becomes NaN, infinite, ...,
+            a stamp is shifted, a frame_id replaced. Other fields are taken for numbers.
         endless: Whether faults may also last until the end of the run.
 
     Raises:
         ValueError: An argument is invalid; the message says which, and what is allowed.
     """
-    for name, value in (('topics', topics), ('nodes', nodes), ('services', services)):
+    for name, value in (
+        ('topics', topics),
+        ('nodes', nodes),
+        ('services', services),
+        ('robots', robots),
+        *(fields or {}).items(),
+    ):
         if isinstance(value, str):
             raise ValueError(f'{name} must be a list of names, got the string {value!r}')
     if not (isinstance(max_faults, int) and max_faults >= 1):
@@ -112,12 +155,13 @@ def fault_schedules(
         (TOPIC_KINDS, 'topic', topics),
         (NODE_KINDS, 'node', nodes),
         (SERVICE_KINDS, 'service', services),
+        (ROBOT_KINDS, 'robot', robots),
         (WORLD_KINDS, '', ()),
     )
     if kinds is None:
         kinds = [kind for known, _, names in targets if names for kind in known]
-        if not kinds:
-            raise ValueError('fault_schedules needs topics, nodes, services or kinds')
+        if not kinds and not fields:
+            raise ValueError('fault_schedules needs topics, nodes, services, robots, fields or kinds')
     strategies = []
     for kind in kinds:
         if isinstance(kind, st.SearchStrategy):
@@ -128,11 +172,14 @@ def fault_schedules(
             known_names = ', '.join(one.__name__ for known, _, _ in targets for one in known)
             got = getattr(kind, '__name__', repr(kind))
             raise ValueError(f'kinds must be among {known_names}, or strategies of faults; got {got}')
-        fields, field, names = found[0]
+        own_fields, field, names = found[0]
         if field and not names:
             raise ValueError(f'{kind.__name__} needs {field}s')
         target: Fields = {field: _one_of(names)} if field else {}
-        strategies.append(_of_kind(kind, {**target, **fields()}, duration, endless))
+        strategies.append(_of_kind(kind, {**target, **own_fields()}, duration, endless))
+    for topic, paths in (fields or {}).items():
+        for path in paths:
+            strategies.append(_of_kind(faults.Corrupt, _corruption(topic, path), duration, endless))
     fault = st.one_of(strategies)
 
     @st.composite
@@ -142,6 +189,21 @@ def fault_schedules(
         return [draw(fault) for _ in range(draw(st.integers(0, max_faults)))]
 
     return draw_schedule()
+
+
+def _corruption(topic: str, path: str) -> Fields:
+    """Return strategies of the fields of a `Corrupt` for the field of a message."""
+    last = path.split('.')[-1]
+    changes: Fields
+    if last == 'stamp':
+        seconds = st.one_of(numbers(-10.0, -STEP), numbers(STEP, 10.0))
+        changes = {'change': st.just('offset'), 'amount': seconds}
+    elif last.endswith('frame_id'):
+        changes = {'change': st.just('set'), 'amount': st.sampled_from(('other_frame', ''))}
+    else:
+        changes = {'change': st.sampled_from(NUMBER_CHANGES)}
+    given: Fields = {'topic': _one_of([topic]), 'field': st.just(path)}
+    return {**given, 'probability': probabilities(), **changes}
 
 
 def _one_of(names: Sequence[str]) -> st.SearchStrategy[str]:

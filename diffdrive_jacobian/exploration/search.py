@@ -16,9 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from diffdrive_jacobian.exploration import child
 from diffdrive_jacobian.exploration.errors import ExplorationError
 from diffdrive_jacobian.exploration.executors import LocalExecutor
-from diffdrive_jacobian.exploration.generation import generate, shrink, st, trials
+from diffdrive_jacobian.exploration.generation import StopShrinking, generate, shrink, st, trials
 from diffdrive_jacobian.exploration.output import check_output, write_finding
 from diffdrive_jacobian.exploration.result import Exploration, Finding
 from diffdrive_jacobian.exploration.scenario import Scenario, ScenarioName
@@ -81,6 +82,11 @@ def explore(
         ExplorationError: The exploration cannot be done, for example because the scenario cannot be
             imported by other processes, or one of the properties is none.
     """
+    if child.serving:
+        raise ExplorationError(
+            'explore was called by the module of the scenario when a process imported it: call it under '
+            "if __name__ == '__main__':"
+        )
     setting = Setting(
         scenario=ScenarioName.of(scenario), properties=_checked_properties(properties), args=tuple(args)
     )
@@ -140,7 +146,7 @@ class _Search:
         self._counts: Counter[str] = Counter()
         self._complaints: Counter[str] = Counter()
         self._known: dict[int, dict[str, Outcome]] = {}
-        self._worlds = self._faults = self._checks = self._rejected = 0
+        self._worlds = self._faults = self._checks = 0
         self._simulated = 0.0
         self._stopped = ''
 
@@ -170,7 +176,6 @@ class _Search:
             simulated=self._simulated,
             faults=self._faults,
             checks=self._checks,
-            rejected=self._rejected,
             stopped=self._stopped,
             notes=tuple(f'in {count} worlds: {text}' for text, count in self._complaints.items()),
         )
@@ -183,8 +188,8 @@ class _Search:
         tasks = self._tasks()
         more = True
         try:
-            while more or waiting:
-                while more and len(waiting) < IN_FLIGHT:
+            while True:
+                while more and len(waiting) < IN_FLIGHT and not (waiting and waiting[0][1].done()):
                     task = next(tasks, None)
                     if task is None:
                         more = False
@@ -192,16 +197,16 @@ class _Search:
                     data = packed(self._setting, [one.trial for one in task])
                     waiting.append((task, self._executor.submit(run_worlds, data)))
                 if not waiting:
-                    break
-                task, future = waiting.popleft()
-                if time.monotonic() >= self._end and not future.done():
-                    self._stopped = f'time limit of {self._limit:g} s'
                     return
+                task, future = waiting.popleft()
                 for one, outcome in zip(task, _result(future), strict=True):
                     if stop_at_first and self._first and one.block > self._block_of_first():
                         self._stopped = 'after the first block with a violation'
                         return
                     self._note(one, outcome)
+                if self.over():
+                    self._stopped = f'time limit of {self._limit:g} s'
+                    return
         finally:
             for _, future in waiting:
                 future.cancel()
@@ -242,7 +247,6 @@ class _Search:
         self._faults += len(one.trial.faults)
         self._checks += outcome.checks
         self._simulated += outcome.seconds
-        self._rejected += outcome.rejected
         if outcome.complaint:
             if not one.trial.faults:
                 raise ExplorationError(f'in a world without faults: {outcome.complaint}')
@@ -356,7 +360,7 @@ class _Fails:
         if key not in self._failing:
             if self.worlds >= self._limit or self._search.over():
                 self.stopped = True
-                return False
+                raise StopShrinking
             self.worlds += 1
             outcome = self._search.run_one(trial, self._index)
             found = self._of(outcome)

@@ -74,8 +74,6 @@ class Outcome:
     """How often faults acted."""
     seconds: float = 0.0
     """Duration in simulated time (s)."""
-    rejected: bool = False
-    """The scenario called `hypothesis.reject` or `assume`."""
     complaint: str = ''
     """A fault or a property that had nothing to act on or to observe."""
     digest: str = ''
@@ -92,7 +90,6 @@ class _Found:
 
     violations: list[Violation] = field(default_factory=list)
     checks: int = 0
-    rejected: bool = False
     complaint: str = ''
     stopping: bool = False
     """Whether the world was ended because the violation that was looked for was found."""
@@ -195,7 +192,6 @@ def run(
                 checks=found.checks,
                 events=len(world.fault_events),
                 seconds=seconds(world),
-                rejected=found.rejected,
                 complaint=found.complaint,
                 digest='' if messages is None else messages.value(),
             )
@@ -219,11 +215,7 @@ def _play(world: Lockstep, scenario: Any, case: Any, found: _Found) -> None:
             raise
         return
     except BaseException as error:
-        # Without importing Hypothesis, which this process may not need.
-        if type(error).__name__ == 'UnsatisfiedAssumption':
-            found.rejected = True
-        else:
-            found.violations.append(of_exception(error, world))
+        found.violations.append(of_exception(error, world))
         return
     _finish(world, found)
 

@@ -109,7 +109,7 @@ class DeadWheel(RobotFault):
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
         """Stop the wheel."""
-        return robot.impair(_saturating(self.wheel, 0.0))
+        return robot.condition.change(_saturating(self.wheel, 0.0))
 
 
 @dataclass(frozen=True, repr=False)
@@ -136,7 +136,7 @@ class SaturatedWheel(RobotFault):
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
         """Limit the wheel."""
-        return robot.impair(_saturating(self.wheel, self.max_velocity))
+        return robot.condition.change(_saturating(self.wheel, self.max_velocity))
 
 
 @dataclass(frozen=True, repr=False)
@@ -166,7 +166,7 @@ class ActuatorLag(RobotFault):
             actuators = model.actuators or Actuators()
             return replace(model, actuators=replace(actuators, lag=max(actuators.lag, self.seconds)))
 
-        return robot.impair(lag)
+        return robot.condition.change(lag)
 
 
 @dataclass(frozen=True, repr=False)
@@ -196,8 +196,8 @@ class EncoderSteps(RobotFault):
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
         """Let the encoders count."""
-        robot.set_encoders(self.per_revolution)
-        return lambda: robot.set_encoders(None)
+        robot.condition.set_encoders(self.per_revolution)
+        return lambda: robot.condition.set_encoders(None)
 
 
 @dataclass(frozen=True, repr=False)
@@ -211,7 +211,9 @@ class Slip(RobotFault):
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
         """Let the wheels slip."""
         seed = injection.rng('slip').randint(0, MAX_SEED)
-        return robot.impair(lambda model: replace(model, drift=replace(_drift(model), seed=seed)))
+        return robot.condition.change(
+            lambda model: replace(model, drift=replace(_drift(model), seed=seed))
+        )
 
 
 @dataclass(frozen=True, repr=False)
@@ -247,7 +249,7 @@ class WrongGeometry(RobotFault):
             products = {name: getattr(drift, name) * getattr(self, name) for name in _MULTIPLIERS}
             return replace(model, drift=replace(drift, **products))
 
-        return robot.impair(differ)
+        return robot.condition.change(differ)
 
 
 @dataclass(frozen=True, repr=False)
@@ -283,7 +285,7 @@ class Push(RobotFault):
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> None:
         """Displace the robot."""
-        robot.push((self.dx, self.dy, self.dtheta), noticed=self.noticed)
+        robot.condition.push((self.dx, self.dy, self.dtheta), noticed=self.noticed)
 
 
 _MULTIPLIERS = (

@@ -79,6 +79,7 @@ class Requirements(Disturbed):
         """
         self._check_open()
         if self._watches:
+            # Not otherwise: a test may have passed because a callback raises what it expects.
             self.settle()
         watches, self._watches = self._watches, []
         expected, self._expected = self._expected, []

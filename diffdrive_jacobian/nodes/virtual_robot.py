@@ -7,7 +7,6 @@ The unicycle model is integrated exactly. The motion depends on the commands and
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -18,7 +17,7 @@ from geometry_msgs.msg import (
     TwistStamped,
 )
 from nav_msgs.msg import Odometry
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from rclpy.clock import JumpHandle, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
@@ -32,6 +31,7 @@ from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.command_time import command_time
+from diffdrive_jacobian.nodes.condition import Condition
 from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
 from diffdrive_jacobian.ros.graph_faults import (
     ALTERNATION_PATIENCE,
@@ -42,9 +42,7 @@ from diffdrive_jacobian.ros.graph_faults import (
 )
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import change_timer_period, log_info
-from diffdrive_jacobian.simulation.encoders import Encoders
-from diffdrive_jacobian.simulation.robot import Robot, RobotModel
-from diffdrive_jacobian.simulation.slip import Drift
+from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import nanoseconds, seconds
 
@@ -67,8 +65,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         super().__init__('virtual_robot', VirtualRobotParameters, **kwargs)
         self._robot: Robot | None = None
         self._latest = 0
-        self._impairments: list[Callable[[RobotModel], RobotModel]] = []
-        self._encoders: Encoders | None = None
+        self.condition = Condition(self._advance, self._remodel, self._move, self._set_pose)
+        """What is wrong with the robot beyond its parameters, for tests."""
         self._configure()
         self._odom = self.advertise(Odometry, 'odom')
         self._joint_states = self.advertise(JointState, 'joint_states')
@@ -130,7 +128,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             return None
         robot = self._robot
         if robot is None:
-            robot = Robot(model=self._model(), stamp=now, pose=self._initial_pose())
+            model = self.condition.model(self.parameters.model())
+            robot = Robot(model=model, stamp=now, pose=self._initial_pose())
             self._publish_start(robot)
         elif now < self._latest:
             self.log_event_warning(
@@ -157,10 +156,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         if advanced is None:
             return
         now, robot = advanced
-        truth = state = robot.at(now)
-        if self._encoders is not None:
-            self._encoders = self._encoders.read(state)
-            state = self._encoders.reported(state)
+        truth = robot.at(now)
+        state = self.condition.reported(truth)
         self._odom.publish(self._serialized_odometry(state, self._period))
         self._joint_states.publish(self._serialized_joints(now, state.wheel_speeds, state.wheel_angles))
         if self._ground_truth is not None:
@@ -257,10 +254,12 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         response.success, response.message = True, f'odometry was reset to {self._initial_pose()}'
         return response
 
-    def _set_pose(self, robot: Robot) -> None:
+    def _move(self, robot: Robot) -> None:
         self._robot = robot
-        if self._encoders is not None:
-            self._encoders = self._encoders.read(robot).placed(robot.pose_tuple)
+
+    def _set_pose(self, robot: Robot) -> None:
+        self._move(robot)
+        self.condition.placed(robot)
         self._publish_start(robot)
         x, y, theta = robot.pose
         self.log_event_info('pose set', f'pose set to x {x:.3f}, y {y:.3f}, theta {theta:.3f}')
@@ -271,10 +270,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
         With encoders of few steps: at their last reading, as it was published.
         """
-        if self._encoders is not None:
-            return np.array(self._encoders.pose)
         robot = self._robot_now()
-        return self._initial_pose() if robot is None else robot.pose.copy()
+        return self._initial_pose() if robot is None else self.condition.odometry_pose(robot)
 
     @property
     def truth(self) -> NDArray[np.float64]:
@@ -284,89 +281,6 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     def _robot_now(self) -> Robot | None:
         return None if self._robot is None else self._robot.at(max(self.now(), self._latest))
-
-    # --- Faults, for tests
-
-    def impair(self, change: Callable[[RobotModel], RobotModel]) -> Callable[[], None]:
-        """Change the model of the robot beyond its parameters, from now on.
-
-        Args:
-            change: Returns the changed model. Several changes apply in the order of the calls.
-
-        Returns:
-            A function that ends the change. The true pose stays apart from the odometry.
-        """
-        self._impairments.append(change)
-        self._remodel()
-
-        def end() -> None:
-            self._impairments.remove(change)
-            self._remodel()
-
-        return end
-
-    def push(self, displacement: ArrayLike, *, noticed: bool = False) -> None:
-        """Displace the robot now, without turning its wheels.
-
-        Args:
-            displacement: `[dx, dy, dtheta]` in the body frame, shape (3,) (m, m, rad).
-            noticed: Whether the odometry follows, as if corrected by a localisation. Otherwise only
-                `ground_truth` shows it.
-
-        Raises:
-            ValueError: The displacement is invalid.
-            MessageError: Simulated time has not started.
-        """
-        if not noticed:
-            self._publish_truth()
-            self._remodel()
-        advanced = self._advance()
-        if advanced is None:
-            raise MessageError(NO_CLOCK)
-        now, robot = advanced
-        robot = robot.pushed(displacement, now, noticed=noticed)
-        if noticed:
-            self._set_pose(robot)
-        else:
-            self._robot = robot
-
-    def set_encoders(self, per_revolution: int | None) -> None:
-        """Report what encoders of so many increments per turn of a wheel count; None: exact angles.
-
-        The odometry goes on from its present pose. `ground_truth` shows where the robot truly is.
-
-        Raises:
-            ValueError: It is not a positive integer.
-            MessageError: Simulated time has not started.
-        """
-        self._publish_truth()
-        self._remodel()
-        advanced = self._advance()
-        if advanced is None:
-            raise MessageError(NO_CLOCK)
-        now, robot = advanced
-        encoders, robot = self._encoders, robot.at(now)
-        if per_revolution is not None:
-            self._encoders = Encoders.at(robot, per_revolution)
-        elif encoders is not None:
-            self._encoders = None
-            pose = encoders.read(robot).pose
-            self._set_pose(robot.placed(pose, robot.covariance, now, odometry_only=True))
-
-    def _model(self) -> RobotModel:
-        """Return the model with the parameters and the faults."""
-        model = self.parameters.model()
-        for change in self._impairments:
-            model = change(model)
-        if self._ground_truth is not None and model.drift is None:
-            # The true pose is known apart from the odometry from now on.
-            return replace(model, drift=Drift())
-        return model
-
-    def _publish_truth(self) -> None:
-        """Publish the ground truth from now on."""
-        if self._ground_truth is None:
-            self._ground_truth = self.advertise(Odometry, 'ground_truth')
 
     # --- Parameters
 
@@ -379,11 +293,11 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self._remodel()
 
     def _remodel(self) -> None:
-        """Continue with the model of the present parameters and faults."""
+        """Continue with the model of the present parameters and condition."""
         advanced = self._advance()
-        model = self._model()
-        if model.drift is not None:
-            self._publish_truth()
+        model = self.condition.model(self.parameters.model())
+        if model.drift is not None and self._ground_truth is None:
+            self._ground_truth = self.advertise(Odometry, 'ground_truth')
         if advanced is not None and model != advanced[1].model:
             now, robot = advanced
             wheels = self.parameters.command_interface == 'wheels'

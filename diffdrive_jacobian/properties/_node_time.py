@@ -7,13 +7,13 @@ from typing import Any
 
 from rclpy.node import Node
 
-from diffdrive_jacobian.faults import nodes as node_faults
+from diffdrive_jacobian.faults import Hang, Push, Slow, TimeJump, TimerJitter
 from diffdrive_jacobian.lockstep import Lockstep
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 ROUNDING = 1e-9
 """Tolerance on times (s)."""
-_AT_ONCE = ('TimeJump', 'Push')
+_AT_ONCE = (Push, TimeJump)
 """Faults that happen once, when they begin, also if they have no end."""
 
 
@@ -56,12 +56,12 @@ def delays(world: Lockstep, node: Node, since: float) -> float:
         if getattr(fault, 'node', '').lstrip('/') != name.lstrip('/'):
             continue
         overlap = min(now, fault.start + fault.duration) - max(since, fault.start)
-        if isinstance(fault, node_faults.Hang):
+        if isinstance(fault, Hang):
             total += max(overlap, 0.0)
-        elif isinstance(fault, node_faults.Slow) and overlap > -3.0 * fault.seconds:
+        elif isinstance(fault, Slow) and overlap > -3.0 * fault.seconds:
             # A callback that has begun, another one that waits, and that of the timer.
             total += 3.0 * fault.seconds
-        elif isinstance(fault, node_faults.TimerJitter) and overlap > -fault.seconds:
+        elif isinstance(fault, TimerJitter) and overlap > -fault.seconds:
             total += fault.seconds
     return total
 
@@ -72,6 +72,6 @@ def end_of_faults(world: Lockstep) -> float:
 
 
 def _end(fault: Any) -> float:
-    if math.isinf(fault.duration) and type(fault).__name__ in _AT_ONCE:
+    if math.isinf(fault.duration) and isinstance(fault, _AT_ONCE):
         return float(fault.start)
     return float(fault.start + fault.duration)

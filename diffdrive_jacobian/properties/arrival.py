@@ -22,7 +22,7 @@ from diffdrive_jacobian.properties.goals import GoalProperty
 class ArrivesOnceFaultsEnd(GoalProperty):
     """The robot arrives at the goal that its controller has received, once the faults have ended.
 
-    A controller is a node that is subscribed to a topic of `goals` and publishes something. It has the
+    A controller is a node that is subscribed to a topic of `goals` and publishes `commands`. It has the
     goal that it received last. The robot must have stood within `tolerance` of that goal at some time
     after the controller has received it, at the latest `within` after that and after the last fault has
     ended. The goal is not due any longer when
@@ -38,11 +38,13 @@ class ArrivesOnceFaultsEnd(GoalProperty):
         within: Longest time (s).
         tolerance: Largest distance to the goal (m) (default: 0.05).
         status: Topic of type action_msgs/GoalStatus (default: 'goal_status').
+        commands: Topic on which the controller publishes (default: 'cmd_vel').
     """
 
     within: float
     tolerance: float = field(default=0.05, kw_only=True)
     status: str = field(default='goal_status', kw_only=True)
+    commands: str = field(default='cmd_vel', kw_only=True)
 
     def __post_init__(self) -> None:
         """Check the fields."""
@@ -50,6 +52,7 @@ class ArrivesOnceFaultsEnd(GoalProperty):
         self._number('within', infinite=False)
         self._number('tolerance', zero=False)
         self._text('status')
+        self._text('commands')
 
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""
@@ -69,6 +72,8 @@ class _ArrivesWatch(Watch):
         world.expect(*map(required.resolved, required.goals))
         for topic in required.goals:
             world.on_delivered(required.resolved(topic), self._on_goal)
+        self._commands = world.node.resolve_topic_name(required.resolved(required.commands))
+        world.expect(self._commands)
         world.expect(required.resolved(required.odom))
         self._odom = world.on_published(required.resolved(required.odom), self._motion.on_odometry)
         world.on_published(required.resolved(required.status), self._on_status)
@@ -76,8 +81,7 @@ class _ArrivesWatch(Watch):
 
     def _on_goal(self, node: Node, message_type: type, message: Any) -> None:
         goal = read_goal(message_type, message, self.seconds)
-        publishes = any(True for _ in node.publishers)
-        if goal is None or not publishes or node is self.world.node:
+        if goal is None or not any(one.topic_name == self._commands for one in node.publishers):
             return
         self._goals[node] = goal
         self.note(f'{self.name_of(node)} received a goal at {goal.pose}')

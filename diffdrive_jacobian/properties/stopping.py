@@ -18,11 +18,11 @@ from diffdrive_jacobian.properties.base import Property, Watch
 class StopsAfterLostOdometry(Property):
     """A controller stops the robot within a time after it has received its last odometry.
 
-    A controller is a node that publishes `commands` and is subscribed to `odom`. What counts is the
-    odometry that it receives, after all faults of the topic, and the command that it has published last,
-    whether or not that arrives: longer than `within` after the last odometry it must be zero. Before its
-    first odometry the time counts from its first command. Nodes that were removed or killed cannot stop
-    anything, and are not checked.
+    A controller is a node that publishes `commands` and is subscribed to `odom`, other than that of the
+    test. What counts is the odometry that it receives, after all faults of the topic, and the command
+    that it has published last, whether or not that arrives: longer than `within` after the last odometry
+    it must be zero. Before its first odometry the time counts from its first command. Nodes that were
+    removed or killed cannot stop anything, and are not checked.
 
     The time is what a timer of the node can measure. It does not pass while the clock of the nodes
     stands still or the node is frozen (`Hang`), it starts again where the clock jumps, and it is longer
@@ -89,7 +89,7 @@ class _LostOdometryWatch(Watch):
     def _on_command(self, publisher: Publisher, message: Any) -> None:
         node = self.owner(publisher)
         twist = read_twist(publisher.msg_type, message)
-        if node is None or twist is None:
+        if node is None or twist is None or node is self.world.node:
             return
         controller = self._controllers.get(node)
         if controller is None:

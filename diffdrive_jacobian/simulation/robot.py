@@ -29,91 +29,31 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.control.saturation import VelocityLimits, saturate
+from diffdrive_jacobian.control.saturation import saturate
 from diffdrive_jacobian.kinematics._arc import arc_end
 from diffdrive_jacobian.kinematics._checks import (
     array,
     floats,
     instance,
     nanoseconds,
-    not_negative,
-    number,
     positive,
     read_only,
 )
-from diffdrive_jacobian.kinematics._elementary import components, operand
+from diffdrive_jacobian.kinematics._elementary import operand
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
 from diffdrive_jacobian.kinematics.se2 import compose
 from diffdrive_jacobian.simulation._uncertainty import Uncertainty
-from diffdrive_jacobian.simulation.actuators import Actuators, Settling, Speeds
+from diffdrive_jacobian.simulation.actuators import Settling, Speeds
 from diffdrive_jacobian.simulation.exact_moments import Moments, gaussian_moments
 from diffdrive_jacobian.simulation.odometry_noise import covariance_entries, twist_covariance_entries
-from diffdrive_jacobian.simulation.slip import Drift, Truth
+from diffdrive_jacobian.simulation.robot_model import RobotModel as RobotModel
+from diffdrive_jacobian.simulation.robot_model import pair
+from diffdrive_jacobian.simulation.slip import Truth
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 STANDSTILL = (0.0, 0.0)
 _State: TypeAlias = tuple[tuple[float, float, float], tuple[float, float], Uncertainty, Truth | None]
 """Pose, wheel angles, uncertainty and truth at a time."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class RobotModel:
-    """Parameters of a robot.
-
-    Raises:
-        ValueError: A length is not positive and finite, the variance or the timeout is negative, the
-            timeout is not an integer, the limits are not those of one robot, or the drift or the
-            actuators are of another class.
-    """
-
-    wheel_radius: float = 0.033
-    """r (m)."""
-    wheel_separation: float = 0.16
-    """L (m)."""
-    limits: VelocityLimits = field(default_factory=VelocityLimits)
-    """Velocity limits; without limits the robot is an ideal unicycle."""
-    command_timeout: int = 0
-    """Time after which the last command is replaced by zero (ns); 0: never."""
-    wheel_travel_variance: float = 1e-5
-    """k, variance of each wheel's travel per distance travelled (m)."""
-    drift: Drift | None = None
-    """In what the true motion differs from the odometry; None: in nothing."""
-    actuators: Actuators | None = None
-    """In what the wheel motors differ from ideal ones; None: in nothing."""
-
-    def __post_init__(self) -> None:
-        """Check every value."""
-        for name, check in _CHECKS.items():
-            object.__setattr__(self, name, number(name, getattr(self, name), check))
-        instance('limits', self.limits, VelocityLimits)
-        if not self.limits.alike:
-            raise ValueError(f'limits must be numbers for one robot, got {self.limits}')
-        if self.drift is not None:
-            instance('drift', self.drift, Drift)
-        if self.actuators is not None:
-            instance('actuators', self.actuators, Actuators)
-        timeout = nanoseconds('command_timeout', self.command_timeout)
-        if timeout < 0:
-            raise ValueError(f'command_timeout must be zero or positive (ns), got {timeout}')
-        object.__setattr__(self, 'command_timeout', timeout)
-
-    def limited(self, command: ArrayLike) -> tuple[float, float]:
-        """Saturate a command `(v, omega)`, shape (2,), keeping its curvature.
-
-        Raises:
-            ValueError: It has another shape or is not finite.
-        """
-        v, omega = saturate(
-            *_pair('command', command), self.limits, self.wheel_radius, self.wheel_separation
-        )
-        return v, omega
-
-
-_CHECKS = {
-    'wheel_radius': positive,
-    'wheel_separation': positive,
-    'wheel_travel_variance': not_negative,
-}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -174,7 +114,7 @@ class Robot:
             '_truth': _truth(self.model, pose.tolist()),
         }
         for name in ('wheel_angles', 'command', 'twist'):
-            values[name] = _pair(name, getattr(self, name))
+            values[name] = pair(name, getattr(self, name))
         if self.commanded_at is not None:
             values['commanded_at'] = nanoseconds('commanded_at', self.commanded_at)
         for name, value in values.items():
@@ -313,7 +253,7 @@ class Robot:
         Raises:
             ValueError: The command has another shape or is not finite; or as `at`.
         """
-        v, omega = _pair('command', command)
+        v, omega = pair('command', command)
         model = self.model
         twist = saturate(v, omega, model.limits, model.wheel_radius, model.wheel_separation)
         if model.actuators is not None:
@@ -566,18 +506,3 @@ def _truth(model: RobotModel, pose: Sequence[float]) -> Truth | None:
     """Return the truth of a robot whose pose is the true one; None: its model has no drift."""
     x, y, theta = pose
     return None if model.drift is None else Truth(model.drift, (x, y, theta))
-
-
-def _pair(name: str, value: Any) -> tuple[float, float]:
-    """Return two finite numbers as a tuple of floats.
-
-    Raises:
-        ValueError: It is something else.
-    """
-    pair = type(value) is tuple and len(value) == 2 and type(value[0]) is type(value[1]) is float
-    if pair and math.isfinite(value[0]) and math.isfinite(value[1]):
-        return value[0], value[1]
-    first, second = components(name, value, 2)
-    if type(first) is not float:
-        raise ValueError(f'{name} must have shape (2,), got {np.shape(value)}')
-    return first, second

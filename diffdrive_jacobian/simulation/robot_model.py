@@ -1,0 +1,91 @@
+"""The parameters of a robot as a value."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from diffdrive_jacobian.control.saturation import VelocityLimits, saturate
+from diffdrive_jacobian.kinematics._checks import instance, nanoseconds, not_negative, number, positive
+from diffdrive_jacobian.kinematics._elementary import components
+from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.simulation.slip import Drift
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RobotModel:
+    """Parameters of a robot.
+
+    Raises:
+        ValueError: A length is not positive and finite, the variance or the timeout is negative, the
+            timeout is not an integer, the limits are not those of one robot, or the drift or the
+            actuators are of another class.
+    """
+
+    wheel_radius: float = 0.033
+    """r (m)."""
+    wheel_separation: float = 0.16
+    """L (m)."""
+    limits: VelocityLimits = field(default_factory=VelocityLimits)
+    """Velocity limits; without limits the robot is an ideal unicycle."""
+    command_timeout: int = 0
+    """Time after which the last command is replaced by zero (ns); 0: never."""
+    wheel_travel_variance: float = 1e-5
+    """k, variance of each wheel's travel per distance travelled (m)."""
+    drift: Drift | None = None
+    """In what the true motion differs from the odometry; None: in nothing."""
+    actuators: Actuators | None = None
+    """In what the wheel motors differ from ideal ones; None: in nothing."""
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        for name, check in _CHECKS.items():
+            object.__setattr__(self, name, number(name, getattr(self, name), check))
+        instance('limits', self.limits, VelocityLimits)
+        if not self.limits.alike:
+            raise ValueError(f'limits must be numbers for one robot, got {self.limits}')
+        if self.drift is not None:
+            instance('drift', self.drift, Drift)
+        if self.actuators is not None:
+            instance('actuators', self.actuators, Actuators)
+        timeout = nanoseconds('command_timeout', self.command_timeout)
+        if timeout < 0:
+            raise ValueError(f'command_timeout must be zero or positive (ns), got {timeout}')
+        object.__setattr__(self, 'command_timeout', timeout)
+
+    def limited(self, command: ArrayLike) -> tuple[float, float]:
+        """Saturate a command `(v, omega)`, shape (2,), keeping its curvature.
+
+        Raises:
+            ValueError: It has another shape or is not finite.
+        """
+        v, omega = saturate(
+            *pair('command', command), self.limits, self.wheel_radius, self.wheel_separation
+        )
+        return v, omega
+
+
+_CHECKS = {
+    'wheel_radius': positive,
+    'wheel_separation': positive,
+    'wheel_travel_variance': not_negative,
+}
+
+
+def pair(name: str, value: Any) -> tuple[float, float]:
+    """Return two finite numbers as a tuple of floats.
+
+    Raises:
+        ValueError: It is something else.
+    """
+    pair = type(value) is tuple and len(value) == 2 and type(value[0]) is type(value[1]) is float
+    if pair and math.isfinite(value[0]) and math.isfinite(value[1]):
+        return value[0], value[1]
+    first, second = components(name, value, 2)
+    if type(first) is not float:
+        raise ValueError(f'{name} must have shape (2,), got {np.shape(value)}')
+    return first, second
