@@ -15,6 +15,7 @@ from diffdrive_jacobian.faults import ClockPause, Hang, Kill, Loss, TimeJump
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.properties import (
     ArrivesOnceFaultsEnd,
+    KeepsDriving,
     PoseFinite,
     PropertyViolation,
     ReachesGoal,
@@ -310,3 +311,29 @@ def test_the_test_itself_is_no_controller(lockstep, robot_at):
     lockstep.remove(robot)
     lockstep.run_for(0.5)
     lockstep.finish()
+
+
+def test_keeps_driving(lockstep, robot_at):
+    """Without odometry it stands, which counts only when the fault is over."""
+    lockstep.require(KeepsDriving(0.5))
+    drive(
+        lockstep,
+        robot_at,
+        Loss('odom', start=0.5, duration=3.0),
+        Hang('go_to_goal', start=4.0, duration=1.0),
+    )
+
+
+def test_a_robot_that_stands_on_its_way(lockstep, robot_at):
+    robot_at()
+    lockstep.add(Student())
+    lockstep.require(KeepsDriving(0.5))
+    lockstep.inject(Loss('cmd_vel', start=1.0, duration=1.0))
+    lockstep.publish('goal_pose', goal_at(3.0))
+    lockstep.run_for(3.0)
+    for student in lockstep.nodes[-1:]:
+        student.command = twist(0.0)
+    with pytest.raises(PropertyViolation) as raised:
+        lockstep.run_for(2.0)
+    assert 3.5 < raised.value.seconds < 3.56
+    assert raised.value.text.startswith('1.54 s after the faults have ended the robot has stood for 0.5')
