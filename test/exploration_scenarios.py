@@ -49,11 +49,11 @@ class Follower(Node):
 
 
 def follow(world, case):
-    """Run both for two seconds."""
+    """Run both for 1.2 s."""
     case = case or {}
     world.create(lambda: Sensor(case.get('speed', 0.0)))
     world.create(Follower)
-    world.run_for(2.0)
+    world.run_for(1.2)
 
 
 class Dividing(Follower):

@@ -15,18 +15,18 @@ from hypothesis import strategies as st
 
 from diffdrive_jacobian.control import find_controller
 from diffdrive_jacobian.exploration import LocalExecutor, SerialExecutor, explore, fault_schedules
-from diffdrive_jacobian.exploration.child import call_in_child, close_child
+from diffdrive_jacobian.exploration.child import call_in_child
 from diffdrive_jacobian.faults import Loss
 from diffdrive_jacobian.properties import NeverFasterThan
 from diffdrive_jacobian.sweeps import Setup, Sweep, sweep
 
-LOSSES = fault_schedules(['speed'], kinds=[Loss], duration=2.0)
+LOSSES = fault_schedules(['speed'], kinds=[Loss], duration=1.2)
 SETUP = Setup(grid=5, starts=3, rate=20.0)
 
 
 def follow_on(executor):
     return explore(
-        follow, [NeverFasterThan(0.75, 1.0)], faults=LOSSES, worlds=7, shrink_worlds=6, executor=executor
+        follow, [NeverFasterThan(0.35, 1.0)], faults=LOSSES, worlds=7, shrink_worlds=6, executor=executor
     )
 
 
@@ -51,29 +51,37 @@ def same_results(executor, expected, monkeypatch):
         np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.fixture(scope='module')
+def local():
+    """Return the default executor, with one process for all tests."""
+    with LocalExecutor(1) as executor:
+        yield executor
+
+
 @pytest.mark.parametrize('kind', ['processes', 'local', 'dask'])
-def test_the_same_results_on_another_executor(expected, monkeypatch, kind):
+def test_the_same_results_on_another_executor(expected, monkeypatch, local, kind):
     if kind == 'processes':
         spawn = multiprocessing.get_context('spawn')
         with ProcessPoolExecutor(1, mp_context=spawn) as executor:
             same_results(executor, expected, monkeypatch)
     elif kind == 'local':
-        with LocalExecutor(2) as executor:
-            same_results(executor, expected, monkeypatch)
+        same_results(local, expected, monkeypatch)
     else:
         distributed = pytest.importorskip('distributed')
         # On a machine without a network, for which it warns.
         address = {'host': '127.0.0.1', 'protocol': 'tcp://', 'dashboard_address': None}
-        cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=False, **address)
+        cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=False, **address)
         with cluster, distributed.Client(cluster) as client, client.get_executor() as executor:
             same_results(executor, expected, monkeypatch)
 
 
-def test_processes_of_worlds_import_little_and_may_die():
-    with LocalExecutor(1) as executor:
-        found = explore(loaded, worlds=1, executor=executor)
-        assert not found.findings, str(found)
-        died = explore(deadly, cases=CASES, worlds=3, executor=executor, shrink_worlds=0)
+def test_processes_of_worlds_import_little(local):
+    found = explore(loaded, worlds=1, executor=local)
+    assert not found.findings, str(found)
+
+
+def test_a_process_that_dies_is_a_finding(local):
+    died = explore(deadly, cases=CASES, worlds=3, executor=local, shrink_worlds=0)
     (finding,) = died.findings
     assert finding.trial.case == {'speed': 2.0}
     assert finding.count == 1
@@ -83,13 +91,10 @@ def test_processes_of_worlds_import_little_and_may_die():
 CASES = st.fixed_dictionaries({'speed': st.sampled_from([0.0, 1.0, 2.0])})
 
 
-def test_an_exception_in_the_process_of_a_thread_is_raised():
-    try:
-        with pytest.raises(ValueError, match='invalid literal'):
-            call_in_child(int, 'x')
-        assert call_in_child(int, '7') == 7
-    finally:
-        close_child()
+def test_an_exception_in_the_process_of_a_thread_is_raised(local):
+    with pytest.raises(ValueError, match='invalid literal'):
+        local.submit(call_in_child, int, 'x').result()
+    assert local.submit(call_in_child, int, '7').result() == 7
 
 
 def test_a_sweep_reports_progress_and_mistakes():

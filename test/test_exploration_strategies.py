@@ -34,7 +34,7 @@ from diffdrive_jacobian.exploration.trial import Trial
 from diffdrive_jacobian.exploration.versions import differences, versions
 
 FEW = settings(max_examples=40, database=None, derandomize=True)
-SHRINK = settings(max_examples=200, database=None, derandomize=True)
+SHRINK = settings(max_examples=100, database=None, derandomize=True)
 
 
 FIELDS = {'odom': ['pose.pose.position.x', 'header.stamp', 'header.frame_id']}
@@ -108,7 +108,7 @@ def test_faults_have_ended_in_time(schedule):
         assert on_grid(fault.duration)
 
 
-@pytest.mark.parametrize('kind', [faults.Kill, faults.TimeJump])
+@pytest.mark.parametrize('kind', [faults.TimeJump])
 def test_only_the_kinds_that_are_asked_for(kind):
     strategy = fault_schedules(['odom'], ['robot'], kinds=[kind], max_faults=1)
     assert type(find(strategy, bool, settings=SHRINK)[0]) is kind

@@ -14,6 +14,7 @@ import struct
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 from typing import IO, Any
 
 serving = False
@@ -38,14 +39,22 @@ class ChildProcess:
 
     def __init__(self) -> None:
         """Start the process."""
+        answers, write = os.pipe()
         # In a session of its own: Ctrl-C in a terminal is for this process, which ends the child.
-        self._process = subprocess.Popen(
-            [sys.executable, '-m', MODULE],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            start_new_session=True,
-            env={**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, sys.path))},
-        )
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, '-m', MODULE, str(write)],
+                stdin=subprocess.PIPE,
+                pass_fds=[write],
+                start_new_session=True,
+                env={**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, sys.path))},
+            )
+        except BaseException:
+            os.close(answers)
+            raise
+        finally:
+            os.close(write)
+        self._answers = os.fdopen(answers, 'rb')
 
     def call(self, function: Any, *args: Any) -> Any:
         """Call a function of a module in the process, and return what it returns.
@@ -55,10 +64,9 @@ class ChildProcess:
             Exception: What the function raises.
         """
         assert self._process.stdin is not None
-        assert self._process.stdout is not None
         try:
             _send(self._process.stdin, pickle.dumps((function, args)))
-            failed, result = pickle.loads(_receive(self._process.stdout))
+            failed, result = pickle.loads(_receive(self._answers))
         except (BrokenPipeError, EOFError):
             code = self._process.wait()
             how = f'was ended by signal {-code}' if code < 0 else f'ended with exit code {code}'
@@ -74,13 +82,11 @@ class ChildProcess:
     def close(self) -> None:
         """End the process."""
         self._process.kill()
-        for stream in (self._process.stdin, self._process.stdout):
-            if stream is not None:
-                try:
-                    stream.close()
-                except BrokenPipeError:
-                    continue
         self._process.wait()
+        if self._process.stdin is not None:
+            with suppress(BrokenPipeError):
+                self._process.stdin.close()
+        self._answers.close()
 
     def __del__(self) -> None:
         """End the process with the thread that it belongs to."""
@@ -154,13 +160,17 @@ def _receive(stream: IO[bytes]) -> bytes:
     return data
 
 
-def _serve() -> None:
-    """Execute the functions that come from standard input, until it ends."""
+def _serve(descriptor: int) -> None:
+    """Execute the functions that come from standard input, until it ends.
+
+    Args:
+        descriptor: File descriptor for the answers.
+    """
     # As of the module that others import: this one is __main__.
     importlib.import_module(MODULE).serving = True  # type: ignore[attr-defined]
     requests = os.fdopen(os.dup(0), 'rb')
-    answers = os.fdopen(os.dup(1), 'wb')
-    # What nodes print must not mix with the answers.
+    answers = os.fdopen(descriptor, 'wb')
+    # What nodes print must not mix with what the program prints about them.
     os.dup2(2, 1)
     while True:
         try:
@@ -185,4 +195,4 @@ def _picklable(error: Exception) -> Exception:
 
 
 if __name__ == '__main__':
-    _serve()
+    _serve(int(sys.argv[1]))

@@ -9,6 +9,7 @@ import numpy as np
 
 from diffdrive_jacobian.reading.run import Run, Series
 from diffdrive_jacobian.reading.trace import Trace, seconds
+from diffdrive_jacobian.text import printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,6 +80,7 @@ def fault_legend(spans: list[FaultSpan]) -> list[Patch]:
 
 
 def _label(fault: str) -> str:
+    fault = printable(fault)
     text = fault if len(fault) <= LABEL else f'{fault[: LABEL - 1]}…'
     # matplotlib reads a dollar as a formula.
     return text.replace('$', r'\$')

@@ -1,0 +1,70 @@
+"""Faults of a recorded lockstep world: read from the bag, and marked in the figure."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from std_msgs.msg import String
+from test_plot_run import sample
+from test_reading import SECOND, write_bag
+
+from diffdrive_jacobian.plots.fault_marks import NAMED, fault_spans
+from diffdrive_jacobian.plots.run_figure import figure
+from diffdrive_jacobian.reading.reader import read_run
+from diffdrive_jacobian.reading.trace import trace
+
+
+def event(at, fault, what):
+    return at, '/fault_events', String(data=json.dumps({'time': at, 'fault': fault, 'what': what}))
+
+
+def run_of(tmp_path, *extra):
+    """Read a run of four seconds that begins at 10 s."""
+    return read_run(write_bag(tmp_path / 'run', sample(extra)))
+
+
+def labels(drawing):
+    return [text.get_text() for legend in drawing.legends for text in legend.get_texts()]
+
+
+def test_faults_are_bands_over_time(tmp_path):
+    loss, kill = "Loss('odom', start=1.0, duration=0.5)", "Kill('robot', start=2.0)"
+    run = run_of(
+        tmp_path,
+        event(11.0, loss, 'begins'),
+        event(11.2, loss, 'messages 1 to 9 of /odom to /controller lost'),
+        event(11.5, loss, 'ends: 25 of 25 messages of /odom to /controller'),
+        event(12.0, kill, 'begins'),
+        event(12.0, kill, '/robot is killed'),
+    )
+    assert run.fault_events[0] == (11 * SECOND, loss, 'begins')
+    assert '5 events of faults' in repr(run)
+    spans = fault_spans(trace(run))
+    assert [span.fault for span in spans] == [loss, kill]
+    assert spans[0][1:] == pytest.approx((1.0, 1.5))
+    # To the end of the run.
+    assert spans[1][1:] == pytest.approx((2.0, 3.98))
+    drawing = figure([run])
+    assert labels(drawing) == [loss, kill]
+    plane, *panels = drawing.axes
+    assert not plane.patches
+    for panel in panels[:-1]:
+        assert [patch.get_x() for patch in panel.patches] == pytest.approx([1.0, 2.0])
+    # Several runs are compared without them.
+    assert labels(figure([run, run])) == []
+
+
+def test_many_faults_are_counted(tmp_path):
+    events = [event(10.1 + 0.1 * number, f'Stale({number})', 'begins') for number in range(NAMED + 3)]
+    drawing = figure([run_of(tmp_path, *events)])
+    assert len(labels(drawing)) == NAMED
+    assert labels(drawing)[-1] == 'and 4 more faults'
+
+
+@pytest.mark.parametrize('data', ['', 'x', '3', '{"fault": 1, "what": "begins"}', '[' * 100_000])
+def test_other_messages_on_the_topic_are_noted(tmp_path, data):
+    run = run_of(tmp_path, (11.0, '/fault_events', String(data=data)))
+    assert run.fault_events == ()
+    assert 'hold invalid' in run.notes[0]
+    assert labels(figure([run])) == []
