@@ -307,3 +307,11 @@ def test_what_waits_behind_an_exception_is_processed_later(lockstep):
         lockstep.run_for(0.7)
     lockstep.run_for(0.25)
     assert relay.numbers == [1, 2, 3, 4, 5, 6, 7]
+
+
+def test_a_node_that_is_made_again_receives_latched_messages(lockstep):
+    lockstep.create(lambda: Source(profile=LATCHED))
+    lockstep.create(lambda: Sink(profile=LATCHED))
+    lockstep.inject(faults.Kill('sink', start=0.15, duration=0.3))
+    lockstep.run_for(0.5)
+    assert lockstep.find('sink').received == [(2, 450.0), (3, 450.0), (4, 450.0), (5, 500.0)]

@@ -182,7 +182,7 @@ def test_each_test_has_a_world_and_robots_of_its_own(run):
     result.assert_outcomes(passed=7, failed=1, errors=1)
     result.stdout.fnmatch_lines(
         [
-            '*TypeError: the marker lockstep takes args=, start= and patience= only, got (3,)',
+            '*TypeError: the marker lockstep takes keyword arguments only, as Lockstep does, got (3,)',
             "*TypeError: virtual_robot has no parameter 'colour'; it has *",
         ]
     )

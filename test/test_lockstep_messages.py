@@ -391,3 +391,16 @@ def test_publishing_what_is_no_message_fails(lockstep, message, described):
 def test_last_takes_the_name_of_a_topic(lockstep):
     with pytest.raises(LockstepError, match='last takes a topic, got the class Vector3'):
         lockstep.last(Vector3)
+
+
+def test_a_service_destroyed_while_a_request_waits_is_not_called(lockstep):
+    called, node = [], lockstep.node
+    service = node.create_service(Trigger, 'ask', lambda _, response: called.append(1) or response)
+    node.create_subscription(Vector3, 'end', lambda _: node.destroy_service(service), 10)
+    publisher, client = node.create_publisher(Vector3, 'end', 10), node.create_client(Trigger, 'ask')
+    lockstep.settle()
+    publisher.publish(Vector3())
+    future = client.call_async(Trigger.Request())
+    lockstep.run_for(0.1)
+    assert called == []
+    assert not future.done()

@@ -431,6 +431,16 @@ def test_entities_of_a_node_are_counted(ros):
     node.destroy_node()
 
 
+def test_a_message_is_waited_for_without_an_executor(ros):
+    publisher = ros.peer.create_publisher(String, 'topic', 10)
+    subscription = ros.peer.create_subscription(String, 'topic', lambda _: None, 10)
+    assert not internals.wait_for_message(ros.context, subscription, 0.0)
+    publisher.publish(String())
+    # It is not taken.
+    for _ in range(2):
+        assert internals.wait_for_message(ros.context, subscription, 10.0)
+
+
 def test_nodes_that_require_a_wait_set_are_detected(ros):
     async def wait(message):
         pass

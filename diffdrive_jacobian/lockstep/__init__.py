@@ -4,8 +4,20 @@ from diffdrive_jacobian.lockstep import Lockstep, LockstepError
 """
 
 from diffdrive_jacobian.lockstep._errors import LockstepError, PropertyViolation
+from diffdrive_jacobian.lockstep._external_answers import Answers, Every, Idle
+from diffdrive_jacobian.lockstep._external_process import ExternalProcess
 from diffdrive_jacobian.lockstep._fault_log import FaultEvent
 from diffdrive_jacobian.lockstep._injection import Injection
 from diffdrive_jacobian.lockstep.world import Lockstep
 
-__all__ = ['FaultEvent', 'Injection', 'Lockstep', 'LockstepError', 'PropertyViolation']
+__all__ = [
+    'Answers',
+    'Every',
+    'ExternalProcess',
+    'FaultEvent',
+    'Idle',
+    'Injection',
+    'Lockstep',
+    'LockstepError',
+    'PropertyViolation',
+]

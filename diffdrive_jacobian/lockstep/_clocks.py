@@ -25,8 +25,14 @@ class Clocks:
         """Start without clocks."""
         self.publisher: Publisher | None = None
         """Publisher of /clock."""
+        self.enabled = True
+        """Whether the time is published."""
+        self.publications = 0
+        """Number of messages on /clock."""
         self._clocks: list[SimulatedClock] = []
         self._message = Clock()
+        self._now = 0
+        self._announced = 0
 
     def find(self, nodes: Iterable[Node]) -> set[Subscription]:
         """Find the clocks of nodes. Return the subscriptions to /clock that are replaced.
@@ -45,9 +51,23 @@ class Clocks:
 
     def set(self, now: int) -> None:
         """Set the time (ns), and publish it if somebody else receives it."""
+        self._now = now
         time = Time(nanoseconds=now, clock_type=ClockType.ROS_TIME)
         for clock in self._clocks:
             clock.set(time)
-        if self.publisher is not None and self.publisher.get_subscription_count() > len(self._clocks):
-            set_time(self._message.clock, now)
+        if self.publisher is None or now == self._announced:
+            return
+        if self.publisher.get_subscription_count() > len(self._clocks):
+            self.publish()
+
+    def announce(self, now: int) -> None:
+        """Publish the time (ns), before the clocks of the nodes are set to it."""
+        self._now = self._announced = now
+        self.publish()
+
+    def publish(self) -> None:
+        """Publish the time that was set last, once more."""
+        if self.enabled and self.publisher is not None:
+            self.publications += 1
+            set_time(self._message.clock, self._now)
             self.publisher.publish(self._message)

@@ -9,15 +9,17 @@ times as long.
 from __future__ import annotations
 
 import inspect
+import sys
 from collections import deque
 from collections.abc import Callable, Container, Iterable
 from typing import Any, TypeAlias
 
+from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy
+from rclpy.qos import DurabilityPolicy, HistoryPolicy
 from rclpy.subscription import Subscription
 
-from diffdrive_jacobian.ros.rclpy_internals import message_taker, receives_info
+from diffdrive_jacobian.ros.rclpy_internals import message_taker, receives_info, wait_for_message
 
 Delivered: TypeAlias = Callable[[Node, Any, Any], None]
 """Receives the node of a subscription, the type of its messages, and a message or its bytes."""
@@ -38,6 +40,8 @@ class Deliveries:
             subscription, create_task(node)
         )
         """Creates the reader of a subscription of a node."""
+        self.held: set[str] = set()
+        """Topics whose messages are not polled: they come from other processes, see `_external`."""
         self._readers: dict[Subscription, Reader] = {}
         self._by_topic: dict[str, list[Reader]] = {}
         self._observers: dict[str, list[Delivered]] = {}
@@ -120,6 +124,8 @@ class Deliveries:
         """
         found = False
         for reader in self._polled:
+            if self.held and reader.topic in self.held:
+                continue
             # As `deliver`, without a call for each.
             taken = reader.take(reader.message_type, reader.raw)
             if taken is not None:
@@ -138,12 +144,13 @@ class Reader:
     __slots__ = (
         '_close',
         '_create_task',
-        '_subscription',
+        'depth',
         'latched',
         'message_type',
         'observers',
         'owner',
         'raw',
+        'subscription',
         'take',
         'topic',
     )
@@ -154,10 +161,27 @@ class Reader:
         self.owner: Node | None = None
         self.observers: list[Delivered] = []
         self.latched = is_latched(subscription)
-        self._subscription = subscription
+        self.depth = queue_depth(subscription)
+        self.subscription = subscription
         self._create_task = create_task
         self.message_type, self.raw = subscription.msg_type, subscription.raw
         self.take, self._close = message_taker(subscription)
+
+    def waits(self, context: Context, timeout: float) -> bool:
+        """Wait until a message from another process can be taken.
+
+        Args:
+            context: The context of the nodes.
+            timeout: Longest wall time (s).
+
+        Returns:
+            Whether there is one.
+        """
+        return wait_for_message(context, self.subscription, timeout)
+
+    def accept(self) -> None:
+        """Take exactly one message, and call the callback."""
+        self.deliver()
 
     def deliver(self) -> bool:
         """Take a message and call the callback. Return False if there is none."""
@@ -173,7 +197,7 @@ class Reader:
             for observer in self.observers:
                 observer(self.owner, self.message_type, taken[0])
         # The callback is looked up for each message, because it may be replaced.
-        subscription = self._subscription
+        subscription = self.subscription
         callback = subscription.callback
         result = callback(*taken) if receives_info(subscription) else callback(taken[0])
         if result is not None and inspect.iscoroutine(result):
@@ -187,6 +211,12 @@ class Reader:
 
 def _nothing(*_: Any) -> None:
     """Take nothing."""
+
+
+def queue_depth(subscription: Subscription) -> int:
+    """Return the largest number of messages that wait in a subscription."""
+    profile = subscription.qos_profile
+    return sys.maxsize if profile.history == HistoryPolicy.KEEP_ALL else max(profile.depth, 1)
 
 
 def is_latched(endpoint: Any) -> bool:

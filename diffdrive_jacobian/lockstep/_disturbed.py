@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -82,7 +82,8 @@ class Disturbed(Messaging):
             seed: Seed of their random numbers.
 
         Raises:
-            LockstepError: An argument is no fault, or a fault is over already.
+            LockstepError: An argument is no fault, or a fault is over already, or affects what nodes in
+                other processes receive.
         """
         self._check_open()
         if not isinstance(seed, int) or isinstance(seed, bool):
@@ -96,8 +97,29 @@ class Disturbed(Messaging):
             self._injections = Injections(self._world(), self._traffic)
             self.on_new_topics(self._injections.look)
         for fault in faults:
+            self._check_receivers(fault)
             self._injections.add(fault, seed)
         self.settle()
+
+    def _on_discovery(self) -> None:
+        """Check that no fault affects what the discovered nodes receive."""
+        for one in self._injections.all if self._injections is not None else ():
+            self._check_receivers(one.fault)
+
+    def _check_receivers(self, fault: Any) -> None:
+        """Raise LockstepError if a fault affects the messages to a node in another process."""
+        topic = getattr(fault, 'topic', '')
+        if self._external is None or not topic or getattr(fault, 'at_publisher', False):
+            return
+        name = self.node.resolve_topic_name(topic)
+        others = self._external.graph.subscribed_nodes(name)
+        if fault.node:
+            others &= {full_name(fault.node, self.node)}
+        if others:
+            raise LockstepError(
+                f'{fault!r} cannot affect {", ".join(sorted(others))}: messages to other processes are '
+                'not intercepted; give node= with the name of a node of this world'
+            )
 
     def _world(self) -> World:
         self._observers.add(self.node)

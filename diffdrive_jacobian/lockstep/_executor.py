@@ -18,6 +18,7 @@ from rclpy.duration import Duration
 from rclpy.event_handler import EventHandler
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
+from rclpy.subscription import Subscription
 from rclpy.task import Task
 from rclpy.timer import Timer
 
@@ -63,6 +64,10 @@ class QuiescentExecutor:
         self._served: dict[Node, Served] = {}
         self._changed = False
         self._has_actions = False
+        self.isolated = True
+        """Whether there are no messages from other processes."""
+        self.unserved: set[Subscription] = set()
+        """Subscriptions whose messages are not taken."""
         self.tasks = Tasks()
         self.agenda = Agenda()
         """What happens at later times."""
@@ -188,7 +193,13 @@ class QuiescentExecutor:
 
     def _has_work(self) -> bool:
         """Return whether anything waits to be executed, or may wait without having been noticed."""
-        return bool(self.deliveries.pending or self._changed or self.tasks or self._has_actions)
+        return bool(
+            self.deliveries.pending
+            or self._changed
+            or self.tasks
+            or self._has_actions
+            or not self.isolated
+        )
 
     def _sooner(self, until_next: int | None) -> int | None:
         """Return the time until the next timer or action (ns); None: there is none."""
@@ -233,15 +244,19 @@ class QuiescentExecutor:
         """Process messages, service calls and tasks until none is left that can continue."""
         while True:
             self._drain()
-            if self._changed:
-                self._changed = False
-                try:
-                    self._register()
-                except BaseException:
-                    self._changed = True
-                    raise
-            elif not (self.tasks and self.tasks.run(self.keeper.closed if self.keeper else None)):
+            if not (self._register_changed() or self._run_tasks()):
                 return
+
+    def _run_tasks(self) -> bool:
+        """Continue the tasks. Return whether any made progress."""
+        return bool(
+            self.tasks and self.tasks.run(self.keeper.closed if self.keeper is not None else None)
+        )
+
+    def serve(self) -> None:
+        """Process requests and responses. Messages wait."""
+        self._handle_events()
+        self._register_changed()
 
     def _drain(self) -> None:
         """Process messages and events until none is left."""
@@ -287,6 +302,18 @@ class QuiescentExecutor:
         self._changed = True
         self.deliveries.drop_destroyed(self._served)
 
+    def _register_changed(self) -> bool:
+        """Register if a node has created or destroyed an entity. Return whether one has."""
+        if not self._changed:
+            return False
+        self._changed = False
+        try:
+            self._register()
+        except BaseException:
+            self._changed = True
+            raise
+        return True
+
     def _register(self) -> None:
         """Register entities that the nodes have created since the last call, and forget destroyed ones.
 
@@ -309,7 +336,8 @@ class QuiescentExecutor:
         self._events.wake()
         # The registration itself does not count as an event.
         self._handle_events()
-        new = self.deliveries.update(self._served, without=self.clocks.find(self._served))
+        without = self.clocks.find(self._served) | self.unserved
+        new = self.deliveries.update(self._served, without)
         # Messages that a subscription has received before.
         for reader in sorted(new, key=lambda reader: reader.latched):
             self.deliveries.admit(reader)

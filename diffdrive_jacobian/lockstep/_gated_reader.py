@@ -70,6 +70,15 @@ class GatedReader(Reader):
             self._pending.extendleft([self] * (len(self._ready) - 1))
         return self._ready.popleft()
 
+    def accept(self) -> None:
+        """Take exactly one message, and let it pass the stages."""
+        if not self.stages:
+            self.deliver()
+        elif (taken := self._take_next(self.message_type, True)) is not None:
+            before = len(self._ready)
+            self._pass(0, *taken)
+            self._pending.extend([self] * (len(self._ready) - before))
+
     def call(self, taken: tuple[Any, dict[str, Any]]) -> None:
         """Call the callback with a message, or let it wait at the gate of the node."""
         if self._gate.free:

@@ -112,6 +112,8 @@ class Guard:
             sys.setprofile(self._on_call)
             return
         self.raised = Stuck(self._diagnose(self._stop_observing(), frame))
+        # What handles the exception has as much time again, before another one replaces it.
+        self._since = time.monotonic()
         raise self.raised
 
     def _stop_observing(self) -> list[str]:

@@ -50,7 +50,12 @@ class Messaging(SimulatedTime):
             self._publishers[key] = self._with_type(topic, create, *key, 10)
         publisher = self._publishers[key]
         self._settle_unless_busy()
+        self.connect()
         subscriptions = publisher.get_subscription_count()
+        if subscriptions == 0 and self._external is not None and not self._busy:
+            self._external.waiting.for_subscription(publisher)
+            self.connect()
+            subscriptions = publisher.get_subscription_count()
         if subscriptions == 0:
             raise LockstepError(
                 f'{publisher.topic_name} has no subscription of type {_type_name(type(message))}\n'
@@ -80,6 +85,8 @@ class Messaging(SimulatedTime):
         # It remaps the name.
         endpoints = self.node.get_subscriptions_info_by_topic(given)
         # By number: two nodes can have one name, and the graph loses it when one of them is destroyed.
+        if self._external is not None:
+            endpoints = self._external.graph.own(endpoints)
         if len(endpoints) <= served.total():
             return
         named = Counter(f'{end.node_namespace.rstrip("/")}/{end.node_name}' for end in endpoints)
@@ -146,13 +153,18 @@ class Messaging(SimulatedTime):
             service_type: Type of the service.
             name: Name of the service.
             request: The request; None: an empty one.
-            timeout: Longest simulated time for the response (s).
+            timeout: Longest simulated time for the response (s); wall time if another process provides
+                the service.
 
         Raises:
             LockstepError: There is no such service, or it does not respond in time.
         """
         self._check_open()
         name = self.node.resolve_service_name(name)
+        self.connect()
+        external = None if self._is_served(name) else self._external
+        if external is not None:
+            external.waiting.for_service(name)
         services = dict(self.node.get_service_names_and_types())
         wanted = _type_name(service_type, 'srv')
         if wanted not in services.get(name, []):
@@ -164,11 +176,23 @@ class Messaging(SimulatedTime):
             )
         client = self.node.create_client(service_type, name)
         try:
+            if external is not None:
+                external.waiting.until(client.service_is_ready, timeout, lambda: f'{name} is not ready')
             future = client.call_async(request or service_type.Request())
+            if external is not None:
+                external.waiting.until(future.done, timeout, lambda: f'no response of {name}')
             self.run_until(future.done, timeout, f'a response of {name}')
             return future.result()
         finally:
             self.node.destroy_client(client)
+
+    def _is_served(self, service: str) -> bool:
+        """Return whether a node of the world provides a service."""
+        return any(
+            node.resolve_service_name(server.srv_name) == service
+            for node in self._executor.nodes
+            for server in node.services
+        )
 
     def _settle_unless_busy(self) -> None:
         """Settle, except within a callback, after which it happens anyway."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import count
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
+from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message, serialize_message
@@ -23,19 +24,31 @@ OMITTED = ('/clock', '/fault_events', '/parameter_events', '/rosout')
 """Topics that are not reported."""
 
 
-Published: TypeAlias = Callable[[Publisher, Any], None]
-"""Receives a publisher and the message or bytes that it has published."""
+Published: TypeAlias = Callable[[Any, Any], None]
+"""Receives a publisher and the message or bytes that it has published.
+
+For messages from other processes an `ExternalSource` takes the place of the publisher.
+"""
+
+
+class ExternalSource(Protocol):
+    """What has messages from other processes, with the attributes of a publisher."""
+
+    topic_name: str
+    msg_type: Any
 
 
 class _Record:
-    """Messages of one publisher."""
+    """Messages of one publisher, or those of other processes on a topic."""
 
     __slots__ = ('at', 'count', 'message', 'message_type', 'observers', 'order', 'readers', 'topic')
 
-    def __init__(self, publisher: Publisher, deliveries: Deliveries, observers: list[Published]) -> None:
+    def __init__(
+        self, topic: str, message_type: Any, deliveries: Deliveries, observers: list[Published]
+    ) -> None:
         self.observers = observers
-        self.topic: str = publisher.topic_name
-        self.message_type: Any = publisher.msg_type
+        self.topic = topic
+        self.message_type = message_type
         self.readers = deliveries.readers_of(self.topic)
         self.count = self.at = self.order = 0
         self.message: Any = None
@@ -65,6 +78,9 @@ class Traffic:
         """Start without messages. `now` returns the simulated time (ns)."""
         self._now = now
         self._records: dict[Publisher, _Record] = {}
+        self._external: dict[str, _Record] = {}
+        self._numbers = count(1)
+        self._deliveries: Deliveries | None = None
         self._observers: dict[str, list[Published]] = {}
         self._restore: Callable[[], None] | None = None
         self.intercept: Callable[[Publisher, Any], bool] | None = None
@@ -72,7 +88,8 @@ class Traffic:
 
     def start(self, deliveries: Deliveries) -> None:
         """Start counting."""
-        traffic, records, now, numbers = self, self._records, self._now, count(1)
+        traffic, records, now, numbers = self, self._records, self._now, self._numbers
+        self._deliveries = deliveries
         extend, observers_of = deliveries.pending.extend, self.observers_of
 
         def counting(publish: Callable[..., None]) -> Callable[..., None]:
@@ -82,8 +99,9 @@ class Traffic:
                 publish(self, msg)
                 record = records.get(self)
                 if record is None:
-                    observers = observers_of(self.topic_name)
-                    record = records[self] = _Record(self, deliveries, observers)
+                    name = self.topic_name
+                    record = _Record(name, self.msg_type, deliveries, observers_of(name))
+                    records[self] = record
                 record.count += 1
                 record.order = next(numbers)
                 record.at = now()
@@ -111,16 +129,60 @@ class Traffic:
 
     def last(self, topic: str) -> Any:
         """Return the last message of a topic as it was received; None: there is none."""
-        records = [record for record in self._records.values() if record.topic == topic]
+        records = [record for record in self._all() if record.topic == topic and record.count]
         return max(records, key=lambda record: record.order).received() if records else None
+
+    def count(self, topic: str) -> int:
+        """Return the number of messages that the nodes of the world have published on a topic."""
+        return sum(record.count for record in self._records.values() if record.topic == topic)
+
+    def sent_to_others(self) -> int:
+        """Return the number of messages of the publishers that have a subscription elsewhere.
+
+        It changes with every message to another process.
+        """
+        return sum(
+            record.count
+            for publisher, record in self._records.items()
+            if record.topic not in OMITTED and _subscriptions(publisher) > len(record.readers)
+        )
+
+    def note_external(self, source: ExternalSource, messages: Sequence[bytes]) -> None:
+        """Count messages from other processes on a topic.
+
+        Args:
+            source: The topic, which takes the place of a publisher.
+            messages: The messages, serialized.
+        """
+        assert self._deliveries is not None, 'start comes first'
+        name = source.topic_name
+        record = self._external.get(name)
+        if record is None:
+            record = _Record(name, source.msg_type, self._deliveries, self.observers_of(name))
+            self._external[name] = record
+        for message in messages:
+            record.count += 1
+            record.order = next(self._numbers)
+            record.at = self._now()
+            record.message = message
+            for observer in record.observers:
+                observer(source, message)
+
+    def _all(self) -> list[_Record]:
+        return [*self._records.values(), *self._external.values()]
 
     def close(self) -> None:
         """Stop counting."""
         if self._restore is not None:
             self._restore()
 
-    def describe(self, nodes: list[Node]) -> str:
-        """Return the last message of each publisher, and the subscribed topics without messages."""
+    def describe(self, nodes: list[Node], others: Collection[str] = ()) -> str:
+        """Return the last message of each publisher, and the subscribed topics without messages.
+
+        Args:
+            nodes: The nodes of the world.
+            others: Names of nodes in other processes.
+        """
         names = {
             publisher: node.get_fully_qualified_name() for node in nodes for publisher in node.publishers
         }
@@ -128,6 +190,10 @@ class Traffic:
             (record.topic, names.get(publisher, 'a removed node'), record)
             for publisher, record in self._records.items()
             if record.topic not in OMITTED
+        ] + [
+            (topic, 'other processes', record)
+            for topic, record in self._external.items()
+            if record.count
         ]
         lines = [
             f'  {topic}: {record.count} from {node}, last at {record.at / NANOSECONDS:g} s: '
@@ -142,17 +208,25 @@ class Traffic:
                 if topic not in active and topic not in OMITTED:
                     subscribers.setdefault(topic, []).append(node.get_fully_qualified_name())
         lines += [
-            f'  {topic}: no message; subscribed by {", ".join(names)}'
+            f'  {topic}: no message; subscribed by {", ".join(dict.fromkeys(names))}'
             for topic, names in sorted(subscribers.items())
         ]
-        if missing := _not_served(nodes):
+        if missing := _not_served(nodes, others):
             lines.append(f'  created, but not added to lockstep: {", ".join(missing)}')
         return '\n'.join([f'last messages, at {self._now() / NANOSECONDS:g} s:', *(lines or ['  none'])])
 
 
-def _not_served(nodes: list[Node]) -> list[str]:
+def _subscriptions(publisher: Publisher) -> int:
+    """Return the number of matched subscriptions of a publisher; 0 if it was destroyed."""
+    try:
+        return int(publisher.get_subscription_count())
+    except InvalidHandle:
+        return 0
+
+
+def _not_served(nodes: list[Node], others: Collection[str]) -> list[str]:
     """Return the names of nodes that were created but not added. Their callbacks are not executed."""
-    served = {node.get_fully_qualified_name() for node in nodes}
+    served = {*others, *(node.get_fully_qualified_name() for node in nodes)}
     created = nodes[0].get_node_names_and_namespaces() if nodes else []
     return sorted({f'{space.rstrip("/")}/{name}' for name, space in created} - served)
 

@@ -84,6 +84,8 @@ class Requirements(Disturbed):
         watches, self._watches = self._watches, []
         expected, self._expected = self._expected, []
         left = {id(required.requirement) for required in watches}
+        if self._external is not None:
+            self._offered.update(self._external.topics())
         for requirement, names in expected:
             # One that was violated has observed something, or its absence.
             if id(requirement) in left and self._offered.isdisjoint(names):

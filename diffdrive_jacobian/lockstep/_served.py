@@ -73,6 +73,11 @@ _IGNORED = object()
 """Instead of a response: the service was destroyed after the request had arrived."""
 
 
+def _ignore(*_: Any) -> object:
+    """Return no response."""
+    return _IGNORED
+
+
 class _Service:
     """A service whose callback may be a coroutine. The response is sent when it ends."""
 
@@ -85,9 +90,13 @@ class _Service:
 
     @property
     def callback(self) -> Callable[[Any, Any], Any]:
-        """Function that returns the response of a request."""
+        """Function that returns the response of a request.
+
+        The EventsExecutor holds a borrowed reference only: an object that is created here would be freed
+        before it is called.
+        """
         if self._service not in self._served.node.services:
-            return lambda *_: _IGNORED
+            return _ignore
         if self._served.gate is not None:
             return _Request
         callback: Callable[[Any, Any], Any] = self._service.callback
@@ -141,6 +150,7 @@ class _Client:
     def __init__(self, client: Client, served: Served) -> None:
         self._client = client
         self._served = served
+        self._latest: _Response | None = None
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._client, name)
@@ -149,7 +159,11 @@ class _Client:
         """Return the future of a request."""
         future = self._client.get_pending_request(sequence_number)
         gate = self._served.gate
-        return future if gate is None else _Response(future, self._client, gate)
+        if gate is None:
+            return future
+        # Kept, in case that the EventsExecutor holds a borrowed reference only.
+        self._latest = _Response(future, self._client, gate)
+        return self._latest
 
 
 class _Response:

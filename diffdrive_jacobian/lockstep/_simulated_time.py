@@ -14,6 +14,7 @@ from rclpy.executors import ExternalShutdownException
 
 from diffdrive_jacobian.lockstep._errors import LockstepError, PropertyViolation
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
+from diffdrive_jacobian.lockstep._external import External
 from diffdrive_jacobian.lockstep._guard import Guard, Stuck
 from diffdrive_jacobian.lockstep._report import Traffic
 from diffdrive_jacobian.lockstep._requirement import Required, Requirement
@@ -21,6 +22,8 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 
 MAX_SECONDS = 2**31 - 1
 """Largest time that fits into a stamp (s)."""
+CONNECTION = 30.0
+"""Longest wall time for the discovery of external nodes (s)."""
 
 
 class SimulatedTime:
@@ -34,6 +37,7 @@ class SimulatedTime:
         self._now = self._start = start
         self._until_next: int | None = None
         self._busy = False
+        self._external: External | None = None
         self._traffic = Traffic(lambda: self._now)
         self._watches: list[Required] = []
 
@@ -65,6 +69,7 @@ class SimulatedTime:
         self._check_open()
         with self._watched():
             self._until_next = self._executor.settle()
+        self._await_others()
         if self._watches:
             self._check_requirements()
 
@@ -73,6 +78,7 @@ class SimulatedTime:
         self._check_open()
         with self._watched():
             self._until_next = self._executor.catch_up()
+        self._await_others()
 
     def step(self, at_most: float | None = None) -> None:
         """Advance to the time at which the next timer expires.
@@ -86,6 +92,7 @@ class SimulatedTime:
         """
         __tracebackhide__ = True
         end = math.inf if at_most is None else self.world_time + checked_nanoseconds('at_most', at_most)
+        self.connect()
         self._catch_up()
         if self._until_next is None and at_most is None:
             raise LockstepError('no timer is running, so step needs at_most')
@@ -100,6 +107,7 @@ class SimulatedTime:
         """
         __tracebackhide__ = True
         end = self.world_time + checked_nanoseconds('seconds', seconds)
+        self.connect()
         self.settle()
         while self.world_time < end:
             self._advance(end)
@@ -118,6 +126,7 @@ class SimulatedTime:
         """
         __tracebackhide__ = True
         end = self.world_time + checked_nanoseconds('timeout', timeout)
+        self.connect()
         self.settle()
         while not condition():
             if self.world_time >= end:
@@ -145,6 +154,7 @@ class SimulatedTime:
             raise ValueError(
                 f'seconds must lead to a time after 0, got {seconds!r} at {self._now / NANOSECONDS:g} s'
             )
+        self.connect()
         self.settle()
         self._now = now
         self._publish_clock()
@@ -152,6 +162,7 @@ class SimulatedTime:
     def _advance(self, end: float) -> None:
         """Advance to the next timer or action, but not beyond an end of world time (ns)."""
         __tracebackhide__ = True
+        self.connect()
         until_next = math.inf if self._until_next is None else self._until_next
         agenda = self._executor.agenda
         # The minimum of integers is exact, also beside infinity.
@@ -163,10 +174,59 @@ class SimulatedTime:
 
     def _publish_clock(self) -> None:
         __tracebackhide__ = True
+        if self._external is not None:
+            self._external.announce()
         with self._watched():
             self._until_next = self._executor.advance(self._now)
+        self._await_others()
         if self._watches:
             self._check_requirements()
+
+    def _await_others(self) -> None:
+        """Wait for the messages from other processes that are due, and execute what they cause."""
+        external = self._external
+        if external is None:
+            return
+        while external.await_answers():
+            with self._watched():
+                external.release()
+                self._until_next = self._executor.settle()
+        until_next = external.until_next()
+        if until_next is not None:
+            self._until_next = min(until_next, self._until_next or until_next)
+
+    def connect(self, timeout: float = CONNECTION) -> None:
+        """Wait until the external nodes are discovered, and have discovered the nodes of the world.
+
+        The methods that let time pass do so themselves, also after new nodes were added or started. Only
+        then do external nodes receive the time. In an isolated world there is nothing to wait for.
+
+        Args:
+            timeout: Longest wall time (s).
+
+        Raises:
+            ValueError: `timeout` is not positive.
+            LockstepError: Nodes are not discovered in time, or a process has ended.
+        """
+        checked_nanoseconds('timeout', timeout)
+        self._check_open()
+        external = self._external
+        if external is None or self._busy:
+            return
+        if external.connected():
+            return
+        self.settle()
+        while not external.connected():
+            external.connect(timeout)
+            # Recorders subscribe to topics that were discovered.
+            self._on_discovery()
+            self.settle()
+        with self._watched():
+            external.begin()
+        self.settle()
+
+    def _on_discovery(self) -> None:
+        """Note that topics may have been discovered."""
 
     @contextmanager
     def _watched(self) -> Iterator[None]:
@@ -202,7 +262,11 @@ class SimulatedTime:
 
     def report(self) -> str:
         """Return the last messages of all topics as text."""
-        return self._traffic.describe(self._executor.nodes)
+        if self._external is None:
+            return self._traffic.describe(self._executor.nodes)
+        lines = self._external.waiting.describe()
+        others = self._external.graph.nodes()
+        return '\n  '.join([self._traffic.describe(self._executor.nodes, others), *lines])
 
 
 def checked_nanoseconds(name: str, seconds: float) -> int:

@@ -8,7 +8,7 @@ so a run is as fast as the machine. Its results are the same each time, bit for 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any, ClassVar, TypeVar
 
@@ -19,17 +19,20 @@ from rosgraph_msgs.msg import Clock
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
+from diffdrive_jacobian.lockstep._external_answers import Expectation
 from diffdrive_jacobian.lockstep._guard import Guard
 from diffdrive_jacobian.lockstep._messaging import described
+from diffdrive_jacobian.lockstep._processes import Processes
 from diffdrive_jacobian.lockstep._requirements import Requirements
 from diffdrive_jacobian.lockstep._simulated_time import checked_nanoseconds
+from diffdrive_jacobian.ros.fastdds_profiles import withdraw
 from diffdrive_jacobian.ros.rclpy_internals import wrap_sleep
-from diffdrive_jacobian.ros.runner import UserError, discovery_off, ros_context
+from diffdrive_jacobian.ros.runner import UserError, environment, ros_context
 
 N = TypeVar('N', bound=Node)
 
 
-class Lockstep(Requirements):
+class Lockstep(Requirements, Processes):
     """Executes nodes in the default context of rclpy, in simulated time.
 
     Nodes are created as usual, after the `Lockstep`, and added to it. `use_sim_time` is true for all of
@@ -46,7 +49,15 @@ class Lockstep(Requirements):
 
     _open: ClassVar[Lockstep | None] = None
 
-    def __init__(self, args: Sequence[str] = (), *, start: float = 1.0, patience: float = 10.0) -> None:
+    def __init__(
+        self,
+        args: Sequence[str] = (),
+        *,
+        start: float = 1.0,
+        patience: float = 10.0,
+        external: Iterable[Expectation] | None = None,
+        domain_id: int | None = None,
+    ) -> None:
         """Initialize rclpy and start without nodes.
 
         Args:
@@ -54,11 +65,16 @@ class Lockstep(Requirements):
             start: Simulated time at the start (s).
             patience: Longest wall time for one simulated time (s). Beyond it an error names the
                 callbacks.
+            external: What nodes in other processes on this machine send (`Answers`, `Every`, `Idle`).
+                Time does not advance before it has been received. None: no other process is discovered.
+            domain_id: The ROS domain in which they are; None: one that is not in use, see `domain_id`.
+                Only with `external`.
 
         Raises:
             LockstepError: rclpy is already initialized, for example by another `Lockstep`, the arguments
                 are invalid, or this is not the main thread.
-            ValueError: `start` or `patience` is not positive, or too long.
+            ValueError: `start` or `patience` is not positive, or too long, or `external` or `domain_id`
+                is invalid.
         """
         super().__init__(checked_nanoseconds('start', start))
         checked_nanoseconds('patience', patience)
@@ -72,19 +88,22 @@ class Lockstep(Requirements):
         self._on_new: list[Callable[[], None]] = []
         self._closing = ExitStack()
         try:
-            self._enter(args, patience)
+            self._enter(args, patience, self._variables(external, domain_id))
+            if external is not None:
+                self._open_to(external)
         except BaseException:
             Lockstep._open = None
             self._closing.close()
             raise
 
-    def _enter(self, args: Sequence[str], patience: float) -> None:
+    def _enter(self, args: Sequence[str], patience: float, variables: Mapping[str, str | None]) -> None:
         arguments = ['lockstep', *args, '--ros-args', '-p', 'use_sim_time:=true']
         try:
-            with discovery_off():
+            with environment(variables):
                 context = self._closing.enter_context(ros_context(arguments, default=True))
         except UserError as error:
             raise LockstepError(str(error)) from error
+        withdraw()
         self._executor = QuiescentExecutor(context, self._on_registered)
         self._closing.callback(self._destroy_nodes)
         try:
@@ -228,6 +247,11 @@ class Lockstep(Requirements):
             return refuse
 
         wrap_sleep(node.get_clock(), refusing)
+
+    def _on_discovery(self) -> None:
+        super()._on_discovery()
+        for callback in self._on_new:
+            callback()
 
     @staticmethod
     def _check_sim_time(node: Node) -> None:

@@ -58,6 +58,15 @@ def fast_heartbeats() -> Iterator[None]:
         withdraw()
 
 
+def open_to_others() -> None:
+    """Announce the participants of this process and send heartbeats every 0.2 s and 0.1 s.
+
+    The conditions are those of `announce_frequently`.
+    """
+    if announce_frequently():
+        _use('heartbeats')
+
+
 def withdraw() -> None:
     """Remove the variable if it names a file of this package.
 

@@ -32,6 +32,8 @@ from rclpy.task import Task
 from rclpy.time import Time
 from rclpy.timer import Timer
 
+from diffdrive_jacobian.time_units import NANOSECONDS
+
 RCLError: type[Exception] = rclpy_implementation.RCLError
 """Error of rcl, for example that a name is invalid or an object was destroyed. A RuntimeError."""
 UnknownROSArgsError: type[Exception] = rclpy_implementation.UnknownROSArgsError
@@ -251,6 +253,24 @@ def message_taker(
     handle = subscription.handle
     handle.__enter__()
     return handle.take_message, lambda: handle.__exit__(None, None, None)
+
+
+def wait_for_message(context: Context, subscription: Subscription, timeout: float) -> bool:
+    """Wait until a subscription has a message. Return whether it has one.
+
+    Relies on the wait set of rclpy, which is not public, and on `Subscription.handle`.
+
+    Args:
+        context: The context of the subscription.
+        subscription: The subscription, which no executor waits for.
+        timeout: Longest wait (s).
+    """
+    with subscription.handle, context.handle:
+        wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, context.handle)
+        wait_set.clear_entities()
+        index = wait_set.add_subscription(subscription.handle)
+        wait_set.wait(round(timeout * NANOSECONDS))
+        return bool(wait_set.is_ready('subscription', index))
 
 
 def receives_info(subscription: Subscription) -> bool:

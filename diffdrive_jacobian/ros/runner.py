@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from itertools import pairwise
 
 import rclpy
@@ -40,23 +40,31 @@ RULES = {
 """Form of the rule after each flag."""
 
 
+DISCOVERY = (
+    'ROS_AUTOMATIC_DISCOVERY_RANGE',
+    'ROS_LOCALHOST_ONLY',
+    'ROS_STATIC_PEERS',
+    'ROS_DISCOVERY_SERVER',
+)
+"""Variables that choose what is discovered. The others take precedence over the first."""
+
+
 @contextmanager
-def discovery_off() -> Iterator[None]:
-    """Isolate contexts that are created: no other context, in whatever process, can reach them."""
-    # The first is set. The others would take precedence over it.
-    names = (
-        'ROS_AUTOMATIC_DISCOVERY_RANGE',
-        'ROS_LOCALHOST_ONLY',
-        'ROS_STATIC_PEERS',
-        'ROS_DISCOVERY_SERVER',
-    )
-    before = {name: os.environ.pop(name, None) for name in names}
-    os.environ[names[0]] = 'OFF'
+def environment(values: Mapping[str, str | None]) -> Iterator[None]:
+    """Set environment variables (None: remove them) for contexts that are created."""
+    before = {name: os.environ.pop(name, None) for name in values}
+    os.environ.update({name: value for name, value in values.items() if value is not None})
     try:
         yield
     finally:
-        del os.environ[names[0]]
+        for name in values:
+            os.environ.pop(name, None)
         os.environ.update({name: value for name, value in before.items() if value is not None})
+
+
+def discovery_off() -> AbstractContextManager[None]:
+    """Isolate contexts that are created: no other context, in whatever process, can reach them."""
+    return environment({**dict.fromkeys(DISCOVERY), DISCOVERY[0]: 'OFF'})
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 Names of this package, which are imported on first use:
 
 - `Lockstep`, `LockstepError`, `PropertyViolation`: as in the package `lockstep`.
+- `Answers`, `Every`, `Idle`: what nodes in other processes send, as in the package `lockstep`.
 - `faults`: the package of the faults that a `Lockstep` injects.
 - `properties`: the package of the properties that a `Lockstep` requires.
 - `explore`, `fault_schedules`, `poses`, ...: all names of the package `exploration`, most of which need
@@ -19,12 +20,22 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from diffdrive_jacobian import faults, properties
-    from diffdrive_jacobian.lockstep import Lockstep, LockstepError, PropertyViolation
+    from diffdrive_jacobian.lockstep import (
+        Answers,
+        Every,
+        Idle,
+        Lockstep,
+        LockstepError,
+        PropertyViolation,
+    )
     from diffdrive_jacobian.testing.golden_run import GoldenRun
     from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
 __all__ = [
+    'Answers',
+    'Every',
     'GoldenRun',
+    'Idle',
     'Lockstep',
     'LockstepError',
     'PropertyViolation',
@@ -36,7 +47,10 @@ __all__ = [
 _PACKAGES = ('faults', 'properties')
 """Packages beside this one that are names of it, too."""
 _MODULES = {
+    'Answers': 'lockstep',
+    'Every': 'lockstep',
     'GoldenRun': 'testing.golden_run',
+    'Idle': 'lockstep',
     'Lockstep': 'lockstep',
     'LockstepError': 'lockstep',
     'PropertyViolation': 'lockstep',

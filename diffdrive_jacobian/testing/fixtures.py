@@ -76,7 +76,8 @@ def pytest_load_initial_conftests(early_config: pytest.Config) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Register the marker."""
     config.addinivalue_line(
-        'markers', 'lockstep(args, start, patience): arguments of the Lockstep of this test'
+        'markers',
+        'lockstep(args, start, patience, external, domain_id): arguments of the Lockstep of this test',
     )
     # The hook before is not called for a plugin that a conftest.py loads.
     _check_fields(config)
@@ -209,7 +210,7 @@ def lockstep(request: pytest.FixtureRequest) -> Iterator[Lockstep]:
     marker = request.node.get_closest_marker('lockstep')
     if marker and marker.args:
         raise TypeError(
-            f'the marker lockstep takes args=, start= and patience= only, got {marker.args!r}'
+            f'the marker lockstep takes keyword arguments only, as Lockstep does, got {marker.args!r}'
         )
     try:
         from diffdrive_jacobian.lockstep import Lockstep

@@ -1,0 +1,221 @@
+"""What a test declares about nodes in other processes, and how many messages are due from them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
+
+from diffdrive_jacobian.time_units import NANOSECONDS
+
+WITHIN = 5.0
+"""Default of `within` (s)."""
+
+
+@dataclass(frozen=True)
+class Answers:
+    """Each message on a topic is answered by messages on another one.
+
+    Simulated time does not advance until the answers have been received. A message on `topic` that
+    answers nothing is an error.
+
+    Attributes:
+        topic: Topic that nodes in other processes publish.
+        to: Topic that is answered, whoever publishes it.
+        count: Number of answers to each message.
+        within: Longest wall time for an answer (s).
+        when: Called once there are new messages on `to`. If it returns a false value, they are not
+            answered. None: all are.
+    """
+
+    topic: str
+    to: str
+    _: KW_ONLY
+    count: int = 1
+    within: float = WITHIN
+    when: Callable[[], object] | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            ValueError: A value is invalid.
+        """
+        _check_name('topic', self.topic)
+        _check_name('to', self.to)
+        if not isinstance(self.count, int) or self.count < 1:
+            raise ValueError(f'count must be an integer of at least 1, got {self.count!r}')
+        _check_positive('within', self.within)
+
+
+@dataclass(frozen=True)
+class Every:
+    """A topic is published by a timer in simulated time.
+
+    Simulated time stops at each expiry of the timer until the message has been received. Any other
+    message on `topic` is an error. A timer on wall time, as of rclcpp's `create_wall_timer`, is no such
+    timer.
+
+    Attributes:
+        topic: Topic that a node in another process publishes.
+        period: Period of the timer (s).
+        created: Time at which the timer is created (s). 0: before the node has received the time, as in
+            its constructor. Then it expires once when the node receives the time, and from then on at
+            multiples of the period.
+        within: Longest wall time for a message (s).
+        when: Called at each expiry. If it returns a false value, nothing is published. None: always.
+    """
+
+    topic: str
+    period: float
+    _: KW_ONLY
+    created: float = 0.0
+    within: float = WITHIN
+    when: Callable[[], object] | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            ValueError: A value is invalid.
+        """
+        _check_name('topic', self.topic)
+        _check_positive('period', self.period)
+        if not 0.0 <= self.created < math.inf:
+            raise ValueError(f'created must be a time of at least 0 s, got {self.created!r}')
+        _check_positive('within', self.within)
+
+
+@dataclass(frozen=True)
+class Idle:
+    """A node is idle when it has processed all that it received, which its parameter services show.
+
+    Whenever something was sent to the node, it is asked for its parameters three times before simulated
+    time advances. An executor with one thread responds to the last request after the callbacks of the
+    messages and timers before it. For nodes whose answers cannot be counted. It needs the node's
+    parameter services.
+
+    Attributes:
+        node: Name of the node.
+        within: Longest wall time for a response (s).
+    """
+
+    node: str
+    _: KW_ONLY
+    within: float = WITHIN
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            ValueError: A value is invalid.
+        """
+        _check_name('node', self.node)
+        _check_positive('within', self.within)
+
+
+Expectation = Answers | Every | Idle
+
+
+def _check_name(name: str, value: object) -> None:
+    if not isinstance(value, str) or not value:
+        raise ValueError(f'{name} must be a name, got {value!r}')
+
+
+def _check_positive(name: str, value: float) -> None:
+    # Periods of less than a nanosecond are zero for rcl.
+    if not (math.isfinite(value) and value * NANOSECONDS >= 1):
+        raise ValueError(f'{name} must be a positive, finite number of seconds, got {value!r}')
+
+
+class AnswersDue:
+    """Counts the answers that are due."""
+
+    def __init__(self, declared: Answers, topic: str, question: str) -> None:
+        """Start with none. `topic` and `question` are full names."""
+        self.topic = topic
+        self.question = question
+        self.within = declared.within
+        self.started = False
+        """Whether the node has been discovered."""
+        self.due = 0
+        self._count = declared.count
+        self._when = declared.when
+        self._asked = 0
+
+    def restart(self, published: Callable[[str], int]) -> None:
+        """Start with none again. What was published before is not answered.
+
+        Args:
+            published: Returns the number of messages that were published on a topic.
+        """
+        self.started = True
+        self.due = 0
+        self._asked = published(self.question)
+
+    def update(self, now: int, published: Callable[[str], int]) -> None:
+        """Count the messages that have been published since the last call.
+
+        Args:
+            now: Simulated time (ns).
+            published: Returns the number of messages that were published on a topic.
+        """
+        if not self.started:
+            return
+        number = published(self.question)
+        new, self._asked = number - self._asked, number
+        if new and (self._when is None or self._when()):
+            self.due += new * self._count
+
+    def next_time(self) -> int | None:
+        """Return None: the next time is not known."""
+        return None
+
+    def describe(self, now: int) -> str:
+        """Return what is due."""
+        return f'answer to message {self._asked} on {self.question}, at {now / NANOSECONDS:g} s'
+
+
+class TicksDue:
+    """Counts the messages of a timer that are due, by the rules of rcl."""
+
+    def __init__(self, declared: Every, topic: str) -> None:
+        """Start with none. `topic` is a full name."""
+        self.topic = topic
+        self.question = ''
+        self.within = declared.within
+        self.started = False
+        """Whether the node has been discovered."""
+        self.due = 0
+        # rclpy and rclcpp truncate.
+        self._period = int(declared.period * NANOSECONDS)
+        self._next = round(declared.created * NANOSECONDS) + self._period
+        self._last = 0
+        self._when = declared.when
+
+    def restart(self, published: Callable[[str], int]) -> None:
+        """Start with none again. Nothing expires before the node has received the time."""
+        self.started = True
+        self.due = 0
+
+    def update(self, now: int, published: Callable[[str], int]) -> None:
+        """Count the expiries up to a time (ns), which may have jumped."""
+        if now < self._last:
+            # A timer restarts when time jumps back behind its last expiry.
+            self._last, self._next = now, now + self._period
+        while self.started and self._next <= now:
+            self._last = now
+            self._next += self._period
+            if self._next < now:
+                # Periods that were missed are skipped.
+                self._next += (1 + (now - self._next) // self._period) * self._period
+            if self._when is None or self._when():
+                self.due += 1
+
+    def next_time(self) -> int | None:
+        """Return the time of the next expiry (ns)."""
+        return self._next if self.started else None
+
+    def describe(self, now: int) -> str:
+        """Return what is due."""
+        return f'message of the timer of {self._period / NANOSECONDS:g} s, at {now / NANOSECONDS:g} s'

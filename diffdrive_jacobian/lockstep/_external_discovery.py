@@ -1,0 +1,77 @@
+"""What is still to be discovered before nodes in other processes can take part."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from rclpy.node import Node
+
+from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._external_expectations import Due
+from diffdrive_jacobian.lockstep._external_graph import CLOCK, UNKNOWN, ExternalGraph, node_name
+from diffdrive_jacobian.lockstep._external_probe import Probe
+from diffdrive_jacobian.lockstep._report import OMITTED
+
+UNTIMED = 2.0
+"""Time for which a node that lacks nothing but the time is waited for (s)."""
+
+
+class Discovery:
+    """The endpoints of the world and those of external nodes."""
+
+    def __init__(self, graph: ExternalGraph, nodes: Sequence[Node]) -> None:
+        """Take the present nodes of the world."""
+        self._graph = graph
+        self._nodes = nodes
+
+    def endpoints(self) -> frozenset[object]:
+        """Return the publishers and subscriptions of the world."""
+        return frozenset(
+            endpoint
+            for node in self._nodes
+            for endpoints in (node.publishers, node.subscriptions)
+            for endpoint in endpoints
+            if endpoint.topic_name not in OMITTED
+        )
+
+    def awaited_nodes(self, expected: Sequence[Due], probes: Sequence[Probe]) -> set[str]:
+        """Return the names of the external nodes from which something is awaited."""
+        infos = [info for one in expected for info in self._graph.publishers(one.topic)]
+        return {node_name(info) for info in infos} | {probe.name for probe in probes}
+
+    def missing(self, expected: Sequence[Due], probes: Sequence[Probe]) -> tuple[list[str], list[str]]:
+        """Return what is missing of the nodes, and which of them are not subscribed to /clock.
+
+        Raises:
+            LockstepError: Another process publishes /clock.
+        """
+        if others := self._graph.publishers(CLOCK):
+            raise LockstepError(f'{node_name(others[0])} publishes {CLOCK}, which only lockstep may do')
+        found = [text for one in expected for text in self._missing_topics(one)]
+        found += [f'no external node provides {probe.service}' for probe in probes if not probe.ready()]
+        found += self._unmatched({one.topic for one in expected})
+        timed = {node_name(info) for info in self._graph.subscriptions(CLOCK)}
+        untimed = [
+            f'{name} is not subscribed to {CLOCK}: its parameter use_sim_time must be true'
+            for name in sorted(self.awaited_nodes(expected, probes) - timed)
+        ]
+        return list(dict.fromkeys(found)), untimed
+
+    def _missing_topics(self, one: Due) -> Iterator[str]:
+        publishers = self._graph.publishers(one.topic)
+        if not publishers:
+            yield f'no external node publishes {one.topic}'
+        if any(info.node_name == UNKNOWN for info in publishers):
+            yield f'the name of the node that publishes {one.topic} is not known'
+        if one.question and not self._graph.subscriptions(one.question):
+            yield f'no external node is subscribed to {one.question}'
+
+    def _unmatched(self, awaited: set[str]) -> Iterator[str]:
+        """Yield what the endpoints of the world lack."""
+        for node in self._nodes:
+            for publisher in node.publishers:
+                if self._graph.subscriptions(publisher.topic_name):
+                    yield from self._graph.unmatched_publisher(publisher)
+            for subscription in node.subscriptions:
+                if subscription.topic_name in awaited:
+                    yield from self._graph.unmatched_subscription(node, subscription)

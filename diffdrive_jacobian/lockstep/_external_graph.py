@@ -1,0 +1,123 @@
+"""Which endpoints belong to other processes, and whether those of the world are matched with them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import (
+    DurabilityPolicy,
+    QoSCompatibility,
+    QoSProfile,
+    qos_check_compatible,
+)
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+CLOCK = '/clock'
+UNKNOWN = '_NODE_NAME_UNKNOWN_'
+"""Name of a node whose endpoints have been discovered before its name."""
+PARTICIPANT = 12
+"""Number of bytes at the start of a GID that are those of the participant."""
+
+
+class ExternalGraph:
+    """Publishers and subscriptions in other processes."""
+
+    def __init__(self, node: Node) -> None:
+        """Find out the participant of this process.
+
+        Args:
+            node: A node that publishes /clock, before any other is discovered.
+        """
+        self._node = node
+        (clock, *_) = node.get_publishers_info_by_topic(CLOCK)
+        self._own = bytes(clock.endpoint_gid)[:PARTICIPANT]
+
+    def publishers(self, topic: str) -> list[TopicEndpointInfo]:
+        """Return the external publishers of a topic."""
+        return self._external(self._node.get_publishers_info_by_topic(topic))
+
+    def subscriptions(self, topic: str) -> list[TopicEndpointInfo]:
+        """Return the external subscriptions of a topic."""
+        return self._external(self._node.get_subscriptions_info_by_topic(topic))
+
+    def own(self, infos: Iterable[TopicEndpointInfo]) -> list[TopicEndpointInfo]:
+        """Return the endpoints of the world."""
+        return [info for info in infos if bytes(info.endpoint_gid)[:PARTICIPANT] == self._own]
+
+    def _external(self, infos: Iterable[TopicEndpointInfo]) -> list[TopicEndpointInfo]:
+        return [info for info in infos if bytes(info.endpoint_gid)[:PARTICIPANT] != self._own]
+
+    def published_topics(self) -> list[str]:
+        """Return the topics that external nodes publish, without those of every node."""
+        names = (name for name, _ in self._node.get_topic_names_and_types())
+        return [
+            name
+            for name in names
+            if name not in ('/rosout', '/parameter_events') and self.publishers(name)
+        ]
+
+    def nodes(self) -> set[str]:
+        """Return the names of the external nodes that publish or are subscribed to anything."""
+        return {
+            node_name(info)
+            for name, _ in self._node.get_topic_names_and_types()
+            for info in (*self.publishers(name), *self.subscriptions(name))
+        }
+
+    def subscribed_nodes(self, topic: str) -> set[str]:
+        """Return the names of the external nodes that are subscribed to a topic."""
+        return {node_name(info) for info in self.subscriptions(topic)}
+
+    def unmatched_publisher(self, publisher: Publisher) -> Iterator[str]:
+        """Yield what a publisher of the world still lacks."""
+        topic = publisher.topic_name
+        infos = self._node.get_subscriptions_info_by_topic(topic)
+        wanted = sum(_compatible(publisher.qos_profile, info.qos_profile) for info in infos)
+        matched = publisher.get_subscription_count()
+        if matched < wanted:
+            yield f'the publisher of {topic} is matched with {matched} of {wanted} subscriptions'
+
+    def unmatched_subscription(self, node: Node, subscription: Subscription) -> Iterator[str]:
+        """Yield what a subscription of the world still lacks, or why it cannot be matched."""
+        topic, requested = subscription.topic_name, subscription.qos_profile
+        infos = self._node.get_publishers_info_by_topic(topic)
+        where = f'the subscription of {node.get_fully_qualified_name()} to {topic}'
+        own_type = type_name(subscription.msg_type)
+        for info in self._external(infos):
+            if info.topic_type != own_type:
+                yield f'{where} is of type {own_type}, the publisher of {info.topic_type}'
+                return
+            if not _compatible(info.qos_profile, requested):
+                yield (
+                    f'{where} and its publisher have incompatible QoS: {_qos(requested)}, and '
+                    f'{_qos(info.qos_profile)}'
+                )
+                return
+        wanted = sum(_compatible(info.qos_profile, requested) for info in infos)
+        matched = subscription.get_publisher_count()
+        if matched < wanted:
+            yield f'{where} is matched with {matched} of {wanted} publishers'
+
+
+def _compatible(offered: QoSProfile, requested: QoSProfile) -> bool:
+    compatibility, _ = qos_check_compatible(offered, requested)
+    return bool(compatibility != QoSCompatibility.ERROR)
+
+
+def _qos(profile: QoSProfile) -> str:
+    latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    return f'{profile.reliability.name.lower()}, {"transient local" if latched else "volatile"}'
+
+
+def node_name(info: TopicEndpointInfo) -> str:
+    """Return the full name of the node of an endpoint."""
+    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+
+
+def type_name(message_type: Any) -> str:
+    """Return the name of a message type: 'nav_msgs/msg/Odometry'."""
+    return f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'

@@ -1,0 +1,119 @@
+"""Waiting in wall time, while simulated time stands still and the processes are observed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, suppress
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+
+from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
+from diffdrive_jacobian.lockstep._external_answers import WITHIN
+from diffdrive_jacobian.lockstep._external_probe import Probe
+from diffdrive_jacobian.lockstep._external_process import ExternalProcess
+
+CLOCK_PERIOD = 0.1
+"""Period at which the time is published again, because a message may be lost (s)."""
+NAP = 0.0001
+"""Period at which a condition is checked (s)."""
+SLOW_NAP = 0.002
+"""The same after `CLOCK_PERIOD` (s)."""
+
+
+class Waiting:
+    """Waits for other processes."""
+
+    def __init__(
+        self,
+        node: Node,
+        executor: QuiescentExecutor,
+        watched: Callable[[], AbstractContextManager[None]],
+        report: Callable[[], str],
+        awaited: Callable[[ExternalProcess], bool],
+    ) -> None:
+        """Start without processes.
+
+        Args:
+            node: Node of the world.
+            executor: Executes its nodes.
+            watched: Returns a context in which callbacks may be executed.
+            report: Returns the last messages of all topics, and the states of the processes, as text.
+            awaited: Returns whether anything is awaited from a process.
+        """
+        self._node = node
+        self._executor = executor
+        self._watched = watched
+        self._report = report
+        self._awaited = awaited
+        self.processes: list[ExternalProcess] = []
+        """The processes that were started."""
+
+    def until(self, condition: Callable[[], object], timeout: float, failure: Callable[[], str]) -> None:
+        """Wait for a condition.
+
+        Args:
+            condition: The condition.
+            timeout: Longest wall time (s).
+            failure: Returns the message of the error.
+
+        Raises:
+            LockstepError: It is not true in time, or a process has ended.
+        """
+        begin = repeated = time.monotonic()
+        while not condition():
+            now = time.monotonic()
+            if now - begin > timeout:
+                raise LockstepError(f'{failure()}\n{self._report()}')
+            if now - repeated > CLOCK_PERIOD:
+                repeated = now
+                self.check_processes()
+                self._executor.clocks.publish()
+            self.serve()
+            time.sleep(NAP if now - begin < CLOCK_PERIOD else SLOW_NAP)
+
+    def for_subscription(self, publisher: Publisher) -> None:
+        """Wait until a publisher has a subscription. If none comes, return after a while."""
+        with suppress(LockstepError):
+            self.until(publisher.get_subscription_count, WITHIN, str)
+
+    def for_service(self, name: str) -> None:
+        """Wait until a service is discovered. If none is, return after a while."""
+
+        def discovered() -> bool:
+            return any(name == other for other, _ in self._node.get_service_names_and_types())
+
+        with suppress(LockstepError):
+            self.until(discovered, WITHIN, str)
+
+    def ask(self, probe: Probe, rounds: int) -> None:
+        """Send requests to a node, each after the response to the one before.
+
+        Raises:
+            LockstepError: It does not respond in time, or a process has ended.
+        """
+        for _ in range(rounds):
+            self.until(probe.ask().done, probe.within, probe.no_response)
+
+    def serve(self) -> None:
+        """Process requests and responses. Messages wait until everything has been received."""
+        with self._watched():
+            self._executor.serve()
+
+    def check_processes(self) -> None:
+        """Check that no process has failed.
+
+        Raises:
+            LockstepError: One has, or it has ended while something is awaited from it.
+        """
+        for process in self.processes:
+            if process.ended_by_test or (code := process.returncode) is None:
+                continue
+            if code or self._awaited(process):
+                raise LockstepError(f'{process.describe()}\n{self._report()}')
+
+    def describe(self) -> list[str]:
+        """Return the states of the processes."""
+        return [process.describe() for process in self.processes]
