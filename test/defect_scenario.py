@@ -12,6 +12,7 @@ from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.properties import (
     AccelerationWithin,
     ArrivesOnceFaultsEnd,
+    KeepsDriving,
     NeverFasterThan,
     NoCommandAfterCancel,
     NoStaleGoals,
@@ -37,6 +38,7 @@ PROPERTIES = (
     StatusProtocol(),
     NoStaleGoals(),
     ArrivesOnceFaultsEnd(DRIVE, tolerance=0.1),
+    KeepsDriving(2.0, tolerance=0.1),
     PoseFinite(),
     StaysWithin((-10.0, 10.0), (-10.0, 10.0)),
 )
