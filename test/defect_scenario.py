@@ -22,6 +22,7 @@ from diffdrive_jacobian.properties import (
     StopsAfterLastCommand,
     StopsAfterLostOdometry,
     StopsOnShutdown,
+    end_of_faults,
 )
 
 LAST_EVENT = 6.0
@@ -79,7 +80,8 @@ def drive(world, case):
         run_to(world, time)
         act()
         world.settle()
-    run_to(world, LAST_EVENT + (1.0 if case['shutdown'] is not None else DRIVE + 0.2))
+    end = max(LAST_EVENT, end_of_faults(world))
+    run_to(world, LAST_EVENT + 1.0 if case['shutdown'] is not None else end + DRIVE + 0.2)
 
 
 def run_to(world, time):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import inf, nan
+from types import SimpleNamespace
 
 import pytest
 from geometry_msgs.msg import Twist
@@ -13,7 +14,7 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from std_srvs.srv import Trigger
 
-from diffdrive_jacobian.faults import ClockPause, Hang, Kill, Loss, TimeJump
+from diffdrive_jacobian.faults import ClockPause, Delay, Duplicate, Hang, Kill, Loss, TimeJump
 from diffdrive_jacobian.lockstep import LockstepError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.properties import (
@@ -29,6 +30,7 @@ from diffdrive_jacobian.properties import (
     StopsAfterLastCommand,
     StopsAfterLostOdometry,
     StopsOnShutdown,
+    end_of_faults,
 )
 
 # --- Stopping
@@ -361,3 +363,22 @@ def test_what_another_process_receives_is_not_known(lockstep):
     lockstep._traffic.note_external(source, [message])
     with pytest.raises(PropertyViolation, match=r'v 0.75 m/s'):
         lockstep.settle()
+
+
+@pytest.mark.parametrize(
+    ('faults', 'end'),
+    [
+        ([], 0.0),
+        ([Loss('odom', start=1.0, duration=2.0), Kill('a', duration=0.5)], 3.0),
+        ([Delay('odom', 2.0, spread=0.5, growth=0.5, start=1.0, duration=2.0)], 6.5),
+        (
+            [Delay('odom', 2.0, duration=1.0), Duplicate('odom', copies=2, seconds=0.5, duration=2.0)],
+            5.0,
+        ),
+        ([TimeJump(-1.0, start=2.0)], 2.0),
+        ([Loss('odom')], inf),
+        ([Delay('odom', 1.0)], inf),
+    ],
+)
+def test_faults_have_ended_when_what_they_delayed_has_arrived(faults, end):
+    assert end_of_faults(SimpleNamespace(faults=faults)) == end

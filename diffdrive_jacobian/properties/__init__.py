@@ -12,6 +12,7 @@ own, derive from `Property` and `Watch`.
 """
 
 from diffdrive_jacobian.lockstep import PropertyViolation
+from diffdrive_jacobian.properties._node_time import end_of_faults
 from diffdrive_jacobian.properties.arrival import ArrivesOnceFaultsEnd, KeepsDriving
 from diffdrive_jacobian.properties.base import Property, Watch
 from diffdrive_jacobian.properties.canceling import NoCommandAfterCancel
@@ -45,4 +46,5 @@ __all__ = [
     'StopsAfterLostOdometry',
     'StopsOnShutdown',
     'Watch',
+    'end_of_faults',
 ]

@@ -29,7 +29,8 @@ class DueGoalProperty(GoalProperty):
     - the node has published CANCELED or ABORTED for it (with the stamp of the goal) on `status`,
     - the node was removed, killed or shut down.
 
-    While there is a fault without an end nothing is due. Time is world time.
+    While there is a fault without an end nothing is due. Time is world time. The faults have ended when
+    what they delayed has arrived, too (`end_of_faults`).
 
     Attributes:
         within: Longest time (s).
