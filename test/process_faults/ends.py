@@ -201,7 +201,7 @@ class Campaign:
     def _violations(self, program, ending, traffic, new, numbers, mode) -> list[str]:
         child, found = ending.child, []
         try:
-            code = child.exit(0.5)
+            code = child.exit(patience=0.5)
         except AssertionError:
             child.signal(signal.SIGKILL)
             return [f'{program.name}, {mode}: does not exit after {numbers}']
