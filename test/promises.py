@@ -41,8 +41,9 @@ MOST_LISTED = 10
 """Violations that are listed of each promise."""
 HEAD = """# Promises
 
-What the package promises where a simulation cannot tell: real processes under signals, crashes, hostile
-messages, failing disks. Each row is tried by a program that counts. `python test/promises.py run` tries
+What the package promises, and how often that was tried: in explored worlds, and where a simulation
+cannot tell, with real processes under signals, crashes, hostile messages, failing disks. Each row is
+tried by a program that counts. `python test/promises.py run` tries
 all of them again and writes this page. It takes about three hours, and root, who may mount small file
 systems. `python test/promises.py run ends soak --quick` tries two of them with few cases. A short form
 is part of the tests (`test/test_process_faults.py`).
@@ -114,6 +115,19 @@ def crashes(count: int) -> Outcome:
 
 
 PROMISES = (
+    Promise(
+        'explored',
+        """Whatever is lost, late, repeated, corrupted or killed: the robot stops when odometry or
+        commands are missing, within the limits of speed, with finite poses; the protocol of goals
+        holds, no command follows a cancellation, send_goal reports what is true, and once the faults
+        have ended the next goal is reached.""",
+        """Exploration in lockstep: robot, bridge, controller and send_goal under up to four random
+        faults, two scenarios (`test/explored_nodes.py`).""",
+        'worlds',
+        campaign('explored_nodes'),
+        5000,
+        50,
+    ),
     Promise(
         'ends',
         """Every program exits within 1 s of SIGINT, SIGTERM or SIGHUP, with the documented exit code,
@@ -250,7 +264,8 @@ def page(results: dict[str, dict[str, object]]) -> str:
         measured = f'; {found["measured"]}' if found['measured'] else ''
         count = f'{found["count"]:,} {promise.unit}'
         lines.append(
-            f'| {promise.text} | {promise.how} | {count}, {found["date"]} | {result}{measured} |'
+            f'| {joined(promise.text)} | {joined(promise.how)} | {count}, {found["date"]} '
+            f'| {result}{measured} |'
         )
         if violations:
             details += ['', f'## What broke {promise.name}', '']
@@ -258,6 +273,11 @@ def page(results: dict[str, dict[str, object]]) -> str:
             if len(violations) > MOST_LISTED:
                 details.append(f'- and {len(violations) - MOST_LISTED} more')
     return '\n'.join([*lines, *details]) + '\n'
+
+
+def joined(text: str) -> str:
+    """Return a text in one line."""
+    return ' '.join(text.split())
 
 
 def stored() -> dict[str, dict[str, object]]:
@@ -283,7 +303,7 @@ def main() -> int:
             if options.names and promise.name not in options.names:
                 continue
             count = options.count or (promise.quick if options.quick else promise.full)
-            print(f'{promise.name}: {" ".join(promise.text.split())}', flush=True)
+            print(f'{promise.name}: {joined(promise.text)}', flush=True)
             found = run(promise, count)
             broken += len(found['violations'])  # type: ignore[arg-type]
             print(f'  {found}', flush=True)
