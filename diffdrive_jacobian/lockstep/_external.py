@@ -49,15 +49,20 @@ class External(Connection):
         asked = self._ask_idle()
         return asked or any(topic.count() > topic.delivered for topic in self._topics.values())
 
-    def announce(self) -> None:
+    def announce(self) -> bool:
         """Publish the time, and wait for what the timers of other processes send.
 
         They expire before those of the world. Otherwise it would depend on the machine whether the
         messages of one time reach a node before its timer expires.
+
+        Returns:
+            Whether the time was published, so that it has advanced.
         """
-        if self.began and not self._executor.clock_pauses:
-            self._executor.clocks.announce(self._now())
-            self.await_answers()
+        if not self.began or self._executor.clock_pauses:
+            return False
+        self._executor.clocks.announce(self._now())
+        self.await_answers()
+        return True
 
     def release(self) -> None:
         """Deliver what was received to the nodes of the world, in the order of the declarations."""

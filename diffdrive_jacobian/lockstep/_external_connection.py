@@ -24,6 +24,8 @@ DISCOVERY_PERIOD = 0.01
 """Period at which the graph is queried during discovery (s)."""
 MIN_CONFIRMATION = 1.0
 """Shortest time for the responses of nodes that have been discovered (s)."""
+SETTLING = 0.1
+"""Time for the discovery of the publishers of idle nodes (s)."""
 REPETITION = 0.2
 """Period at which a request is repeated during discovery (s): a response may be lost then."""
 UNCONFIRMED = 0.5
@@ -122,16 +124,23 @@ class Connection:
         while True:
             self.waiting.check_processes()
             self._count_published_topics()
+            known = len(self._topics)
             missing, untimed = self._discovery().missing(*self._awaited(), self._topics)
             if not (missing or untimed):
-                break
+                # A node that responds has created its publishers, but they may be discovered later.
+                self.confirm(max(timeout - (time.monotonic() - begin), MIN_CONFIRMATION))
+                if self._expectations.probes():
+                    time.sleep(SETTLING)
+                    self._count_published_topics()
+                if len(self._topics) == known:
+                    break
+                continue
             waited = time.monotonic() - begin
             only_untimed = None if missing else only_untimed or waited
             if waited > timeout or (only_untimed and waited - only_untimed > UNTIMED):
                 raise LockstepError(self._not_discovered(waited, [*missing, *untimed]))
             self.waiting.serve()
             time.sleep(DISCOVERY_PERIOD)
-        self.confirm(max(timeout - (time.monotonic() - begin), MIN_CONFIRMATION))
         self._endpoints = self._discovery().endpoints()
         self._complete = True
 
