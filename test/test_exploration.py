@@ -11,7 +11,7 @@ from pathlib import Path
 
 import exploration_scenarios as scenarios
 import pytest
-from exploration_scenarios import changing, divide, follow
+from exploration_scenarios import changing, divide, follow, identified
 from hypothesis import strategies as st
 
 from diffdrive_jacobian.bags.bag_reader import open_bag
@@ -159,6 +159,11 @@ def test_a_scenario_that_is_not_deterministic_is_reported():
     (finding,) = serial(changing, cases=SPEEDS, worlds=8).findings
     assert not finding.deterministic
     assert 'not deterministic: a second run' in str(finding)
+
+
+def test_random_identifiers_of_goals_do_not_count():
+    (finding,) = serial(identified, worlds=1).findings
+    assert finding.deterministic
 
 
 # --- Stops
