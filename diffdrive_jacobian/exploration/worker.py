@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import threading
 from collections.abc import Sequence
+from concurrent.futures import Future
 from typing import Any
 
 import rclpy
@@ -74,3 +75,17 @@ def run_worlds_here(data: bytes) -> list[Outcome]:
     values: tuple[Any, ...] = pickle.loads(data)
     setting, trials, only, digest = values
     return [run(setting, trial, only=only, digest=digest) for trial in trials]
+
+
+def result_of(future: Future[list[Outcome]]) -> list[Outcome]:
+    """Return the result of a task.
+
+    Raises:
+        ExplorationError: The executor failed, or a fault or a property is invalid.
+    """
+    try:
+        return future.result()
+    except ExplorationError:
+        raise
+    except Exception as error:
+        raise ExplorationError(f'a world could not be run: {type(error).__name__}: {error}') from error
