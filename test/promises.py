@@ -119,7 +119,8 @@ PROMISES = (
         """Every program exits within 1 s of SIGINT, SIGTERM or SIGHUP, with the documented exit code,
         and without a traceback or temporary files. Nodes publish a last zero.""",
         """Each of the 14 programs: at a random time of its start, while it runs, flooded, with callbacks
-        of 50 ms, by two signals. The time in which it waits for a core does not count.""",
+        of 50 ms, by two signals. The time in which its main thread waits for a core does not count.
+        Before its first line only Python's own handlers are there.""",
         'ends',
         campaign('process_faults.ends'),
         50,
@@ -248,10 +249,9 @@ def page(results: dict[str, dict[str, object]]) -> str:
         violations = [str(one) for one in found['violations']]  # type: ignore[attr-defined]
         result = f'**{len(violations)} broke it**' if violations else 'kept'
         measured = f'; {found["measured"]}' if found['measured'] else ''
-        count = f'{found["count"]:,} {promise.unit}'
-        lines.append(
-            f'| {promise.text} | {promise.how} | {count}, {found["date"]} | {result}{measured} |'
-        )
+        count = f'{found["count"]:,} {promise.unit}, {found["date"]}'
+        text, how = (' '.join(one.split()) for one in (promise.text, promise.how))
+        lines.append(f'| {text} | {how} | {count} | {result}{measured} |')
         if violations:
             details += ['', f'## What broke {promise.name}', '']
             details += [f'- `{one.replace("`", chr(39))}`' for one in violations[:MOST_LISTED]]
