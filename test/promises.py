@@ -133,7 +133,8 @@ PROMISES = (
         """Every program exits within 1 s of SIGINT, SIGTERM or SIGHUP, with the documented exit code,
         and without a traceback or temporary files. Nodes publish a last zero.""",
         """Each of the 14 programs: at a random time of its start, while it runs, flooded, with callbacks
-        of 50 ms, by two signals. The time in which it waits for a core does not count.""",
+        of 50 ms, by two signals. The time in which its main thread waits for a core does not count.
+        Before its first line only Python's own handlers are there.""",
         'ends',
         campaign('process_faults.ends'),
         50,
@@ -262,22 +263,15 @@ def page(results: dict[str, dict[str, object]]) -> str:
         violations = [str(one) for one in found['violations']]  # type: ignore[attr-defined]
         result = f'**{len(violations)} broke it**' if violations else 'kept'
         measured = f'; {found["measured"]}' if found['measured'] else ''
-        count = f'{found["count"]:,} {promise.unit}'
-        lines.append(
-            f'| {joined(promise.text)} | {joined(promise.how)} | {count}, {found["date"]} '
-            f'| {result}{measured} |'
-        )
+        count = f'{found["count"]:,} {promise.unit}, {found["date"]}'
+        text, how = (' '.join(one.split()) for one in (promise.text, promise.how))
+        lines.append(f'| {text} | {how} | {count} | {result}{measured} |')
         if violations:
             details += ['', f'## What broke {promise.name}', '']
             details += [f'- `{one.replace("`", chr(39))}`' for one in violations[:MOST_LISTED]]
             if len(violations) > MOST_LISTED:
                 details.append(f'- and {len(violations) - MOST_LISTED} more')
     return '\n'.join([*lines, *details]) + '\n'
-
-
-def joined(text: str) -> str:
-    """Return a text in one line."""
-    return ' '.join(text.split())
 
 
 def stored() -> dict[str, dict[str, object]]:
@@ -303,7 +297,7 @@ def main() -> int:
             if options.names and promise.name not in options.names:
                 continue
             count = options.count or (promise.quick if options.quick else promise.full)
-            print(f'{promise.name}: {joined(promise.text)}', flush=True)
+            print(f'{promise.name}: {" ".join(promise.text.split())}', flush=True)
             found = run(promise, count)
             broken += len(found['violations'])  # type: ignore[arg-type]
             print(f'  {found}', flush=True)
