@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from defective_controllers import CONTROLLERS, MAX_OMEGA, MAX_V
 from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
@@ -81,6 +83,9 @@ def drive(world, case):
         act()
         world.settle()
     end = max(LAST_EVENT, end_of_faults(world))
+    if end == math.inf:
+        # Nothing is due then.
+        end = LAST_EVENT
     run_to(world, LAST_EVENT + 1.0 if case['shutdown'] is not None else end + DRIVE + 0.2)
 
 
