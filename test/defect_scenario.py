@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from defective_controllers import CONTROLLERS, MAX_OMEGA, MAX_V
 from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
@@ -12,6 +14,7 @@ from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.properties import (
     AccelerationWithin,
     ArrivesOnceFaultsEnd,
+    KeepsDriving,
     NeverFasterThan,
     NoCommandAfterCancel,
     NoStaleGoals,
@@ -21,6 +24,7 @@ from diffdrive_jacobian.properties import (
     StopsAfterLastCommand,
     StopsAfterLostOdometry,
     StopsOnShutdown,
+    end_of_faults,
 )
 
 LAST_EVENT = 6.0
@@ -37,6 +41,7 @@ PROPERTIES = (
     StatusProtocol(),
     NoStaleGoals(),
     ArrivesOnceFaultsEnd(DRIVE, tolerance=0.1),
+    KeepsDriving(2.0, tolerance=0.1),
     PoseFinite(),
     StaysWithin((-10.0, 10.0), (-10.0, 10.0)),
 )
@@ -77,7 +82,11 @@ def drive(world, case):
         run_to(world, time)
         act()
         world.settle()
-    run_to(world, LAST_EVENT + (1.0 if case['shutdown'] is not None else DRIVE + 0.2))
+    end = max(LAST_EVENT, end_of_faults(world))
+    if end == math.inf:
+        # Nothing is due then.
+        end = LAST_EVENT
+    run_to(world, LAST_EVENT + 1.0 if case['shutdown'] is not None else end + DRIVE + 0.2)
 
 
 def run_to(world, time):

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
+import uuid
 from itertools import count
 
+from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import Twist, Vector3
 from rclpy.node import Node
 
@@ -81,6 +83,16 @@ def changing(world, case):
     world.run_for(0.2)
     if case['speed'] > 1.0:
         raise ValueError('fast')
+
+
+def identified(world, case):
+    """Publish a random identifier, as a goal has it, and fail."""
+    publisher = world.node.create_publisher(GoalStatus, 'goal_status', 10)
+    status = GoalStatus()
+    status.goal_info.goal_id.uuid = list(uuid.uuid4().bytes)
+    publisher.publish(status)
+    assert case is None, 'not empty'
+    raise ValueError('always')
 
 
 def deadly(world, case):

@@ -75,24 +75,32 @@ def cases(controller):
 
 
 def explored(name, worlds, seed):
-    """Explore the worlds of one controller."""
-    return explore(
-        drive,
-        PROPERTIES,
-        cases=cases(name),
-        faults=schedules(),
-        worlds=worlds,
-        seed=seed,
-        stop_at_first=name != RIGHT,
-        shrink_worlds=SHRINK_WORLDS,
-    )
+    """Explore the worlds of one controller, and shrink what is violated first."""
+
+    def explored_for(properties, **kwargs):
+        return explore(
+            drive,
+            properties,
+            cases=cases(name),
+            faults=schedules(),
+            worlds=worlds,
+            seed=seed,
+            stop_at_first=name != RIGHT,
+            **kwargs,
+        )
+
+    found = explored_for(PROPERTIES, shrink_worlds=0)
+    if not found.findings:
+        return found, None
+    index = found.findings[0].violation.index
+    first = [PROPERTIES[index]] if index >= 0 else []
+    return found, explored_for(first, shrink_worlds=SHRINK_WORLDS).findings[0]
 
 
-def row(name, exploration, seconds):
+def row(name, exploration, finding, seconds):
     """Return the line of the table of one exploration."""
-    if not exploration.findings:
+    if finding is None:
         return f'| {name} | no | {exploration.worlds} | | | | {seconds:.0f} |'
-    finding = exploration.findings[0]
     case = finding.trial.case
     parts = [f'start {case["start"]}', f'goals {case["goals"]}']
     parts += [f'{what} at {case[what]:g} s' for what in ('cancel', 'shutdown') if case[what] is not None]
@@ -124,8 +132,8 @@ def main():
     print('\n'.join(HEAD))
     for name in chosen.names or CONTROLLERS:
         begin = time.monotonic()
-        exploration = explored(name, chosen.worlds, chosen.seed)
-        lines.append(row(name, exploration, time.monotonic() - begin))
+        exploration, finding = explored(name, chosen.worlds, chosen.seed)
+        lines.append(row(name, exploration, finding, time.monotonic() - begin))
         print(lines[-1], flush=True)
         if bool(exploration.findings) != (name in DEFECTIVE):
             failed.append(name)

@@ -12,6 +12,7 @@ from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, Twist
 from hypothesis import strategies as st
 from nav_msgs.msg import Goals
+from process_faults.outcome import Outcome
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
@@ -30,7 +31,7 @@ from diffdrive_jacobian.properties import (
 )
 from diffdrive_jacobian.ros.remote_goal import ANSWER_PATIENCE, Result, send_goal_in
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.testing import fault_schedules, faults, goals, poses, times
+from diffdrive_jacobian.testing import explore, fault_schedules, faults, goals, poses, times
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 DISTURBED = 4.0
@@ -253,3 +254,18 @@ def properties():
         StopsAfterLostOdometry(TIMEOUT + timer, node='go_to_goal'),
         StopsAfterLastCommand(TIMEOUT + 1.0 / RATE + timer, commands='joint_command'),
     ]
+
+
+def run(count):
+    """Explore so many worlds of each scenario, for the table of promises."""
+    results = [
+        explore(scenario, properties(), cases=cases, faults=schedules, worlds=count)
+        for scenario, cases, schedules in SCENARIOS.values()
+    ]
+    found = [f'{finding.violation.key}: {finding.trial}' for one in results for finding in one.findings]
+    worlds = sum(one.worlds for one in results)
+    measured = (
+        f'{sum(one.faults for one in results):,} faults, {sum(one.checks for one in results):,} checks, '
+        f'{worlds / sum(one.seconds for one in results):.1f} worlds/s'
+    )
+    return Outcome(worlds, found, measured)

@@ -15,6 +15,7 @@ import gc
 import importlib
 import io
 import marshal
+import math
 import os
 import pkgutil
 import re
@@ -36,7 +37,7 @@ from typing import TextIO
 PACKAGE = 'diffdrive_jacobian'
 LIBRARIES = (
     *('numpy', 'matplotlib.figure', 'matplotlib.backends.backend_agg', 'rich.progress'),
-    *('rosbags.rosbag2', 'rosbags.typesys', 'ruamel.yaml', 'apsw', 'lz4.frame', 'unittest.mock'),
+    *('rosbags.rosbag2', 'rosbags.typesys.stores.ros2_jazzy', 'ruamel.yaml', 'apsw', 'lz4.frame'),
 )
 """What programs without ROS import."""
 EVERYTHING = (*LIBRARIES, 'pytest', 'rclpy.executors', 'rclpy.node', PACKAGE)
@@ -338,7 +339,10 @@ class Popen:
             subprocess.TimeoutExpired: It runs still.
         """
         if self.returncode is None:
-            if not select.select([self._pidfd], [], [], timeout)[0]:
+            # Not select, which takes no descriptor beyond 1023.
+            ended = select.poll()
+            ended.register(self._pidfd, select.POLLIN)
+            if not ended.poll(None if timeout is None else math.ceil(timeout * 1e3)):
                 raise subprocess.TimeoutExpired(self.args, timeout)
             self.returncode = self._server.ask(self.pid)
             os.close(self._pidfd)

@@ -41,8 +41,9 @@ MOST_LISTED = 10
 """Violations that are listed of each promise."""
 HEAD = """# Promises
 
-What the package promises where a simulation cannot tell: real processes under signals, crashes, hostile
-messages, failing disks. Each row is tried by a program that counts. `python test/promises.py run` tries
+What the package promises, and how often that was tried: in explored worlds, and where a simulation
+cannot tell, with real processes under signals, crashes, hostile messages, failing disks. Each row is
+tried by a program that counts. `python test/promises.py run` tries
 all of them again and writes this page. It takes about three hours, and root, who may mount small file
 systems. `python test/promises.py run ends soak --quick` tries two of them with few cases. A short form
 is part of the tests (`test/test_process_faults.py`).
@@ -115,11 +116,25 @@ def crashes(count: int) -> Outcome:
 
 PROMISES = (
     Promise(
+        'explored',
+        """Whatever is lost, late, repeated, corrupted or killed: the robot stops when odometry or
+        commands are missing, within the limits of speed, with finite poses; the protocol of goals
+        holds, no command follows a cancellation, send_goal reports what is true, and once the faults
+        have ended the next goal is reached.""",
+        """Exploration in lockstep: robot, bridge, controller and send_goal under up to four random
+        faults, two scenarios (`test/explored_nodes.py`).""",
+        'worlds',
+        campaign('explored_nodes'),
+        5000,
+        50,
+    ),
+    Promise(
         'ends',
         """Every program exits within 1 s of SIGINT, SIGTERM or SIGHUP, with the documented exit code,
         and without a traceback or temporary files. Nodes publish a last zero.""",
         """Each of the 14 programs: at a random time of its start, while it runs, flooded, with callbacks
-        of 50 ms, by two signals. The time in which it waits for a core does not count.""",
+        of 50 ms, by two signals. The time in which its main thread waits for a core does not count.
+        Before its first line only Python's own handlers are there.""",
         'ends',
         campaign('process_faults.ends'),
         50,
@@ -248,10 +263,9 @@ def page(results: dict[str, dict[str, object]]) -> str:
         violations = [str(one) for one in found['violations']]  # type: ignore[attr-defined]
         result = f'**{len(violations)} broke it**' if violations else 'kept'
         measured = f'; {found["measured"]}' if found['measured'] else ''
-        count = f'{found["count"]:,} {promise.unit}'
-        lines.append(
-            f'| {promise.text} | {promise.how} | {count}, {found["date"]} | {result}{measured} |'
-        )
+        count = f'{found["count"]:,} {promise.unit}, {found["date"]}'
+        text, how = (' '.join(one.split()) for one in (promise.text, promise.how))
+        lines.append(f'| {text} | {how} | {count} | {result}{measured} |')
         if violations:
             details += ['', f'## What broke {promise.name}', '']
             details += [f'- `{one.replace("`", chr(39))}`' for one in violations[:MOST_LISTED]]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import exploration_scenarios as scenarios
 import pytest
-from exploration_scenarios import changing, divide, follow, moving
+from exploration_scenarios import changing, divide, follow, identified, moving
 from hypothesis import strategies as st
 
 from diffdrive_jacobian.bags.bag_reader import open_bag
@@ -21,6 +21,7 @@ from diffdrive_jacobian.exploration import (
     explore,
     fault_schedules,
     numbers,
+    search,
 )
 from diffdrive_jacobian.exploration.result import described_replay
 from diffdrive_jacobian.faults import Delay, Loss
@@ -165,6 +166,11 @@ def test_a_scenario_that_is_not_deterministic_is_reported():
     assert 'not deterministic: a second run' in str(finding)
 
 
+def test_random_identifiers_of_goals_do_not_count():
+    (finding,) = serial(identified, worlds=1).findings
+    assert finding.deterministic
+
+
 # --- Stops
 
 
@@ -211,7 +217,7 @@ class Stuck(SerialExecutor):
 @pytest.mark.parametrize('at', [3, 5])
 def test_a_world_that_does_not_end_is_given_up(tmp_path, monkeypatch, at):
     """In the fourth task of worlds, and while shrinking."""
-    monkeypatch.setattr(sys.modules[explore.__module__], 'GRACE', 0.0)
+    monkeypatch.setattr(search, 'GRACE', 0.0)
     arguments = {'cases': st.integers(50, 70), 'worlds': 21, 'output': tmp_path}
     found = explore(failing, executor=Stuck(at), time_limit=1.0, **arguments)
     assert 'a world still ran' in found.stopped

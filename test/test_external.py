@@ -20,11 +20,12 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.faults import ClockPause, Kill, Loss, TimeJump
-from diffdrive_jacobian.lockstep import Answers, Every, Idle, Lockstep, LockstepError
+from diffdrive_jacobian.lockstep import Answers, Every, Idle, Lockstep, LockstepError, PropertyViolation
 from diffdrive_jacobian.lockstep import _external_process as external_process
 from diffdrive_jacobian.lockstep._external_answers import AnswersDue, TicksDue
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.properties import NeverFasterThan
 
 SECOND = 1_000_000_000
 SCRIPT = external_nodes.__file__
@@ -273,6 +274,17 @@ def test_a_node_of_the_world_that_is_killed_and_made_again_is_discovered_again(w
     assert received == pytest.approx([0.1, 0.2, 0.3, 0.4, 1.0, 1.1, 1.2, 1.3, 1.4, 1.5])
 
 
+@pytest.mark.parametrize('declared', [Answers('echo/cmd_vel', to='echo/odom'), Idle('echo')])
+def test_properties_observe_external_nodes(world_of, declared):
+    world = world_of(declared)
+    world.require(NeverFasterThan(2.5, 1.0, topic='echo/cmd_vel'))
+    for speed in (1.0, 2.0):
+        world.publish('echo/odom', odometry(speed))
+    assert world.last('echo/cmd_vel').twist.linear.x == 2.0
+    with pytest.raises(PropertyViolation, match='NeverFasterThan'):
+        world.publish('echo/odom', odometry(3.0))
+
+
 # --- What goes wrong
 
 
@@ -308,6 +320,16 @@ def test_topics_that_nobody_has_are_named_with_those_that_are_there(world_of):
         '/echo/cmd_vel',
     ):
         assert text in str(error.value)
+
+
+@pytest.mark.parametrize('declared', [Answers('echo/cmd_vel', to='echo/odom'), Idle('echo')])
+def test_qos_that_does_not_fit_is_named(world_of, declared):
+    world = world_of(declared)
+    world.listen(TwistStamped, 'echo/cmd_vel', latched=True)
+    with pytest.raises(
+        LockstepError, match=r'/lockstep to /echo/cmd_vel .* incompatible QoS: .*transient local, and'
+    ):
+        world.connect(timeout=1.0)
 
 
 def test_another_type_is_named(world_of):

@@ -12,9 +12,21 @@ from property_nodes import Sender, twist
 from diffdrive_jacobian import properties
 from diffdrive_jacobian.properties import (
     AccelerationWithin,
+    ArrivesOnceFaultsEnd,
+    KeepsDriving,
     NeverFasterThan,
+    NoCommandAfterCancel,
+    NoStaleGoals,
+    PoseFinite,
     PropertyViolation,
+    ReachesGoal,
+    Settles,
     StatusProtocol,
+    StaysNear,
+    StaysWithin,
+    StopsAfterLastCommand,
+    StopsAfterLostOdometry,
+    StopsOnShutdown,
 )
 from diffdrive_jacobian.testing import LockstepError
 
@@ -126,6 +138,18 @@ VALUES = [
     ),
     (AccelerationWithin(1, 2, slack=0.2), 'AccelerationWithin(1.0, 2.0, slack=0.2)'),
     (StatusProtocol(goals=['goal_pose']), "StatusProtocol(goals=('goal_pose',))"),
+    (StopsAfterLostOdometry(0.5, node='a'), "StopsAfterLostOdometry(0.5, node='a')"),
+    (StopsAfterLastCommand(0.5), 'StopsAfterLastCommand(0.5)'),
+    (StopsOnShutdown(), 'StopsOnShutdown()'),
+    (NoCommandAfterCancel(), 'NoCommandAfterCancel()'),
+    (NoStaleGoals(), 'NoStaleGoals()'),
+    (ReachesGoal(5, tolerance=0.1), 'ReachesGoal(5.0, tolerance=0.1)'),
+    (Settles(5, 0.1), 'Settles(5.0, 0.1)'),
+    (ArrivesOnceFaultsEnd(5), 'ArrivesOnceFaultsEnd(5.0)'),
+    (KeepsDriving(1), 'KeepsDriving(1.0)'),
+    (StaysWithin([0, 1], y=(-1, 1)), 'StaysWithin((0.0, 1.0), (-1.0, 1.0))'),
+    (StaysNear([[0, 0], [1, 0]], 0.1), 'StaysNear(((0.0, 0.0), (1.0, 0.0)), 0.1)'),
+    (PoseFinite(), 'PoseFinite()'),
 ]
 
 
@@ -149,6 +173,14 @@ def test_properties_are_values(one, expression):
         ),
         (lambda: StatusProtocol(goals='goal_pose'), "goals must be a tuple of names, got 'goal_pose'"),
         (lambda: StatusProtocol(namespace=1), 'namespace must be a string, got 1'),
+        (
+            lambda: StaysWithin((1, 0), (0, 1)),
+            r'x must be the least and the largest value, got \(1, 0\)',
+        ),
+        (lambda: StaysWithin(1.0, (0, 1)), 'x must be the least and the largest value, got 1.0'),
+        (lambda: StaysNear([1, 2], 0.1), r'path must be a sequence of \(x, y\), got \[1, 2\]'),
+        (lambda: Settles(1.0, 0.0), 'tolerance must be a number above 0, got 0.0'),
+        (lambda: ReachesGoal(float('inf')), 'within must be a finite number of at least 0, got inf'),
     ],
 )
 def test_invalid_fields_are_refused(create, words):
@@ -260,6 +292,6 @@ def test_the_page_has_a_property_of_one_s_own(lockstep, robot_at):
 
 def test_the_page_lists_every_property():
     table = PAGES['doc/lockstep.md'].read_text()
-    base = {'Property', 'PropertyViolation', 'Watch'}
+    base = {'Property', 'PropertyViolation', 'Watch', 'end_of_faults'}
     missing = [name for name in properties.__all__ if name not in base and f'`{name}(' not in table]
     assert missing == []

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from math import inf, nan
+from types import SimpleNamespace
 
 import pytest
+from geometry_msgs.msg import Twist
 from lockstep_nodes import make
 from nav_msgs.msg import Odometry
 from property_nodes import Scene, Student, goal_at, odometry_at, twist
 from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
 from std_srvs.srv import Trigger
 
-from diffdrive_jacobian.faults import ClockPause, Hang, Kill, Loss, TimeJump
+from diffdrive_jacobian.faults import ClockPause, Delay, Duplicate, Hang, Kill, Loss, TimeJump
+from diffdrive_jacobian.lockstep import LockstepError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.properties import (
     ArrivesOnceFaultsEnd,
+    KeepsDriving,
+    NeverFasterThan,
     PoseFinite,
     PropertyViolation,
     ReachesGoal,
@@ -24,6 +30,7 @@ from diffdrive_jacobian.properties import (
     StopsAfterLastCommand,
     StopsAfterLostOdometry,
     StopsOnShutdown,
+    end_of_faults,
 )
 
 # --- Stopping
@@ -310,3 +317,68 @@ def test_the_test_itself_is_no_controller(lockstep, robot_at):
     lockstep.remove(robot)
     lockstep.run_for(0.5)
     lockstep.finish()
+
+
+def test_keeps_driving(lockstep, robot_at):
+    """Without odometry it stands, which counts only when the fault is over."""
+    lockstep.require(KeepsDriving(0.5))
+    drive(
+        lockstep,
+        robot_at,
+        Loss('odom', start=0.5, duration=3.0),
+        Hang('go_to_goal', start=4.0, duration=1.0),
+    )
+
+
+def test_a_robot_that_stands_on_its_way(lockstep, robot_at):
+    robot_at()
+    lockstep.add(Student())
+    lockstep.require(KeepsDriving(0.5))
+    lockstep.inject(Loss('cmd_vel', start=1.0, duration=1.0))
+    lockstep.publish('goal_pose', goal_at(3.0))
+    lockstep.run_for(3.0)
+    for student in lockstep.nodes[-1:]:
+        student.command = twist(0.0)
+    with pytest.raises(PropertyViolation) as raised:
+        lockstep.run_for(2.0)
+    assert 3.5 < raised.value.seconds < 3.56
+    assert raised.value.text.startswith('1.54 s after the faults have ended the robot has stood for 0.5')
+
+
+def test_what_another_process_receives_is_not_known(lockstep):
+    """Such properties must not seem to hold. Those of the messages alone are observed."""
+    source = type('Source', (), {'topic_name': '/cmd_vel', 'msg_type': Twist})()
+    message = serialize_message(twist(0.75))
+    for required in (
+        StopsAfterLostOdometry(1.0),
+        StopsOnShutdown(),
+        ArrivesOnceFaultsEnd(1.0),
+        KeepsDriving(1.0),
+    ):
+        lockstep.require(required)
+        with pytest.raises(LockstepError, match='/cmd_vel, which is in another process'):
+            lockstep._traffic.note_external(source, [message])
+        lockstep._watches.pop().end()
+    lockstep.require(NeverFasterThan(0.5, 1.0))
+    lockstep._traffic.note_external(source, [message])
+    with pytest.raises(PropertyViolation, match=r'v 0.75 m/s'):
+        lockstep.settle()
+
+
+@pytest.mark.parametrize(
+    ('faults', 'end'),
+    [
+        ([], 0.0),
+        ([Loss('odom', start=1.0, duration=2.0), Kill('a', duration=0.5)], 3.0),
+        ([Delay('odom', 2.0, spread=0.5, growth=0.5, start=1.0, duration=2.0)], 6.5),
+        (
+            [Delay('odom', 2.0, duration=1.0), Duplicate('odom', copies=2, seconds=0.5, duration=2.0)],
+            5.0,
+        ),
+        ([TimeJump(-1.0, start=2.0)], 2.0),
+        ([Loss('odom')], inf),
+        ([Delay('odom', 1.0)], inf),
+    ],
+)
+def test_faults_have_ended_when_what_they_delayed_has_arrived(faults, end):
+    assert end_of_faults(SimpleNamespace(faults=faults)) == end

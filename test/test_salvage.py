@@ -69,6 +69,7 @@ def bag(request, tmp_path_factory):
 def test_cuts_at_random_bytes(bag, capsys):
     path, messages, data, mode = bag
     chance = random.Random(f'{path.name}{len(data)}{mode}')
+    ended = ends(data, messages) if mode == CompressionMode.NONE else []
     sizes = {0, 1, 8, 100, len(data) - 1, *(chance.randrange(len(data)) for _ in range(CUTS - 5))}
     for size in sorted(sizes):
         broken = cut(path, size)
@@ -85,22 +86,20 @@ def test_cuts_at_random_bytes(bag, capsys):
             assert 'holds no message that can be saved' in err
         assert_subset(found, messages)
         if mode == CompressionMode.NONE:
-            assert found == whole(data, size, messages)
+            # In MCAP up to the cut, in SQLite in whole pages.
+            last = size if data.startswith(b'\x89MCAP') else size - size % PAGE
+            whole = [one for one, end in zip(messages, ended, strict=True) if end <= last]
+            assert found == whole
 
 
-def whole(data, size, messages):
-    """Give the messages whose bytes are all there: in MCAP up to the cut, in SQLite in whole pages."""
+def ends(data, messages):
+    """Return where in the file the bytes of each message are complete."""
     if data.startswith(b'\x89MCAP'):
-        return [one for one in messages if 0 <= data.find(one[2]) <= size - len(one[2])]
-    end = size - size % PAGE
-    kept = []
-    for one in messages:
-        # The larger ones are in several pages: the last of these counts.
-        place = data.rfind(one[2][-64:])
-        first = data.rfind(one[2][:64])
-        if max(place + 64, first + 64) <= end and end > 0:
-            kept.append(one)
-    return kept
+        return [data.index(content) + len(content) for _, _, content in messages]
+    # The larger ones are in several pages: the last of these counts.
+    return [
+        max(data.rindex(content[-64:]), data.rindex(content[:64])) + 64 for _, _, content in messages
+    ]
 
 
 def test_complete_files_without_metadata(bag, capsys):

@@ -54,12 +54,10 @@ HIDDEN = (*ROS_MODULES, 'rpyutils')
 
 def execute(program, *arguments, modules=HIDDEN, **kwargs):
     """Run a program without some packages, in a fork of a process that has never imported them."""
-    # All others import NumPy.
-    libraries = () if 'numpy' in modules else forked.LIBRARIES
     return forked.run(
         ABSENT.format(modules=modules) + program,
         arguments,
-        modules=tuple(name for name in libraries if name.split('.')[0] not in modules),
+        modules=forked.LIBRARIES if modules == HIDDEN else (),
         timeout=60,
         **kwargs,
     )

@@ -16,10 +16,10 @@ from diffdrive_jacobian.exploration.scenario import scenario_from
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.exploration.executors import LocalExecutor, SerialExecutor
+    from diffdrive_jacobian.exploration.exploring import explore
     from diffdrive_jacobian.exploration.reproduction import reproducing
     from diffdrive_jacobian.exploration.result import Exploration, Finding, Replay
     from diffdrive_jacobian.exploration.schedules import fault_schedules
-    from diffdrive_jacobian.exploration.search import explore
     from diffdrive_jacobian.exploration.strategies import (
         angles,
         gains,
@@ -55,7 +55,7 @@ __all__ = [
 ]
 
 _MODULES = {
-    'explore': 'search',
+    'explore': 'exploring',
     'fault_schedules': 'schedules',
     'reproducing': 'reproduction',
     **dict.fromkeys(('Exploration', 'Finding', 'Replay'), 'result'),

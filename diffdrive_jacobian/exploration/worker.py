@@ -5,6 +5,8 @@ from __future__ import annotations
 import pickle
 import threading
 from collections.abc import Sequence
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
 from typing import Any
 
 import rclpy
@@ -88,3 +90,28 @@ def run_worlds_here(data: bytes) -> list[Outcome]:
     values: tuple[Any, ...] = pickle.loads(data)
     setting, trials, only, digest = values
     return [run(setting, trial, only=only, digest=digest) for trial in trials]
+
+
+class NotEndedError(BaseException):
+    """A task still runs. Not an Exception, which Hypothesis would take for a failure."""
+
+
+def result_of(future: Future[list[Outcome]], timeout: float | None) -> list[Outcome]:
+    """Return the result of a task.
+
+    Args:
+        future: The task.
+        timeout: Longest wall time to wait (s); None: no limit.
+
+    Raises:
+        ExplorationError: The executor failed, or a fault or a property is invalid.
+        NotEndedError: The task still runs after `timeout`.
+    """
+    try:
+        return future.result(timeout)
+    except ExplorationError:
+        raise
+    except Exception as error:
+        if isinstance(error, FutureTimeoutError) and not future.done():
+            raise NotEndedError from None
+        raise ExplorationError(f'a world could not be run: {type(error).__name__}: {error}') from error

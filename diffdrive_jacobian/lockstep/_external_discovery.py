@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 from rclpy.node import Node
 
@@ -39,8 +39,15 @@ class Discovery:
         infos = [info for one in expected for info in self._graph.publishers(one.topic)]
         return {node_name(info) for info in infos} | {probe.name for probe in probes}
 
-    def missing(self, expected: Sequence[Due], probes: Sequence[Probe]) -> tuple[list[str], list[str]]:
+    def missing(
+        self, expected: Sequence[Due], probes: Sequence[Probe], topics: Collection[str]
+    ) -> tuple[list[str], list[str]]:
         """Return what is missing of the nodes, and which of them are not subscribed to /clock.
+
+        Args:
+            expected: What is due.
+            probes: Requests to the nodes that are to be idle.
+            topics: Topics from which the world is to receive messages.
 
         Raises:
             LockstepError: Another process publishes /clock.
@@ -49,7 +56,7 @@ class Discovery:
             raise LockstepError(f'{node_name(others[0])} publishes {CLOCK}, which only lockstep may do')
         found = [text for one in expected for text in self._missing_topics(one)]
         found += [f'no external node provides {probe.service}' for probe in probes if not probe.ready()]
-        found += self._unmatched({one.topic for one in expected})
+        found += self._unmatched(topics)
         timed = {node_name(info) for info in self._graph.subscriptions(CLOCK)}
         untimed = [
             f'{name} is not subscribed to {CLOCK}: its parameter use_sim_time must be true'
@@ -66,7 +73,7 @@ class Discovery:
         if one.question and not self._graph.subscriptions(one.question):
             yield f'no external node is subscribed to {one.question}'
 
-    def _unmatched(self, awaited: set[str]) -> Iterator[str]:
+    def _unmatched(self, awaited: Collection[str]) -> Iterator[str]:
         """Yield what the endpoints of the world lack."""
         for node in self._nodes:
             for publisher in node.publishers:

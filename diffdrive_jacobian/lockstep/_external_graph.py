@@ -72,6 +72,14 @@ class ExternalGraph:
         """Return the names of the external nodes that are subscribed to a topic."""
         return {node_name(info) for info in self.subscriptions(topic)}
 
+    def topics_of(self, node: str) -> list[str]:
+        """Return the topics that an external node publishes, without those of every node."""
+        return [
+            name
+            for name in self.published_topics()
+            if any(node_name(info) == node for info in self.publishers(name))
+        ]
+
     def unmatched_publisher(self, publisher: Publisher) -> Iterator[str]:
         """Yield what a publisher of the world still lacks."""
         topic = publisher.topic_name

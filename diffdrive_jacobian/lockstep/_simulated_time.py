@@ -176,8 +176,10 @@ class SimulatedTime:
 
     def _publish_clock(self) -> None:
         __tracebackhide__ = True
-        if self._external is not None:
-            self._external.announce()
+        if self._external is not None and self._external.announce():
+            with self._watched():
+                self._executor.clocks.set(self._now)
+                self._external.release()
         with self._watched():
             self._until_next = self._executor.advance(self._now)
         self._await_others()

@@ -12,7 +12,8 @@ own, derive from `Property` and `Watch`.
 """
 
 from diffdrive_jacobian.lockstep import PropertyViolation
-from diffdrive_jacobian.properties.arrival import ArrivesOnceFaultsEnd
+from diffdrive_jacobian.properties._node_time import end_of_faults
+from diffdrive_jacobian.properties.arrival import ArrivesOnceFaultsEnd, KeepsDriving
 from diffdrive_jacobian.properties.base import Property, Watch
 from diffdrive_jacobian.properties.canceling import NoCommandAfterCancel
 from diffdrive_jacobian.properties.goals import ReachesGoal, Settles
@@ -29,6 +30,7 @@ from diffdrive_jacobian.properties.stopping import (
 __all__ = [
     'AccelerationWithin',
     'ArrivesOnceFaultsEnd',
+    'KeepsDriving',
     'NeverFasterThan',
     'NoCommandAfterCancel',
     'NoStaleGoals',
@@ -44,4 +46,5 @@ __all__ = [
     'StopsAfterLostOdometry',
     'StopsOnShutdown',
     'Watch',
+    'end_of_faults',
 ]

@@ -7,7 +7,17 @@ from typing import Any
 
 from rclpy.node import Node
 
-from diffdrive_jacobian.faults import Hang, Push, Slow, TimeJump, TimerJitter
+from diffdrive_jacobian.faults import (
+    Delay,
+    Duplicate,
+    Hang,
+    LateService,
+    Push,
+    Reorder,
+    Slow,
+    TimeJump,
+    TimerJitter,
+)
 from diffdrive_jacobian.lockstep import Lockstep
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -67,11 +77,27 @@ def delays(world: Lockstep, node: Node, since: float) -> float:
 
 
 def end_of_faults(world: Lockstep) -> float:
-    """Return the world time at which the last fault ends (s); infinite: one of them has no end."""
-    return max(map(_end, world.faults), default=0.0)
+    """Return the world time at which all faults have ended, and what they delayed has arrived (s).
+
+    Infinite: one of them has no end. Faults of one topic may delay a message one after the other.
+    """
+    return max(map(_end, world.faults), default=0.0) + sum(map(_longest_delay, world.faults))
 
 
 def _end(fault: Any) -> float:
     if math.isinf(fault.duration) and isinstance(fault, _AT_ONCE):
         return float(fault.start)
     return float(fault.start + fault.duration)
+
+
+def _longest_delay(fault: Any) -> float:
+    """Return how long something is under way at most that a fault has delayed (s)."""
+    if isinstance(fault, Delay):
+        # Without growth also a delay without an end has one.
+        growth = fault.growth * fault.duration if fault.growth else 0.0
+        return float(fault.seconds + fault.spread + growth)
+    if isinstance(fault, Duplicate):
+        return float(fault.copies * fault.seconds)
+    if isinstance(fault, (LateService, Reorder, Slow, TimerJitter)) and math.isfinite(fault.seconds):
+        return float(fault.seconds)
+    return 0.0

@@ -19,20 +19,18 @@ from diffdrive_jacobian.properties.goals import GoalProperty
 
 
 @dataclass(frozen=True, repr=False)
-class ArrivesOnceFaultsEnd(GoalProperty):
-    """The robot arrives at the goal that its controller has received, once the faults have ended.
+class DueGoalProperty(GoalProperty):
+    """A property of the goals that a controller has received. Base class.
 
     A controller is a node that is subscribed to a topic of `goals` and publishes `commands`. It has the
-    goal that it received last. The robot must have stood within `tolerance` of that goal at some time
-    after the controller has received it, at the latest `within` after that and after the last fault has
-    ended. The goal is not due any longer when
+    goal that it received last. That is due until the robot has stood within `tolerance` of it, or
 
     - the cancel service of the node has responded,
     - the node has published CANCELED or ABORTED for it (with the stamp of the goal) on `status`,
     - the node was removed, killed or shut down.
 
-    While there is a fault without an end nothing is due. A run that ends before the goal is reached
-    violates the property: let it run longer. Time is world time.
+    While there is a fault without an end nothing is due. Time is world time. The faults have ended when
+    what they delayed has arrived, too (`end_of_faults`).
 
     Attributes:
         within: Longest time (s).
@@ -54,17 +52,42 @@ class ArrivesOnceFaultsEnd(GoalProperty):
         self._text('status')
         self._text('commands')
 
+
+@dataclass(frozen=True, repr=False)
+class ArrivesOnceFaultsEnd(DueGoalProperty):
+    """The robot arrives at the goal that its controller has received, once the faults have ended.
+
+    A goal must not be due (`DueGoalProperty`) later than `within` after the controller has received it
+    and the last fault has ended. A run that ends before the goal is reached violates the property: let
+    it run longer.
+    """
+
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""
         return _ArrivesWatch(self, world)
 
 
-class _ArrivesWatch(Watch):
-    def __init__(self, required: ArrivesOnceFaultsEnd, world: Lockstep) -> None:
+@dataclass(frozen=True, repr=False)
+class KeepsDriving(DueGoalProperty):
+    """The robot does not stand still on its way, once the faults have ended.
+
+    While a goal is due (`DueGoalProperty`) the robot must not stand for longer than `within`, beginning
+    when the controller has received the goal and the last fault has ended. It stands while the twists in
+    its odometry are at most 0.01 m/s and 0.05 rad/s.
+    """
+
+    def watch(self, world: Lockstep) -> Watch:
+        """Begin to observe a run."""
+        return _KeepsDrivingWatch(self, world)
+
+
+class _DueGoalWatch(Watch):
+    def __init__(self, required: DueGoalProperty, world: Lockstep) -> None:
         super().__init__(world)
         self._required = required
         self._goals: dict[Node, Goal] = {}
         self._ended: dict[Node, Goal] = {}
+        self._moved = self.seconds
         self._motion = Motion(self._on_motion)
         self._read_status = FieldReader(
             lambda _: ('status', 'goal_info.stamp.sec', 'goal_info.stamp.nanosec')
@@ -74,6 +97,7 @@ class _ArrivesWatch(Watch):
             world.on_delivered(required.resolved(topic), self._on_goal)
         self._commands = world.node.resolve_topic_name(required.resolved(required.commands))
         world.expect(self._commands)
+        world.on_published(self._commands, lambda publisher, _: self.check_observable(publisher))
         world.expect(required.resolved(required.odom))
         self._odom = world.on_published(required.resolved(required.odom), self._motion.on_odometry)
         world.on_published(required.resolved(required.status), self._on_status)
@@ -106,25 +130,24 @@ class _ArrivesWatch(Watch):
                 self._goals[node] = ended
 
     def _on_motion(self, pose: Pose, _: Twist) -> None:
-        if not self._goals or not self._motion.stands:
-            return
-        for node, goal in list(self._goals.items()):
-            if pose.distance(goal.pose) <= self._required.tolerance:
-                # Steps of time may be long: it may have arrived too late.
-                self._check()
-                self._goals.pop(node, None)
+        if not self._motion.stands:
+            self._moved = self.seconds
+        elif self._goals:
+            for node, goal in list(self._goals.items()):
+                if pose.distance(goal.pose) <= self._required.tolerance:
+                    # Steps of time may be long: this may be too late.
+                    self._check()
+                    self._goals.pop(node, None)
 
     def check(self) -> str | None:
-        """Return that a goal was not reached in time; None: all were."""
+        """Return what is violated; None: nothing."""
         if self._goals:
             self._check()
         return self._found
 
     def _check(self) -> None:
-        for node, goal in self._due():
-            due = max(goal.seconds, end_of_faults(self.world))
-            if self.seconds - due > self._required.within + ROUNDING:
-                self.found(self._text(node, goal, f'{self.seconds - due:g} s after {self._since(goal)}'))
+        """Find what is violated by goals that are due."""
+        raise NotImplementedError
 
     def _due(self) -> list[tuple[Node, Goal]]:
         nodes = self.world.nodes
@@ -132,28 +155,53 @@ class _ArrivesWatch(Watch):
             del self._goals[node]
         return list(self._goals.items())
 
-    def _since(self, goal: Goal) -> str:
+    def _begin(self, goal: Goal) -> tuple[float, str]:
+        """Return when the time for a goal begins, and what happened then."""
         end = end_of_faults(self.world)
-        return 'the faults have ended' if end > goal.seconds else 'the goal was received'
+        if end > goal.seconds:
+            return end, 'the faults have ended'
+        return goal.seconds, 'the goal was received'
 
-    def _text(self, node: Node, goal: Goal, when: str) -> str:
+    def _where(self, node: Node, goal: Goal) -> str:
         pose = self._motion.pose
-        where = (
-            f'there was no odometry on {self._odom}'
-            if pose is None
-            else f'the robot is {pose.distance(goal.pose):.6g} m from the goal of '
-            f'{self.name_of(node)} at {goal.pose}: {pose}, {self._motion.twist}'
+        if pose is None:
+            return f'there was no odometry on {self._odom}'
+        return (
+            f'the robot is {pose.distance(goal.pose):.6g} m from the goal of {self.name_of(node)} at '
+            f'{goal.pose}: {pose}, {self._motion.twist}'
         )
-        return f'{when} {where}; allowed: within {self._required.tolerance:g} m and standing'
+
+
+class _ArrivesWatch(_DueGoalWatch):
+    def _check(self) -> None:
+        for node, goal in self._due():
+            begin, what = self._begin(goal)
+            if self.seconds - begin > self._required.within + ROUNDING:
+                self.found(
+                    f'{self.seconds - begin:g} s after {what} {self._where(node, goal)}; allowed: '
+                    f'within {self._required.tolerance:g} m and standing'
+                )
 
     def finish(self) -> str | None:
         """Return that a goal was not reached yet; None: there is no such goal."""
-        if math.isinf(end_of_faults(self.world)):
-            return None
         for node, goal in self._due():
-            due = max(goal.seconds, end_of_faults(self.world))
-            text = self._text(
-                node, goal, f'the run ended {self.seconds - due:g} s after {self._since(goal)}'
-            )
-            return self.described(f'{text}. Let it run for {self._required.within:g} s after that')
+            begin, what = self._begin(goal)
+            if math.isfinite(begin):
+                return self.described(
+                    f'the run ended {self.seconds - begin:g} s after {what}: {self._where(node, goal)}; '
+                    f'allowed: within {self._required.tolerance:g} m and standing. Let it run for '
+                    f'{self._required.within:g} s after that'
+                )
         return None
+
+
+class _KeepsDrivingWatch(_DueGoalWatch):
+    def _check(self) -> None:
+        for node, goal in self._due():
+            begin, what = self._begin(goal)
+            stood = self.seconds - max(begin, self._moved)
+            if stood > self._required.within + ROUNDING:
+                self.found(
+                    f'{self.seconds - begin:g} s after {what} the robot has stood for {stood:g} s, and '
+                    f'{self._where(node, goal)}; allowed: {self._required.within:g} s'
+                )

@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.faults.fault import literal
-from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.lockstep import Lockstep, LockstepError
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 RECENT = 5
@@ -132,11 +132,30 @@ class Watch:
         return None
 
     def owner(self, publisher: Publisher) -> Node | None:
-        """Return the node that has a publisher; None: it was removed, or not added yet."""
+        """Return the node that has a publisher; None: it was removed, or not added yet.
+
+        Raises:
+            LockstepError: The message comes from another process.
+        """
         owner = self._owners.get(publisher)
-        if owner is None and (owner := self.world.node_of(publisher)) is not None:
-            self._owners[publisher] = owner
+        if owner is None:
+            self.check_observable(publisher)
+            owner = self.world.node_of(publisher)
+            if owner is not None:
+                self._owners[publisher] = owner
         return owner
+
+    def check_observable(self, publisher: Publisher) -> None:
+        """Check that a message comes from a node of this process, of which all can be observed.
+
+        Raises:
+            LockstepError: It comes from another process.
+        """
+        if not isinstance(publisher, Publisher):
+            raise LockstepError(
+                f'a property observes the node that publishes {publisher.topic_name}, which is in '
+                'another process: what that node receives is not known here'
+            )
 
     def name_of(self, node: Node) -> str:
         """Return the fully qualified name of a node, also after it was destroyed."""

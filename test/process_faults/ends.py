@@ -60,7 +60,7 @@ class Program(NamedTuple):
 
 def _paths(*words: str) -> Callable[[Path, Path], list[str]]:
     """Return the words with the paths for BAG and NEW."""
-    return lambda bag, new: [{'BAG': str(bag), 'NEW': str(new)}.get(word, word) for word in words]
+    return lambda bag, new: [word.replace('BAG', str(bag)).replace('NEW', str(new)) for word in words]
 
 
 NODE_ARGUMENTS = ('--ros-args', '-p')
@@ -201,7 +201,7 @@ class Campaign:
     def _violations(self, program, ending, traffic, new, numbers, mode) -> list[str]:
         child, found = ending.child, []
         try:
-            code = child.exit(0.5)
+            code = child.exit(patience=0.5)
         except AssertionError:
             child.signal(signal.SIGKILL)
             return [f'{program.name}, {mode}: does not exit after {numbers}']

@@ -82,7 +82,10 @@ INPUTS = (
     Input('watch_run', 'goals', Goals),
     Input('watch_run', 'goal_status', GoalStatus),
 )
-TOOLS = {'send_goal': (('50', '0'), 'waiting: ', 130), 'watch_run': (('--no-browser',), 'page: ', 0)}
+TOOLS = {
+    'send_goal': (('50', '0', '--wait', '1e5'), 'waiting: ', 130),
+    'watch_run': (('--no-browser',), 'page: ', 0),
+}
 """Arguments of programs that are not nodes, what they print when they run, and their exit codes."""
 
 

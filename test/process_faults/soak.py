@@ -266,7 +266,10 @@ def run(count: int, seed: int = 0) -> Outcome:
         faults = 0
         while (elapsed := time.monotonic() - begun) < 60.0 * count:
             fault = chance.choice(list(made.faults))
-            made.faults[fault]()
+            try:
+                made.faults[fault]()
+            except AssertionError as error:
+                violations.append(f'{fault}: {error}')
             faults += 1
             made.spin(chance.uniform(0.5, 1.5) * PERIOD)
             memory = made.memory()

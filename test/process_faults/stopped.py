@@ -38,7 +38,7 @@ ARGUMENTS = {
 
 
 class Team:
-    """Three nodes in processes, and what is heard of them with the time of receipt (s)."""
+    """Three nodes in processes, and what is heard of them with its time (s)."""
 
     def __init__(self, world: World) -> None:
         self.world, self.harness = world, world.harness
@@ -57,7 +57,7 @@ class Team:
     def _hear(self, topic: str, kind: Any) -> None:
         found = self.heard[topic] = []
         self.harness.peer.create_subscription(
-            kind, topic, lambda message: found.append((time.monotonic(), message)), 1000
+            kind, topic, lambda message: found.append((when(message), message)), 1000
         )
 
     def start(self, name: str) -> None:
@@ -94,6 +94,14 @@ class Team:
         """Return how long after a time the last moving message came (s); negative: there was none."""
         times = [at for at, message in self.heard[topic] if moving(message) and at > since]
         return times[-1] - since if times else -1.0
+
+
+def when(message: Any) -> float:
+    """Return the time of a message (s, monotonic): its stamp if it has that of its publication."""
+    if not isinstance(message, Odometry):
+        return time.monotonic()
+    stamp = message.header.stamp
+    return stamp.sec + stamp.nanosec / 1e9 - time.time() + time.monotonic()
 
 
 def moving(message: Any) -> bool:

@@ -11,7 +11,7 @@ from unittest import mock
 
 import processes
 from conftest import Harness
-from processes import World, open_world
+from processes import Child, World, open_world
 
 LIFE = 900.0
 """How long a process may live (s)."""
@@ -27,6 +27,7 @@ def quiet_world(folder: Path, life: float = LIFE) -> Iterator[World]:
         mock.patch.object(processes, 'LIMIT', life),
         mock.patch.object(processes, 'PATIENCE', PATIENCE),
         mock.patch.object(Harness, 'until', until),
+        mock.patch.object(Child, 'exit', partialmethod(Child.exit, patience=PATIENCE)),
         ExitStack() as stack,
     ):
         world = stack.enter_context(open_world(folder))
