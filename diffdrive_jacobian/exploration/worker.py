@@ -58,9 +58,7 @@ def _one_by_one(data: bytes) -> list[Outcome]:
         try:
             outcomes += call_in_child(run_worlds_here, one)
         except ChildDiedError as error:
-            died = Violation(
-                key=f'no exception: {error}', seconds=0.0, text=str(error), name='NoExceptionProcessDied'
-            )
+            died = Violation(key=str(error), seconds=0.0, text=str(error), name='NoExceptionProcessDied')
             outcomes.append(Outcome(violations=(died,)))
     return outcomes
 
