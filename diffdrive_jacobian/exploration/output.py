@@ -27,7 +27,7 @@ TEST = '''"""{title}
 
 {description}
 
-{written} (seed {seed}). Passes once the controller is mended.
+{written}(seed={seed}). Passes once the controller is mended.
 """
 
 {imports}
