@@ -11,6 +11,8 @@ from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import Twist, Vector3
 from rclpy.node import Node
 
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+
 PERIOD = 0.1
 TIMEOUT = None
 """Age at which the follower ignores the last reading (s): None, which is its defect."""
@@ -93,6 +95,13 @@ def identified(world, case):
     publisher.publish(status)
     assert case is None, 'not empty'
     raise ValueError('always')
+
+
+def robot(world, case):
+    """Command a robot to go faster and faster."""
+    world.create(VirtualRobot)
+    world.create(Follower)
+    world.run_for(0.5)
 
 
 def deadly(world, case):

@@ -309,11 +309,6 @@ def test_mistakes_are_named(arguments, words):
         explore(**{'executor': SerialExecutor(), **arguments})
 
 
-def test_a_fault_without_effect_is_noted():
-    found = serial(follow, faults=fault_schedules(['typo'], kinds=[Loss]), worlds=4)
-    assert re.search(r'note: in \d worlds: .*typo', str(found))
-
-
 def test_where_a_replay_differs():
     assert described_replay(True, False, ['numpy 1 here, 2 there']) == (
         'violated as found, but not bit for bit; numpy 1 here, 2 there'

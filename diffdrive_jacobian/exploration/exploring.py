@@ -12,7 +12,7 @@ from diffdrive_jacobian.exploration import child
 from diffdrive_jacobian.exploration.errors import ExplorationError
 from diffdrive_jacobian.exploration.executors import LocalExecutor
 from diffdrive_jacobian.exploration.generation import st, trials
-from diffdrive_jacobian.exploration.output import check_output
+from diffdrive_jacobian.exploration.output import check_output, remove_others
 from diffdrive_jacobian.exploration.result import Exploration
 from diffdrive_jacobian.exploration.scenario import Scenario, ScenarioName
 from diffdrive_jacobian.exploration.search import Search
@@ -58,7 +58,8 @@ def explore(
         executor: Runs the worlds; None: all cores of this machine. Any Executor of `concurrent.futures`
             serves, also `Client.get_executor()` of Dask.
         output: Folder for what was found: for each violation the case, a test that reproduces it, a bag
-            and a picture. None: nothing is written.
+            and a picture. What an earlier exploration has written there is removed, except after Ctrl-C.
+            None: nothing is written.
 
     Returns:
         The result. After Ctrl-C it has what was found so far.
@@ -95,6 +96,8 @@ def explore(
         search = Search(setting, strategy, seed, worlds, used, time_limit)
         result = search.run(stop_at_first, shrink_worlds, folder)
         complete = not result.stopped
+        if output is not None and result.stopped != 'interrupted':
+            remove_others(Path(output), result.findings)
         return result
     finally:
         if executor is None:

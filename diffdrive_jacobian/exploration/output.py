@@ -8,6 +8,7 @@ import re
 import shutil
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,13 @@ from diffdrive_jacobian.exploration.worker import can_run_here
 
 CASE = 'counterexample.json'
 """Name of the file with the case."""
+WRITTEN = 'Found and written by explore'
+"""Words of each test that is written."""
 TEST = '''"""{title}
 
 {description}
 
-Found by explore with seed {seed}; written by it. Passes once the controller is mended.
+{written}(seed={seed}). Passes once the controller is mended.
 """
 
 {imports}
@@ -106,6 +109,39 @@ def _is_foreign(folder: Path) -> bool:
     return folder.is_dir() and not (folder / CASE).exists() and any(folder.iterdir())
 
 
+def remove_others(output: Path, findings: Sequence[Finding]) -> None:
+    """Remove what an earlier exploration has written, other than what was found again.
+
+    Other files stay, and so do the files of a counterexample that was renamed or copied from elsewhere.
+
+    Args:
+        output: Folder of all findings.
+        findings: What was found now.
+    """
+    kept = {finding.directory.name for finding in findings if finding.directory is not None}
+    for case in output.glob(f'*/{CASE}'):
+        folder = case.parent
+        test = folder / f'test_{_snake(folder.name)}.py'
+        if folder.name in kept or folder.is_symlink() or not _is_written(test):
+            continue
+        with suppress(OSError):
+            # What pytest compiled would keep the folders.
+            for file in (test, *folder.glob(f'__pycache__/{test.stem}.*')):
+                file.unlink()
+            _remove_earlier(folder)
+            for empty in (folder / '__pycache__', folder):
+                if empty.is_dir() and not any(empty.iterdir()):
+                    empty.rmdir()
+
+
+def _is_written(test: Path) -> bool:
+    """Return whether a file is a test that `explore` has written."""
+    try:
+        return WRITTEN in test.read_text(errors='replace')
+    except OSError:
+        return False
+
+
 def _remove_earlier(folder: Path) -> None:
     """Remove what an earlier exploration has written into a folder."""
     shutil.rmtree(folder / BAG, ignore_errors=True)
@@ -179,11 +215,14 @@ def test_source(finding: Finding, folder: Path, name: str, seed: int) -> str:
     loads += [_load(folder, setting.scenario, *one) for one in sorted(local)]
     loads = [line for line in loads if line]
     imports += [f'from {module} import {", ".join(sorted(names[module]))}' for module in sorted(names)]
-    first = violation.text.strip().splitlines()
-    title = f'{violation.key} is violated at {violation.seconds:g} s.'
+    title, description = f'{violation.key}, at {violation.seconds:g} s.', violation.headline
+    if violation.index >= 0:
+        title = f'{violation.key} is violated at {violation.seconds:g} s.'
+        description = '\n'.join(violation.text.strip().splitlines()[:10])
     return TEST.format(
         title=_quoted(title),
-        description=_quoted('\n'.join(first[:10] if violation.index >= 0 else first[-1:])),
+        description=_quoted(description),
+        written=WRITTEN,
         seed=seed,
         imports='\n'.join(imports) + '\n',
         loads='\n'.join(loads),

@@ -116,7 +116,10 @@ class Search:
             faults=self._faults,
             checks=self._checks,
             stopped=self._stopped,
-            notes=tuple(f'in {count} worlds: {text}' for text, count in self._complaints.items()),
+            notes=tuple(
+                f'{text} ({count} of {self._worlds} worlds)'
+                for text, count in self._complaints.most_common()
+            ),
         )
 
     # --- Worlds
@@ -186,10 +189,9 @@ class Search:
         self._faults += len(one.trial.faults)
         self._checks += outcome.checks
         self._simulated += outcome.seconds
-        if outcome.complaint:
-            if not one.trial.faults:
-                raise ExplorationError(f'in a world without faults: {outcome.complaint}')
-            self._complaints[outcome.complaint] += 1
+        if outcome.complaints and not one.trial.faults:
+            raise ExplorationError(f'in a world without faults: {outcome.complaints[0]}')
+        self._complaints.update(outcome.complaints)
         self._known.setdefault(one.block, {})[one.key] = outcome
         for violation in outcome.violations:
             self._counts[violation.key] += 1

@@ -76,7 +76,7 @@ def run_world_afresh(data: bytes) -> list[Outcome]:
 
 
 def _died(error: ChildDiedError) -> Outcome:
-    died = Violation(key=f'no exception: {error}', seconds=0.0, text=str(error), name=DIED)
+    died = Violation(key=str(error), seconds=0.0, text=str(error), name=DIED)
     return Outcome(violations=(died,))
 
 

@@ -9,7 +9,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 
-from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._errors import IneffectiveFaultsError, LockstepError
 from diffdrive_jacobian.lockstep._fault_log import TOPIC, FaultEvent, FaultLog
 from diffdrive_jacobian.lockstep._injection import Injectable, Injections, check_injectable
 from diffdrive_jacobian.lockstep._injection_base import World, full_name
@@ -171,4 +171,4 @@ class Disturbed(Messaging):
             LockstepError: One did not, for example because the name of its topic is misspelt.
         """
         if self._injections is not None and (ineffective := self._injections.ineffective()):
-            raise LockstepError('faults without effect: ' + '; '.join(ineffective))
+            raise IneffectiveFaultsError(ineffective, self._injections.missing())
