@@ -267,10 +267,11 @@ class SimulatedTime:
     def report(self) -> str:
         """Return the last messages of all topics as text."""
         if self._external is None:
-            return self._traffic.describe(self._executor.nodes)
+            return self._traffic.describe(self._executor.nodes, self.world_time)
         lines = self._external.waiting.describe()
         others = self._external.graph.nodes()
-        return '\n  '.join([self._traffic.describe(self._executor.nodes, others), *lines])
+        text = self._traffic.describe(self._executor.nodes, self.world_time, others)
+        return '\n  '.join([text, *lines])
 
 
 def checked_nanoseconds(name: str, seconds: float) -> int:
