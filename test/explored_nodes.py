@@ -28,6 +28,7 @@ from diffdrive_jacobian.properties import (
     StatusProtocol,
     StopsAfterLastCommand,
     StopsAfterLostOdometry,
+    end_of_faults,
 )
 from diffdrive_jacobian.ros.remote_goal import ANSWER_PATIENCE, Result, send_goal_in
 from diffdrive_jacobian.signals import Signals
@@ -126,7 +127,8 @@ def chain(world, case):
     for seconds, what, argument in sorted(case['script'], key=lambda action: action[0]):
         go_on_until(world, seconds)
         operator.do(what, argument)
-    go_on_until(world, DISTURBED + 1.0)
+    # What was delayed arrives after the last fault.
+    go_on_until(world, end_of_faults(world) + 1.0)
     # Whatever has happened, the next goal is reached.
     for name in NODES:
         world.find(name)

@@ -8,6 +8,7 @@ from typing import Any
 from rclpy.node import Node
 
 from diffdrive_jacobian.faults import (
+    ActuatorLag,
     Delay,
     Duplicate,
     Hang,
@@ -23,6 +24,8 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 
 ROUNDING = 1e-9
 """Tolerance on times (s)."""
+DECAY = 7.0
+"""Time constants after which a robot whose motors lag stands still: exp(-7) is 0.001."""
 _AT_ONCE = (Push, TimeJump)
 """Faults that happen once, when they begin, also if they have no end."""
 
@@ -45,8 +48,9 @@ class ReactionTime:
         """Return the time that has passed (s)."""
         world_time, clock = self._world.world_time, self._world.now
         by_world, by_clock = world_time - self._world_time, clock - self._clock
+        jumped = _jumped(self._world.faults, self._world_time, world_time)
         self._world_time, self._clock = world_time, clock
-        if 0 <= by_clock <= by_world:
+        if 0 <= by_clock <= by_world and not jumped:
             self._passed += by_clock
         else:
             self._passed += by_world
@@ -58,19 +62,35 @@ class ReactionTime:
         return self.now() - max(time, self._jumped)
 
 
+def _jumped(faults: list[Any], before: int, now: int) -> bool:
+    """Return whether the clock jumped between two world times (ns).
+
+    After a pause a jump forward may look as if time had passed evenly.
+    """
+    if before == now:
+        return False
+    jumps = (fault for fault in faults if isinstance(fault, TimeJump))
+    times = (time for fault in jumps for time in (fault.start, fault.start + fault.duration))
+    return any(before < time * NANOSECONDS <= now for time in times)
+
+
 def delays(world: Lockstep, node: Node, since: float) -> float:
     """Return by how much faults of a node may have delayed its reaction since a world time (s)."""
     name, now = node.get_fully_qualified_name(), world.world_time / NANOSECONDS
     total = 0.0
     for fault in world.faults:
-        if getattr(fault, 'node', '').lstrip('/') != name.lstrip('/'):
+        affected = getattr(fault, 'node', '') or getattr(fault, 'robot', '')
+        if affected.lstrip('/') != name.lstrip('/'):
             continue
         overlap = min(now, fault.start + fault.duration) - max(since, fault.start)
         if isinstance(fault, Hang):
             total += max(overlap, 0.0)
-        elif isinstance(fault, Slow) and overlap > -3.0 * fault.seconds:
-            # A callback that has begun, another one that waits, and that of the timer.
-            total += 3.0 * fault.seconds
+        elif isinstance(fault, Slow):
+            # A callback that has begun, others that wait, and that of the timer, which may expire early.
+            longest = (3.0 + len(list(node.timers))) * fault.seconds
+            total += longest if overlap > -longest else 0.0
+        elif isinstance(fault, ActuatorLag):
+            total += DECAY * fault.seconds if overlap > -DECAY * fault.seconds else 0.0
         elif isinstance(fault, TimerJitter) and overlap > -fault.seconds:
             total += fault.seconds
     return total
