@@ -444,6 +444,10 @@ def test_a_push_moves_the_robot_and_its_odometry_only_if_it_is_noticed(lockstep,
     lockstep.run_for(0.4)
     close(robot.truth, (1.0, 0.0, math.pi / 2.0))
     lockstep.run_for(0.2)
+    assert [(event.time_ns, event.what) for event in lockstep.fault_events] == [
+        (500_000_000, 'begins'),
+        (500_000_000, 'ends'),
+    ]
     moved = (0.8, 0.1, math.pi / 2.0 + 0.3)
     close(robot.truth, moved)
     close(pose_of(topics.odom[-1]), moved if noticed else (1.0, 0.0, math.pi / 2.0))

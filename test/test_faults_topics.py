@@ -61,6 +61,38 @@ def test_a_random_delay_keeps_the_order_also_after_its_end(lockstep):
     assert late[-8:] == [0.0] * 8
 
 
+def test_a_delay_ends_when_its_last_message_has_arrived(lockstep):
+    delay = faults.Delay('count', 1.0, start=0.25, duration=0.2)
+    got = play(lockstep, delay, seconds=0.6)
+    assert got == IN_TIME[:2]
+    report = lockstep.report()
+    assert f'{delay!r}: over, its last message arrives at 1.4 s, 2 of 2 messages' in report
+    lockstep.run_for(1.4)
+    # The two that were delayed, and those that wait behind them.
+    assert got[2:6] == [(3, 1300.0), (4, 1400.0), (5, 1400.0), (6, 1400.0)]
+    total = '2 of 2 messages of /count to /sink and 9 behind them'
+    assert [(event.time_ns / 1e9, event.what) for event in lockstep.fault_events] == [
+        (0.25, 'begins'),
+        (0.45, 'messages 3 to 4 of /count to /sink delayed by 1 s, from 0.3 s to 0.4 s'),
+        (0.45, 'is over, its last message arrives at 1.4 s'),
+        (1.4, 'messages 5 to 13 of /count to /sink delayed by 0.1 s to 0.9 s, from 0.5 s to 1.3 s'),
+        (1.4, f'ends: {total}'),
+    ]
+    assert f'{delay!r}: ended, {total}' in lockstep.report()
+
+
+def test_messages_to_a_node_that_was_started_again_are_counted_together(lockstep):
+    loss = faults.Loss('count', duration=0.45)
+    play(lockstep, loss, faults.Kill('sink', start=0.25, duration=0.1))
+    assert whats(lockstep)[-1] == 'ends: 3 of 3 messages of /count to /sink'
+
+
+def test_the_report_says_which_fault_has_not_begun(lockstep):
+    play(lockstep, faults.Loss('count', start=5.0))
+    lockstep.finish()
+    assert "Loss('count', start=5.0): has not begun, starts at 5 s" in lockstep.report()
+
+
 def test_reordered_messages_are_overtaken(lockstep):
     got = play(lockstep, faults.Reorder('count', 0.3, 0.15), seconds=2.0, seed=1)
     late = {number for number, time in got if time == 100.0 * number + 150.0}

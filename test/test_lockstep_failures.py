@@ -32,7 +32,7 @@ def test_condition_that_is_never_true_is_named_with_the_last_messages(lockstep):
         lockstep.run_until(lambda: False, timeout=3.0, what='pigs fly')
     first, *rest = str(caught.value).splitlines()
     assert first == 'not within 3 s of simulated time: pigs fly'
-    assert rest[0] == 'last messages, at 4 s:'
+    assert rest[0] == 'last messages, at 4 s of the clock, 3 s after the start:'
     assert '  /b: 1 from /parrot, last at 1 s: Vector3(x=0.5)' in rest
     with pytest.raises(LockstepError, match=r'condition .*never \(.*test_lockstep_failures.py:\d+\)'):
         lockstep.run_until(never, timeout=0.1)

@@ -52,7 +52,7 @@ def test_a_violation_names_property_time_value_limit_and_what_was_before(lockste
         'allowed: |v| <= 0.5 m/s, |omega| <= 2 rad/s\nbefore that:\n'
         '  0 s: /cmd_vel: v 0.25 m/s, omega 0 rad/s'
     )
-    assert 'last messages, at 2 s:' in str(violation)
+    assert 'last messages, at 2 s of the clock, 1 s after the start:' in str(violation)
     assert (violation.property, violation.seconds) == (NeverFasterThan(0.5, 2.0), 1.0)
     assert isinstance(violation, LockstepError)
     again = pickle.loads(pickle.dumps(violation))

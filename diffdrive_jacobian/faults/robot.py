@@ -71,6 +71,8 @@ class RobotFault(Fault):
                 done = True
                 undo = self.apply(node, injection)
                 undone[:] = [(node, undo)] if undo is not None else []
+                if not self.lasting:
+                    injection.end()
 
         def end(node: Node) -> None:
             for affected, undo in undone:
@@ -259,7 +261,7 @@ class Push(RobotFault):
     The displacement is in its own frame: dx forward, dy to the left. The wheels do not turn, so `odom`
     and `joint_states` do not notice, and `ground_truth` shows it. With `noticed` the odometry is
     displaced too, as if it was corrected by a localisation, and a new `start_pose` is published. It
-    happens once, whatever the duration.
+    happens once, and is over then, whatever the duration.
 
     Attributes:
         dx: Displacement forward (m).

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -100,9 +100,12 @@ class Hits:
             name: Name of the topic and of the node.
             note: Adds an event.
         """
-        self._name = name
+        self.name = name
         self._note = note
-        self._number = self._during = self._hit = 0
+        self._number = 0
+        self.counts: Counter[str] = Counter()
+        """Number of messages `during` the fault, of those that it affected (`hit`), and of later ones
+        that wait `behind` them."""
         # Of the messages that are not noted yet: what happened, first and last number, and time.
         self._kind = ''
         self._first = self._last = self._since = self._until = 0
@@ -118,14 +121,14 @@ class Hits:
             active: Whether the fault is active.
         """
         self._number += 1
-        self._during += active
+        self.counts['during'] += active
         kind = _kind(data, out)
         if kind != self._kind:
             self.flush()
             self._kind, self._first, self._since = kind, self._number, now
             self._delays = (0, 0)
         if kind:
-            self._hit += 1
+            self.counts['hit' if active else 'behind'] += 1
             self._last, self._until = self._number, now
             delays = [delay for delay, _ in out if delay > 0]
             least, most = self._delays
@@ -150,11 +153,22 @@ class Hits:
         if self._delays[1] > 0:
             least, most = (in_seconds(delay) for delay in self._delays)
             by = f' by {least}' if least == most else f' by {least} to {most}'
-        return f'{number} of {self._name} {self._kind}{by}, {when}'
+        return f'{number} of {self.name} {self._kind}{by}, {when}'
 
-    def total(self) -> str:
-        """Return how many of the messages during the fault were affected."""
-        return f'{self._hit} of {self._during} messages of {self._name}'
+
+def totals(hits: Iterable[Hits]) -> str:
+    """Return how many of the messages during a fault were affected, by topic and node.
+
+    A node that was started again has new subscriptions with the same names.
+    """
+    counts: dict[str, Counter[str]] = {}
+    for one in hits:
+        counts.setdefault(one.name, Counter()).update(one.counts)
+    return ', '.join(
+        f'{count["hit"]} of {count["during"]} messages of {name}'
+        + (f' and {count["behind"]} behind them' if count['behind'] else '')
+        for name, count in counts.items()
+    )
 
 
 def _kind(data: bytes, out: list[tuple[int, bytes]]) -> str:

@@ -12,7 +12,7 @@ from typing import Protocol
 from rclpy.node import Node
 
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
-from diffdrive_jacobian.lockstep._fault_log import FaultLog, Hits
+from diffdrive_jacobian.lockstep._fault_log import FaultLog, Hits, in_seconds, totals
 from diffdrive_jacobian.lockstep._gates import Gate
 from diffdrive_jacobian.lockstep._keeper import Keeper
 from diffdrive_jacobian.time_units import nanoseconds
@@ -93,6 +93,8 @@ class InjectionBase:
         self._on_start: list[Callable[[], None]] = []
         self._on_end: list[Callable[[], None]] = []
         self._hits: list[Hits] = []
+        self._last_arrival = 0
+        """World time at which the last message arrives that the fault has delayed (ns)."""
 
     # --- Time
 
@@ -101,7 +103,7 @@ class InjectionBase:
         start, duration = self.fault.start, self.fault.duration
         self._agenda.at(nanoseconds(start), self._start)
         if math.isfinite(duration):
-            self._agenda.at(nanoseconds(start) + nanoseconds(duration), self._end)
+            self._agenda.at(nanoseconds(start) + nanoseconds(duration), self.end)
 
     def at_start(self, action: Callable[[], None]) -> None:
         """Call a function when the fault begins."""
@@ -117,14 +119,28 @@ class InjectionBase:
         for action in self._on_start:
             action()
 
-    def _end(self) -> None:
+    def end(self) -> None:
+        """End the fault now. Messages that it has delayed still arrive late."""
+        if self.ended:
+            return
         self.active, self.ended = False, True
         for action in self._on_end:
             action()
+        if self._last_arrival > self._agenda.now:
+            self._flush()
+            self.note(f'is over, its last message arrives at {in_seconds(self._last_arrival)}')
+            self._agenda.at(self._last_arrival, self._note_end)
+        else:
+            self._note_end()
+
+    def _flush(self) -> None:
         for hits in self._hits:
             hits.flush()
-        totals = self.totals()
-        what = f'ends: {totals}' if totals else 'ends'
+
+    def _note_end(self) -> None:
+        self._flush()
+        affected = self.totals()
+        what = f'ends: {affected}' if affected else 'ends'
         self._world.log.add(self._position, self.fault, what, last=True)
 
     # --- Random numbers
@@ -142,11 +158,18 @@ class InjectionBase:
 
     def totals(self) -> str:
         """Return how many messages were affected so far; empty: the fault affects no messages."""
-        return ', '.join(hits.total() for hits in self._hits)
+        return totals(self._hits)
 
     def state(self) -> str:
         """Return whether the fault is active, and what it did so far."""
-        state = 'active' if self.active else 'ended' if self.ended else 'not begun'
+        if self.active:
+            state = 'active'
+        elif not self.ended:
+            state = f'has not begun, starts at {self.fault.start:g} s'
+        elif self._last_arrival > self._agenda.now:
+            state = f'over, its last message arrives at {in_seconds(self._last_arrival)}'
+        else:
+            state = 'ended'
         details = self._missing if self._missing else self.totals()
         return f'{state}, {details}' if details else state
 
@@ -171,6 +194,11 @@ class InjectionBase:
         """Check whether there is anything that the fault affects."""
         if self._missing is not None and self._is_there(self._world.executor.nodes):
             self._missing = None
+
+    @property
+    def missing(self) -> str | None:
+        """What the fault needs and has not met, as a sentence; None: nothing."""
+        return self._missing
 
     def ineffective(self) -> str | None:
         """Return why the fault affects nothing; None: it has met what it could affect."""

@@ -176,11 +176,12 @@ class Traffic:
         if self._restore is not None:
             self._restore()
 
-    def describe(self, nodes: list[Node], others: Collection[str] = ()) -> str:
+    def describe(self, nodes: list[Node], world_time: int, others: Collection[str] = ()) -> str:
         """Return the last message of each publisher, and the subscribed topics without messages.
 
         Args:
             nodes: The nodes of the world.
+            world_time: Time since the start (ns).
             others: Names of nodes in other processes.
         """
         names = {
@@ -213,7 +214,9 @@ class Traffic:
         ]
         if missing := _not_served(nodes, others):
             lines.append(f'  created, but not added to lockstep: {", ".join(missing)}')
-        return '\n'.join([f'last messages, at {self._now() / NANOSECONDS:g} s:', *(lines or ['  none'])])
+        clock, passed = self._now() / NANOSECONDS, world_time / NANOSECONDS
+        title = f'last messages, at {clock:g} s of the clock, {passed:g} s after the start:'
+        return '\n'.join([title, *(lines or ['  none'])])
 
 
 def _subscriptions(publisher: Publisher) -> int:

@@ -118,6 +118,7 @@ class TopicInjection(InjectionBase):
             if keeps_order:
                 out = [(max(delay, earliest - now), data) for delay, data in out]
                 earliest = max([earliest, *(now + delay for delay, _ in out)])
+            self._last_arrival = max([self._last_arrival, *(now + delay for delay, _ in out)])
             hits.add(now, data, out, active=self.active)
             return out
 

@@ -28,7 +28,7 @@ def measured(one: Trace, quantity: str) -> Array:
     run = one.run
     if quantity in _WHEEL:
         values = np.column_stack([seconds(run, run.wheels), run.wheels.values[:, _WHEEL[quantity]]])
-        return line(values, np.flatnonzero(np.diff(values[:, 0]) < 0.0) + 1)
+        return line(values, _back_in_time(values))
     if quantity in _TWIST:
         values = run.odometry.values[:, 3 + _TWIST[quantity]]
         return line(np.column_stack([one.time, values]), one.breaks)
@@ -86,10 +86,15 @@ def _tightest(choose: Callable[[list[float]], float], bounds: list[float]) -> fl
 
 
 def _continued(one: Trace, rows: Array) -> Array:
-    """Return a line whose last value is continued to the end of the run."""
+    """Return a line whose last value is continued to the end of the run, broken where time goes back."""
     if len(rows):
         rows = np.vstack([rows, [max(one.time[-1], rows[-1, 0]), rows[-1, 1]]])
-    return line(rows, np.array([], dtype=np.intp))
+    return line(rows, _back_in_time(rows))
+
+
+def _back_in_time(rows: Array) -> Indices:
+    """Return before which rows time goes back."""
+    return np.flatnonzero(np.diff(rows[:, 0]) < 0.0) + 1
 
 
 def line(rows: Array, breaks: Indices) -> Array:

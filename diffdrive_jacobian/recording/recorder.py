@@ -61,6 +61,7 @@ class Recorder(Node):  # type: ignore[misc]
         sink: Sink,
         *,
         with_info: bool = False,
+        now: Callable[[], int] | None = None,
         **kwargs: Any,
     ) -> None:
         """Create the node without subscriptions; `discover` creates them.
@@ -72,6 +73,8 @@ class Recorder(Node):  # type: ignore[misc]
                 EventsExecutor of Jazzy. Missed messages are then counted, and a message is recorded
                 with the time at which the middleware received it. Otherwise, and always with simulated
                 time, it is recorded with the time of the node's clock when its callback runs.
+            now: Returns the time with which messages are recorded (ns), for a clock that may go back
+                (default: that of the node's clock).
             kwargs: As for `rclpy.node.Node`.
 
         Raises:
@@ -88,6 +91,7 @@ class Recorder(Node):  # type: ignore[misc]
         self._refused: set[str] = set()
         self._queries: dict[str, ParameterQuery] = {}
         self._with_info = with_info
+        self._clock_now = now or (lambda: int(self.get_clock().now().nanoseconds))
         self._stamped = with_info and not self.get_parameter('use_sim_time').value
         self._missed: dict[str, MissedMessages] = {}
         self._reported: Counter[str] = Counter()
@@ -298,7 +302,7 @@ class Recorder(Node):  # type: ignore[misc]
 
     def _now(self) -> int:
         # A bag cannot contain a negative time.
-        return max(0, int(self.get_clock().now().nanoseconds))
+        return max(0, self._clock_now())
 
     def _add(self, channel: int, stamp: int, data: bytes) -> None:
         self._sink.add(Message(channel, stamp, data))

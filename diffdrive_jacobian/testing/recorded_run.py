@@ -24,7 +24,8 @@ class RecordedRun:
     def __init__(self, world: Lockstep, directory: Path) -> None:
         """Start to record all topics, as the bag `run` in a directory.
 
-        What an earlier run of the test left in the directory is replaced.
+        What an earlier run of the test left in the directory is replaced. Messages are recorded with
+        world time, so that their order remains where the clock of the nodes jumps back.
 
         Raises:
             OSError: It cannot be written there.
@@ -41,7 +42,10 @@ class RecordedRun:
         self._finished = False
         self._error: RecordingError | None = None
         self._kept: str | None = None
-        recorder = Recorder(Selection(everything=True), self._recording)
+        offset = world.now - world.world_time
+        recorder = Recorder(
+            Selection(everything=True), self._recording, now=lambda: offset + world.world_time
+        )
         world.add(recorder, observer=True)
         world.on_new_topics(recorder.discover)
         recorder.discover()

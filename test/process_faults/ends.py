@@ -148,7 +148,7 @@ class Campaign:
     def __init__(
         self, world: World, folder: Path, bag: Path, chance: random.Random, *, fresh: bool = False
     ) -> None:
-        """Take a world. With `fresh`, programs are new interpreters, not forks: they import all."""
+        """Take a world. With `fresh`, programs are new interpreters, which import everything."""
         self.world, self.folder, self.bag, self.chance = world, folder, bag, chance
         self.fresh = fresh
         self.number = 0
