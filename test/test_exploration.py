@@ -10,10 +10,10 @@ from concurrent.futures import Future
 from pathlib import Path
 
 import exploration_scenarios as scenarios
+import inner_sessions  # noqa: F401  What it imports is not imported again.
 import pytest
 from exploration_scenarios import changing, divide, follow, identified, moving
 from hypothesis import strategies as st
-from inner_sessions import run_in_process
 
 from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.exploration import (
@@ -113,7 +113,7 @@ def test_the_written_test_reproduces_it_until_the_controller_is_mended(found, py
     )
     assert checked.returncode == 0, checked.stdout
     options = ('-p', 'no:cacheprovider', '-p', 'no:xdist', file)
-    result = run_in_process(pytester, *options)
+    result = pytester.runpytest_inprocess(*options)
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(
         [
@@ -122,7 +122,7 @@ def test_the_written_test_reproduces_it_until_the_controller_is_mended(found, py
         ]
     )
     monkeypatch.setattr(scenarios, 'TIMEOUT', 0.5)
-    run_in_process(pytester, *options).assert_outcomes(passed=1)
+    pytester.runpytest_inprocess(*options).assert_outcomes(passed=1)
 
 
 def test_another_exploration_replaces_what_was_written(found):
