@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import uuid
 from itertools import count
 
@@ -109,10 +110,24 @@ def deadly(world, case):
         os._exit(3)
 
 
+def reading(world, case):
+    """Read the standard input to its end."""
+    assert sys.stdin.read() == ''
+
+
+def crowded(world, case):
+    """Fail in a process that has run a world before."""
+    assert next(_calls) == 0
+
+
+def moving(world, case):
+    """Change the working directory, and fail."""
+    os.chdir('/')
+    raise ValueError('moved')
+
+
 def loaded(world, case):
     """Fail if a process that only runs worlds has imported what it does not need."""
-    import sys
-
     import diffdrive_jacobian.testing
 
     assert diffdrive_jacobian.testing.Lockstep is type(world)

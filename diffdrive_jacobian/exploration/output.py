@@ -7,10 +7,13 @@ import os
 import re
 import shutil
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+from diffdrive_jacobian.bags.journal import JOURNAL
 from diffdrive_jacobian.exploration.child import ChildDiedError, call_in_child
 from diffdrive_jacobian.exploration.errors import ExplorationError
 from diffdrive_jacobian.exploration.recorded_world import BAG, PICTURE, record
@@ -59,7 +62,12 @@ def check_output(folder: Path) -> None:
 
 
 def write_finding(
-    finding: Finding, output: Path, others: Sequence[Finding], *, seed: int = 0, record_it: bool = True
+    finding: Finding,
+    output: Path,
+    others: Sequence[Finding],
+    *,
+    seed: int = 0,
+    executor: Executor | None = None,
 ) -> Finding:
     """Write a finding into a folder of its own, in the place of one of an earlier exploration.
 
@@ -70,7 +78,8 @@ def write_finding(
         output: Folder of all findings.
         others: Findings that have a folder already.
         seed: Seed of the exploration.
-        record_it: Whether to run the case again and write the bag and the picture.
+        executor: Runs the case again, to write the bag and the picture, on this machine; None: these are
+            not written.
 
     Returns:
         The finding, with its folder.
@@ -78,7 +87,7 @@ def write_finding(
     taken = {other.directory for other in others}
     stem = re.sub(r'\W+', '_', finding.violation.name)
     number, folder = 1, output / stem
-    while folder in taken:
+    while folder in taken or _is_foreign(folder):
         number += 1
         folder = output / f'{stem}_{number}'
     notes = list(finding.notes)
@@ -88,8 +97,8 @@ def write_finding(
         (folder / CASE).write_text(_case(finding, seed))
         name = _snake(folder.name)
         (folder / f'test_{name}.py').write_text(test_source(finding, folder, name, seed))
-        if record_it:
-            notes += _record(finding, folder)
+        if executor is not None:
+            notes += _record(finding, folder, executor)
     except OSError as error:
         notes.append(f'not written: {error}')
     return replace(finding, directory=folder, notes=tuple(notes))
@@ -128,20 +137,30 @@ def _is_written(test: Path) -> bool:
         return False
 
 
+def _is_foreign(folder: Path) -> bool:
+    """Return whether a folder has files, and none of an earlier exploration."""
+    return folder.is_dir() and not (folder / CASE).exists() and any(folder.iterdir())
+
+
 def _remove_earlier(folder: Path) -> None:
     """Remove what an earlier exploration has written into a folder."""
     shutil.rmtree(folder / BAG, ignore_errors=True)
-    for file in (folder / PICTURE, folder / CASE):
+    # The journal is there if the process of the recording ended.
+    for file in (folder / PICTURE, folder / CASE, folder / (BAG + JOURNAL)):
         file.unlink(missing_ok=True)
 
 
-def _record(finding: Finding, folder: Path) -> list[str]:
+def _record(finding: Finding, folder: Path, executor: Executor) -> list[str]:
     """Record the smallest case. Return notes on what could not be written."""
     arguments = finding.setting, finding.trial, finding.violation.index, str(folder)
     try:
-        return list(record(*arguments) if can_run_here() else call_in_child(record, *arguments))
+        return executor.submit(_record_in_process, *arguments).result()
     except ChildDiedError as error:
         return [f'not recorded: {error}']
+
+
+def _record_in_process(*arguments: Any) -> list[str]:
+    return list(record(*arguments) if can_run_here() else call_in_child(record, *arguments))
 
 
 def _case(finding: Finding, seed: int) -> str:

@@ -47,7 +47,7 @@ class Finding:
     def __str__(self) -> str:
         """Return a description of a few lines."""
         source = Source()
-        event = 'violated' if self.violation.index >= 0 else 'raised'
+        event = 'violated' if self.violation.index >= 0 else 'failed'
         lines = [
             f'{self.violation.key}',
             f'  {self.count} worlds, the first is number {self.first_world}; '
@@ -65,7 +65,10 @@ class Finding:
             )
         lines += [f'  {note}' for note in self.notes]
         if self.directory is not None:
-            lines.append(f'  {self.directory}')
+            here = Path.cwd()
+            within = self.directory.is_relative_to(here)
+            shown = self.directory.relative_to(here) if within else self.directory
+            lines.append(f'  {shown}')
         return '\n'.join(lines)
 
 

@@ -27,6 +27,8 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 
 QUIET = ('--disable-rosout-logs', '--disable-stdout-logs', '--disable-external-lib-logs')
 """ROS arguments of explored worlds. Logs of thousands of worlds help nobody, and take time."""
+DIED = 'NoExceptionProcessDied'
+"""Name of the violation of a world that ends its process."""
 LONGEST_TEXT = 20_000
 """Length beyond which the text of a violation is cut (characters)."""
 LONGEST_LINE = 500

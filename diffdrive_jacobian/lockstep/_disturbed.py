@@ -15,6 +15,8 @@ from diffdrive_jacobian.lockstep._injection import Injectable, Injections, check
 from diffdrive_jacobian.lockstep._injection_base import World, full_name
 from diffdrive_jacobian.lockstep._keeper import Keeper
 from diffdrive_jacobian.lockstep._messaging import Messaging, described
+from diffdrive_jacobian.lockstep._simulated_time import MAX_SECONDS
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 N = TypeVar('N', bound=Node)
 
@@ -135,9 +137,12 @@ class Disturbed(Messaging):
         )
 
     def _shift_clock(self, duration: int) -> int:
-        """Let the clock of the nodes jump by a time (ns). Return by how much it did."""
+        """Let the clock of the nodes jump by a time (ns). Return by how much it did.
+
+        The new time is one that a stamp can represent.
+        """
         before = self._now
-        self._now = max(1, before + duration)
+        self._now = min(max(1, before + duration), MAX_SECONDS * NANOSECONDS)
         self._executor.clocks.set(self._now)
         return self._now - before
 
