@@ -73,7 +73,7 @@ def test_an_exception_is_described_by_its_first_line(tmp_path):
     assert re.fullmatch(
         r'LockstepError in test_exploration_output.py:\d+ \(unfinished\)', finding.violation.key
     )
-    assert f'\n  raised at 0.3 s: {expected}\n' in str(finding)
+    assert f'\n  failed at 0.3 s: {expected}\n' in str(finding)
     source = next(finding.directory.glob('test_*.py')).read_text()
     assert source.startswith(f'"""{finding.violation.key}, at 0.3 s.\n\n{expected}\n\n')
 

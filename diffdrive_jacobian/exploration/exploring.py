@@ -96,8 +96,8 @@ def explore(
         search = Search(setting, strategy, seed, worlds, used, time_limit)
         result = search.run(stop_at_first, shrink_worlds, folder)
         complete = not result.stopped
-        if output is not None and result.stopped != 'interrupted':
-            remove_others(Path(output), result.findings)
+        if folder is not None and result.stopped != 'interrupted':
+            remove_others(folder, result.findings)
         return result
     finally:
         if executor is None:

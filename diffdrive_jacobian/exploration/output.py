@@ -104,11 +104,6 @@ def write_finding(
     return replace(finding, directory=folder, notes=tuple(notes))
 
 
-def _is_foreign(folder: Path) -> bool:
-    """Return whether a folder has files, and none of an earlier exploration."""
-    return folder.is_dir() and not (folder / CASE).exists() and any(folder.iterdir())
-
-
 def remove_others(output: Path, findings: Sequence[Finding]) -> None:
     """Remove what an earlier exploration has written, other than what was found again.
 
@@ -140,6 +135,11 @@ def _is_written(test: Path) -> bool:
         return WRITTEN in test.read_text(errors='replace')
     except OSError:
         return False
+
+
+def _is_foreign(folder: Path) -> bool:
+    """Return whether a folder has files, and none of an earlier exploration."""
+    return folder.is_dir() and not (folder / CASE).exists() and any(folder.iterdir())
 
 
 def _remove_earlier(folder: Path) -> None:

@@ -47,7 +47,7 @@ class Finding:
     def __str__(self) -> str:
         """Return a description of a few lines."""
         source = Source()
-        event = 'violated' if self.violation.index >= 0 else 'raised'
+        event = 'violated' if self.violation.index >= 0 else 'failed'
         lines = [
             f'{self.violation.key}',
             f'  {self.count} worlds, the first is number {self.first_world}; '
