@@ -14,7 +14,11 @@ def nanoseconds(seconds: float) -> int:
     Args:
         seconds: The duration; finite (s).
     """
-    rounded = round(seconds * NANOSECONDS)
+    try:
+        rounded = round(seconds * NANOSECONDS)
+    except OverflowError:
+        # The product is infinite.
+        rounded = int(seconds) * NANOSECONDS
     return rounded or (seconds > 0.0) - (seconds < 0.0)
 
 

@@ -4,6 +4,8 @@ per test that no other test can hear, and waiting for conditions instead of slee
 from __future__ import annotations
 
 import os
+import signal
+import sys
 import time
 
 # Before rclpy is loaded: nobody outside a test's context hears it, messages check their fields'
@@ -16,17 +18,18 @@ import pytest
 
 pytest_plugins = ['pytester']
 
+# What the tests start must not ignore these, also if a shell started the tests in the background or with
+# nohup. They themselves go on ignoring them.
+for number in (signal.SIGHUP, signal.SIGINT):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, lambda *_: None)
+
 LONGEST_FIRST = (
-    *(
-        'test_pages',
-        'test_recover_crash',
-        'test_processes',
-        'test_replay_run',
-        'test_tools',
-        'test_salvage',
-    ),
-    *('test_record_run', 'test_live_browser', 'test_secondary_tracking', 'test_fixtures', 'test_flood'),
-    *('test_own_controllers', 'test_se2', 'test_recording', 'test_calibrate_run', 'test_calibration'),
+    *('test_pages', 'test_explored_nodes', 'test_forked', 'test_salvage', 'test_processes'),
+    *('test_replay_run', 'test_recover_crash', 'test_calibrate_run', 'test_exploration'),
+    *('test_external', 'test_own_controllers', 'test_fixtures', 'test_se2', 'test_process_faults'),
+    *('test_record_run', 'test_recording', 'test_live_browser', 'test_secondary_tracking'),
+    *('test_flood', 'test_calibration', 'test_faults_same', 'test_tools'),
 )
 """Files with tests that take seconds. They start first, so that none is left for the end."""
 CHUNK = 4
@@ -146,6 +149,16 @@ def ros(request):
         harness = Harness(context, executor)
         yield harness
         harness.close()
+
+
+@pytest.fixture
+def no_display(monkeypatch):
+    """Ask matplotlib for a window, where there is none. `matplotlib.pyplot`, which obeys, is absent."""
+    monkeypatch.delenv('DISPLAY', raising=False)
+    monkeypatch.setenv('MPLBACKEND', 'tkagg')
+    # Another test may have imported it. `from matplotlib import pyplot` reads the attribute.
+    monkeypatch.delattr('matplotlib.pyplot', raising=False)
+    monkeypatch.setitem(sys.modules, 'matplotlib.pyplot', None)
 
 
 @pytest.fixture

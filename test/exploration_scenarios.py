@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import sys
 import uuid
 from itertools import count
 
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import Twist, Vector3
 from rclpy.node import Node
+
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 
 PERIOD = 0.1
 TIMEOUT = None
@@ -94,16 +97,37 @@ def identified(world, case):
     raise ValueError('always')
 
 
+def robot(world, case):
+    """Command a robot to go faster and faster."""
+    world.create(VirtualRobot)
+    world.create(Follower)
+    world.run_for(0.5)
+
+
 def deadly(world, case):
     """End the process."""
     if case['speed'] == 2.0:
         os._exit(3)
 
 
+def reading(world, case):
+    """Read the standard input to its end."""
+    assert sys.stdin.read() == ''
+
+
+def crowded(world, case):
+    """Fail in a process that has run a world before."""
+    assert next(_calls) == 0
+
+
+def moving(world, case):
+    """Change the working directory, and fail."""
+    os.chdir('/')
+    raise ValueError('moved')
+
+
 def loaded(world, case):
     """Fail if a process that only runs worlds has imported what it does not need."""
-    import sys
-
     import diffdrive_jacobian.testing
 
     assert diffdrive_jacobian.testing.Lockstep is type(world)

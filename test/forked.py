@@ -176,8 +176,9 @@ def _import(name: str) -> None:
     if name != PACKAGE:
         return
     for each in pkgutil.walk_packages(module.__path__, f'{name}.'):
-        # The fixtures of pytest are not part of any program.
-        if not each.name.startswith(f'{name}.testing'):
+        # What tests use is not part of any program: pytest warns of plugins, as that of Hypothesis,
+        # that were imported before it.
+        if not each.name.startswith((f'{name}.testing', f'{name}.exploration')):
             importlib.import_module(each.name)
     from rclpy.type_support import check_for_type_support
 

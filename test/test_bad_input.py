@@ -20,6 +20,7 @@ WHEELS = {'r': 0.033, 'L': 0.16}
 LIMITS = VelocityLimits(min_v=-0.1, max_v=0.22, min_omega=-2.0, max_omega=2.0, max_wheel_speed=10.0)
 MODEL = RobotModel(limits=LIMITS, command_timeout=10**9)
 ROBOT = Robot(model=MODEL, stamp=0, pose=np.array(POSE)).commanded(TWIST, 0)
+DRIFTING = Robot(model=dataclasses.replace(MODEL, drift=Drift(seed=3)), stamp=0, pose=np.array(POSE))
 COVARIANCE = np.diag([1e-4, 1e-4, 1e-3])
 LINE = StraightLine([0.0, 0.0], [1.0, 0.0], 0.1)
 WAYPOINTS = Waypoints([[1.0, 0.0, 0.0], [1.0, 1.0, 2.0]])
@@ -103,6 +104,8 @@ OTHERS = {
     ROBOT.at: {'stamp': 5},
     ROBOT.commanded: {'command': TWIST, 'stamp': 5},
     ROBOT.placed: {'pose': POSE, 'covariance': COVARIANCE, 'stamp': 5},
+    ROBOT.reported: {'pose': POSE, 'wheel_angles': TWIST, 'twist': TWIST},
+    DRIFTING.pushed: {'displacement': POSE, 'stamp': 5},
     ROBOT.remodelled: {'model': MODEL, 'stamp': 5},
     ROBOT.restarted: {'stamp': 5},
     ROBOT.twist_covariance: {'interval': 0.02},

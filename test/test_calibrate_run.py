@@ -405,8 +405,8 @@ def test_too_short_and_no_bag(folder, capsys):
     refuses(capsys, 2, 'each bag can be given once')
 
 
-def test_the_figure_needs_no_display(monkeypatch):
-    monkeypatch.delenv('DISPLAY', raising=False)
+@pytest.mark.usefixtures('no_display')
+def test_the_figure_needs_no_display():
     assert calibration_figure.draw(calibrate([RECORDING], NOMINAL), 'svg').startswith(b'<?xml')
 
 

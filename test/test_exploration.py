@@ -11,8 +11,9 @@ from pathlib import Path
 
 import exploration_scenarios as scenarios
 import pytest
-from exploration_scenarios import changing, divide, follow, identified
+from exploration_scenarios import changing, divide, follow, identified, moving
 from hypothesis import strategies as st
+from inner_sessions import run_in_process
 
 from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.exploration import (
@@ -21,6 +22,7 @@ from diffdrive_jacobian.exploration import (
     explore,
     fault_schedules,
     numbers,
+    search,
 )
 from diffdrive_jacobian.exploration.result import described_replay
 from diffdrive_jacobian.faults import Delay, Loss
@@ -111,7 +113,7 @@ def test_the_written_test_reproduces_it_until_the_controller_is_mended(found, py
     )
     assert checked.returncode == 0, checked.stdout
     options = ('-p', 'no:cacheprovider', '-p', 'no:xdist', file)
-    result = pytester.runpytest_inprocess(*options)
+    result = run_in_process(pytester, *options)
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(
         [
@@ -120,16 +122,20 @@ def test_the_written_test_reproduces_it_until_the_controller_is_mended(found, py
         ]
     )
     monkeypatch.setattr(scenarios, 'TIMEOUT', 0.5)
-    pytester.runpytest_inprocess(*options).assert_outcomes(passed=1)
+    run_in_process(pytester, *options).assert_outcomes(passed=1)
 
 
 def test_another_exploration_replaces_what_was_written(found):
     folder = found.findings[0].directory
     before = (folder / 'counterexample.json').read_text()
     (folder / 'notes.txt').write_text('mine')
+    # The process of a recording had ended.
+    (folder / 'run.journal').touch()
     serial(follow, [SLOW], faults=LOSSES, worlds=12, seed=1, shrink_worlds=0, output=folder.parent)
     assert (folder / 'counterexample.json').read_text() != before
     assert (folder / 'notes.txt').read_text() == 'mine'
+    assert (folder / 'run' / 'run.mcap').exists()
+    assert not (folder / 'run.journal').exists()
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
 
 
@@ -198,6 +204,40 @@ def test_a_time_limit_is_only_a_stop():
     assert found.stopped == 'time limit of 1e-09 s'
 
 
+class Stuck(SerialExecutor):
+    """Starts worlds that do not end, from a call on."""
+
+    def __init__(self, at):
+        self.left = at
+
+    def submit(self, fn, /, *args, **kwargs):
+        self.left -= 1
+        return Future() if self.left < 0 else super().submit(fn, *args, **kwargs)
+
+
+@pytest.mark.parametrize('at', [3, 5])
+def test_a_world_that_does_not_end_is_given_up(tmp_path, monkeypatch, at):
+    """In the fourth task of worlds, and while shrinking."""
+    monkeypatch.setattr(search, 'GRACE', 0.0)
+    arguments = {'cases': st.integers(50, 70), 'worlds': 21, 'output': tmp_path}
+    found = explore(failing, executor=Stuck(at), time_limit=1.0, **arguments)
+    assert 'a world still ran' in found.stopped
+    (finding,) = found.findings
+    assert not finding.complete
+
+
+def test_files_of_others_stay(tmp_path, monkeypatch):
+    """Those in a folder of the same name. A relative output stays where it was, too."""
+    precious = tmp_path / 'found' / 'NoExceptionValueError' / 'run' / 'precious'
+    precious.parent.mkdir(parents=True)
+    precious.touch()
+    monkeypatch.chdir(tmp_path)
+    found = serial(moving, worlds=1, output='found')
+    assert precious.exists()
+    assert found.findings[0].directory == tmp_path / 'found' / 'NoExceptionValueError_2'
+    assert (found.findings[0].directory / 'run').is_dir()
+
+
 class Interrupted(SerialExecutor):
     """Presses Ctrl-C at a call."""
 
@@ -247,6 +287,9 @@ def test_a_limit_of_shrinking_is_reported():
         ({'properties': [NeverFasterThan]}, r'create one: NeverFasterThan\(...\)'),
         ({'properties': ['fast']}, "instances of Property, got 'fast'"),
         ({'properties': [SLOW, SLOW]}, 'given once'),
+        ({'properties': None}, 'properties must be a list, got None'),
+        ({'time_limit': '1'}, "time_limit must be positive, got '1'"),
+        ({'faults': st.just(Loss('odom'))}, r"lists of faults; it gave Loss\('odom'\)"),
         ({'worlds': 0}, 'worlds must be an integer of at least 1, got 0'),
         ({'seed': -1}, 'seed'),
         ({'shrink_worlds': 1.5}, 'shrink_worlds'),
@@ -264,11 +307,6 @@ def test_mistakes_are_named(arguments, words):
     arguments = {'scenario': nothing, 'worlds': 1, **arguments}
     with pytest.raises(ExplorationError, match=words):
         explore(**{'executor': SerialExecutor(), **arguments})
-
-
-def test_a_fault_without_effect_is_noted():
-    found = serial(follow, faults=fault_schedules(['typo'], kinds=[Loss]), worlds=4)
-    assert re.search(r'note: in \d worlds: .*typo', str(found))
 
 
 def test_where_a_replay_differs():

@@ -10,12 +10,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exploration_scenarios import deadly, follow, loaded
+from exploration_scenarios import crowded, deadly, follow, loaded, reading
 from hypothesis import strategies as st
 
 from diffdrive_jacobian.control import find_controller
 from diffdrive_jacobian.exploration import LocalExecutor, SerialExecutor, explore, fault_schedules
 from diffdrive_jacobian.exploration.child import call_in_child
+from diffdrive_jacobian.exploration.replay import replay
+from diffdrive_jacobian.exploration.trial import Outcome
 from diffdrive_jacobian.faults import Loss
 from diffdrive_jacobian.properties import NeverFasterThan
 from diffdrive_jacobian.sweeps import Setup, Sweep, sweep
@@ -80,12 +82,28 @@ def test_processes_of_worlds_import_little(local):
     assert not found.findings, str(found)
 
 
-def test_a_process_that_dies_is_a_finding(local):
-    died = explore(deadly, cases=CASES, worlds=3, executor=local, shrink_worlds=0)
+def test_a_process_that_dies_is_a_finding(local, tmp_path, monkeypatch):
+    died = explore(deadly, cases=CASES, worlds=3, executor=local, shrink_worlds=0, output=tmp_path)
     (finding,) = died.findings
     assert finding.trial.case == {'speed': 2.0}
     assert finding.count == 1
     assert re.search('process of the world ended with exit code 3', str(finding))
+    assert 'not recorded: the process of the world ended with exit code 3' in str(finding)
+    assert (finding.directory / 'counterexample.json').exists()
+    monkeypatch.setattr(sys.modules[replay.__module__], 'run_world_afresh', lambda _: [Outcome()])
+    # Not in this process.
+    assert not died.replay().same_verdict
+
+
+def test_a_scenario_that_reads_its_input_gets_none(local):
+    found = explore(reading, worlds=1, executor=local)
+    assert not found.findings, str(found)
+
+
+def test_what_depends_on_earlier_worlds_is_not_deterministic(local):
+    found = explore(crowded, cases=CASES, worlds=3, executor=local, shrink_worlds=0)
+    (finding,) = found.findings
+    assert not finding.deterministic
 
 
 CASES = st.fixed_dictionaries({'speed': st.sampled_from([0.0, 1.0, 2.0])})

@@ -140,6 +140,7 @@ def test_corruption_and_faults_of_the_robot(schedule):
     [
         ({}, 'needs topics, nodes'),
         ({'fields': {'odom': 'x'}}, 'odom must be a list'),
+        ({'fields': ['odom']}, r"fields must be a dict .* got \['odom'\]"),
         ({'topics': 'odom'}, 'a list of names'),
         ({'topics': ['odom'], 'max_faults': 0}, 'max_faults'),
         ({'topics': ['odom'], 'duration': math.inf}, 'duration'),
@@ -262,7 +263,10 @@ def test_scenarios_are_found_by_name(tmp_path):
     # Also when another module has the name already.
     (tmp_path / 'json.py').write_text('def drive(world, case):\n    return "own"\n')
     assert scenario_from(tmp_path, 'json', 'drive')(None, None) == 'own'
-    with pytest.raises(ExplorationError, match='drive of module nowhere cannot be imported from'):
+    with pytest.raises(
+        ExplorationError,
+        match=r'drive of module nowhere cannot be imported from .*, which has no nowhere.py',
+    ):
         scenario_from(tmp_path, 'nowhere', 'drive')
 
 

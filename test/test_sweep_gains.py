@@ -273,15 +273,13 @@ def test_names_that_are_taken_meanwhile_are_not_overwritten(folder, monkeypatch,
     ('ending', 'magic'),
     [('PNG', b'\x89PNG\r\n'), ('svg', b'<?xml'), ('pdf', b'%PDF-')],
 )
-def test_what_is_named_is_what_is_written_without_a_display(folder, capsys, monkeypatch, ending, magic):
-    monkeypatch.delenv('DISPLAY', raising=False)
-    monkeypatch.setenv('MPLBACKEND', 'tkagg')
+@pytest.mark.usefixtures('no_display')
+def test_what_is_named_is_what_is_written_without_a_display(folder, capsys, ending, magic):
     assert run(*QUICK, '-o', f'a.{ending}') == 0
     assert left(folder) == [f'a.{ending}']
     assert Path(f'a.{ending}').read_bytes().startswith(magic)
     assert Path(f'a.{ending}').stat().st_size < 600_000
     assert capsys.readouterr().out.splitlines()[0] == f'a.{ending}'
-    assert 'matplotlib.pyplot' not in sys.modules
 
 
 def test_csv_holds_the_numbers(folder, capsys):

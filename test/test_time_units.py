@@ -27,6 +27,10 @@ def test_only_a_zero_duration_becomes_zero(duration):
     assert nanoseconds(-duration) == -1
 
 
+def test_the_longest_duration_is_finite():
+    assert nanoseconds(1e300) == int(1e300) * NANOSECONDS
+
+
 def test_timestamps_survive_the_round_trip():
     assert nanoseconds(seconds(1_700_000_000 * NANOSECONDS)) == 1_700_000_000 * NANOSECONDS
 

@@ -131,6 +131,25 @@ def call_in_child(function: Any, *args: Any) -> Any:
         raise
 
 
+def call_in_fresh_child(function: Any, *args: Any) -> Any:
+    """Call a function in a new process, which ends afterwards, and return what it returns.
+
+    Raises:
+        ChildDiedError: The process ended.
+        Exception: What the function raises.
+    """
+    children = _children()
+    if children.closed:
+        raise ChildDiedError('the executor was shut down')
+    child = ChildProcess()
+    children.add(child)
+    try:
+        return child.call(function, *args)
+    finally:
+        children.discard(child)
+        child.close()
+
+
 def close_child() -> None:
     """End the process of this thread, if it has one."""
     child = _of_thread.__dict__.pop('child', None)
@@ -170,6 +189,10 @@ def _serve(descriptor: int) -> None:
     importlib.import_module(MODULE).serving = True  # type: ignore[attr-defined]
     requests = os.fdopen(os.dup(0), 'rb')
     answers = os.fdopen(descriptor, 'wb')
+    # A scenario that reads its input must not wait for that of this function.
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.close(nothing)
     # What nodes print must not mix with what the program prints about them.
     os.dup2(2, 1)
     while True:
@@ -182,7 +205,11 @@ def _serve(descriptor: int) -> None:
             answer = pickle.dumps((False, function(*args)))
         except Exception as error:
             answer = pickle.dumps((True, _picklable(error)))
-        _send(answers, answer)
+        try:
+            _send(answers, answer)
+        except BrokenPipeError:
+            # The process that asked is gone. The interpreter would complain that it cannot flush.
+            os._exit(0)
 
 
 def _picklable(error: Exception) -> Exception:

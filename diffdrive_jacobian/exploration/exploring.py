@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from diffdrive_jacobian.exploration import child
 from diffdrive_jacobian.exploration.errors import ExplorationError
 from diffdrive_jacobian.exploration.executors import LocalExecutor
 from diffdrive_jacobian.exploration.generation import st, trials
-from diffdrive_jacobian.exploration.output import check_output
+from diffdrive_jacobian.exploration.output import check_output, remove_others
 from diffdrive_jacobian.exploration.result import Exploration
 from diffdrive_jacobian.exploration.scenario import Scenario, ScenarioName
 from diffdrive_jacobian.exploration.search import Search
@@ -52,13 +52,14 @@ def explore(
         seed: Seed of everything that is random.
         stop_at_first: Whether to stop at the first block of worlds (50) with a violation.
         time_limit: Wall time after which no more worlds are started (s); None: no limit. The result then
-            depends on the speed of the machine.
+            depends on the speed of the machine. Worlds that still run 30 s later are given up.
         shrink_worlds: Largest number of worlds that are run to shrink one violation.
         args: ROS arguments of all nodes, as for `Lockstep`.
         executor: Runs the worlds; None: all cores of this machine. Any Executor of `concurrent.futures`
             serves, also `Client.get_executor()` of Dask.
         output: Folder for what was found: for each violation the case, a test that reproduces it, a bag
-            and a picture. None: nothing is written.
+            and a picture. What an earlier exploration has written there is removed, except after Ctrl-C.
+            None: nothing is written.
 
     Returns:
         The result. After Ctrl-C it has what was found so far.
@@ -78,10 +79,12 @@ def explore(
     _check_number('worlds', worlds, 1)
     _check_number('shrink_worlds', shrink_worlds, 0)
     _check_number('seed', seed, 0)
-    if time_limit is not None and not time_limit > 0.0:
+    if time_limit is not None and not (_is_number(time_limit) and time_limit > 0.0):
         raise ExplorationError(f'time_limit must be positive, got {time_limit!r}')
-    if output is not None:
-        check_output(Path(output))
+    # A scenario may change the working directory.
+    folder = None if output is None else Path(output).absolute()
+    if folder is not None:
+        check_output(folder)
     strategy = trials(_case_strategy(cases), _fault_strategy(faults))
     if executor is not None and not callable(getattr(executor, 'submit', None)):
         raise ExplorationError(
@@ -91,8 +94,10 @@ def explore(
     complete = False
     try:
         search = Search(setting, strategy, seed, worlds, used, time_limit)
-        result = search.run(stop_at_first, shrink_worlds, None if output is None else Path(output))
+        result = search.run(stop_at_first, shrink_worlds, folder)
         complete = not result.stopped
+        if output is not None and result.stopped != 'interrupted':
+            remove_others(Path(output), result.findings)
         return result
     finally:
         if executor is None:
@@ -102,6 +107,8 @@ def explore(
 def _checked_properties(properties: Any) -> tuple[Property, ...]:
     if isinstance(properties, Property):
         raise ExplorationError(f'properties must be a list: [{properties!r}]')
+    if not isinstance(properties, Iterable):
+        raise ExplorationError(f'properties must be a list, got {properties!r}')
     for one in properties:
         if not isinstance(one, Property):
             hint = '; create one: ' + one.__name__ + '(...)' if isinstance(one, type) else ''
@@ -118,6 +125,10 @@ def _checked_properties(properties: Any) -> tuple[Property, ...]:
 def _check_number(name: str, value: object, least: int) -> None:
     if not isinstance(value, int) or isinstance(value, bool) or value < least:
         raise ExplorationError(f'{name} must be an integer of at least {least}, got {value!r}')
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def _case_strategy(

@@ -38,13 +38,19 @@ def trials(cases: st.SearchStrategy[Any], faults: st.SearchStrategy[Any]) -> st.
 
     @st.composite
     def draw_trial(draw: st.DrawFn) -> Trial:
-        schedule = tuple(draw(faults))
+        schedule = _schedule(draw(faults))
         case = draw(cases)
         # Without faults the seed has no effect.
         seed = draw(st.integers(0, MAX_SEED)) if schedule else 0
         return Trial(case=case, faults=schedule, seed=seed)
 
     return draw_trial()
+
+
+def _schedule(drawn: Any) -> tuple[Any, ...]:
+    if not isinstance(drawn, (list, tuple)):
+        raise ExplorationError(f'faults must be a strategy of lists of faults; it gave {drawn!r}')
+    return tuple(drawn)
 
 
 def generate(strategy: st.SearchStrategy[Trial], seed: int, block: int, count: int) -> list[Trial]:

@@ -7,9 +7,13 @@ import os
 import re
 import shutil
 from collections.abc import Sequence
+from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+from diffdrive_jacobian.bags.journal import JOURNAL
 from diffdrive_jacobian.exploration.child import ChildDiedError, call_in_child
 from diffdrive_jacobian.exploration.errors import ExplorationError
 from diffdrive_jacobian.exploration.recorded_world import BAG, PICTURE, record
@@ -20,11 +24,13 @@ from diffdrive_jacobian.exploration.worker import can_run_here
 
 CASE = 'counterexample.json'
 """Name of the file with the case."""
+WRITTEN = 'Found and written by explore'
+"""Words of each test that is written."""
 TEST = '''"""{title}
 
 {description}
 
-Found by explore with seed {seed}; written by it. Passes once the controller is mended.
+{written}(seed={seed}). Passes once the controller is mended.
 """
 
 {imports}
@@ -56,7 +62,12 @@ def check_output(folder: Path) -> None:
 
 
 def write_finding(
-    finding: Finding, output: Path, others: Sequence[Finding], *, seed: int = 0, record_it: bool = True
+    finding: Finding,
+    output: Path,
+    others: Sequence[Finding],
+    *,
+    seed: int = 0,
+    executor: Executor | None = None,
 ) -> Finding:
     """Write a finding into a folder of its own, in the place of one of an earlier exploration.
 
@@ -67,7 +78,8 @@ def write_finding(
         output: Folder of all findings.
         others: Findings that have a folder already.
         seed: Seed of the exploration.
-        record_it: Whether to run the case again and write the bag and the picture.
+        executor: Runs the case again, to write the bag and the picture, on this machine; None: these are
+            not written.
 
     Returns:
         The finding, with its folder.
@@ -75,7 +87,7 @@ def write_finding(
     taken = {other.directory for other in others}
     stem = re.sub(r'\W+', '_', finding.violation.name)
     number, folder = 1, output / stem
-    while folder in taken:
+    while folder in taken or _is_foreign(folder):
         number += 1
         folder = output / f'{stem}_{number}'
     notes = list(finding.notes)
@@ -85,27 +97,70 @@ def write_finding(
         (folder / CASE).write_text(_case(finding, seed))
         name = _snake(folder.name)
         (folder / f'test_{name}.py').write_text(test_source(finding, folder, name, seed))
-        if record_it:
-            notes += _record(finding, folder)
+        if executor is not None:
+            notes += _record(finding, folder, executor)
     except OSError as error:
         notes.append(f'not written: {error}')
     return replace(finding, directory=folder, notes=tuple(notes))
 
 
+def _is_foreign(folder: Path) -> bool:
+    """Return whether a folder has files, and none of an earlier exploration."""
+    return folder.is_dir() and not (folder / CASE).exists() and any(folder.iterdir())
+
+
+def remove_others(output: Path, findings: Sequence[Finding]) -> None:
+    """Remove what an earlier exploration has written, other than what was found again.
+
+    Other files stay, and so do the files of a counterexample that was renamed or copied from elsewhere.
+
+    Args:
+        output: Folder of all findings.
+        findings: What was found now.
+    """
+    kept = {finding.directory.name for finding in findings if finding.directory is not None}
+    for case in output.glob(f'*/{CASE}'):
+        folder = case.parent
+        test = folder / f'test_{_snake(folder.name)}.py'
+        if folder.name in kept or folder.is_symlink() or not _is_written(test):
+            continue
+        with suppress(OSError):
+            # What pytest compiled would keep the folders.
+            for file in (test, *folder.glob(f'__pycache__/{test.stem}.*')):
+                file.unlink()
+            _remove_earlier(folder)
+            for empty in (folder / '__pycache__', folder):
+                if empty.is_dir() and not any(empty.iterdir()):
+                    empty.rmdir()
+
+
+def _is_written(test: Path) -> bool:
+    """Return whether a file is a test that `explore` has written."""
+    try:
+        return WRITTEN in test.read_text(errors='replace')
+    except OSError:
+        return False
+
+
 def _remove_earlier(folder: Path) -> None:
     """Remove what an earlier exploration has written into a folder."""
     shutil.rmtree(folder / BAG, ignore_errors=True)
-    for file in (folder / PICTURE, folder / CASE):
+    # The journal is there if the process of the recording ended.
+    for file in (folder / PICTURE, folder / CASE, folder / (BAG + JOURNAL)):
         file.unlink(missing_ok=True)
 
 
-def _record(finding: Finding, folder: Path) -> list[str]:
+def _record(finding: Finding, folder: Path, executor: Executor) -> list[str]:
     """Record the smallest case. Return notes on what could not be written."""
     arguments = finding.setting, finding.trial, finding.violation.index, str(folder)
     try:
-        return list(record(*arguments) if can_run_here() else call_in_child(record, *arguments))
+        return executor.submit(_record_in_process, *arguments).result()
     except ChildDiedError as error:
         return [f'not recorded: {error}']
+
+
+def _record_in_process(*arguments: Any) -> list[str]:
+    return list(record(*arguments) if can_run_here() else call_in_child(record, *arguments))
 
 
 def _case(finding: Finding, seed: int) -> str:
@@ -160,11 +215,14 @@ def test_source(finding: Finding, folder: Path, name: str, seed: int) -> str:
     loads += [_load(folder, setting.scenario, *one) for one in sorted(local)]
     loads = [line for line in loads if line]
     imports += [f'from {module} import {", ".join(sorted(names[module]))}' for module in sorted(names)]
-    first = violation.text.strip().splitlines()
-    title = f'{violation.key} is violated at {violation.seconds:g} s.'
+    title, description = f'{violation.key}, at {violation.seconds:g} s.', violation.headline
+    if violation.index >= 0:
+        title = f'{violation.key} is violated at {violation.seconds:g} s.'
+        description = '\n'.join(violation.text.strip().splitlines()[:10])
     return TEST.format(
         title=_quoted(title),
-        description=_quoted('\n'.join(first[:10] if violation.index >= 0 else first[-1:])),
+        description=_quoted(description),
+        written=WRITTEN,
         seed=seed,
         imports='\n'.join(imports) + '\n',
         loads='\n'.join(loads),

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from diffdrive_jacobian.exploration.trial import Setting, Trial, run
 from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.plots.fault_marks import ViolationMark
 from diffdrive_jacobian.plots.run_figure import draw
 from diffdrive_jacobian.reading import BagError, read_run
 from diffdrive_jacobian.recording.recorder import Recorder, Selection
@@ -35,14 +36,21 @@ def record(setting: Setting, trial: Trial, only: int, folder: str) -> list[str]:
         try:
             yield
         finally:
+            ended.append(world.now)
             writing.finish()
 
+    ended: list[int] = []
     try:
-        run(setting, trial, only=only, during=recording)
+        outcome = run(setting, trial, only=only, during=recording)
     except (RecordingError, OSError) as error:
         return [f'no bag: {error}']
+    # A violation ends the world.
+    violations = [
+        ViolationMark(ended[0], f'violated: {one.key}' if one.index >= 0 else one.key)
+        for one in outcome.violations[:1]
+    ]
     try:
-        draw([read_run(bag)], Path(folder) / PICTURE)
+        draw([read_run(bag)], Path(folder) / PICTURE, violations=violations)
     except (BagError, ModuleNotFoundError, OSError) as error:
         return [f'no picture: {error}']
     return []

@@ -29,7 +29,7 @@ def reproducing(world: Lockstep, case: Path) -> Iterator[None]:
     with MessageDigest(world) as messages:
         try:
             yield
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             if isinstance(error, PropertyViolation):
                 key, time = repr(error.property), seconds(world)
             else:
@@ -39,5 +39,5 @@ def reproducing(world: Lockstep, case: Path) -> Iterator[None]:
             same = verdict and time == found['seconds'] and messages.value() == found['digest']
             text = described_replay(verdict, same, differences(versions(), found['versions']))
             # As add_note of Python 3.11.
-            error.__notes__ = [*getattr(error, '__notes__', []), text]  # type: ignore[attr-defined]
+            error.__notes__ = [*getattr(error, '__notes__', []), text]  # type: ignore[union-attr]
             raise

@@ -9,6 +9,9 @@ from diffdrive_jacobian.exploration.source import Source
 from diffdrive_jacobian.exploration.trial import Setting, Trial, Violation
 from diffdrive_jacobian.exploration.versions import differences, versions
 
+NOTED = 10
+"""Number of notes that are printed."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
@@ -44,13 +47,13 @@ class Finding:
     def __str__(self) -> str:
         """Return a description of a few lines."""
         source = Source()
-        first = self.violation.text.strip().splitlines()[-1 if self.violation.index < 0 else 0]
+        event = 'violated' if self.violation.index >= 0 else 'raised'
         lines = [
             f'{self.violation.key}',
             f'  {self.count} worlds, the first is number {self.first_world}; '
             f'smallest case after {self.shrink_worlds} worlds'
             + ('' if self.complete else ' (not shrunk to the end)'),
-            f'  violated at {self.violation.seconds:g} s: {first}',
+            f'  {event} at {self.violation.seconds:g} s: {self.violation.headline}',
             f'  case:   {source.expression(self.trial.case)}',
             f'  faults: {source.expression(list(self.trial.faults))}'
             + (f', seed {self.trial.seed}' if self.trial.faults else ''),
@@ -62,7 +65,10 @@ class Finding:
             )
         lines += [f'  {note}' for note in self.notes]
         if self.directory is not None:
-            lines.append(f'  {self.directory}')
+            here = Path.cwd()
+            within = self.directory.is_relative_to(here)
+            shown = self.directory.relative_to(here) if within else self.directory
+            lines.append(f'  {shown}')
         return '\n'.join(lines)
 
 
@@ -154,7 +160,9 @@ class Exploration:
             )
         if self.stopped:
             lines.append(f'stopped: {self.stopped}')
-        lines += [f'note: {note}' for note in self.notes]
+        lines += [f'note: {note}' for note in self.notes[:NOTED]]
+        if len(self.notes) > NOTED:
+            lines.append(f'note: and {len(self.notes) - NOTED} more notes')
         return '\n\n'.join(['\n'.join(lines), *map(str, self.findings)])
 
 

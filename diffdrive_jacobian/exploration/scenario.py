@@ -72,6 +72,8 @@ class ScenarioName:
             return getattr(self._module(), self.name)  # type: ignore[no-any-return]
         except (ImportError, AttributeError) as error:
             where = f' from {self.root}' if self.root else ''
+            if self.root and _file(Path(self.root), self.module) is None:
+                where += f', which has no {self.module.replace(".", "/")}.py'
             raise ExplorationError(
                 f'scenario {self.name} of module {self.module} cannot be imported{where}: {error}'
             ) from error

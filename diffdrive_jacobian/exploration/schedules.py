@@ -139,6 +139,11 @@ def fault_schedules(
     Raises:
         ValueError: An argument is invalid; the message says which, and what is allowed.
     """
+    if fields is not None and not isinstance(fields, Mapping):
+        raise ValueError(
+            "fields must be a dict of lists by topic, such as {'odom': ['pose.pose.position.x']}; "
+            f'got {fields!r}'
+        )
     for name, value in (
         ('topics', topics),
         ('nodes', nodes),

@@ -12,16 +12,24 @@ import time
 from collections import Counter, deque
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
 from diffdrive_jacobian.exploration.errors import ExplorationError
+from diffdrive_jacobian.exploration.executors import LocalExecutor, SerialExecutor
 from diffdrive_jacobian.exploration.generation import generate, shrink, st
 from diffdrive_jacobian.exploration.output import write_finding
 from diffdrive_jacobian.exploration.result import Exploration, Finding
 from diffdrive_jacobian.exploration.shrinking import Fails, key_of
 from diffdrive_jacobian.exploration.trial import Outcome, Setting, Trial, Violation
-from diffdrive_jacobian.exploration.worker import packed, result_of, run_worlds
+from diffdrive_jacobian.exploration.worker import (
+    NotEndedError,
+    packed,
+    result_of,
+    run_world_afresh,
+    run_worlds,
+)
 
 BLOCK = 50
 """Number of trials that Hypothesis generates from one seed."""
@@ -29,6 +37,8 @@ TASK = 5
 """Number of worlds in one task of the executor."""
 IN_FLIGHT = 64
 """Number of tasks that the executor has at a time. Worlds beyond a stop are run in vain."""
+GRACE = 30.0
+"""Wall time after the time limit for worlds that are running (s)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,13 +85,24 @@ class Search:
         try:
             self._explore(stop_at_first)
             found_at = time.monotonic()
-            for key in self._first:
-                finding = self._shrunk(key, shrink_worlds)
-                if output is not None:
-                    finding = write_finding(finding, output, findings, seed=self._seed)
-                findings.append(finding)
+            # What is written is written here, where the folder is.
+            here = isinstance(self._executor, (LocalExecutor, SerialExecutor))
+            with nullcontext(self._executor) if here else LocalExecutor(1) as recorder:
+                for key in self._first:
+                    finding = self._shrunk(key, shrink_worlds)
+                    if output is not None:
+                        finding = write_finding(
+                            finding, output, findings, seed=self._seed, executor=recorder
+                        )
+                    findings.append(finding)
         except KeyboardInterrupt:
             self._stopped = 'interrupted'
+            findings += self._not_shrunk(findings, output)
+        except NotEndedError:
+            self._stopped = (
+                f'time limit of {self._limit:g} s; a world still ran {GRACE:g} s later: does its '
+                'scenario end?'
+            )
             findings += self._not_shrunk(findings, output)
         now = time.monotonic()
         return Exploration(
@@ -95,7 +116,10 @@ class Search:
             faults=self._faults,
             checks=self._checks,
             stopped=self._stopped,
-            notes=tuple(f'in {count} worlds: {text}' for text, count in self._complaints.items()),
+            notes=tuple(
+                f'{text} ({count} of {self._worlds} worlds)'
+                for text, count in self._complaints.most_common()
+            ),
         )
 
     # --- Worlds
@@ -117,7 +141,7 @@ class Search:
                 if not waiting:
                     return
                 task, future = waiting.popleft()
-                for one, outcome in zip(task, result_of(future), strict=True):
+                for one, outcome in zip(task, self._result(future), strict=True):
                     if stop_at_first and self._first and one.block > self._block_of_first():
                         self._stopped = 'after the first block with a violation'
                         return
@@ -165,10 +189,9 @@ class Search:
         self._faults += len(one.trial.faults)
         self._checks += outcome.checks
         self._simulated += outcome.seconds
-        if outcome.complaint:
-            if not one.trial.faults:
-                raise ExplorationError(f'in a world without faults: {outcome.complaint}')
-            self._complaints[outcome.complaint] += 1
+        if outcome.complaints and not one.trial.faults:
+            raise ExplorationError(f'in a world without faults: {outcome.complaints[0]}')
+        self._complaints.update(outcome.complaints)
         self._known.setdefault(one.block, {})[one.key] = outcome
         for violation in outcome.violations:
             self._counts[violation.key] += 1
@@ -194,7 +217,7 @@ class Search:
             lambda worlds: worlds < shrink_worlds and not self._over(),
         )
         smallest = shrink(self._strategy, self._seed, first.block, BLOCK, fails)
-        again = [self._run(smallest, violation.index, digest=True) for _ in range(2)]
+        again = [self._run(smallest, violation.index, digest=True, afresh=one) for one in (False, True)]
         violations = [outcome.of(key) for outcome in again]
         same = violations[0] is not None and (again[0].digest, violations[0]) == (
             again[1].digest,
@@ -216,10 +239,18 @@ class Search:
     def _over(self) -> bool:
         return time.monotonic() >= self._end
 
-    def _run(self, trial: Trial, index: int, *, digest: bool = False) -> Outcome:
+    def _run(self, trial: Trial, index: int, *, digest: bool = False, afresh: bool = False) -> Outcome:
+        """Run a world, in a new process if `afresh`, unless worlds are to run in this thread."""
         data = packed(self._setting, [trial], only=index, digest=digest)
-        (outcome,) = result_of(self._executor.submit(run_worlds, data))
+        afresh = afresh and not isinstance(self._executor, SerialExecutor)
+        (outcome,) = self._result(
+            self._executor.submit(run_world_afresh if afresh else run_worlds, data)
+        )
         return outcome
+
+    def _result(self, future: Future[list[Outcome]]) -> list[Outcome]:
+        left = self._end - time.monotonic()
+        return result_of(future, max(0.0, left) + GRACE if math.isfinite(left) else None)
 
     def _not_shrunk(self, findings: list[Finding], output: Path | None) -> list[Finding]:
         """Return what was found, but not shrunk before Ctrl-C."""
@@ -238,8 +269,6 @@ class Search:
                 complete=False,
             )
             if output is not None:
-                finding = write_finding(
-                    finding, output, [*findings, *rest], seed=self._seed, record_it=False
-                )
+                finding = write_finding(finding, output, [*findings, *rest], seed=self._seed)
             rest.append(finding)
         return rest

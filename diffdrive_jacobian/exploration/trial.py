@@ -16,14 +16,23 @@ import diffdrive_jacobian
 from diffdrive_jacobian.exploration.digest import MessageDigest
 from diffdrive_jacobian.exploration.scenario import ScenarioName
 from diffdrive_jacobian.faults import Fault
-from diffdrive_jacobian.lockstep import Lockstep, LockstepError, PropertyViolation
+from diffdrive_jacobian.lockstep import (
+    IneffectiveFaultsError,
+    Lockstep,
+    LockstepError,
+    PropertyViolation,
+)
 from diffdrive_jacobian.properties import Property, Watch
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 QUIET = ('--disable-rosout-logs', '--disable-stdout-logs', '--disable-external-lib-logs')
 """ROS arguments of explored worlds. Logs of thousands of worlds help nobody, and take time."""
+DIED = 'NoExceptionProcessDied'
+"""Name of the violation of a world that ends its process."""
 LONGEST_TEXT = 20_000
 """Length beyond which the text of a violation is cut (characters)."""
+LONGEST_LINE = 500
+"""Length beyond which the first line of an exception is cut (characters)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +69,13 @@ class Violation:
     """Short name, a valid identifier."""
     index: int = -1
     """Index of the property; -1: an exception."""
+    message: str = ''
+    """Kind and first line of an exception."""
+
+    @property
+    def headline(self) -> str:
+        """The description in one line."""
+        return self.message or self.text.strip().partition('\n')[0]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,8 +90,8 @@ class Outcome:
     """How often faults acted."""
     seconds: float = 0.0
     """Duration in simulated time (s)."""
-    complaint: str = ''
-    """A fault or a property that had nothing to act on or to observe."""
+    complaints: tuple[str, ...] = ()
+    """What faults or a property needed and did not find."""
     digest: str = ''
     """Hash of all messages, if it was asked for."""
 
@@ -90,7 +106,7 @@ class _Found:
 
     violations: list[Violation] = field(default_factory=list)
     checks: int = 0
-    complaint: str = ''
+    complaints: tuple[str, ...] = ()
     stopping: bool = False
     """Whether the world was ended because the violation that was looked for was found."""
 
@@ -192,7 +208,7 @@ def run(
                 checks=found.checks,
                 events=len(world.fault_events),
                 seconds=seconds(world),
-                complaint=found.complaint,
+                complaints=found.complaints,
                 digest='' if messages is None else messages.value(),
             )
 
@@ -228,20 +244,25 @@ def _finish(world: Lockstep, found: _Found) -> None:
     except PropertyViolation:
         if not found.stopping:
             raise
+    except IneffectiveFaultsError as error:
+        found.complaints = tuple(f'a fault had no effect: {reason}' for reason in error.reasons)
     except LockstepError as error:
-        found.complaint = str(error).partition('\n')[0]
+        found.complaints = (str(error).partition('\n')[0],)
 
 
 def of_exception(error: BaseException, world: Lockstep) -> Violation:
     """Return an exception of a node or of the scenario as a violation."""
     kind = type(error).__name__
     place = _place(error.__traceback__)
+    # The last messages of all topics may follow.
+    first = str(error).strip().partition('\n')[0]
     text = ''.join(traceback.format_exception(type(error), error, error.__traceback__))
     return Violation(
-        key=f'no exception: {kind}{place}',
+        key=f'{kind}{place}',
         name=f'NoException{kind}',
         seconds=seconds(world),
         text=text[-LONGEST_TEXT:],
+        message=f'{kind}: {first}'[:LONGEST_LINE] if first else kind,
     )
 
 

@@ -6,13 +6,14 @@ import pickle
 import threading
 from collections.abc import Sequence
 from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
 from typing import Any
 
 import rclpy
 
-from diffdrive_jacobian.exploration.child import ChildDiedError, call_in_child
+from diffdrive_jacobian.exploration.child import ChildDiedError, call_in_child, call_in_fresh_child
 from diffdrive_jacobian.exploration.errors import ExplorationError
-from diffdrive_jacobian.exploration.trial import Outcome, Setting, Trial, Violation, run
+from diffdrive_jacobian.exploration.trial import DIED, Outcome, Setting, Trial, Violation, run
 
 
 def packed(
@@ -58,11 +59,25 @@ def _one_by_one(data: bytes) -> list[Outcome]:
         try:
             outcomes += call_in_child(run_worlds_here, one)
         except ChildDiedError as error:
-            died = Violation(
-                key=f'no exception: {error}', seconds=0.0, text=str(error), name='NoExceptionProcessDied'
-            )
-            outcomes.append(Outcome(violations=(died,)))
+            outcomes.append(_died(error))
     return outcomes
+
+
+def run_world_afresh(data: bytes) -> list[Outcome]:
+    """Run one world in a new process, where no other has left anything behind.
+
+    Args:
+        data: From `packed`, with one trial.
+    """
+    try:
+        return list(call_in_fresh_child(run_worlds_here, data))
+    except ChildDiedError as error:
+        return [_died(error)]
+
+
+def _died(error: ChildDiedError) -> Outcome:
+    died = Violation(key=str(error), seconds=0.0, text=str(error), name=DIED)
+    return Outcome(violations=(died,))
 
 
 def can_run_here() -> bool:
@@ -77,15 +92,26 @@ def run_worlds_here(data: bytes) -> list[Outcome]:
     return [run(setting, trial, only=only, digest=digest) for trial in trials]
 
 
-def result_of(future: Future[list[Outcome]]) -> list[Outcome]:
+class NotEndedError(BaseException):
+    """A task still runs. Not an Exception, which Hypothesis would take for a failure."""
+
+
+def result_of(future: Future[list[Outcome]], timeout: float | None) -> list[Outcome]:
     """Return the result of a task.
+
+    Args:
+        future: The task.
+        timeout: Longest wall time to wait (s); None: no limit.
 
     Raises:
         ExplorationError: The executor failed, or a fault or a property is invalid.
+        NotEndedError: The task still runs after `timeout`.
     """
     try:
-        return future.result()
+        return future.result(timeout)
     except ExplorationError:
         raise
     except Exception as error:
+        if isinstance(error, FutureTimeoutError) and not future.done():
+            raise NotEndedError from None
         raise ExplorationError(f'a world could not be run: {type(error).__name__}: {error}') from error

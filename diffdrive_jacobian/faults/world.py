@@ -16,8 +16,9 @@ from diffdrive_jacobian.time_units import nanoseconds
 class TimeJump(Fault):
     """The clock of all nodes jumps, forward or back, as when a simulator is reset.
 
-    After `duration` it jumps back by as much. It never goes below 1 ns, where it stays if it should go
-    further. rcl determines how timers react: one whose time lies before the new time ticks once.
+    After `duration` it jumps back by as much. The new time is between 1 ns and 2147483647 s, as a
+    stamp can represent, where it stays if it should go further. rcl determines how timers react: one
+    whose time lies before the new time ticks once.
 
     Attributes:
         seconds: Length of the jump (s), negative: back.
@@ -76,6 +77,8 @@ class LateService(Fault):
 @dataclass(frozen=True, repr=False)
 class ParameterChange(NodeFault):
     """Somebody changes a parameter of a node, and changes it back after `duration`.
+
+    If another change of it began meanwhile and still lasts, that one remains until its own end.
 
     The node may refuse the value, which is noted in the events. It is an error if it has no such
     parameter.

@@ -3,7 +3,7 @@
 from diffdrive_jacobian.lockstep import Lockstep, LockstepError
 """
 
-from diffdrive_jacobian.lockstep._errors import LockstepError, PropertyViolation
+from diffdrive_jacobian.lockstep._errors import IneffectiveFaultsError, LockstepError, PropertyViolation
 from diffdrive_jacobian.lockstep._external_answers import Answers, Every, Idle
 from diffdrive_jacobian.lockstep._external_process import ExternalProcess
 from diffdrive_jacobian.lockstep._fault_log import FaultEvent
@@ -16,6 +16,7 @@ __all__ = [
     'ExternalProcess',
     'FaultEvent',
     'Idle',
+    'IneffectiveFaultsError',
     'Injection',
     'Lockstep',
     'LockstepError',

@@ -9,12 +9,14 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 
-from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._errors import IneffectiveFaultsError, LockstepError
 from diffdrive_jacobian.lockstep._fault_log import TOPIC, FaultEvent, FaultLog
 from diffdrive_jacobian.lockstep._injection import Injectable, Injections, check_injectable
 from diffdrive_jacobian.lockstep._injection_base import World, full_name
 from diffdrive_jacobian.lockstep._keeper import Keeper
 from diffdrive_jacobian.lockstep._messaging import Messaging, described
+from diffdrive_jacobian.lockstep._simulated_time import MAX_SECONDS
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 N = TypeVar('N', bound=Node)
 
@@ -135,9 +137,12 @@ class Disturbed(Messaging):
         )
 
     def _shift_clock(self, duration: int) -> int:
-        """Let the clock of the nodes jump by a time (ns). Return by how much it did."""
+        """Let the clock of the nodes jump by a time (ns). Return by how much it did.
+
+        The new time is one that a stamp can represent.
+        """
         before = self._now
-        self._now = max(1, before + duration)
+        self._now = min(max(1, before + duration), MAX_SECONDS * NANOSECONDS)
         self._executor.clocks.set(self._now)
         return self._now - before
 
@@ -166,4 +171,4 @@ class Disturbed(Messaging):
             LockstepError: One did not, for example because the name of its topic is misspelt.
         """
         if self._injections is not None and (ineffective := self._injections.ineffective()):
-            raise LockstepError('faults without effect: ' + '; '.join(ineffective))
+            raise IneffectiveFaultsError(ineffective, self._injections.missing())

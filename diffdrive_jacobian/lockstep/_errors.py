@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 
@@ -10,6 +11,27 @@ class LockstepError(Exception):
 
     The first line of the message describes the error. The last messages of all topics may follow.
     """
+
+
+class IneffectiveFaultsError(LockstepError):
+    """Injected faults met nothing that they could affect."""
+
+    def __init__(self, faults: Sequence[str], reasons: Sequence[str]) -> None:
+        """Describe the faults.
+
+        Args:
+            faults: Each fault with its reason.
+            reasons: Only the reasons, such as `no node /x was seen`.
+        """
+        super().__init__(faults, reasons)
+        self.faults = tuple(faults)
+        """Each fault with its reason."""
+        self.reasons = tuple(dict.fromkeys(reasons))
+        """The different reasons."""
+
+    def __str__(self) -> str:
+        """Return the message."""
+        return 'faults without effect: ' + '; '.join(self.faults)
 
 
 class PropertyViolation(LockstepError):  # noqa: N818

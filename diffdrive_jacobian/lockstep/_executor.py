@@ -135,13 +135,13 @@ class QuiescentExecutor:
     def kill(self, node: Node) -> None:
         """Remove and destroy a node at once. Nothing that was sent to it is processed."""
         self.killed.add(node)
-        self.tasks.cancel(node)
         self._forget(node)
         node.destroy_node()
         self._note_change()
 
     def _forget(self, node: Node) -> None:
         served = self._served.pop(node)
+        self.tasks.cancel(node)
         if self.keeper is not None:
             self.keeper.dismiss(node)
         _release(served)

@@ -8,9 +8,11 @@ import shlex
 import signal
 import socket
 import subprocess
+import threading
 import time
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
@@ -95,7 +97,11 @@ class ExternalProcess:
             name: value for name, value in os.environ.items() if name not in (VARIABLE, *DISCOVERY)
         }
         try:
-            with self._files[0].open('wb') as out, self._files[1].open('wb') as err:
+            with (
+                self._files[0].open('wb') as out,
+                self._files[1].open('wb') as err,
+                _children_receive_sigint(),
+            ):
                 self._process = subprocess.Popen(
                     list(command),
                     stdin=subprocess.DEVNULL,
@@ -184,6 +190,24 @@ class ExternalProcess:
             state = f'{self.command} has exited with {code}'
         printed = (self._printed(1) or self._printed(0)).splitlines()
         return '\n    '.join([state, *printed[-SHOWN_LINES:]])
+
+
+@contextmanager
+def _children_receive_sigint() -> Iterator[None]:
+    """Let processes that are started meanwhile receive SIGINT, which ends them.
+
+    If a shell has started this process in the background, this process ignores SIGINT, and what it
+    starts would, too. A new process has no handlers of this one. Only the main thread can set them.
+    """
+    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    if not ignored or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.signal(signal.SIGINT, lambda *_: None)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def end_all(processes: Sequence[ExternalProcess]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -26,6 +27,16 @@ class Waiting(NamedTuple):
     """Name of the queue."""
     work: Callable[[], Any]
     """Executes it."""
+
+
+@dataclass(eq=False)
+class Change:
+    """A parameter that a fault has changed."""
+
+    node: Any
+    name: str
+    before: Any
+    """Value before the change."""
 
 
 class Gate:
@@ -50,6 +61,8 @@ class Gate:
         """Callbacks that wait, the oldest first."""
         self.lost: Counter[str] = Counter()
         """Number of messages and requests that were lost from full queues, by name."""
+        self.changes: list[Change] = []
+        """Parameters that are changed now, the earliest change first."""
         self.deaths = 0
         """Number of faults because of which the node is not there."""
         self._holds = 0

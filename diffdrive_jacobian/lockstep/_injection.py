@@ -72,6 +72,10 @@ class Injections:
         """Return descriptions of the faults that met nothing that they could affect."""
         return [text for injection in self.all if (text := injection.ineffective())]
 
+    def missing(self) -> list[str]:
+        """Return what these faults needed, as sentences."""
+        return [injection.missing for injection in self.all if injection.missing]
+
     def events(self) -> list[FaultEvent]:
         """Return all events, also of the latest messages, of which there may be more."""
         log = self._world.log

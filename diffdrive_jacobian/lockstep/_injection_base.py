@@ -195,6 +195,11 @@ class InjectionBase:
         if self._missing is not None and self._is_there(self._world.executor.nodes):
             self._missing = None
 
+    @property
+    def missing(self) -> str | None:
+        """What the fault needs and has not met, as a sentence; None: nothing."""
+        return self._missing
+
     def ineffective(self) -> str | None:
         """Return why the fault affects nothing; None: it has met what it could affect."""
         return f'{self.fault!r}: {self._missing}' if self._missing else None

@@ -57,8 +57,9 @@ class Keeper:
         )
 
     def closed(self, node: Node) -> bool:
-        """Return whether no callback of a node is executed."""
-        return self.gate(node).closed
+        """Return whether no callback of a node is executed, which may have been removed."""
+        gate = self._by_node.get(node)
+        return gate is not None and gate.closed
 
     def run(self, node: Node, timer: Timer) -> Any:
         """Call the callback of a timer of a node. Return its result.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from functools import partial
 from typing import Any
 
 from rclpy.exceptions import ParameterUninitializedException
@@ -14,7 +13,7 @@ from rclpy.parameter import Parameter
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._fault_log import in_seconds
-from diffdrive_jacobian.lockstep._gates import Gate, ResponseDelay
+from diffdrive_jacobian.lockstep._gates import Change, Gate, ResponseDelay
 from diffdrive_jacobian.lockstep._injection_base import InjectionBase, full_name
 from diffdrive_jacobian.ros.rclpy_internals import PARAMETERS_OF_RCLPY, declared_parameters
 
@@ -131,9 +130,12 @@ class NodeInjection(InjectionBase):
     # --- Parameters
 
     def change_parameter(self, node: str, name: str, value: Any) -> None:
-        """Change a parameter of a node when the fault begins, and back when it ends."""
+        """Change a parameter of a node when the fault begins, and back when it ends.
+
+        While a later change of it lasts, that one remains, and at its end the value is as before both.
+        """
         gate = self._gate(node)
-        changed: list[tuple[Node, Any]] = []
+        changed: list[Change] = []
         value = list(value) if isinstance(value, tuple) else value
 
         def change() -> None:
@@ -146,12 +148,27 @@ class NodeInjection(InjectionBase):
         def set_value(target: Node) -> None:
             before = self._set(target, name, value)
             if before is not None:
-                changed.append((target, before))
+                changed.append(Change(target, name, before))
+                gate.changes.extend(changed)
 
         def change_back() -> None:
-            for target, before in changed:
-                if target is self._world.find(gate.name):
-                    gate.enter(self, 'parameters', None, partial(self._set, target, name, before))
+            target = self._world.find(gate.name)
+            if target is not None:
+                # A frozen node may not have processed the change yet.
+                gate.enter(self, 'parameters', None, lambda: set_back(target))
+
+        def set_back(target: Node) -> None:
+            for one in changed:
+                later = [
+                    other
+                    for other in gate.changes[gate.changes.index(one) + 1 :]
+                    if (other.node, other.name) == (one.node, name)
+                ]
+                gate.changes.remove(one)
+                if later:
+                    later[0].before = one.before
+                elif one.node is target:
+                    self._set(target, name, one.before)
 
         self.at_start(change)
         self.at_end(change_back)

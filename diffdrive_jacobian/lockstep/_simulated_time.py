@@ -144,15 +144,17 @@ class SimulatedTime:
         Timers do not expire one by one in between. rcl determines how they react to the jump.
 
         Raises:
-            ValueError: `seconds` is zero or not finite, or the new time is not positive.
+            ValueError: `seconds` is zero or not finite, or the new time does not fit into a stamp.
         """
         __tracebackhide__ = True
         if not math.isfinite(seconds) or seconds == 0.0:
             raise ValueError(f'seconds must be finite and not zero, got {seconds!r}')
-        now = self._now + round(seconds * NANOSECONDS)
+        before = self._now / NANOSECONDS
+        now = self._now + round(seconds * NANOSECONDS) if before + seconds <= MAX_SECONDS else 0
         if now <= 0:
             raise ValueError(
-                f'seconds must lead to a time after 0, got {seconds!r} at {self._now / NANOSECONDS:g} s'
+                f'seconds must lead to a time after 0, at most {MAX_SECONDS} s, '
+                f'got {seconds!r} at {before:g} s'
             )
         self.connect()
         self.settle()

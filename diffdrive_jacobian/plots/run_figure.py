@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from diffdrive_jacobian.plots.fault_marks import draw_faults, fault_legend, fault_spans
+from diffdrive_jacobian.plots.fault_marks import ViolationMark, mark_faults
 from diffdrive_jacobian.plots.ground_truth import draw_ground_truth, ground_truth_mark
 from diffdrive_jacobian.plots.output_files import FORMATS, create
 from diffdrive_jacobian.plots.style import DPI, styled
@@ -64,13 +64,20 @@ _ARROW: Any = {
 }
 
 
-def draw(runs: Sequence[Run], path: Path, *, replace: bool = False) -> None:
+def draw(
+    runs: Sequence[Run],
+    path: Path,
+    *,
+    replace: bool = False,
+    violations: Sequence[ViolationMark] = (),
+) -> None:
     """Draw runs into one set of axes, and write the figure to a new file.
 
     Args:
         runs: One or more, with odometry.
         path: Ends in .png, .svg or .pdf.
         replace: Whether to replace the file if it exists.
+        violations: Violated properties of a single run.
 
     Raises:
         BagError: A run has no odometry.
@@ -90,7 +97,7 @@ def draw(runs: Sequence[Run], path: Path, *, replace: bool = False) -> None:
         warnings.filterwarnings('ignore', message='Glyph')
         # With many runs there may be no room for their names.
         warnings.filterwarnings('ignore', message='constrained_layout not applied')
-        figure(runs).savefig(drawn, format=ending, dpi=DPI)
+        figure(runs, violations).savefig(drawn, format=ending, dpi=DPI)
     create(path, drawn.getvalue(), replace=replace)
 
 
@@ -103,7 +110,7 @@ def names(paths: Sequence[Path]) -> list[str]:
     return [os.fsencode('/'.join(one[-count:])).decode(errors='replace') for one in parts]
 
 
-def figure(runs: Sequence[Run]) -> Figure:
+def figure(runs: Sequence[Run], violations: Sequence[ViolationMark] = ()) -> Figure:
     """Return a figure of runs in one set of axes. The plane is the first of its axes.
 
     A single run is drawn with its commands, the changes of its goals, and the uncertainty along its
@@ -144,10 +151,8 @@ def figure(runs: Sequence[Run]) -> Figure:
         below = drawing.add_subplot(grid[-1, :])
         below.axis('off')
         marks = [*_marks(traces), *(uncertainty_marks() if uncertain else [])]
-        faults = fault_spans(traces[0]) if len(runs) == 1 else []
-        draw_faults(panels.values(), faults)
-        if faults:
-            drawing.legend(handles=fault_legend(faults), loc='outside upper right', ncol=2, fontsize=8.0)
+        if len(runs) == 1:
+            mark_faults(drawing, list(panels.values()), traces[0], violations)
         if any(len(run.ground_truth) for run in runs):
             marks.append(ground_truth_mark(*([GREY] if len(runs) > 1 else [])))
         below.legend(handles=marks, loc='center', ncol=4 if uncertain else 6, borderaxespad=0.0)

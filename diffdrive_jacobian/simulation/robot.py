@@ -39,7 +39,7 @@ from diffdrive_jacobian.kinematics._checks import (
     positive,
     read_only,
 )
-from diffdrive_jacobian.kinematics._elementary import operand
+from diffdrive_jacobian.kinematics._elementary import components, operand
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
 from diffdrive_jacobian.kinematics.se2 import compose
 from diffdrive_jacobian.simulation._uncertainty import Uncertainty
@@ -293,8 +293,13 @@ class Robot:
             pose: `(x, y, theta)` of the odometry, finite (m, m, rad).
             wheel_angles: `(right, left)`, finite (rad).
             twist: `(v, omega)`, finite (m/s, rad/s).
+
+        Raises:
+            ValueError: An argument has another shape or is not finite.
         """
-        state = pose, wheel_angles, self._uncertainty, self._truth
+        reported, angles = _triple('pose', pose), pair('wheel_angles', wheel_angles)
+        twist = pair('twist', twist)
+        state = reported, angles, self._uncertainty, self._truth
         return _robot(self.model, self.stamp, state, self.command, twist, self.commanded_at)
 
     def pushed(self, displacement: ArrayLike, stamp: int, *, noticed: bool = False) -> Robot:
@@ -310,6 +315,7 @@ class Robot:
             ValueError: The displacement has another shape or is not finite, the pose overflows, the
                 model has no drift; or as `at`.
         """
+        displacement = _triple('displacement', displacement)
         here = self.at(stamp)
         if here.model.drift is None and not noticed:
             raise ValueError('model must have a drift: without one the odometry is the true pose')
@@ -500,6 +506,18 @@ def _robot(
     _set(robot, '_settling', settling)
     _set(robot, '_ahead', None)
     return robot
+
+
+def _triple(name: str, value: ArrayLike) -> tuple[float, float, float]:
+    """Return three finite numbers as a tuple of floats.
+
+    Raises:
+        ValueError: It is something else.
+    """
+    x, y, theta = components(name, value, 3)
+    if type(x) is not float:
+        raise ValueError(f'{name} must have shape (3,), got {np.shape(value)}')
+    return x, y, theta
 
 
 def _truth(model: RobotModel, pose: Sequence[float]) -> Truth | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import random
+import select
 import signal
 import tempfile
 import time
@@ -118,11 +119,16 @@ class Ending:
         self.cpu = after_used - used
 
     def _ended_before(self, deadline: float) -> bool:
-        while time.monotonic() < deadline:
-            # It stays a zombie, of which Linux still has the times.
-            if os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None:
-                return True
-            self._meanwhile()
+        # Nobody waits for it: it stays a zombie, of which Linux still has the times.
+        process, ended = os.pidfd_open(self.pid), select.poll()
+        ended.register(process, select.POLLIN)
+        try:
+            while time.monotonic() < deadline:
+                if ended.poll(0):
+                    return True
+                self._meanwhile()
+        finally:
+            os.close(process)
         return False
 
     def _scheduled(self) -> tuple[float, float]:
@@ -139,8 +145,12 @@ class Ending:
 class Campaign:
     """Ends programs in a world, one after the other."""
 
-    def __init__(self, world: World, folder: Path, bag: Path, chance: random.Random) -> None:
+    def __init__(
+        self, world: World, folder: Path, bag: Path, chance: random.Random, *, fresh: bool = False
+    ) -> None:
+        """Take a world. With `fresh`, programs are new interpreters, which import everything."""
         self.world, self.folder, self.bag, self.chance = world, folder, bag, chance
+        self.fresh = fresh
         self.number = 0
         self.start_up: dict[str, float] = {}
         self.harness = world.harness
@@ -166,7 +176,7 @@ class Campaign:
         slow = mode == 'callback' and program.ready == 'subscribed to'
         source = SLOW_CALLBACKS.strip() + '\n' + processes.PROGRAM if slow else processes.PROGRAM
         with mock.patch.object(processes, 'PROGRAM', source):
-            child = self.world.start(program.name, *arguments)
+            child = self.world.start(program.name, *arguments, fresh=self.fresh)
         ending = Ending(child, lambda: traffic.spin(mode == 'busy'))
         if mode == 'start-up' or not program.ready:
             until = begun + self.chance.uniform(0.0, self.start_up.get(program.name, 1.0))
@@ -329,7 +339,8 @@ def run(count: int, seed: int = 0, programs: tuple[str, ...] = ()) -> Outcome:
                 stack.close()
                 place = folder / f'world{index}'
                 place.mkdir()
-                campaign = Campaign(stack.enter_context(quiet_world(place)), place, bag, chance)
+                made = stack.enter_context(quiet_world(place))
+                campaign = Campaign(made, place, bag, chance, fresh=True)
             try:
                 found, ending = campaign.end(program, mode)
             except AssertionError as error:
