@@ -16,8 +16,9 @@ a block say what differs:
     <!-- test: edit FILE, WORDS -->      replaces the one line of the file that has these words
     <!-- output -->                      is all that the block before printed; `...` stands for lines
     <!-- output: part -->                its lines are in what the block before printed, in this order
+    <!-- output: part, exact -->         the same, with equal numbers (also without `part`)
 
-Numbers in outputs may differ.
+Numbers in other outputs may differ.
 """
 
 from __future__ import annotations
@@ -238,18 +239,24 @@ def is_run(block: Block) -> bool:
 
 def masked(line: str) -> str:
     """Return a line without what may differ from run to run: numbers and the width of spaces."""
-    return ' '.join(re.sub(r'-?\d+(\.\d+)?(e[-+]?\d+)?', '#', line).split())
+    return spaced(re.sub(r'-?\d+(\.\d+)?(e[-+]?\d+)?', '#', line))
+
+
+def spaced(line: str) -> str:
+    """Return a line with single spaces."""
+    return ' '.join(line.split())
 
 
 def check_output(quoted: Block, printed: str) -> None:
     """Compare a quoted output with the real one.
 
     Raises:
-        AssertionError: They differ in more than numbers.
+        AssertionError: They differ in more than numbers, or at all if the quotation is exact.
     """
-    real = [masked(line) for line in printed.strip().splitlines()]
-    lines = [masked(line) for line in quoted.code.strip().splitlines()]
-    if quoted.notes['output'] == 'part':
+    compared = spaced if 'exact' in quoted.notes['output'] else masked
+    real = [compared(line) for line in printed.strip().splitlines()]
+    lines = [compared(line) for line in quoted.code.strip().splitlines()]
+    if 'part' in quoted.notes['output']:
         rest = iter(real)
         for line in lines:
             assert line in rest, (
@@ -269,7 +276,7 @@ def refreshed(quoted: Block, printed: str) -> str:
     A part stays as it is; if it is out of date, that is reported.
     """
     lines, real = quoted.code.splitlines(), printed.strip().splitlines()
-    if quoted.notes['output'] == 'part':
+    if 'part' in quoted.notes['output']:
         try:
             check_output(quoted, printed)
         except AssertionError as error:

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
+from geometry_msgs.msg import Twist, Vector3
 from std_msgs.msg import String
 from test_plot_run import sample
 from test_reading import SECOND, write_bag
 
+from diffdrive_jacobian.faults import Push, TimeJump
 from diffdrive_jacobian.plots.fault_marks import NAMED, fault_spans
 from diffdrive_jacobian.plots.run_figure import figure
 from diffdrive_jacobian.reading.reader import read_run
+from diffdrive_jacobian.reading.time_series import commanded, measured
 from diffdrive_jacobian.reading.trace import trace
+from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
 
 def event(at, fault, what):
@@ -68,3 +73,28 @@ def test_other_messages_on_the_topic_are_noted(tmp_path, data):
     assert run.fault_events == ()
     assert 'hold invalid' in run.notes[0]
     assert labels(figure([run])) == []
+
+
+def test_lines_are_broken_where_time_goes_back_and_a_push_is_a_line(lockstep, robot_at, tmp_path):
+    robot_at(cmd_vel_timeout=0.0)
+    recorded = RecordedRun(lockstep, tmp_path)
+    push, jump = Push(0.1, start=0.2), TimeJump(-0.3, start=0.5)
+    lockstep.inject(push, jump)
+    for _ in range(8):
+        lockstep.publish('cmd_vel', Twist(linear=Vector3(x=0.1)))
+        lockstep.run_for(0.1)
+    run = read_run(recorded.finish())
+    one = trace(run)
+    # Recorded in the order in which it happened.
+    assert len(one.breaks) == 1
+    (back,) = one.breaks
+    assert one.time[back] < one.time[back - 1] - 0.25
+    assert (np.diff(run.odometry.received) > 0).all()
+    for lines in (measured(one, 'v'), measured(one, 'left'), commanded(one, 'v')):
+        gaps = np.flatnonzero(np.isnan(lines[:, 0]))
+        assert len(gaps)
+        assert not (np.diff(lines[:, 0]) < 0.0).any(), 'a line leads back in time'
+    spans = {span.fault: span for span in fault_spans(one)}
+    # The axis begins with the first odometry.
+    assert spans[repr(push)][1:] == pytest.approx((0.18, 0.18))
+    assert spans[repr(jump)].end > spans[repr(jump)].begin

@@ -51,6 +51,19 @@ def test_code_runs_and_prints_what_the_page_quotes(tmp_path, name):
         check_output(quoted, printed)
 
 
+@pytest.mark.parametrize('part', ['', 'part, '])
+def test_numbers_are_compared_in_exact_quotations_only(part):
+    (loose, exact) = blocks(
+        f'<!-- output: {part} -->\n```text\nat 1 s  x\n```\n'
+        f'<!-- output: {part}exact -->\n```text\nat 1 s  x\n```\n'
+    )
+    for quoted in (loose, exact):
+        check_output(quoted, 'at 1 s x')
+    check_output(loose, 'at 1.02 s x')
+    with pytest.raises(AssertionError):
+        check_output(exact, 'at 1.02 s x')
+
+
 def test_few_blocks_are_not_run():
     skipped = [block for text in TEXTS.values() for block in blocks(text) if 'skip' in block.notes]
     assert all(block.notes['skip'] for block in skipped)

@@ -104,8 +104,7 @@ class Hits:
         self._note = note
         self._number = 0
         self.counts: Counter[str] = Counter()
-        """Number of messages `during` the fault, of those that it affected (`hit`), and of later ones
-        that wait `behind` them."""
+        """Messages `during` the fault, those that it `hit`, and later ones `behind` them."""
         # Of the messages that are not noted yet: what happened, first and last number, and time.
         self._kind = ''
         self._first = self._last = self._since = self._until = 0

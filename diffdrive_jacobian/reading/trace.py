@@ -115,9 +115,20 @@ def _breaks(run: Run) -> Indices:
     stamps, values = run.odometry.stamps, run.odometry.values
     reset = np.zeros(len(stamps) - 1, dtype=np.bool_)
     reset[jumps(run.odometry) - 1] = True
-    for stamp, pose in zip(run.start_pose.stamps, run.start_pose.values, strict=True):
-        first = int(np.searchsorted(stamps, stamp))
-        if first < len(stamps) and stamps[first] == stamp:
+    received, starts = run.odometry.received, run.start_pose
+    # Time goes back before these messages. Between them stamps do not decrease.
+    back = np.flatnonzero(np.diff(stamps) < 0) + 1
+    edges = [0, *back.tolist(), len(stamps)]
+    passes = np.searchsorted(received[back - 1], starts.received).tolist()
+    for which, at, stamp, pose in zip(
+        passes, starts.received, starts.stamps, starts.values, strict=True
+    ):
+        begin, end = edges[which], edges[which + 1]
+        if which and at < received[begin] and stamp >= stamps[begin - 1]:
+            # It was published before time went back.
+            begin, end = edges[which - 1], begin
+        first = begin + int(np.searchsorted(stamps[begin:end], stamp))
+        if first < end and stamps[first] == stamp:
             # A message with the same stamp may be from before the reset.
             first += not np.allclose(values[first, :2], pose[:2], rtol=0.0, atol=1e-9)
         if 0 < first < len(stamps):
