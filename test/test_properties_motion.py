@@ -14,7 +14,16 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from std_srvs.srv import Trigger
 
-from diffdrive_jacobian.faults import ClockPause, Delay, Duplicate, Hang, Kill, Loss, TimeJump
+from diffdrive_jacobian.faults import (
+    ActuatorLag,
+    ClockPause,
+    Delay,
+    Duplicate,
+    Hang,
+    Kill,
+    Loss,
+    TimeJump,
+)
 from diffdrive_jacobian.lockstep import LockstepError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.properties import (
@@ -51,6 +60,25 @@ def test_stops_after_lost_odometry(lockstep, robot_at, timeout, within):
     assert raised.value.text.startswith('the last command of /student is v 0.2 m/s, omega 0 rad/s, 0.')
     assert f'received its last message on /odom; allowed: {within:g} s' in raised.value.text
     assert abs(raised.value.seconds - 1.0 - within) < 0.021
+
+
+def test_a_jump_after_a_pause_is_no_time_that_has_passed(lockstep, robot_at):
+    """At the time of the jump the clock has advanced by as much as world time since the pause began."""
+    lockstep.require(StopsAfterLostOdometry(0.3))
+    robot_at()
+    lockstep.add(Student(timeout=0.3))
+    lockstep.inject(ClockPause(start=1.0, duration=1.0), TimeJump(1.0, start=2.0))
+    lockstep.run_for(3.0)
+    lockstep.finish()
+
+
+def test_motors_that_lag_roll_on(lockstep, robot_at):
+    lockstep.require(StopsAfterLastCommand(0.6))
+    robot_at(cmd_vel_timeout=0.5)
+    lockstep.inject(ActuatorLag(0.2, start=0.1, duration=2.0))
+    lockstep.publish('cmd_vel', twist(0.5))
+    lockstep.run_for(3.0)
+    lockstep.finish()
 
 
 def test_only_what_a_node_can_do_is_required_of_it(lockstep, robot_at):
