@@ -483,7 +483,7 @@ def test_the_example_is_given_in_python(pytester):
     session = 'import sys, pytest\nsys.exit(pytest.main(sys.argv[1:]))'
     ended = forked.run(session, ['test_my_law.py'], **kwargs)
     assert ended.returncode == 0
-    assert re.search(r'^=+ 1 passed in', ended.stdout, re.MULTILINE)
+    assert re.search(r'^=+ 1 passed\b', ended.stdout, re.MULTILINE)
     ended = forked.run((pytester.path / 'sweep_my_law.py').read_text(), **kwargs)
     assert ended.returncode == 0
     assert re.search(r'fastest: kp .*\n\[.* .*\]', ended.stdout)
