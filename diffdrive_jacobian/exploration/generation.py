@@ -146,7 +146,7 @@ def _number(seed: int, block: int) -> int:
 
 @contextmanager
 def _own_constants_only() -> Iterator[None]:
-    """Let Hypothesis use no constants of the running program; versions before 6.131 use none."""
+    """Stop Hypothesis from using constants of the running program. Versions before 6.131 do not."""
     try:
         from hypothesis.internal.conjecture import providers
     except ImportError:

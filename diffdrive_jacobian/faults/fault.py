@@ -12,9 +12,10 @@ import numbers
 import random
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import MISSING, dataclass, field, fields
-from typing import Any, ClassVar
+from dataclasses import dataclass, field
+from typing import ClassVar
 
+from diffdrive_jacobian.faults.expression import Expression
 from diffdrive_jacobian.lockstep import Injection
 
 Filter = Callable[[int, bytes], Iterable[tuple[int, bytes]]]
@@ -28,7 +29,7 @@ message before the fault begins and after it has ended.
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
-class Fault(ABC):
+class Fault(Expression, ABC):
     """Something that goes wrong in a `Lockstep`, from `start` for `duration`.
 
     Subclasses are decorated with `@dataclass(frozen=True, repr=False)`.
@@ -53,18 +54,7 @@ class Fault(ABC):
 
     @abstractmethod
     def install(self, injection: Injection) -> None:
-        """Let the fault happen in a world."""
-
-    def __repr__(self) -> str:
-        """Return the expression that makes this fault."""
-        shown = []
-        for one in sorted(fields(self), key=lambda one: bool(one.kw_only)):
-            value = getattr(self, one.name)
-            if one.default is MISSING:
-                shown.append(literal(value))
-            elif value != one.default:
-                shown.append(f'{one.name}={literal(value)}')
-        return f'{type(self).__name__}({", ".join(shown)})'
+        """Schedule the fault in a world."""
 
     def _number(
         self,
@@ -111,17 +101,6 @@ class Fault(ABC):
             )
         object.__setattr__(self, name, int(value))
 
-    def _text(self, name: str, *, empty: bool = False) -> None:
-        """Check that a field is a string.
-
-        Raises:
-            ValueError: It is not, or it is empty and must not be.
-        """
-        value = getattr(self, name)
-        if not isinstance(value, str) or not (value or empty):
-            kind = 'a string' if empty else 'a string that is not empty'
-            raise ValueError(f'{type(self).__name__}: {name} must be {kind}, got {value!r}')
-
 
 @dataclass(frozen=True, repr=False)
 class TopicFault(Fault):
@@ -166,7 +145,7 @@ class TopicFault(Fault):
         """
 
     def install(self, injection: Injection) -> None:
-        """Let the messages of the topic pass through the filter."""
+        """Filter the messages of the topic."""
         injection.filter_topic(
             self.topic,
             self.node,
@@ -174,16 +153,6 @@ class TopicFault(Fault):
             keeps_order=self.keeps_order,
             at_publisher=self.at_publisher,
         )
-
-
-def literal(value: Any) -> str:
-    """Return a Python expression for a value; `repr` of an infinite float is none."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return f"float('{value}')"
-    if isinstance(value, (list, tuple)):
-        inner = ', '.join(map(literal, value))
-        return f'[{inner}]' if isinstance(value, list) else f'({inner}{"," * (len(value) == 1)})'
-    return repr(value)
 
 
 def _range(low: float, high: float, above: bool) -> str:

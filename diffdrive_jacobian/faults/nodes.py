@@ -39,7 +39,7 @@ class Kill(NodeFault):
     """
 
     def install(self, injection: Injection) -> None:
-        """Let the node be killed."""
+        """Schedule the end of the node."""
         injection.kill(self.node)
 
 
@@ -53,7 +53,7 @@ class Hang(NodeFault):
     """
 
     def install(self, injection: Injection) -> None:
-        """Let the node be frozen."""
+        """Hold the callbacks of the node."""
         injection.hold(self.node)
 
 
@@ -79,7 +79,7 @@ class Slow(NodeFault):
         self._number('seconds', low=0.0, above=True)
 
     def install(self, injection: Injection) -> None:
-        """Let the callbacks take time."""
+        """Set the duration of the callbacks."""
         injection.slow(self.node, nanoseconds(self.seconds))
 
 
@@ -101,6 +101,6 @@ class TimerJitter(NodeFault):
         self._number('seconds', low=0.0, above=True)
 
     def install(self, injection: Injection) -> None:
-        """Let the timers jitter."""
+        """Delay the ticks of the timers."""
         rng = injection.rng(self.node)
         injection.delay_timers(self.node, lambda: nanoseconds(self.seconds * rng.random()))

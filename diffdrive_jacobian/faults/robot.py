@@ -53,10 +53,10 @@ class RobotFault(Fault):
 
     @abstractmethod
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo | None:
-        """Let the fault begin. Return what ends it; None: nothing does."""
+        """Begin the fault. Return what ends it; None: nothing does."""
 
     def install(self, injection: Injection) -> None:
-        """Let the fault happen to the robot, whenever there is one during the fault."""
+        """Apply the fault to the robot, whenever there is one during the fault."""
         undone: list[tuple[Node, Undo]] = []
         done = False
 
@@ -162,7 +162,7 @@ class ActuatorLag(RobotFault):
         self._number('seconds', low=0.0, above=True)
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
-        """Let the motors lag."""
+        """Set the lag of the motors."""
 
         def lag(model: RobotModel) -> RobotModel:
             actuators = model.actuators or Actuators()
@@ -197,7 +197,7 @@ class EncoderSteps(RobotFault):
             )
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
-        """Let the encoders count."""
+        """Set the resolution of the encoders."""
         robot.condition.set_encoders(self.per_revolution)
         return lambda: robot.condition.set_encoders(None)
 
@@ -211,7 +211,7 @@ class Slip(RobotFault):
     """
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
-        """Let the wheels slip."""
+        """Start the slip of the wheels."""
         seed = injection.rng('slip').randint(0, MAX_SEED)
         return robot.condition.change(
             lambda model: replace(model, drift=replace(_drift(model), seed=seed))

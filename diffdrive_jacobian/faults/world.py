@@ -34,7 +34,7 @@ class TimeJump(Fault):
             raise ValueError(f'TimeJump: seconds must not be zero, got {self.seconds!r}')
 
     def install(self, injection: Injection) -> None:
-        """Let the clock jump."""
+        """Schedule the jump of the clock."""
         injection.jump(nanoseconds(self.seconds))
 
 
@@ -46,7 +46,7 @@ class ClockPause(Fault):
     """
 
     def install(self, injection: Injection) -> None:
-        """Let the clock stand."""
+        """Schedule the pause of the clock."""
         injection.pause_clock()
 
 
@@ -69,7 +69,7 @@ class LateService(Fault):
         self._number('seconds', low=0.0, above=True, infinite=True)
 
     def install(self, injection: Injection) -> None:
-        """Let the responses be late."""
+        """Delay the responses of the service."""
         late = nanoseconds(self.seconds) if math.isfinite(self.seconds) else None
         injection.delay_responses(self.service, late)
 
@@ -108,5 +108,5 @@ class ParameterChange(NodeFault):
         )
 
     def install(self, injection: Injection) -> None:
-        """Let the parameter be changed."""
+        """Schedule the change of the parameter."""
         injection.change_parameter(self.node, self.name, self.value)

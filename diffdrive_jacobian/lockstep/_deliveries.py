@@ -89,7 +89,7 @@ class Deliveries:
         return reader
 
     def replace(self, nodes: Iterable[Node]) -> None:
-        """Let `new_reader` create the readers of all present subscriptions again."""
+        """Create the readers of all present subscriptions again, by `new_reader`."""
         owners = {subscription: node for node in nodes for subscription in node.subscriptions}
         replaced = {}
         for subscription, reader in self._readers.items():

@@ -74,7 +74,7 @@ class Disturbed(Messaging):
         return nodes[full]
 
     def inject(self, *faults: Injectable, seed: int = 0) -> None:
-        """Let faults happen. Their times count from the start of this `Lockstep`.
+        """Inject faults. Their times count from the start of this `Lockstep`.
 
         Faults of one topic affect a message in the order in which they were injected. The random numbers
         of a fault depend on `seed` and the fault alone, not on other faults, unless they are equal.
@@ -137,7 +137,7 @@ class Disturbed(Messaging):
         )
 
     def _shift_clock(self, duration: int) -> int:
-        """Let the clock of the nodes jump by a time (ns). Return by how much it did.
+        """Shift the clock of the nodes by a time (ns). Return by how much it was shifted.
 
         The new time is one that a stamp can represent.
         """

@@ -118,7 +118,7 @@ class QuiescentExecutor:
         self._changed = True
 
     def use(self, keeper: Keeper) -> None:
-        """Let a keeper keep the gates of the nodes."""
+        """Set the keeper of the gates of the nodes."""
         self.keeper = keeper
         for served in self._served.values():
             keeper.admit(served)
@@ -285,7 +285,7 @@ class QuiescentExecutor:
         return events > 1
 
     def call_timer(self, handle: TimerHandle, timer: Timer, node: Node) -> None:
-        """Let a timer tick."""
+        """Call the callback of a timer."""
         handle.call_timer()
         keeper = self.keeper
         result = timer.callback() if keeper is None else keeper.run(node, timer)

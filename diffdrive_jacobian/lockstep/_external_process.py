@@ -194,7 +194,7 @@ class ExternalProcess:
 
 @contextmanager
 def _children_receive_sigint() -> Iterator[None]:
-    """Let processes that are started meanwhile receive SIGINT, which ends them.
+    """Make processes that are started meanwhile receive SIGINT, which ends them.
 
     If a shell has started this process in the background, this process ignores SIGINT, and what it
     starts would, too. A new process has no handlers of this one. Only the main thread can set them.

@@ -86,7 +86,7 @@ class Gate:
         self._changed(self)
 
     def release(self) -> None:
-        """Let the node continue."""
+        """Continue the node."""
         self._holds -= 1
         self._changed(self)
 

@@ -30,7 +30,7 @@ class Injectable(Timed, Protocol):
     """A fault."""
 
     def install(self, injection: Injection) -> None:
-        """Let it happen."""
+        """Schedule it."""
 
 
 class Injections:

@@ -99,7 +99,7 @@ class InjectionBase:
     # --- Time
 
     def schedule(self) -> None:
-        """Let the fault begin and end at its times."""
+        """Schedule the start and the end of the fault."""
         start, duration = self.fault.start, self.fault.duration
         self._agenda.at(nanoseconds(start), self._start)
         if math.isfinite(duration):

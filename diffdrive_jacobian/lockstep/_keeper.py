@@ -33,7 +33,7 @@ class Keeper:
         return self._by_node[node]
 
     def admit(self, served: Served) -> None:
-        """Give a node a gate."""
+        """Create the gate of a node."""
         gate = self.gates.of(served.node.get_fully_qualified_name())
         served.gate, served.gates = gate, self.gates
         self._by_node[served.node] = gate

@@ -53,7 +53,7 @@ class NodeInjection(InjectionBase):
         self.at_end(release)
 
     def slow(self, node: str, duration: int) -> None:
-        """Let each callback of a node take a time (ns)."""
+        """Set the duration of each callback of a node (ns)."""
         gate = self._gate(node)
 
         def end() -> None:
@@ -210,7 +210,7 @@ class NodeInjection(InjectionBase):
     # --- Clock
 
     def jump(self, duration: int) -> None:
-        """Let the clock jump by a time (ns) when the fault begins, and back when it ends."""
+        """Shift the clock by a time (ns) when the fault begins, and back when it ends."""
         done: list[int] = []
 
         def there() -> None:
@@ -224,7 +224,7 @@ class NodeInjection(InjectionBase):
         self.at_end(back)
 
     def pause_clock(self) -> None:
-        """Let the clock stand."""
+        """Stop the clock during the fault."""
         executor = self._world.executor
 
         def pause() -> None:

@@ -36,7 +36,7 @@ class Requirements(Disturbed):
         self._observing: list[tuple[list[Any], Any]] = []
 
     def inject(self, *faults: Injectable, seed: int = 0) -> None:
-        """Let faults happen, as `Disturbed.inject`."""
+        """Inject faults, as `Disturbed.inject`."""
         super().inject(*faults, seed=seed)
         self.faults.extend(faults)
 

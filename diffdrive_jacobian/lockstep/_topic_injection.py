@@ -45,7 +45,7 @@ class TopicInjection(InjectionBase):
         keeps_order: bool = False,
         at_publisher: bool = False,
     ) -> None:
-        """Let the messages of a topic pass through a filter.
+        """Filter the messages of a topic.
 
         Args:
             topic: Name of the topic.

@@ -6,12 +6,12 @@ import math
 import numbers
 from abc import ABC, abstractmethod
 from collections import deque
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import dataclass, field
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from diffdrive_jacobian.faults.fault import literal
+from diffdrive_jacobian.faults.expression import Expression
 from diffdrive_jacobian.lockstep import Lockstep, LockstepError
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -20,7 +20,7 @@ RECENT = 5
 
 
 @dataclass(frozen=True, repr=False)
-class Property(ABC):
+class Property(Expression, ABC):
     """Something that must hold in a run of a `Lockstep`. Required by `Lockstep.require`.
 
     A property is a value. It can be compared, pickled, and printed as the expression that makes it. What
@@ -50,17 +50,6 @@ class Property(ABC):
             return name
         return f'{self.namespace.rstrip("/")}/{name}'
 
-    def __repr__(self) -> str:
-        """Return the expression that makes this property."""
-        shown = []
-        for one in sorted(fields(self), key=lambda one: bool(one.kw_only)):
-            value = getattr(self, one.name)
-            if one.default is MISSING and not one.kw_only:
-                shown.append(literal(value))
-            elif value != one.default:
-                shown.append(f'{one.name}={literal(value)}')
-        return f'{type(self).__name__}({", ".join(shown)})'
-
     def _number(self, name: str, *, infinite: bool = True, zero: bool = True) -> None:
         """Check that a field is a number that is not negative, and make it a float.
 
@@ -79,17 +68,6 @@ class Property(ABC):
             allowed = f'a{"" if infinite else " finite"} number {"of at least" if zero else "above"} 0'
             raise ValueError(f'{type(self).__name__}: {name} must be {allowed}, got {value!r}')
         object.__setattr__(self, name, float(value))
-
-    def _text(self, name: str, *, empty: bool = False) -> None:
-        """Check that a field is a string.
-
-        Raises:
-            ValueError: It is not, or it is empty and must not be.
-        """
-        value = getattr(self, name)
-        if not isinstance(value, str) or not (value or empty):
-            kind = 'a string' if empty else 'a string that is not empty'
-            raise ValueError(f'{type(self).__name__}: {name} must be {kind}, got {value!r}')
 
     def _texts(self, name: str) -> None:
         """Check that a field is a sequence of strings, and make it a tuple.

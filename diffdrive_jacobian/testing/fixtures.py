@@ -84,7 +84,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def _check_fields(config: pytest.Config) -> None:
-    """Let message modules check their fields until the end of the session, if the option is set."""
+    """Enable the field checks of message modules until the end of the session, if the option is set."""
     if not config.getini('lockstep_check_fields') or config.stash.get(_CHECKS_FIELDS, False):
         return
     config.stash[_CHECKS_FIELDS] = True

@@ -1,0 +1,47 @@
+"""Values that are printed as the Python expression that makes them: faults and properties."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import MISSING, dataclass, fields
+from typing import Any
+
+
+@dataclass(frozen=True, repr=False)
+class Expression:
+    """Base class of dataclasses that are printed as the expression that makes them.
+
+    Subclasses are decorated with `@dataclass(frozen=True, repr=False)`.
+    """
+
+    def __repr__(self) -> str:
+        """Return the expression that makes this value."""
+        shown = []
+        for one in sorted(fields(self), key=lambda one: bool(one.kw_only)):
+            value = getattr(self, one.name)
+            if one.default is MISSING and not one.kw_only:
+                shown.append(literal(value))
+            elif value != one.default:
+                shown.append(f'{one.name}={literal(value)}')
+        return f'{type(self).__name__}({", ".join(shown)})'
+
+    def _text(self, name: str, *, empty: bool = False) -> None:
+        """Check that a field is a string.
+
+        Raises:
+            ValueError: It is not, or it is empty and must not be.
+        """
+        value = getattr(self, name)
+        if not isinstance(value, str) or not (value or empty):
+            kind = 'a string' if empty else 'a string that is not empty'
+            raise ValueError(f'{type(self).__name__}: {name} must be {kind}, got {value!r}')
+
+
+def literal(value: Any) -> str:
+    """Return a Python expression for a value; `repr` of an infinite float is none."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return f"float('{value}')"
+    if isinstance(value, (list, tuple)):
+        inner = ', '.join(map(literal, value))
+        return f'[{inner}]' if isinstance(value, list) else f'({inner}{"," * (len(value) == 1)})'
+    return repr(value)
