@@ -225,7 +225,8 @@ def test_a_world_that_does_not_end_is_given_up(tmp_path, monkeypatch, at):
     """In the fourth task of worlds, and while shrinking."""
     monkeypatch.setattr(search, 'GRACE', 0.0)
     arguments = {'cases': st.integers(50, 70), 'worlds': 21, 'output': tmp_path}
-    found = explore(failing, executor=Stuck(at), time_limit=1.0, **arguments)
+    # Long enough to get there on a busy machine.
+    found = explore(failing, executor=Stuck(at), time_limit=5.0, **arguments)
     assert 'a world still ran' in found.stopped
     (finding,) = found.findings
     assert not finding.complete
