@@ -18,7 +18,8 @@ from diffdrive_jacobian.live.goal_progress import GoalEnd, GoalProgress
 from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.live.trail import JUMP, Trail
 from diffdrive_jacobian.messages.goal_status import GoalState
-from diffdrive_jacobian.parameters.nodes import GoToGoalParameters, VirtualRobotParameters
+from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
+from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.reading.run import number
 
 ROBOT_DEFAULTS = VirtualRobotParameters()

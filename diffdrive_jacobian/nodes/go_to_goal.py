@@ -16,7 +16,7 @@ from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
 from diffdrive_jacobian.nodes.goal import Goal, GoalIdentifiers, read_goal
 from diffdrive_jacobian.nodes.other_drivers import OtherDrivers
-from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
+from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.ros import serialization
 from diffdrive_jacobian.ros.graph_faults import several_publishers, unread
 from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode

@@ -32,7 +32,7 @@ from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.command_time import command_time
 from diffdrive_jacobian.nodes.condition import Condition
-from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
+from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.ros.graph_faults import (
     ALTERNATION_PATIENCE,
     alternating_commands,

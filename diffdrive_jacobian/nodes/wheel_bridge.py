@@ -14,7 +14,7 @@ from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.command_time import command_time
-from diffdrive_jacobian.parameters.nodes import WheelBridgeParameters
+from diffdrive_jacobian.parameters.wheel_bridge import WheelBridgeParameters
 from diffdrive_jacobian.ros.graph_faults import ALTERNATION_PATIENCE, alternating_commands, unread
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.kinematics._elementary import wrapped
 from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros
-from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
+from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.reading.run import Run
 from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.simulation.slip import Drift

@@ -9,7 +9,7 @@ from rclpy.parameter import Parameter
 from diffdrive_jacobian.lockstep import Lockstep
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.parameters.declaration import specifications
-from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
+from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 
 
 def place_robot(

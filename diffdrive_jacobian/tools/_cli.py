@@ -18,7 +18,6 @@ from diffdrive_jacobian.parameters.declaration import (
     ParameterError,
     specifications,
 )
-from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 
 DONE, FAILED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
 """Exit codes: done, not done, wrong arguments, interrupted by a signal."""
@@ -281,6 +280,9 @@ def add_wait_matching(parser: argparse.ArgumentParser, what: str, default: str) 
 
 def tolerance(text: str) -> float:
     """Parse a distance that is a valid xy_goal_tolerance (m)."""
+    # Not above: it imports every control law.
+    from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
+
     value = number(text)
     try:
         GoToGoalParameters(xy_goal_tolerance=value)

@@ -15,6 +15,7 @@ from functools import partial
 
 from diffdrive_jacobian.ros.fastdds_profiles import announce_frequently
 from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.tools._startup import long_lived, without_message_generator
 
 INTERRUPTED = 130
 OUTPUT_ERROR = 'the standard output cannot be written'
@@ -76,8 +77,10 @@ def _run(module: str, function: str, *arguments: str, watched: bool = False) -> 
             for replaced in (name, f'__{name}__'):
                 setattr(sys, replaced, open(os.devnull, 'w'))  # noqa: SIM115
     announce_frequently()
+    without_message_generator()
     try:
-        run = getattr(importlib.import_module(f'diffdrive_jacobian.tools.{module}'), function)
+        with long_lived():
+            run = getattr(importlib.import_module(f'diffdrive_jacobian.tools.{module}'), function)
         if watched:
             signals.exit_on_second(partial(_exit, module))
         code: int = run(*arguments, sys.argv[1:], signals)

@@ -11,13 +11,9 @@ from typing import NamedTuple
 
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import NodeParameters, specifications
-from diffdrive_jacobian.parameters.nodes import (
-    GoToGoalParameters,
-    VirtualRobotParameters,
-    WheelBridgeParameters,
-)
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools._startup import long_lived
 from diffdrive_jacobian.tools._unused_files import warn_of_unused_files
 
 
@@ -25,17 +21,14 @@ class Program(NamedTuple):
     """The program that runs a node."""
 
     class_name: str
-    """Class of the node."""
-    parameters: type[NodeParameters]
-    """Its parameters."""
+    """Name of the class of the node, in the module with the name of the program."""
     description: str
-    """Description for --help. The module of the node is imported only when the node runs."""
+    """Description for --help."""
 
 
 NODES: dict[str, Program] = {
     'virtual_robot': Program(
         'VirtualRobot',
-        VirtualRobotParameters,
         'Simulate a differential-drive robot. Subscribes to cmd_vel or joint_command. Publishes odom, '
         'joint_states, cmd_vel_out, start_pose and TF. initialpose and reset_odometry set its pose. A '
         'command takes effect on receipt, or at its stamp if it has one. cmd_vel_out is each command '
@@ -44,7 +37,6 @@ NODES: dict[str, Program] = {
     ),
     'go_to_goal': Program(
         'GoToGoal',
-        GoToGoalParameters,
         'Drive a robot to goals. Subscribes to odom, goal_pose and goals. Publishes cmd_vel and '
         'goal_status. The service cancel_goal cancels a goal. While a goal is active, each odometry '
         'message is answered by one command. Without a goal nothing is published on cmd_vel, so that '
@@ -52,7 +44,6 @@ NODES: dict[str, Program] = {
     ),
     'wheel_bridge': Program(
         'WheelBridge',
-        WheelBridgeParameters,
         'Convert body twists to wheel speeds. Subscribes to cmd_vel. Publishes joint_command. Each '
         'command gives one message with the same stamp, or with the time of receipt if it has none. '
         'When no more commands are received, one zero command follows after the timeout.',
@@ -74,18 +65,21 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
     if own:
         # Not otherwise: to create the parser describes all parameters, which takes time.
         hint = 'send_goal X Y sends a goal' if name == 'go_to_goal' else ''
-        parser, parameters = _parser(name, program), [program.parameters]
-        ros = _cli.with_params_file(ros, _cli.parse(parser, own, parameters=parameters, hint=hint))
-    # Not above: --help needs no ROS. Only the node that runs: each takes time to import.
-    from diffdrive_jacobian.ros.runner import ros_context, running
+        parameters = _parameters(name, program)
+        parser = _parser(name, program, parameters)
+        ros = _cli.with_params_file(ros, _cli.parse(parser, own, parameters=[parameters], hint=hint))
+    with long_lived():
+        # Not above: --help needs no ROS. Only the node that runs: each takes time to import.
+        from diffdrive_jacobian.ros.runner import ros_context, running
 
-    create = getattr(importlib.import_module(f'diffdrive_jacobian.nodes.{name}'), program.class_name)
+        create = getattr(importlib.import_module(f'diffdrive_jacobian.nodes.{name}'), program.class_name)
     try:
         with (
             ros_context([name, *ros]) as context,
             running(context, isolated=False) as runner,
         ):
-            node = runner.add(lambda: create(context=context))
+            with long_lived():
+                node = runner.add(lambda: create(context=context))
             warn_of_unused_files(name, ros, [node.get_fully_qualified_name()])
             runner.spin(lambda: signals.count > 0)
     except UserError as error:
@@ -93,13 +87,20 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
     return _cli.DONE
 
 
-def _parser(name: str, program: Program) -> _cli.Parser:
+def _parameters(name: str, program: Program) -> type[NodeParameters]:
+    """Return the parameters of a node, without importing ROS, nor those of the others."""
+    module = importlib.import_module(f'diffdrive_jacobian.parameters.{name}')
+    parameters: type[NodeParameters] = getattr(module, f'{program.class_name}Parameters')
+    return parameters
+
+
+def _parser(name: str, program: Program, parameters: type[NodeParameters]) -> _cli.Parser:
     parser = _cli.Parser(
         prog=name,
         usage=f'{name} [-h] [--params-file FILE | --robot NAME] '
         '[--ros-args -p PARAMETER:=VALUE -r NAME:=NAME ...]',
         description=textwrap.fill(program.description, 90),
-        epilog=_description(program.parameters),
+        epilog=_description(parameters),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     _cli.add_params_file(parser)

@@ -13,7 +13,7 @@ from typing import Any
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import from_ros
 from diffdrive_jacobian.parameters.file import robot_parameters
-from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
+from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.plots import sweep_figure
 from diffdrive_jacobian.plots.output_files import FORMATS, create, extension, free_stem, new_file
 from diffdrive_jacobian.signals import Signals

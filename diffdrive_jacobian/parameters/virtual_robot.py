@@ -1,0 +1,129 @@
+"""The parameters of the node virtual_robot."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+from diffdrive_jacobian.control.saturation import VelocityLimits
+from diffdrive_jacobian.messages.plausibility import MAX_POSITION
+from diffdrive_jacobian.parameters._fields import (
+    STAMPED,
+    differ,
+    max_wheel_velocity_field,
+    timeout_field,
+    wheel_radius_field,
+    wheel_separation_field,
+)
+from diffdrive_jacobian.parameters.declaration import parameter
+from diffdrive_jacobian.parameters.limits import LimitParameters, number_or
+from diffdrive_jacobian.simulation.robot import RobotModel
+from diffdrive_jacobian.simulation.slip import MAX_SEED, Drift
+from diffdrive_jacobian.time_units import nanoseconds
+
+
+def _true_multiplier(what: str) -> Any:
+    return parameter(
+        1.0,
+        f'True {what}, relative to the nominal one [-]. Read-only.',
+        bounds=(0.1, 10.0),
+        read_only=True,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class VirtualRobotParameters(LimitParameters):
+    """Parameters of the node virtual_robot."""
+
+    publish_rate: float = parameter(
+        50.0, 'Publishing rate of odom and joint_states [Hz].', bounds=(0.1, 1000.0)
+    )
+    odom_frame_id: str = parameter('odom', 'Name of the frame of the odometry.')
+    base_frame_id: str = parameter('base_link', 'Name of the frame of the robot, at the axle centre.')
+    wheel_radius: float = wheel_radius_field()
+    wheel_separation: float = wheel_separation_field()
+    max_wheel_velocity: float = max_wheel_velocity_field()
+    cmd_vel_timeout: float = timeout_field(
+        0.5, 'Time without a command after which the robot stops [s]; 0: never.'
+    )
+    x: float = parameter(
+        0.0, 'Initial position x, also after a reset [m].', bounds=(-MAX_POSITION, MAX_POSITION)
+    )
+    y: float = parameter(
+        0.0, 'Initial position y, also after a reset [m].', bounds=(-MAX_POSITION, MAX_POSITION)
+    )
+    theta: float = parameter(
+        0.0, 'Initial heading, also after a reset [rad].', bounds=(-math.tau, math.tau)
+    )
+    wheel_travel_variance: float = parameter(
+        1e-5,
+        'Variance of the distance travelled by a wheel, per distance [m^2/m].',
+        bounds=(0.0, 1.0),
+    )
+    command_interface: str = parameter(
+        'twist',
+        'Subscribe to cmd_vel (twist) or to joint_command (wheels). Read-only.',
+        choices=('twist', 'wheels'),
+        read_only=True,
+    )
+    enable_stamped_cmd_vel: bool = parameter(False, STAMPED, read_only=True)
+    left_wheel_name: str = parameter('left_wheel_joint', 'Name of the joint of the left wheel.')
+    right_wheel_name: str = parameter('right_wheel_joint', 'Name of the joint of the right wheel.')
+    enable_odom_tf: bool = parameter(
+        True,
+        'Publish the transform from odom_frame_id to base_frame_id, if tf2_ros is installed. Read-only.',
+        read_only=True,
+    )
+    simulate_slip: bool = parameter(
+        False,
+        'Let the wheels slip as wheel_travel_variance says, and publish ground_truth. Read-only.',
+        read_only=True,
+    )
+    slip_seed: int = parameter(
+        0, 'Seed of the random slip. Read-only.', bounds=(0, MAX_SEED), read_only=True
+    )
+    true_left_wheel_radius_multiplier: float = _true_multiplier('radius of the left wheel')
+    true_right_wheel_radius_multiplier: float = _true_multiplier('radius of the right wheel')
+    true_wheel_separation_multiplier: float = _true_multiplier('wheel separation')
+    ground_truth_frame_id: str = parameter('map', 'Name of the frame of ground_truth.')
+
+    def check(self) -> None:
+        """Raise ParameterError if the names of the wheels or of the frames are equal."""
+        differ('left_wheel_name', self.left_wheel_name, 'right_wheel_name', self.right_wheel_name)
+        differ('odom_frame_id', self.odom_frame_id, 'base_frame_id', self.base_frame_id)
+        if self.drift() is not None:
+            truth = 'ground_truth_frame_id', self.ground_truth_frame_id
+            differ(*truth, 'odom_frame_id', self.odom_frame_id)
+            differ(*truth, 'base_frame_id', self.base_frame_id)
+
+    @property
+    def wheel_names(self) -> tuple[str, str]:
+        """Names of the left and the right wheel joint, in the order of messages."""
+        return self.left_wheel_name, self.right_wheel_name
+
+    def limits(self) -> VelocityLimits:
+        """Return the limits of the twist and of the wheel speed."""
+        max_wheel_speed = number_or(self.max_wheel_velocity, math.inf)
+        return replace(self.twist_limits(), max_wheel_speed=max_wheel_speed)
+
+    def model(self) -> RobotModel:
+        """Return the model of the robot with these parameters."""
+        return RobotModel(
+            wheel_radius=self.wheel_radius,
+            wheel_separation=self.wheel_separation,
+            limits=self.limits(),
+            command_timeout=nanoseconds(self.cmd_vel_timeout),
+            wheel_travel_variance=self.wheel_travel_variance,
+            drift=self.drift(),
+        )
+
+    def drift(self) -> Drift | None:
+        """Return in what the true motion differs from the odometry; None: in nothing."""
+        drift = Drift(
+            seed=self.slip_seed if self.simulate_slip else None,
+            right_wheel_radius_multiplier=self.true_right_wheel_radius_multiplier,
+            left_wheel_radius_multiplier=self.true_left_wheel_radius_multiplier,
+            wheel_separation_multiplier=self.true_wheel_separation_multiplier,
+        )
+        return None if drift == Drift() else drift

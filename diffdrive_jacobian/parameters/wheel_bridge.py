@@ -1,0 +1,60 @@
+"""The parameters of the node wheel_bridge."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from diffdrive_jacobian.parameters._fields import (
+    STAMPED,
+    differ,
+    max_wheel_velocity_field,
+    timeout_field,
+    wheel_radius_field,
+    wheel_separation_field,
+)
+from diffdrive_jacobian.parameters.declaration import NodeParameters, parameter
+from diffdrive_jacobian.parameters.limits import number_or
+
+
+def _multiplier(what: str) -> Any:
+    return parameter(1.0, f'Correction factor for the {what} [-].', bounds=(0.1, 10.0))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class WheelBridgeParameters(NodeParameters):
+    """Parameters of the node wheel_bridge."""
+
+    wheel_radius: float = wheel_radius_field()
+    wheel_separation: float = wheel_separation_field()
+    wheel_separation_multiplier: float = _multiplier('wheel separation')
+    left_wheel_radius_multiplier: float = _multiplier('radius of the left wheel')
+    right_wheel_radius_multiplier: float = _multiplier('radius of the right wheel')
+    max_wheel_velocity: float = max_wheel_velocity_field()
+    cmd_vel_timeout: float = timeout_field(
+        0.5, 'Time without a command after which the wheels are stopped [s]; 0: never.'
+    )
+    left_wheel_name: str = parameter('left_wheel_joint', 'Name of the joint of the left wheel.')
+    right_wheel_name: str = parameter('right_wheel_joint', 'Name of the joint of the right wheel.')
+    joint_command_type: str = parameter(
+        'JointState',
+        'Type of joint_command: JointState, or Float64MultiArray with [left, right]. Read-only.',
+        choices=('JointState', 'Float64MultiArray'),
+        read_only=True,
+    )
+    enable_stamped_cmd_vel: bool = parameter(False, STAMPED, read_only=True)
+
+    def check(self) -> None:
+        """Raise ParameterError if the names of the wheels are equal."""
+        differ('left_wheel_name', self.left_wheel_name, 'right_wheel_name', self.right_wheel_name)
+
+    @property
+    def wheel_names(self) -> tuple[str, str]:
+        """Names of the left and the right wheel joint, in the order of messages."""
+        return self.left_wheel_name, self.right_wheel_name
+
+    @property
+    def wheel_speed_limit(self) -> float:
+        """The limit of the wheel speeds (rad/s); infinite: none."""
+        return number_or(self.max_wheel_velocity, math.inf)
