@@ -1,4 +1,4 @@
-"""Text of unknown origin, such as a topic name in a bag, made safe to print."""
+"""Text for messages: lists of names, and text of unknown origin, such as a topic name in a bag."""
 
 from __future__ import annotations
 
@@ -39,3 +39,12 @@ def format_size(size: int) -> str:
 
 def _escape(character: str) -> str:
     return character.encode('unicode_escape').decode('ascii')
+
+
+def listed(names: list[str]) -> str:
+    """Return names in one line, sorted: `/a`, `/a and /b`, `/a, /b and /c`; repetitions as counts."""
+    counts = {name: names.count(name) for name in sorted(names)}
+    words = [name if count == 1 else f'{name} ({count} times)' for name, count in counts.items()]
+    if len(words) < 2:
+        return ''.join(words)
+    return f'{", ".join(words[:-1])} and {words[-1]}'

@@ -110,12 +110,3 @@ class Graph:
 def base_name(topic: str) -> str:
     """Return the name of a topic without its namespace."""
     return topic.rsplit('/', 1)[-1]
-
-
-def listed(names: list[str]) -> str:
-    """Return names in one line, sorted: `/a`, `/a and /b`, `/a, /b and /c`; repetitions as counts."""
-    counts = {name: names.count(name) for name in sorted(names)}
-    words = [name if count == 1 else f'{name} ({count} times)' for name, count in counts.items()]
-    if len(words) < 2:
-        return ''.join(words)
-    return f'{", ".join(words[:-1])} and {words[-1]}'

@@ -13,15 +13,14 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
-from diffdrive_jacobian.diagnosis.description import listed
 from diffdrive_jacobian.diagnosis.lasting import Interleaving
-from diffdrive_jacobian.diagnosis.topics import (
+from diffdrive_jacobian.diagnosis.remedies import (
     ONE_PUBLISHER,
     SAME_NAMES,
     START_PUBLISHER,
     START_READER,
 )
-from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.text import listed, printable
 
 Check: TypeAlias = Callable[[], str | None]
 

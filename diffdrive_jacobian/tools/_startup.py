@@ -1,8 +1,9 @@
-"""What shortens the start of a program. It changes the process, so only programs use it, not the library."""
+"""What shortens the start of a program. It affects the whole process, so the library does not use it."""
 
 from __future__ import annotations
 
 import gc
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,6 +20,15 @@ def without_message_generator() -> None:
     """
     if 'rosidl_generator_py' not in sys.modules:
         sys.modules[_GENERATOR] = None  # type: ignore[assignment]
+
+
+def without_blas_threads() -> None:
+    """Let NumPy start no threads for linear algebra, unless the user has chosen their number.
+
+    OpenBLAS starts one for each further core when NumPy is imported. Each is busy for milliseconds until
+    it sleeps. The matrices of a robot are too small for threads.
+    """
+    os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 
 @contextmanager

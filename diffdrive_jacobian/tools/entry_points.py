@@ -15,7 +15,11 @@ from functools import partial
 
 from diffdrive_jacobian.ros.fastdds_profiles import announce_frequently
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools._startup import long_lived, without_message_generator
+from diffdrive_jacobian.tools._startup import (
+    long_lived,
+    without_blas_threads,
+    without_message_generator,
+)
 
 INTERRUPTED = 130
 OUTPUT_ERROR = 'the standard output cannot be written'
@@ -78,6 +82,7 @@ def _run(module: str, function: str, *arguments: str, watched: bool = False) -> 
                 setattr(sys, replaced, open(os.devnull, 'w'))  # noqa: SIM115
     announce_frequently()
     without_message_generator()
+    without_blas_threads()
     try:
         with long_lived():
             run = getattr(importlib.import_module(f'diffdrive_jacobian.tools.{module}'), function)
