@@ -15,7 +15,6 @@ from diffdrive_jacobian.diagnosis.description import (
     Participant,
     Quality,
     Stream,
-    listed,
 )
 from diffdrive_jacobian.diagnosis.environment import (
     INSTALLATION,
@@ -34,6 +33,7 @@ from diffdrive_jacobian.diagnosis.machine import (
     shared_memory,
 )
 from diffdrive_jacobian.diagnosis.topics import check_topics, mismatch
+from diffdrive_jacobian.text import listed
 
 TWIST, STAMPED = 'geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistStamped'
 ODOMETRY, STATES = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/JointState'

@@ -239,4 +239,4 @@ def test_help_lists_every_parameter(capsys, name):
         run_node.run_node(name, ['--help'], Signals())
     assert end.value.code == 0
     lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
-    assert set(specifications(run_node.NODES[name].parameters)) <= set(lines)
+    assert set(specifications(run_node.parameters_of(name))) <= set(lines)

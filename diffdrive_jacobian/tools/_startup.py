@@ -36,11 +36,13 @@ def long_lived() -> Iterator[None]:
     """Create objects that last as long as the process, such as modules and nodes.
 
     The garbage collector would visit all of them again and again, and find nothing. It pauses here, and
-    never visits them later.
+    does not visit them later.
     """
+    enabled = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        gc.freeze()
-        gc.enable()
+        if enabled:
+            gc.freeze()
+            gc.enable()

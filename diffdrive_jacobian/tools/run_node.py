@@ -65,7 +65,7 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
     if own:
         # Not otherwise: to create the parser describes all parameters, which takes time.
         hint = 'send_goal X Y sends a goal' if name == 'go_to_goal' else ''
-        parameters = _parameters(name, program)
+        parameters = parameters_of(name)
         parser = _parser(name, program, parameters)
         ros = _cli.with_params_file(ros, _cli.parse(parser, own, parameters=[parameters], hint=hint))
     with long_lived():
@@ -87,10 +87,14 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
     return _cli.DONE
 
 
-def _parameters(name: str, program: Program) -> type[NodeParameters]:
-    """Return the parameters of a node, without importing ROS, nor those of the others."""
+def parameters_of(name: str) -> type[NodeParameters]:
+    """Return the parameters of a node. Neither ROS nor the parameters of other nodes are imported.
+
+    Args:
+        name: One of NODES.
+    """
     module = importlib.import_module(f'diffdrive_jacobian.parameters.{name}')
-    parameters: type[NodeParameters] = getattr(module, f'{program.class_name}Parameters')
+    parameters: type[NodeParameters] = getattr(module, f'{NODES[name].class_name}Parameters')
     return parameters
 
 
