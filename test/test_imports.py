@@ -144,17 +144,3 @@ def test_only_the_tools_print():
             if isinstance(node, (ast.Name, ast.Attribute)) and named:
                 loud.add(place(path))
     assert loud == {'tools'}
-
-
-def test_a_node_starts_without_what_only_the_tools_need():
-    """What is slow to import would delay its first odometry."""
-    run = subprocess.run(
-        [sys.executable, '-c', LOAD, f'{PACKAGE}.tools.run_node'],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
-    )
-    loaded = {name.split('.')[0] for name in run.stdout.split()}
-    assert PACKAGE in loaded
-    assert not loaded & {'matplotlib', 'rich', 'rosbags', 'ruamel'}

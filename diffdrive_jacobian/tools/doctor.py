@@ -22,6 +22,7 @@ from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools._startup import long_lived
 
 PROGRAM = 'doctor'
 DISCOVERY = 3.5
@@ -81,10 +82,11 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
 
 def _observe(options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> tuple[str, Graph]:
     """Return the name of the middleware, and the graph."""
-    # Not above: --help needs no ROS, and a diagnosis without ROS is one as well.
-    from rclpy import get_rmw_implementation_identifier
+    with long_lived():
+        # Not above: --help needs no ROS, and a diagnosis without ROS is one as well.
+        from rclpy import get_rmw_implementation_identifier
 
-    from diffdrive_jacobian.ros.observation import observe
+        from diffdrive_jacobian.ros.observation import observe
 
     if not options.json:
         print(

@@ -16,6 +16,7 @@ from diffdrive_jacobian.parameters.nodes import CONTROLLERS, NODE_PARAMETERS
 from diffdrive_jacobian.plots.output_files import NOT_OVERWRITTEN
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli, _live
+from diffdrive_jacobian.tools._startup import long_lived
 from diffdrive_jacobian.tools._waiting import busy
 
 if TYPE_CHECKING:
@@ -50,9 +51,10 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         from diffdrive_jacobian.tools._live_drive import drive_with_page
 
         return drive_with_page(options, heading, ros, signals)
-    # Not above: --help needs no ROS.
-    from diffdrive_jacobian.drives import DriveError, drive, waypoints_through
-    from diffdrive_jacobian.recording.record import open_recording, saved_on_error
+    with long_lived():
+        # Not above: --help needs no ROS.
+        from diffdrive_jacobian.drives import DriveError, drive, waypoints_through
+        from diffdrive_jacobian.recording.record import open_recording, saved_on_error
 
     goals = waypoints_through(np.reshape(options.coordinates, (-1, 2)), heading or 0.0)
     recording = None

@@ -14,6 +14,7 @@ from diffdrive_jacobian.recording.selection import RUN_TOPICS, Selection
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools._startup import long_lived
 from diffdrive_jacobian.tools._waiting import Waiting, busy
 
 if TYPE_CHECKING:
@@ -86,10 +87,11 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     for option in ('--regex', 'topics'):
         if options.all and getattr(options, option.lstrip('-')):
             parser.error(f'{option.replace("topics", "TOPIC")} has no effect with --all')
-    # Not above: --help needs no ROS.
-    from diffdrive_jacobian.recording.record import open_recording, record
-    from diffdrive_jacobian.recording.recording import RecordingError
-    from diffdrive_jacobian.tools._bags import describe
+    with long_lived():
+        # Not above: --help needs no ROS.
+        from diffdrive_jacobian.recording.record import open_recording, record
+        from diffdrive_jacobian.recording.recording import RecordingError
+        from diffdrive_jacobian.tools._bags import describe
 
     topics = tuple(options.topics)
     selection = Selection(

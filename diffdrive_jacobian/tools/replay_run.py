@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _cli, verify_run
+from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools._startup import long_lived
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.replay import ReplayResult
@@ -25,7 +26,8 @@ MATCH_PATIENCE = 5.0
 
 
 def _replay(bag: Path, options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> int:
-    from diffdrive_jacobian.replay import COMMANDS, GOALS, NothingToPlayError, Playback, replay
+    with long_lived():
+        from diffdrive_jacobian.replay import COMMANDS, GOALS, NothingToPlayError, Playback, replay
 
     playback = Playback(
         names=None if options.all_topics else GOALS if options.goals else COMMANDS,
@@ -118,6 +120,9 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
     own, ros = _cli.split_arguments(arguments)
     if any(VERIFY.startswith(word) and word.startswith('--v') for word in own):
+        # Slow to import.
+        from diffdrive_jacobian.tools import verify_run
+
         rest = [word for word in own if not (VERIFY.startswith(word) and word.startswith('--v'))]
         return verify_run.run_as_option(PROGRAM, VERIFY, [*rest, *ros], signals)
     parser = _parser()

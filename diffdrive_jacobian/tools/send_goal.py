@@ -12,6 +12,7 @@ from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools._startup import long_lived
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.ros.remote_goal import GoalResult
@@ -26,8 +27,9 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     options = _cli.parse(parser, own)
     heading = _cli.given_heading(parser, options)
     _cli.refuse_with(parser, options, '--timeout', '--no-wait')
-    # Not above: --help needs no ROS.
-    from diffdrive_jacobian.ros.remote_goal import send_goal
+    with long_lived():
+        # Not above: --help needs no ROS.
+        from diffdrive_jacobian.ros.remote_goal import send_goal
 
     try:
         with _Progress(f'goal ({options.x:g}, {options.y:g})') as progress:

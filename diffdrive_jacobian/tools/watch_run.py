@@ -9,6 +9,7 @@ from pathlib import Path
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli, _live
+from diffdrive_jacobian.tools._startup import long_lived
 
 PROGRAM = 'watch_run'
 
@@ -52,7 +53,8 @@ def _bag(options: argparse.Namespace, signals: Signals) -> int:
 
 
 def _nodes(options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> int:
-    from diffdrive_jacobian.live.running import watch_nodes
+    with long_lived():
+        from diffdrive_jacobian.live.running import watch_nodes
 
     try:
         watch_nodes(

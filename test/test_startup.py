@@ -1,0 +1,113 @@
+"""Programs start fast: they import only what they need, and leave out what rclpy imports in vain."""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from diffdrive_jacobian.tools import _startup
+
+STARTED = """
+import gc, json, os, sys
+from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.tools import entry_points
+
+def catch(self):
+    self.count = 1
+
+Signals.catch = catch
+sys.argv = ['virtual_robot']
+code = entry_points.virtual_robot()
+threads = os.environ['OPENBLAS_NUM_THREADS']
+collector = gc.isenabled(), gc.get_freeze_count()
+print(json.dumps([code, sorted(sys.modules), threads, collector]))
+"""
+HELP = """
+import contextlib, importlib, io, sys
+from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.tools import entry_points
+
+for tool in sys.argv[1:]:
+    with contextlib.redirect_stdout(io.StringIO()) as output, contextlib.suppress(SystemExit):
+        importlib.import_module(f'diffdrive_jacobian.tools.{tool}').main(['--help'], Signals())
+    assert f'usage: {tool}' in output.getvalue()
+print(*sys.modules)
+"""
+
+
+def run(*arguments: str) -> str:
+    """Run an interpreter of its own, and return what it prints."""
+    environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
+    environment.pop('OPENBLAS_NUM_THREADS', None)
+    return subprocess.run(
+        [sys.executable, '-c', *arguments],
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        timeout=60,
+    ).stdout
+
+
+@pytest.fixture(scope='module')
+def started():
+    """Exit code, modules, threads of OpenBLAS and the collector's state of a robot that was started."""
+    return json.loads(run(STARTED))
+
+
+def test_a_node_starts_without_what_only_the_tools_need(started):
+    """What is slow to import would delay its first odometry."""
+    code, modules, _, _ = started
+    assert code == 0
+    assert {'numpy', 'rclpy', 'diffdrive_jacobian.nodes.virtual_robot'} <= set(modules)
+    unneeded = {
+        *('matplotlib', 'rich', 'rosbags', 'ruamel.yaml'),
+        # With the installed controllers.
+        *('importlib.metadata', 'difflib'),
+        *('diffdrive_jacobian.diagnosis.description', 'diffdrive_jacobian.parameters.go_to_goal'),
+    }
+    assert not unneeded & set(modules)
+
+
+def test_message_classes_are_loaded_without_their_generator(started):
+    """It has the parser lark and the template engine em, which take as long as to create a node."""
+    modules = set(started[1])
+    assert 'rosidl_generator_py.import_type_support_impl' in modules
+    assert not {'lark', 'em', 'rosidl_parser.parser', 'rosidl_pycommon'} & modules
+
+
+def test_the_collector_does_not_visit_what_was_created_at_the_start(started):
+    enabled, frozen = started[3]
+    assert enabled
+    assert frozen > 20_000
+
+
+def test_openblas_starts_no_threads(started):
+    assert started[2] == '1'
+
+
+def test_a_number_of_threads_that_the_user_has_chosen_is_kept(monkeypatch):
+    monkeypatch.setenv('OPENBLAS_NUM_THREADS', '3')
+    _startup.without_blas_threads()
+    assert os.environ['OPENBLAS_NUM_THREADS'] == '3'
+
+
+def test_a_collector_that_was_disabled_before_stays_so():
+    gc.disable()
+    try:
+        with _startup.long_lived():
+            pass
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
+
+
+def test_the_help_of_programs_that_need_ros_imports_nothing_slow():
+    modules = set(run(HELP, 'send_goal', 'record_run', 'replay_run', 'watch_run', 'doctor').split())
+    assert 'diffdrive_jacobian.tools.doctor' in modules
+    assert not {'numpy', 'rclpy', 'rosbags', 'ruamel.yaml', 'matplotlib', 'rich'} & modules
