@@ -1,25 +1,33 @@
 """Start-up: time and CPU time from the start of a process to the first odometry that it publishes.
 
-Beside the console script `virtual_robot` as it is installed: a script of a bare node (odometry at 50 Hz,
-`rclpy.spin`). Both are run in the same way by this file, `python start_up.py SCRIPT`: it wraps rclpy's
-`Publisher.publish`, prints the time of the first message on odom (the monotonic clock is the same for
-all processes) and the CPU time of the process until then, and removes the wrapper. That imports rclpy a
-moment earlier and costs two calls; an observer in another process would add the time of discovery.
+Beside the console script `virtual_robot`: a script of a bare node (odometry at 50 Hz, `rclpy.spin`).
+Both are run in the same way, by `first_odometry.py`, in two environments:
+
+- this one, where the package may be an editable installation (`pip install -e`). The finder of such an
+  installation is imported by every Python process of the environment;
+- one with a copy of the package, as `pip install` makes it.
 """
 
 from __future__ import annotations
 
+import compileall
 import os
+import shutil
 import subprocess
 import sys
+import sysconfig
+import tempfile
 import threading
 import time
+import venv
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from table import Goal, Row, interleave
 
 PATIENCE = 30.0
-"""A process is killed if it says nothing, or does not end, for this long (s)."""
+"""A process is killed if it prints nothing, or does not end, for this long (s)."""
 BARE = """
 import rclpy
 from nav_msgs.msg import Odometry
@@ -41,33 +49,38 @@ class Robot(Node):
 rclpy.init()
 rclpy.spin(Robot())
 """
-SCRIPTS = {'our': str(Path(sys.executable).with_name('virtual_robot')), 'bare': ''}
+OBSERVER = Path(__file__).with_name('first_odometry.py')
+PACKAGE = Path(__file__).parents[2] / 'diffdrive_jacobian'
+INSTALLATIONS = ('this environment', 'a copy of the package')
+QUANTITIES = (
+    'process start to first odometry (ms)',
+    'CPU time until the first odometry (ms)',
+)
 
 
-def observed(script: str) -> None:
-    """Run a script in this process; print when it first published odometry, and its CPU time (ns)."""
-    from rclpy.publisher import Publisher
+@contextmanager
+def installed() -> Iterator[str]:
+    """Create an environment with a copy of the package and the packages of this one.
 
-    publish = Publisher.publish
+    Yields:
+        Its interpreter.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        venv.create(folder, symlinks=True)
+        site = Path(sysconfig.get_path('purelib', 'venv', {'base': folder}))
+        shutil.copytree(PACKAGE, site / PACKAGE.name, ignore=shutil.ignore_patterns('__pycache__'))
+        compileall.compile_dir(site, quiet=1)
+        # The finders of editable installations there are not used: only their own directory's are.
+        (site / 'dependencies.pth').write_text(sysconfig.get_path('purelib') + '\n')
+        yield str(Path(folder, 'bin', 'python'))
 
-    def first(self: Publisher, message: object) -> None:
-        publish(self, message)
-        if self.topic_name == '/odom':
-            print(time.monotonic_ns(), time.process_time_ns(), flush=True)
-            Publisher.publish = publish
 
-    Publisher.publish = first
-    sys.argv = [script or 'bare']
-    source = Path(script).read_text() if script else BARE
-    exec(compile(source, sys.argv[0], 'exec'), {'__name__': '__main__'})
-
-
-def start(side: str) -> tuple[float, float]:
+def start(interpreter: str, script: str) -> tuple[float, float]:
     """Start a process; return the time and the CPU time until the first odometry (ms)."""
     # A domain of its own: nothing else is discovered.
     domain = str(os.getpid() % 100 + 1)
     environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_DOMAIN_ID': domain}
-    command = [sys.executable, __file__, SCRIPTS[side]]
+    command = [interpreter, str(OBSERVER), script]
     begun = time.monotonic_ns()
     process = subprocess.Popen(
         command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
@@ -97,27 +110,30 @@ def _first_line(process: subprocess.Popen) -> str:
 
 
 def rows(quick: bool) -> list[Row]:
-    """Start both sides in turn."""
-    figures = interleave(SCRIPTS, 3 if quick else 15, start)
-    quantities = (
-        'process start to first odometry (ms)',
-        'CPU time until the first odometry (ms)',
-    )
-    return [
-        Row(
-            group='start-up',
-            ours='virtual_robot, the console script',
-            beside='bare node, rclpy.spin',
-            quantity=quantity,
-            pairs=[
-                (our[number], bare[number])
-                for our, bare in zip(figures['our'], figures['bare'], strict=True)
-            ],
-            goal=Goal(1.1),
+    """Start both sides in both environments in turn."""
+    # Users have the compiled modules, also those of an editable installation.
+    compileall.compile_dir(PACKAGE, quiet=1)
+    with installed() as interpreter, tempfile.NamedTemporaryFile('w', suffix='.py') as bare:
+        bare.write(BARE)
+        bare.flush()
+        ours = str(Path(sys.executable).with_name('virtual_robot'))
+        interpreters = dict(zip(INSTALLATIONS, (sys.executable, interpreter), strict=True))
+        sides = [(where, script) for where in INSTALLATIONS for script in (ours, bare.name)]
+        figures = interleave(
+            sides, 3 if quick else 15, lambda side: start(interpreters[side[0]], side[1])
         )
-        for number, quantity in enumerate(quantities)
-    ]
-
-
-if __name__ == '__main__':
-    observed(sys.argv[1])
+        return [
+            Row(
+                group='start-up',
+                ours=f'virtual_robot, {where}',
+                beside='bare node, rclpy.spin',
+                quantity=quantity,
+                pairs=[
+                    (one[number], other[number])
+                    for one, other in zip(figures[where, ours], figures[where, bare.name], strict=True)
+                ],
+                goal=Goal(1.1),
+            )
+            for where in INSTALLATIONS
+            for number, quantity in enumerate(QUANTITIES)
+        ]
