@@ -20,8 +20,8 @@ from lockstep_nodes import (
 from ros_messages import goal, goals, pose_of
 
 from diffdrive_jacobian.control import Arrival, offset_point, saturate
-from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.kinematics import diff_drive, se2
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.parameters.declaration import ParameterError

@@ -12,8 +12,8 @@ from diffdrive_jacobian.control.go_to_goal import go_to_goal, turn_in_place
 from diffdrive_jacobian.control.offset_point import offset_point
 from diffdrive_jacobian.control.pose import go_to_pose
 from diffdrive_jacobian.control.resolved_rate import StraightLine, resolved_rate
-from diffdrive_jacobian.control.saturation import VelocityLimits, saturate
 from diffdrive_jacobian.control.waypoints import Waypoints
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits, saturate
 
 __all__ = [
     'Arrival',

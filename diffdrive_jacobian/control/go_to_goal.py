@@ -15,7 +15,6 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.control.controller import Boundary, Controller, GainValues, ReferenceGains
-from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.kinematics._elementary import (
     agree,
     arctan2,
@@ -26,6 +25,7 @@ from diffdrive_jacobian.kinematics._elementary import (
     sin,
     wrapped,
 )
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 
 
 def go_to_goal(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any) -> tuple[Any, Any]:

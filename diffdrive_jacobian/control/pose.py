@@ -23,7 +23,6 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.control.controller import Boundary, Controller, GainValues
-from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.kinematics._checks import positive
 from diffdrive_jacobian.kinematics._elementary import (
     agree,
@@ -37,6 +36,7 @@ from diffdrive_jacobian.kinematics._elementary import (
     sinc,
     wrapped,
 )
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 
 FASTER = 2.0
 """Ratio of the default rates at which heading and distance converge [-]."""

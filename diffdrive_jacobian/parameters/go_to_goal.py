@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from diffdrive_jacobian.control.controller import Controller
 from diffdrive_jacobian.control.controllers import BUILT_IN, ControllerError, Controllers
 from diffdrive_jacobian.control.controllers import CONTROLLERS as CONTROLLERS
-from diffdrive_jacobian.control.saturation import VelocityLimits
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.plausibility import MAX_SPEED
 from diffdrive_jacobian.parameters._fields import STAMPED, timeout_field
 from diffdrive_jacobian.parameters.declaration import ParameterError, parameter

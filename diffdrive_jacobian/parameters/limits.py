@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from diffdrive_jacobian.control.saturation import VelocityLimits
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.plausibility import MAX_SPEED
 from diffdrive_jacobian.parameters.declaration import NodeParameters, parameter
 

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.controller import Controller, Law
 from diffdrive_jacobian.control.controllers import controller_of
-from diffdrive_jacobian.control.saturation import VelocityLimits
 from diffdrive_jacobian.kinematics._checks import (
     array,
     floats,
@@ -22,6 +21,7 @@ from diffdrive_jacobian.kinematics._checks import (
     number,
     positive,
 )
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
