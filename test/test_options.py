@@ -78,6 +78,11 @@ def test_the_configurations_of_an_installation_are_found(tmp_path, monkeypatch):
     monkeypatch.delenv('AMENT_PREFIX_PATH')
     monkeypatch.setattr(module, '__file__', str(tmp_path / 'a' / 'b' / 'c.py'))
     assert configurations()['rover'] == folder / 'rover.yaml'
+    # As pip and colcon install. The list of the installed files, which is slow to read, is not needed.
+    site = tmp_path / 'lib' / 'python3' / 'site-packages'
+    monkeypatch.setattr(module, '__file__', str(site / 'a' / 'b' / 'c.py'))
+    monkeypatch.setattr(module, '_listed_files', lambda: pytest.fail('it reads the list'))
+    assert configurations() == {'rover': folder / 'rover.yaml'}
 
 
 def test_robot_stands_for_its_parameter_file(capsys):
