@@ -15,8 +15,8 @@ def without_message_generator() -> None:
     """Let message classes be loaded without the generator that wrote them.
 
     A message class imports rosidl_generator_py for one function. That package also imports its generator
-    and the parser of message definitions, which takes longer than to create a node with its topics. It
-    does without them where they cannot be imported, as after `None` in `sys.modules`.
+    and the parser of message definitions, which takes longer than to create a node. It does without them
+    where they cannot be imported, as after `None` in `sys.modules`.
     """
     if 'rosidl_generator_py' not in sys.modules:
         sys.modules[_GENERATOR] = None  # type: ignore[assignment]
