@@ -23,7 +23,7 @@ def catch(self):
 Signals.catch = catch
 sys.argv = ['virtual_robot']
 code = entry_points.virtual_robot()
-threads = os.environ['OPENBLAS_NUM_THREADS']
+threads = os.environ.get('OPENBLAS_NUM_THREADS')
 collector = gc.isenabled(), gc.get_freeze_count()
 print(json.dumps([code, sorted(sys.modules), threads, collector]))
 """
