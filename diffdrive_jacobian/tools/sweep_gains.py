@@ -12,7 +12,6 @@ from typing import Any
 
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import from_ros
-from diffdrive_jacobian.parameters.file import robot_parameters
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.plots import sweep_figure
 from diffdrive_jacobian.plots.output_files import FORMATS, create, extension, free_stem, new_file
@@ -20,7 +19,6 @@ from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.simulation import RobotModel
 from diffdrive_jacobian.sweeps.sweep import Setup, Sweep, SweptControllers, describe, sweep, table
 from diffdrive_jacobian.tools import _cli
-from diffdrive_jacobian.tools._progress import Batch
 from diffdrive_jacobian.tools._waiting import busy
 
 PROGRAM = 'sweep_gains'
@@ -92,6 +90,9 @@ def _sweep(options: argparse.Namespace, signals: Signals) -> Sweep:
         robot=_robot(options),
     )
     _check(signals)
+    # Slow to import.
+    from diffdrive_jacobian.tools._progress import Batch
+
     with Batch('sweeping', setup.loops) as bar:
 
         def progress(done: int) -> None:
@@ -116,6 +117,9 @@ def _robot(options: argparse.Namespace) -> RobotModel:
     """
     values: dict[str, Any] = {}
     if options.params_file is not None:
+        # Slow to import.
+        from diffdrive_jacobian.parameters.file import robot_parameters
+
         values.update(robot_parameters(options.params_file))
     for name, limit in (('linear.x', options.max_velocity), ('angular.z', options.max_yaw_rate)):
         if limit is not None:
