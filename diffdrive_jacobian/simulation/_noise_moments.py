@@ -24,7 +24,8 @@ SMALL_TURN = 0.05
 """Turn below which the power series is used (rad)."""
 RADIUS = 1.0
 """Largest argument of the power series, `2 |omega t| + 4 m`. Longer straight arcs are halved."""
-
+SHORT_TURN, SHORT_NOISE = 0.02, 1e-5
+"""Largest turn (rad) and largest m of an arc for which `short_arc` is precise: 20 ms at 1 rad/s."""
 
 FIRST_ORDER, LAST_ORDER = 6, 21
 
@@ -58,6 +59,64 @@ class NoiseMoments(NamedTuple):
     """E[gamma_x sin psi] (m)."""
     yc: float
     ys: float
+
+
+def short_arc(
+    alpha: float, turn: float, nu: float, beta: float, m: float
+) -> tuple[float, float, float, float, float, float, float, float, float, float, float]:
+    """Compute the moments of an arc between two messages, by the first terms of their series.
+
+    All terms above 1e-14 of the standard deviations of position and heading are there, for a turn and an
+    m of at most `SHORT_TURN` and `SHORT_NOISE`. In the frame of the chord, half of the terms of other
+    frames are zero.
+
+    Args:
+        alpha: v t (m).
+        turn: omega t (rad).
+        nu: vv t (m^2).
+        beta: vw t (m rad), at most `sqrt(2 m nu)`.
+        m: ww t / 2.
+
+    Returns:
+        The entries of `NoiseMoments`, but in the frame of the chord, turned by `turn / 2` from that of
+        the reported pose at the start.
+    """
+    s, a, b = turn * turn, alpha * m, beta * turn
+    at, bm = a * turn, b * m
+    ab, aa, bb = alpha * beta, alpha * a, beta * beta
+    # sin(turn / 2) / (turn / 2), and coefficients that several moments share.
+    chord = 1.0 - s * (1 / 24 - s / 1920)
+    sixth = 1 / 6 - s * (1 / 240 - s / 26880)
+    bent = alpha * b * (1 / 6 - s * (1 / 120 - s / 5040))
+    short = 1 / 6 - s / 240
+    shift = nu * (s * (1 / 12 - s / 240) + m * (1.0 - s / 6 - m * (4 / 3)))
+    return (
+        a * (m * (1 / 6 - s / 120 - m / 24) - 0.5 * chord) + bm * (1 / 24 - s / 960 - m / 48),
+        beta * (0.5 * chord - m * (0.25 - s / 96 - m / 12))
+        - at * (0.5 * sixth - m * (1 / 24 - s / 960 - m / 80)),
+        nu
+        - shift
+        - bent
+        + ab * turn * m * (1 / 3 - s / 45 - m * (7 / 12))
+        - bb * (0.5 - s / 24 - m * (2 / 3))
+        + aa * (s * (1 / 60 - s / 1260) + m * (7 / 12 - s * (19 / 240) - m * (19 / 30))),
+        ab * (0.5 - s * (1 / 24 - s / 720) - m * (17 / 12 - s * (31 / 240) - m * (5 / 3)))
+        - alpha * at * (1 / 12 - s * (1 / 180 - s / 6720) - m * (31 / 120 - s / 56 - m * (73 / 240)))
+        - nu * turn * m * (1 / 3 - s / 30 - m * (2 / 3))
+        + beta * bm / 8,
+        shift
+        - bent
+        - ab * turn * m * (0.25 - s / 60 - m * (23 / 40))
+        + bb * (0.25 - s / 48 - m * (7 / 12))
+        + aa * (2 / 3 - s * (0.05 - s / 630) - m * (5 / 6 - s * (67 / 720) - m * 0.7)),
+        beta * (chord - m * (1.0 - s / 24 - 0.5 * m)) - at * (sixth - m * (short - m * 0.075)),
+        a * (chord - m * (2 / 3 - s / 30 - 0.25 * m)) - bm * (short - m / 8),
+        a * m * (7 / 6 - s * (13 / 240) - m * (19 / 12)) + bm * (short - m * (11 / 24)),
+        beta * (chord - m * (2.0 - s / 12 - m * (8 / 3)))
+        - at * (sixth - m * (2.0 * short - m * 0.425)),
+        at * m * (0.25 - s / 160 - 0.4 * m) - beta * m * (1.5 - s / 16 - 2.5 * m),
+        a * (chord - m * (5 / 3 - s * 0.075 - 1.75 * m)) - bm * (short - m * (11 / 24)),
+    )
 
 
 def series(alpha: float, turn: float, nu: float, beta: float, m: float) -> NoiseMoments:

@@ -110,7 +110,7 @@ class Robot:
             'pose': pose,
             'covariance': covariance,
             'pose_tuple': tuple(pose.tolist()),
-            '_uncertainty': Uncertainty(gaussian_moments(entries)),
+            '_uncertainty': Uncertainty(tuple(gaussian_moments(entries))),
             '_truth': _truth(self.model, pose.tolist()),
         }
         for name in ('wheel_angles', 'command', 'twist'):
@@ -169,7 +169,7 @@ class Robot:
         Raises:
             ValueError: They overflow.
         """
-        return self._uncertainty.moments()
+        return Moments(*self._uncertainty.moments())
 
     @property
     def expiry(self) -> int | None:
