@@ -15,6 +15,7 @@ from diffdrive_jacobian.simulation._noise_moments import (
     SHORT_NOISE,
     SHORT_TURN,
     NoiseMoments,
+    central,
     series,
     short_arc,
 )
@@ -107,7 +108,7 @@ def test_the_short_form_is_the_series_up_to_its_limits(m, turn, alpha):
     nu, to_end = m / 2.0, complex(math.cos(turn / 2.0), -math.sin(turn / 2.0))
     for beta in (m, -m, 0.3 * m, 0.0):
         short = NoiseMoments(*short_arc(alpha, turn, nu, beta, m))
-        expected = NoiseMoments(*series(alpha, turn, nu, beta, m))
+        expected = NoiseMoments(*central(series(alpha, turn, nu, beta, m), m))
         position = nu + alpha * alpha * m
         for x, y in (('x', 'y'), ('xt', 'yt'), ('xc', 'yc'), ('xs', 'ys')):
             turned = complex(getattr(short, x), getattr(short, y)) * to_end

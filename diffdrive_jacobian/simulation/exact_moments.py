@@ -29,6 +29,7 @@ from diffdrive_jacobian.simulation._noise_moments import (
     SHORT_TURN,
     SMALL_TURN,
     NoiseMoments,
+    central,
     closed_form,
     series,
     short_arc,
@@ -211,7 +212,7 @@ def _extended(
     sinc = sin(half) / half if half else 1.0
     along, across = alpha * (sin(turn) / turn if turn else 1.0), -alpha * sinc * sin(half)
     gx, gy = cosine * along - sine * across, sine * along + cosine * across
-    return _composed(moments, cosine, sine, gx, gy, m, noise)
+    return _composed(moments, cosine, sine, gx, gy, m, None if noise is None else central(noise, m))
 
 
 def _composed(
@@ -226,7 +227,8 @@ def _composed(
     """Compute the moments after an arc that starts with an error and adds its noise.
 
     With the reported displacement g and the noise gamma, both in the world, and `u = exp(i delta)`,
-    the error becomes `e + (u - 1) g + u gamma`. The noise is independent of e and delta.
+    the error becomes `e + (u - 1) g + u gamma`. The noise is independent of e and delta. Its mean p
+    lengthens the displacement: with `h = g + p` the error is `e + p + (u - 1) h + u (gamma - p)`.
 
     Args:
         moments: Entries of `Moments` at the start.
@@ -235,7 +237,8 @@ def _composed(
         gx: Displacement in the world (m).
         gy: Likewise.
         m: Half the variance of the error of the heading that the arc adds.
-        noise: Entries of `NoiseMoments` in that frame; None: there is no noise.
+        noise: The mean of the noise in that frame, and the moments about it, in the order of
+            `NoiseMoments`; None: there is no noise.
     """
     xx, xy, xt, yy, yt, tt, x, y, xc, xs, yc, ys = moments
     # E[C], E[cos delta], E[C^2], E[S^2], E[cos delta C]; E[S], E[C S] are zero.
@@ -243,48 +246,46 @@ def _composed(
     u = 1.0 + c
     cc = c * c * (u * (u + 2.0) + 3.0) / 2.0
     ss = -c * (1.0 + u) * (1.0 + u * u) / 2.0
-    uc = c + cc
     loss = expm1(-m)
     decay = 1.0 + loss
-    cg, sg = cc * decay + c * loss, ss * decay
-    gxx, gyy = gx * gx, gy * gy
-    # E[(e + (u - 1) g) ...]
-    end_xx = xx + 2.0 * (xc * gx - xs * gy) + cc * gxx + ss * gyy
-    end_xy = xy + (xc - ys) * gy + (xs + yc) * gx + (cc - ss) * gx * gy
-    end_yy = yy + 2.0 * (yc * gy + ys * gx) + cc * gyy + ss * gxx
-    tu = tt * u
-    end_xt, end_yt = xt - tu * gy, yt + tu * gx
-    end_x, end_y = x + c * gx, y + c * gy
-    end_xc, end_xs = xc * decay + x * loss + cg * gx, xs * decay - sg * gy
-    end_yc, end_ys = yc * decay + y * loss + cg * gy, ys * decay + sg * gx
+    px = py = 0.0
+    if noise is not None:
+        nx, ny, nxx, nxy, nyy, nxt, nyt, nxc, nxs, nyc, nys = noise
+        px, py = cosine * nx - sine * ny, sine * nx + cosine * ny
+    hx, hy = gx + px, gy + py
+    # Of e + p + (u - 1) h.
+    shifted_x, shifted_y = x + c * hx, y + c * hy
+    end_x, end_y = shifted_x + px, shifted_y + py
+    hxx, hyy, tu = hx * hx, hy * hy, tt * u
+    end_xx = xx + 2.0 * (xc * hx - xs * hy) + cc * hxx + ss * hyy + px * (shifted_x + end_x)
+    end_xy = xy + (xc - ys) * hy + (xs + yc) * hx + (cc - ss) * hx * hy + px * shifted_y + py * end_x
+    end_yy = yy + 2.0 * (yc * hy + ys * hx) + cc * hyy + ss * hxx + py * (shifted_y + end_y)
+    end_xt, end_yt = xt - tu * hy, yt + tu * hx
+    end_xc, end_xs = (xc + c * px + cc * hx) * decay + end_x * loss, (xs - ss * hy) * decay
+    end_yc, end_ys = (yc + c * py + cc * hy) * decay + end_y * loss, (ys + ss * hx) * decay
     if noise is None:
         position = end_x, end_y, end_xc, end_xs, end_yc, end_ys
         return end_xx, end_xy, end_xt, end_yy, end_yt, tt, *position
-    nx, ny, nxx, nxy, nyy, nxt, nyt, nxc, nxs, nyc, nys = noise
-    px, py = cosine * nx - sine * ny, sine * nx + cosine * ny
-    pxt, pyt = cosine * nxt - sine * nyt, sine * nxt + cosine * nyt
-    pxc, pyc = cosine * nxc - sine * nyc, sine * nxc + cosine * nyc
-    pxs, pys = cosine * nxs - sine * nys, sine * nxs + cosine * nys
-    square_c, square_s, product = cosine * cosine, sine * sine, cosine * sine
-    cross = 2.0 * product * nxy
+    # Of u (gamma - p): E[cos^2 delta] = 1 - ss.
+    ux, product = 1.0 - ss, cosine * sine
+    square_c, square_s, cross = cosine * cosine, sine * sine, 2.0 * product * nxy
     pxx = square_c * nxx - cross + square_s * nyy
     pyy = square_s * nxx + cross + square_c * nyy
     pxy = product * (nxx - nyy) + (square_c - square_s) * nxy
-    # E[u gamma u gamma], and twice E[(e + (u - 1) g) u gamma].
+    pxc, pyc = cosine * nxc - sine * nyc, sine * nxc + cosine * nyc
+    pxs, pys = cosine * nxs - sine * nys, sine * nxs + cosine * nys
     spread = ss * (pxx - pyy)
-    qxx, qyy, qxy, qyx = uc * gx + x + xc, uc * gy + y + yc, ss * gy - xs, ss * gx + ys
-    ux = 1.0 - ss
     return (
-        end_xx + pxx - spread + 2.0 * (qxx * px + qxy * py),
-        end_xy + (ux - ss) * pxy + (qxx - qyx) * py + (qyy - qxy) * px,
-        end_xt + u * pxt - tu * py,
-        end_yy + pyy + spread + 2.0 * (qyy * py + qyx * px),
-        end_yt + u * pyt + tu * px,
+        end_xx + pxx - spread,
+        end_xy + (ux - ss) * pxy,
+        end_xt + u * (cosine * nxt - sine * nyt),
+        end_yy + pyy + spread,
+        end_yt + u * (sine * nxt + cosine * nyt),
         tt + 2.0 * m,
-        end_x + u * px,
-        end_y + u * py,
-        end_xc + ux * pxc + ss * pys + uc * px,
-        end_xs + ux * pxs - ss * (pyc + py),
-        end_yc + ux * pyc - ss * pxs + uc * py,
-        end_ys + ux * pys + ss * (pxc + px),
+        end_x,
+        end_y,
+        end_xc + ux * pxc + ss * pys,
+        end_xs + ux * pxs - ss * pyc,
+        end_yc + ux * pyc - ss * pxs,
+        end_ys + ux * pys + ss * pxc,
     )

@@ -21,9 +21,9 @@ Source: doc/mathematics.md, "Motion".
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import inf, isfinite
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -32,6 +32,7 @@ from numpy.typing import ArrayLike, NDArray
 from diffdrive_jacobian.control.saturation import saturate
 from diffdrive_jacobian.kinematics._arc import arc_end
 from diffdrive_jacobian.kinematics._checks import (
+    MAX_NANOSECONDS,
     array,
     floats,
     instance,
@@ -174,10 +175,12 @@ class Robot:
     @property
     def expiry(self) -> int | None:
         """Time at which the timeout stops the robot (ns); None: it is not moving, or has no timeout."""
-        if self.commanded_at is None or not self.model.command_timeout:
+        commanded_at, timeout = self.commanded_at, self.model.command_timeout
+        if commanded_at is None or not timeout:
             return None
         # If the timeout was shortened, it expires now, not in the past.
-        return max(self.stamp, self.commanded_at + self.model.command_timeout)
+        expiry, now = commanded_at + timeout, self.stamp
+        return expiry if expiry > now else now
 
     @property
     def next_change(self) -> int | None:
@@ -200,7 +203,7 @@ class Robot:
         (v, omega), r, L = self.twist, self.model.wheel_radius, self.model.wheel_separation
         half = omega * L / 2.0
         omega_R, omega_L = (v + half) / r, (v - half) / r
-        if not (math.isfinite(omega_R) and math.isfinite(omega_L)):
+        if not (isfinite(omega_R) and isfinite(omega_L)):
             raise ValueError('twist must give finite wheel speeds, but they overflow')
         return omega_R, omega_L
 
@@ -219,9 +222,10 @@ class Robot:
             ValueError: As `twist_covariance`.
         """
         model = self.model
-        interval = operand('interval', interval, positive)
-        if type(interval) is not float:
-            raise ValueError(f'interval must be a single number, got shape {np.shape(interval)}')
+        if type(interval) is not float or not 0.0 < interval < inf:
+            interval = operand('interval', interval, positive)
+            if type(interval) is not float:
+                raise ValueError(f'interval must be a single number, got shape {np.shape(interval)}')
         return twist_covariance_entries(
             self.twist, model.wheel_separation, model.wheel_travel_variance, interval
         )
@@ -445,7 +449,8 @@ class Robot:
         Raises:
             ValueError: As `at`.
         """
-        stamp = nanoseconds('stamp', stamp)
+        if type(stamp) is not int or stamp > MAX_NANOSECONDS:
+            stamp = nanoseconds('stamp', stamp)
         if stamp < self.stamp:
             raise ValueError(f'stamp cannot go back from {self.stamp} ns to {stamp} ns')
         expiry = self.expiry
@@ -468,18 +473,21 @@ class Robot:
         model, (x, y, theta), (right, left) = self.model, self.pose_tuple, self.wheel_angles
         omega_R, omega_L = self.wheel_speeds
         angles = right + omega_R * dt, left + omega_L * dt
-        if not (math.isfinite(angles[0]) and math.isfinite(angles[1])):
+        if not (isfinite(angles[0]) and isfinite(angles[1])):
             raise ValueError(f'wheel_angles must be finite, got {list(angles)}')
         L, k = model.wheel_separation, model.wheel_travel_variance
         if truth is not None:
             truth = truth.after(self.stamp, stamp, twist, L, k)
         uncertainty = self._uncertainty.after((theta, twist, dt, L, k))
         state = arc_end(x, y, theta, v, omega, dt), angles, uncertainty, truth
-        _set(self, '_ahead', (stamp, state))
+        object.__setattr__(self, '_ahead', (stamp, state))
         return state
 
 
-_set = object.__setattr__
+class _Draft:
+    """A robot while it is created: attributes of a frozen one are set in several times the time."""
+
+    __slots__ = Robot.__slots__
 
 
 def _robot(
@@ -492,20 +500,15 @@ def _robot(
     settling: Settling | None = None,
 ) -> Robot:
     """Return a robot with checked values, without checking them again for every message."""
-    robot = object.__new__(Robot)
-    pose, angles, uncertainty, truth = state
-    _set(robot, 'model', model)
-    _set(robot, 'stamp', stamp)
-    _set(robot, 'pose_tuple', pose)
-    _set(robot, '_uncertainty', uncertainty)
-    _set(robot, '_truth', truth)
-    _set(robot, 'wheel_angles', angles)
-    _set(robot, 'command', command)
-    _set(robot, 'twist', twist)
-    _set(robot, 'commanded_at', commanded_at)
-    _set(robot, '_settling', settling)
-    _set(robot, '_ahead', None)
-    return robot
+    robot: Any = _Draft()
+    robot.pose_tuple, robot.wheel_angles, robot._uncertainty, robot._truth = state
+    robot.model, robot.stamp = model, stamp
+    robot.command, robot.twist, robot.commanded_at = command, twist, commanded_at
+    robot._settling, robot._ahead = settling, None
+    # Both classes have the same slots. Those of the arrays stay empty, see `Robot.__getattr__`.
+    robot.__class__ = Robot
+    created: Robot = robot
+    return created
 
 
 def _triple(name: str, value: ArrayLike) -> tuple[float, float, float]:
