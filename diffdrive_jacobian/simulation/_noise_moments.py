@@ -8,7 +8,8 @@ frame of the reported pose. psi is Gaussian with variance `ww t`, gamma is not.
 Notation: `x = i omega t`, `m = ww t / 2`, `alpha = v t`, `beta = vw t`, `h = exp(i psi)`. The moments
 obey a linear differential equation with constant coefficients. Its solution is written with divided
 differences of the exponential function: `[a, b] = (exp(a) - exp(b)) / (a - b)`, and so on. Where the
-points of those are close to each other, a power series is used, so that no digits cancel.
+points of those are close to each other, a power series is used, so that no digits cancel. For the arcs
+between two messages its first terms suffice.
 
 Source: doc/mathematics.md, "Odometry covariance".
 """

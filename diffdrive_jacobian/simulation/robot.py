@@ -85,6 +85,8 @@ class Robot:
     """The applied twist: the command after saturation, as the motors follow it."""
     commanded_at: int | None = None
     """Time at which the command took effect (ns); None: it is zero."""
+    expiry: int | None = field(init=False, repr=False)
+    """Time at which the timeout stops the robot (ns); None: it is not moving, or has no timeout."""
     pose_tuple: tuple[float, float, float] = field(init=False, repr=False)
     """`(x, y, theta)`, the pose as floats (m, m, rad)."""
     _uncertainty: Uncertainty = field(init=False, repr=False)
@@ -118,6 +120,7 @@ class Robot:
             values[name] = pair(name, getattr(self, name))
         if self.commanded_at is not None:
             values['commanded_at'] = nanoseconds('commanded_at', self.commanded_at)
+        values['expiry'] = _expiry(self.model, values['stamp'], values.get('commanded_at'))
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
@@ -173,21 +176,11 @@ class Robot:
         return Moments(*self._uncertainty.moments())
 
     @property
-    def expiry(self) -> int | None:
-        """Time at which the timeout stops the robot (ns); None: it is not moving, or has no timeout."""
-        commanded_at, timeout = self.commanded_at, self.model.command_timeout
-        if commanded_at is None or not timeout:
-            return None
-        # If the timeout was shortened, it expires now, not in the past.
-        expiry, now = commanded_at + timeout, self.stamp
-        return expiry if expiry > now else now
-
-    @property
     def next_change(self) -> int | None:
         """Next time at which the twist changes without a command, by the timeout or the lag (ns); None:
         it does not.
         """
-        expiry, settling = self.expiry, self._settling
+        settling, expiry = self._settling, self.expiry
         if settling is None:
             return expiry
         return settling.end if expiry is None else min(settling.end, expiry)
@@ -472,8 +465,9 @@ class Robot:
             return self.pose_tuple, self.wheel_angles, self._uncertainty, truth.at_rest()
         model, (x, y, theta), (right, left) = self.model, self.pose_tuple, self.wheel_angles
         omega_R, omega_L = self.wheel_speeds
-        angles = right + omega_R * dt, left + omega_L * dt
-        if not (isfinite(angles[0]) and isfinite(angles[1])):
+        right, left = angles = right + omega_R * dt, left + omega_L * dt
+        # A finite sum has finite terms.
+        if not (isfinite(right + left) or (isfinite(right) and isfinite(left))):
             raise ValueError(f'wheel_angles must be finite, got {list(angles)}')
         L, k = model.wheel_separation, model.wheel_travel_variance
         if truth is not None:
@@ -504,11 +498,22 @@ def _robot(
     robot.pose_tuple, robot.wheel_angles, robot._uncertainty, robot._truth = state
     robot.model, robot.stamp = model, stamp
     robot.command, robot.twist, robot.commanded_at = command, twist, commanded_at
+    robot.expiry = None if commanded_at is None else _expiry(model, stamp, commanded_at)
     robot._settling, robot._ahead = settling, None
     # Both classes have the same slots. Those of the arrays stay empty, see `Robot.__getattr__`.
     robot.__class__ = Robot
     created: Robot = robot
     return created
+
+
+def _expiry(model: RobotModel, stamp: int, commanded_at: int | None) -> int | None:
+    """Return the time at which the timeout stops a robot (ns), see `Robot.expiry`."""
+    timeout = model.command_timeout
+    if commanded_at is None or not timeout:
+        return None
+    # If the timeout was shortened, it expires now, not in the past.
+    expiry = commanded_at + timeout
+    return expiry if expiry > stamp else stamp
 
 
 def _triple(name: str, value: ArrayLike) -> tuple[float, float, float]:
