@@ -11,6 +11,14 @@ from moments_reference import DRIVES, noisy_runs, reference
 
 from diffdrive_jacobian.kinematics.se2 import integrate
 from diffdrive_jacobian.simulation import Robot, RobotModel
+from diffdrive_jacobian.simulation._noise_moments import (
+    SHORT_NOISE,
+    SHORT_TURN,
+    NoiseMoments,
+    central,
+    series,
+    short_arc,
+)
 from diffdrive_jacobian.simulation.exact_moments import Moments, gaussian, propagate_moments
 from diffdrive_jacobian.simulation.odometry_noise import propagate_covariance
 
@@ -90,6 +98,38 @@ def test_for_small_noise_it_is_the_first_order_form(v, omega, duration):
         deviations = np.sqrt(np.diag(first))
         error = np.abs(exact.second_moment - first)
         assert np.all(error <= 1e-7 * np.outer(deviations, deviations))
+
+
+@pytest.mark.parametrize('m', [SHORT_NOISE, 0.1 * SHORT_NOISE, 1e-9])
+@pytest.mark.parametrize('turn', [SHORT_TURN, -SHORT_TURN, 0.2 * SHORT_TURN, 1e-6, 0.0])
+@pytest.mark.parametrize('alpha', [0.0, 1e-3, -0.1, 2.0, -100.0])
+def test_the_short_form_is_the_series_up_to_its_limits(m, turn, alpha):
+    """With wheels one metre apart, `nu = m / 2` and `|beta| <= m`; alpha is a multiple of that."""
+    nu, to_end = m / 2.0, complex(math.cos(turn / 2.0), -math.sin(turn / 2.0))
+    for beta in (m, -m, 0.3 * m, 0.0):
+        short = NoiseMoments(*short_arc(alpha, turn, nu, beta, m))
+        expected = NoiseMoments(*central(series(alpha, turn, nu, beta, m), m))
+        position = nu + alpha * alpha * m
+        for x, y in (('x', 'y'), ('xt', 'yt'), ('xc', 'yc'), ('xs', 'ys')):
+            turned = complex(getattr(short, x), getattr(short, y)) * to_end
+            error = turned - complex(getattr(expected, x), getattr(expected, y))
+            assert abs(error) <= 1e-13 * math.sqrt(position * m)
+        assert short.xx + short.yy == pytest.approx(expected.xx + expected.yy, rel=1e-13)
+        turned = complex(short.xx - short.yy, 2.0 * short.xy) * to_end * to_end
+        error = turned - complex(expected.xx - expected.yy, 2.0 * expected.xy)
+        assert abs(error) <= 1e-13 * position
+
+
+@pytest.mark.parametrize('side', [0.999999, 1.000001])
+@pytest.mark.parametrize(('v', 'omega'), [(0.2, 1.0), (0.08, -1.0), (0.0, 2.0), (0.2, 0.0), (-0.2, 0.1)])
+def test_on_both_sides_of_the_limits_of_the_short_form_the_moments_are_exact(v, omega, side):
+    duration = side * SHORT_TURN / abs(omega or 1.0)
+    rate = (abs(v + omega * L / 2.0) + abs(v - omega * L / 2.0)) / (2.0 * L * L)
+    for k in (0.5 * SHORT_NOISE / rate / duration, SHORT_NOISE / rate / duration * side):
+        for start in STARTS.values():
+            actual = propagate_moments(gaussian(start), START, (v, omega), duration, L, k)
+            expected = reference(gaussian(start), START[2], (v, omega), duration, L, k)
+            close(actual, expected, tolerance=2e-13)
 
 
 def test_driving_straight_the_mean_falls_short_by_the_known_amount():

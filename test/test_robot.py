@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import pickle
 from dataclasses import replace
 
@@ -336,6 +337,26 @@ def test_a_time_that_was_computed_is_not_computed_again():
     assert first._uncertainty is again._uncertainty is robot.commanded((0.1, 0.0), 1000)._uncertainty
     assert first.pose_tuple == tuple(first.pose.tolist())
     assert first.covariance_tuple == tuple(first.covariance.ravel().tolist())
+
+
+def test_states_that_are_computed_are_robots_like_those_that_are_given():
+    """They are created without the checks of the constructor."""
+    given = start()
+    for robot in (
+        given.at(1000),
+        given.commanded((0.2, 1.0), 1000),
+        given.commanded((1.0, 0.0), 5).at(9),
+    ):
+        assert type(robot) is Robot
+        assert not hasattr(robot, '__dict__')
+        for one in dataclasses.fields(robot):
+            with pytest.raises(dataclasses.FrozenInstanceError):
+                setattr(robot, one.name, getattr(given, one.name))
+        again = pickle.loads(pickle.dumps(robot))
+        assert state(again) == state(robot)
+        assert again.expiry == robot.expiry
+        with pytest.raises(AttributeError, match="'Robot' object has no attribute 'speed'"):
+            robot.speed  # noqa: B018
 
 
 def test_a_covariance_that_overflows_raises_an_error_whenever_it_is_read():

@@ -6,6 +6,7 @@ document B's law the distance is measured from the offset point (doc/mathematics
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any
@@ -110,6 +111,9 @@ class Arrival:
 
     def reached(self, x: float, y: float, theta: float, x_goal: float, y_goal: float) -> bool:
         """Return whether the distance to a goal is within the tolerance, without checks."""
+        offset = self.offset
+        if type(offset) is float and offset == 0.0:
+            return math.hypot(x_goal - x, y_goal - y) <= self.xy_tolerance
         return bool(self._distance(x, y, theta, x_goal, y_goal) <= self.xy_tolerance)
 
     def faces(self, theta: Any, heading: Any) -> Any:

@@ -79,9 +79,12 @@ class Waypoints:
         Raises:
             ValueError: An argument is of another class or shape, or not finite.
         """
-        x, y, theta = components('pose', pose, 3)
-        if type(theta) is not float:
-            raise ValueError(f'pose must have shape (3,), got {np.shape(pose)}')
+        # Tuples are unpacked here, because a call would take as long as the rest.
+        x, y, theta = pose if type(pose) is tuple and len(pose) == 3 else components('pose', pose, 3)
+        if not (type(x) is type(y) is type(theta) is float and isfinite(x + y + theta)):
+            x, y, theta = components('pose', pose, 3)
+            if type(theta) is not float:
+                raise ValueError(f'pose must have shape (3,), got {np.shape(pose)}')
         if not callable(law) or type(arrival) is not Arrival:
             function('law', law)
             instance('arrival', arrival, Arrival)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from diffdrive_jacobian.kinematics._elementary import wrapped
+from diffdrive_jacobian.kinematics._elementary import all_finite, wrapped
 
 
 def arc_end(
@@ -25,10 +25,13 @@ def arc_end(
         # The result of sinc is exactly 1 for a tiny angle, which replaces zero.
         chord = v * dt * (math.sin(half) / half if half else 1.0)
         end_x, end_y = x + chord * math.cos(heading), y + chord * math.sin(heading)
-        end_theta = wrapped(theta + turn)
+        end_theta = theta + turn
+        if not -math.pi < end_theta <= math.pi:
+            end_theta = wrapped(end_theta)
     except ValueError:
         # math.sin(inf)
-        end_x = math.inf
-    if not (math.isfinite(end_x) and math.isfinite(end_y) and math.isfinite(end_theta)):
+        end_x = end_y = end_theta = math.inf
+    # A finite sum has finite terms.
+    if not math.isfinite(end_x + end_y + end_theta) and not all_finite((end_x, end_y, end_theta)):
         raise ValueError('pose, twist and dt must give a finite result, but it overflows')
     return end_x, end_y, end_theta

@@ -181,6 +181,10 @@ class _Walk:
 
         # A short message has few texts, and usually the same ones as before.
         convert = _converted_before if self._offset <= _MAX_REMEMBERED else _converted
+        if texts == [0] and len(picks) > 2:
+            # Such as a frame and numbers.
+            text, numbers = picks[0], itemgetter(*picks[1:])
+            return lambda values: (convert(values[text]), *numbers(values))
 
         def pick_texts(values: tuple[Any, ...]) -> tuple[Any, ...]:
             picked = list(pick(values))

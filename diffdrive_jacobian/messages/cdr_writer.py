@@ -73,6 +73,12 @@ class Writer:
         try:
             if not self._more:
                 return self._pack(*self._head, *values, *self._tail)
+            if len(self._more) == 1:
+                # Usually a stamp, the names of frames, and numbers.
+                ((constant, part),) = self._more
+                return self._pack(
+                    *self._head, *values[self._first], constant, *values[part], *self._tail
+                )
             arguments = [*self._head, *values[self._first]]
             for constant, part in self._more:
                 arguments.append(constant)

@@ -109,7 +109,12 @@ def decoding(
         def decode_numbered(data: bytes, info: Mapping[str, Any]) -> None:
             # None where the middleware does not number messages.
             numbers.number = info.get('publication_sequence_number')
-            decode(data)
+            try:
+                values = read(data)
+            except DecodingError as error:
+                refused(error)
+                return
+            callback(*values)
 
         chosen = with_message_info(decode_numbered)
     # Reports name a callback.

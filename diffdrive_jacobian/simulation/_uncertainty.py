@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
-from diffdrive_jacobian.simulation.exact_moments import Moments, propagated_moments
+from diffdrive_jacobian.simulation.exact_moments import Entries, propagated_moments
 
 Arc: TypeAlias = tuple[float, tuple[float, float], float, float, float]
 """Heading at the start (rad), twist (m/s, rad/s), duration (s), wheel separation (m), k (m)."""
@@ -22,9 +22,9 @@ class Uncertainty:
 
     __slots__ = ('_moments', '_number', '_pending')
 
-    def __init__(self, moments: Moments) -> None:
+    def __init__(self, moments: Entries) -> None:
         """Start from given moments."""
-        self._moments: Moments | None = moments
+        self._moments: Entries | None = moments
         self._pending: tuple[Uncertainty, Arc] | None = None
         self._number = 0
 
@@ -38,8 +38,8 @@ class Uncertainty:
         later._number = self._number + 1
         return later
 
-    def moments(self) -> Moments:
-        """Return the moments.
+    def moments(self) -> Entries:
+        """Return the entries of the moments.
 
         Raises:
             ValueError: They overflow.

@@ -15,7 +15,8 @@ Source: doc/mathematics.md, "Odometry covariance".
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from math import cos, exp, expm1, isfinite, sin
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,10 +25,14 @@ from diffdrive_jacobian.kinematics._checks import not_negative, number, positive
 from diffdrive_jacobian.kinematics._elementary import components
 from diffdrive_jacobian.simulation._noise_moments import (
     RADIUS,
+    SHORT_NOISE,
+    SHORT_TURN,
     SMALL_TURN,
     NoiseMoments,
+    central,
     closed_form,
     series,
+    short_arc,
 )
 from diffdrive_jacobian.simulation.odometry_noise import covariance_entries
 
@@ -70,6 +75,10 @@ SURE = Moments(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """The moments of no error."""
 
 
+Entries: TypeAlias = tuple[float, ...]
+"""The entries of `Moments` as a plain tuple, which is created in a fifth of the time."""
+
+
 def gaussian(covariance: ArrayLike) -> Moments:
     """Return the moments of a Gaussian error about the reported pose.
 
@@ -89,7 +98,7 @@ def gaussian_moments(entries: tuple[float, ...]) -> Moments:
     """Compute what `gaussian` returns from the entries xx, xy, xt, yy, yt, tt, which were checked."""
     xx, xy, xt, yy, yt, tt = entries
     # Stein's lemma: E[e f(delta)] = E[e delta] E[f'(delta)].
-    decay = math.exp(-tt / 2.0)
+    decay = exp(-tt / 2.0)
     return Moments(xx, xy, xt, yy, yt, tt, 0.0, 0.0, 0.0, xt * decay, 0.0, yt * decay)
 
 
@@ -126,24 +135,24 @@ def propagate_moments(
         )
     dt, L = number('dt', dt, not_negative), number('L', L, positive)
     k = number('wheel_travel_variance', wheel_travel_variance, not_negative)
-    values = Moments(*components('moments', moments, 12))
+    values = tuple(components('moments', moments, 12))
     propagated = propagated_moments(values, theta, (v, omega), dt, L, k)
     if propagated is None:
         raise ValueError(
             'moments, pose, twist, dt, L and wheel_travel_variance must give a finite result, '
             'but it overflows'
         )
-    return propagated
+    return Moments(*propagated)
 
 
 def propagated_moments(
-    moments: Moments,
+    moments: Entries,
     theta: float,
     twist: tuple[float, float],
     dt: float,
     L: float,
     wheel_travel_variance: float,
-) -> Moments | None:
+) -> Entries | None:
     """Compute what `propagate_moments` returns for values that were checked before.
 
     Returns:
@@ -154,17 +163,27 @@ def propagated_moments(
     try:
         right = wheel_travel_variance * abs(v + half) * dt
         left = wheel_travel_variance * abs(v - half) * dt
-        alpha, turn = v * dt, omega * dt
-        nu, beta, m = (right + left) / 4.0, (right - left) / (2.0 * L), (right + left) / (2.0 * L * L)
-        noise = _noise(alpha, turn, nu, beta, m) if m else None
-        end = _composed(moments, theta, alpha, turn, m, noise)
+        alpha, turn, both = v * dt, omega * dt, right + left
+        nu, beta, m = both / 4.0, (right - left) / (2.0 * L), both / (2.0 * L * L)
+        if m <= SHORT_NOISE and -SHORT_TURN <= turn <= SHORT_TURN:
+            # Nearly every arc of a robot: all in the frame of the chord.
+            half = turn / 2.0
+            chord = alpha * (sin(half) / half if half else 1.0)
+            cosine, sine = cos(theta + half), sin(theta + half)
+            noise = short_arc(alpha, turn, nu, beta, m) if m else None
+            end = _composed(moments, cosine, sine, chord * cosine, chord * sine, m, noise)
+        else:
+            end = _extended(moments, theta, alpha, turn, m, _noise(alpha, turn, nu, beta, m))
     except (OverflowError, ValueError, ZeroDivisionError):
         return None
-    return end if all(map(math.isfinite, end)) else None
+    # A finite sum has finite terms.
+    return end if isfinite(sum(end)) or all(map(isfinite, end)) else None
 
 
-def _noise(alpha: float, turn: float, nu: float, beta: float, m: float) -> NoiseMoments:
-    """Compute the moments of the noise of one arc."""
+def _noise(alpha: float, turn: float, nu: float, beta: float, m: float) -> NoiseMoments | None:
+    """Compute the moments of the noise of one arc; None: there is no noise."""
+    if not m:
+        return None
     if abs(turn) >= SMALL_TURN:
         return closed_form(alpha, turn, nu, beta, m)
     argument, halvings = 2.0 * abs(turn) + 4.0 * m, 0
@@ -176,74 +195,97 @@ def _noise(alpha: float, turn: float, nu: float, beta: float, m: float) -> Noise
     alpha, turn, nu, beta, m = alpha * share, turn * share, nu * share, beta * share, m * share
     noise = series(alpha, turn, nu, beta, m)
     for _ in range(halvings):
-        first = _composed(SURE, -2.0 * turn, alpha, turn, m, noise)
-        xx, xy, xt, yy, yt, _, *others = _composed(first, -turn, alpha, turn, m, noise)
+        first = _extended(tuple(SURE), -2.0 * turn, alpha, turn, m, noise)
+        xx, xy, xt, yy, yt, _, *others = _extended(first, -turn, alpha, turn, m, noise)
         x, y, *trigonometric = others
         noise = NoiseMoments(x, y, xx, xy, yy, xt, yt, *trigonometric)
         alpha, turn, m = 2.0 * alpha, 2.0 * turn, 2.0 * m
     return noise
 
 
+def _extended(
+    moments: Entries, theta: float, alpha: float, turn: float, m: float, noise: NoiseMoments | None
+) -> Entries:
+    """Compute the moments after an arc whose noise is given in the frame of the pose at its end."""
+    cosine, sine = cos(theta + turn), sin(theta + turn)
+    half = turn / 2.0
+    sinc = sin(half) / half if half else 1.0
+    along, across = alpha * (sin(turn) / turn if turn else 1.0), -alpha * sinc * sin(half)
+    gx, gy = cosine * along - sine * across, sine * along + cosine * across
+    return _composed(moments, cosine, sine, gx, gy, m, None if noise is None else central(noise, m))
+
+
 def _composed(
-    moments: Moments, theta: float, alpha: float, turn: float, m: float, noise: NoiseMoments | None
-) -> Moments:
+    moments: Entries,
+    cosine: float,
+    sine: float,
+    gx: float,
+    gy: float,
+    m: float,
+    noise: tuple[float, ...] | None,
+) -> Entries:
     """Compute the moments after an arc that starts with an error and adds its noise.
 
     With the reported displacement g and the noise gamma, both in the world, and `u = exp(i delta)`,
-    the error becomes `e + (u - 1) g + u gamma`. The noise is independent of e and delta.
+    the error becomes `e + (u - 1) g + u gamma`. The noise is independent of e and delta. Its mean p
+    lengthens the displacement: with `h = g + p` the error is `e + p + (u - 1) h + u (gamma - p)`.
+
+    Args:
+        moments: Entries of `Moments` at the start.
+        cosine: Direction in the world of the x axis of the frame of the noise.
+        sine: Likewise.
+        gx: Displacement in the world (m).
+        gy: Likewise.
+        m: Half the variance of the error of the heading that the arc adds.
+        noise: The mean of the noise in that frame, and the moments about it, in the order of
+            `NoiseMoments`; None: there is no noise.
     """
     xx, xy, xt, yy, yt, tt, x, y, xc, xs, yc, ys = moments
     # E[C], E[cos delta], E[C^2], E[S^2], E[cos delta C]; E[S], E[C S] are zero.
-    c = math.expm1(-tt / 2.0)
+    c = expm1(-tt / 2.0)
     u = 1.0 + c
     cc = c * c * (u * (u + 2.0) + 3.0) / 2.0
     ss = -c * (1.0 + u) * (1.0 + u * u) / 2.0
-    uc = c + cc
-    # The displacement, as the noise, in the frame of the pose at the end, then in the world.
-    cosine, sine = math.cos(theta + turn), math.sin(theta + turn)
-    half = turn / 2.0
-    sinc = math.sin(half) / half if half else 1.0
-    along, across = alpha * (math.sin(turn) / turn if turn else 1.0), -alpha * sinc * math.sin(half)
-    gx, gy = cosine * along - sine * across, sine * along + cosine * across
-    decay, loss = math.exp(-m), math.expm1(-m)
-    cg, sg = cc * decay + c * loss, ss * decay
-    # E[(e + (u - 1) g) ...]
-    end_xx = xx + 2.0 * (xc * gx - xs * gy) + cc * gx * gx + ss * gy * gy
-    end_xy = xy + xc * gy + xs * gx + yc * gx - ys * gy + (cc - ss) * gx * gy
-    end_yy = yy + 2.0 * (yc * gy + ys * gx) + cc * gy * gy + ss * gx * gx
-    tu = tt * u
-    end_xt, end_yt = xt - tu * gy, yt + tu * gx
-    end_x, end_y = x + c * gx, y + c * gy
-    end_xc, end_xs = xc * decay + x * loss + cg * gx, xs * decay - sg * gy
-    end_yc, end_ys = yc * decay + y * loss + cg * gy, ys * decay + sg * gx
+    loss = expm1(-m)
+    decay = 1.0 + loss
+    px = py = 0.0
+    if noise is not None:
+        nx, ny, nxx, nxy, nyy, nxt, nyt, nxc, nxs, nyc, nys = noise
+        px, py = cosine * nx - sine * ny, sine * nx + cosine * ny
+    hx, hy = gx + px, gy + py
+    # Of e + p + (u - 1) h.
+    shifted_x, shifted_y = x + c * hx, y + c * hy
+    end_x, end_y = shifted_x + px, shifted_y + py
+    hxx, hyy, tu = hx * hx, hy * hy, tt * u
+    end_xx = xx + 2.0 * (xc * hx - xs * hy) + cc * hxx + ss * hyy + px * (shifted_x + end_x)
+    end_xy = xy + (xc - ys) * hy + (xs + yc) * hx + (cc - ss) * hx * hy + px * shifted_y + py * end_x
+    end_yy = yy + 2.0 * (yc * hy + ys * hx) + cc * hyy + ss * hxx + py * (shifted_y + end_y)
+    end_xt, end_yt = xt - tu * hy, yt + tu * hx
+    end_xc, end_xs = (xc + c * px + cc * hx) * decay + end_x * loss, (xs - ss * hy) * decay
+    end_yc, end_ys = (yc + c * py + cc * hy) * decay + end_y * loss, (ys + ss * hx) * decay
     if noise is None:
-        return Moments(
-            *(end_xx, end_xy, end_xt, end_yy, end_yt, tt),
-            *(end_x, end_y, end_xc, end_xs, end_yc, end_ys),
-        )
-    nx, ny, nxx, nxy, nyy, nxt, nyt, nxc, nxs, nyc, nys = noise
-    px, py = cosine * nx - sine * ny, sine * nx + cosine * ny
-    pxt, pyt = cosine * nxt - sine * nyt, sine * nxt + cosine * nyt
+        position = end_x, end_y, end_xc, end_xs, end_yc, end_ys
+        return end_xx, end_xy, end_xt, end_yy, end_yt, tt, *position
+    # Of u (gamma - p): E[cos^2 delta] = 1 - ss.
+    ux, product = 1.0 - ss, cosine * sine
+    square_c, square_s, cross = cosine * cosine, sine * sine, 2.0 * product * nxy
+    pxx = square_c * nxx - cross + square_s * nyy
+    pyy = square_s * nxx + cross + square_c * nyy
+    pxy = product * (nxx - nyy) + (square_c - square_s) * nxy
     pxc, pyc = cosine * nxc - sine * nyc, sine * nxc + cosine * nyc
     pxs, pys = cosine * nxs - sine * nys, sine * nxs + cosine * nys
-    pxx = cosine * cosine * nxx - 2.0 * cosine * sine * nxy + sine * sine * nyy
-    pyy = sine * sine * nxx + 2.0 * cosine * sine * nxy + cosine * cosine * nyy
-    pxy = cosine * sine * (nxx - nyy) + (cosine * cosine - sine * sine) * nxy
-    # E[u gamma u gamma], and twice E[(e + (u - 1) g) u gamma].
     spread = ss * (pxx - pyy)
-    qxx, qyy, qxy, qyx = uc * gx + x + xc, uc * gy + y + yc, ss * gy - xs, ss * gx + ys
-    ux, uy = 1.0 - ss, ss
-    return Moments(
-        end_xx + pxx - spread + 2.0 * (qxx * px + qxy * py),
-        end_xy + (1.0 - 2.0 * ss) * pxy + qxx * py - qxy * px + qyy * px - qyx * py,
-        end_xt + u * pxt - tu * py,
-        end_yy + pyy + spread + 2.0 * (qyy * py + qyx * px),
-        end_yt + u * pyt + tu * px,
+    return (
+        end_xx + pxx - spread,
+        end_xy + (ux - ss) * pxy,
+        end_xt + u * (cosine * nxt - sine * nyt),
+        end_yy + pyy + spread,
+        end_yt + u * (sine * nxt + cosine * nyt),
         tt + 2.0 * m,
-        end_x + u * px,
-        end_y + u * py,
-        end_xc + ux * pxc + uy * pys + uc * px,
-        end_xs + ux * pxs - uy * pyc - ss * py,
-        end_yc + ux * pyc - uy * pxs + uc * py,
-        end_ys + ux * pys + uy * pxc + ss * px,
+        end_x,
+        end_y,
+        end_xc + ux * pxc + ss * pys,
+        end_xs + ux * pxs - ss * pyc,
+        end_yc + ux * pyc - ss * pxs,
+        end_ys + ux * pys + ss * pxc,
     )

@@ -81,9 +81,17 @@ def twist_covariance_entries(
     Raises:
         ValueError: The result overflows.
     """
-    operands = *twist, L, wheel_travel_variance, interval
-    vv, vw, wv, ww = evaluated(True, 'twist and interval', _twist_covariance, *operands)
-    return vv, vw, wv, ww
+    v, omega = twist
+    half = omega * L / 2.0
+    right, left = wheel_travel_variance * abs(v + half), wheel_travel_variance * abs(v - half)
+    try:
+        both, cross = right + left, (right - left) / (2.0 * L * interval)
+        vv, ww = both / (4.0 * interval), both / (L * L * interval)
+    except ZeroDivisionError:
+        vv = math.inf
+    if not (math.isfinite(vv) and math.isfinite(cross) and math.isfinite(ww)):
+        raise ValueError('twist and interval must give a finite result, but it overflows')
+    return vv, cross, cross, ww
 
 
 def propagate_covariance(

@@ -21,9 +21,9 @@ Source: doc/mathematics.md, "Motion".
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import inf, isfinite
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -31,6 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._arc import arc_end
 from diffdrive_jacobian.kinematics._checks import (
+    MAX_NANOSECONDS,
     array,
     floats,
     instance,
@@ -84,6 +85,8 @@ class Robot:
     """The applied twist: the command after saturation, as the motors follow it."""
     commanded_at: int | None = None
     """Time at which the command took effect (ns); None: it is zero."""
+    expiry: int | None = field(init=False, repr=False)
+    """Time at which the timeout stops the robot (ns); None: it is not moving, or has no timeout."""
     pose_tuple: tuple[float, float, float] = field(init=False, repr=False)
     """`(x, y, theta)`, the pose as floats (m, m, rad)."""
     _uncertainty: Uncertainty = field(init=False, repr=False)
@@ -110,13 +113,14 @@ class Robot:
             'pose': pose,
             'covariance': covariance,
             'pose_tuple': tuple(pose.tolist()),
-            '_uncertainty': Uncertainty(gaussian_moments(entries)),
+            '_uncertainty': Uncertainty(tuple(gaussian_moments(entries))),
             '_truth': _truth(self.model, pose.tolist()),
         }
         for name in ('wheel_angles', 'command', 'twist'):
             values[name] = pair(name, getattr(self, name))
         if self.commanded_at is not None:
             values['commanded_at'] = nanoseconds('commanded_at', self.commanded_at)
+        values['expiry'] = _expiry(self.model, values['stamp'], values.get('commanded_at'))
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
@@ -169,22 +173,14 @@ class Robot:
         Raises:
             ValueError: They overflow.
         """
-        return self._uncertainty.moments()
-
-    @property
-    def expiry(self) -> int | None:
-        """Time at which the timeout stops the robot (ns); None: it is not moving, or has no timeout."""
-        if self.commanded_at is None or not self.model.command_timeout:
-            return None
-        # If the timeout was shortened, it expires now, not in the past.
-        return max(self.stamp, self.commanded_at + self.model.command_timeout)
+        return Moments(*self._uncertainty.moments())
 
     @property
     def next_change(self) -> int | None:
         """Next time at which the twist changes without a command, by the timeout or the lag (ns); None:
         it does not.
         """
-        expiry, settling = self.expiry, self._settling
+        settling, expiry = self._settling, self.expiry
         if settling is None:
             return expiry
         return settling.end if expiry is None else min(settling.end, expiry)
@@ -200,7 +196,7 @@ class Robot:
         (v, omega), r, L = self.twist, self.model.wheel_radius, self.model.wheel_separation
         half = omega * L / 2.0
         omega_R, omega_L = (v + half) / r, (v - half) / r
-        if not (math.isfinite(omega_R) and math.isfinite(omega_L)):
+        if not (isfinite(omega_R) and isfinite(omega_L)):
             raise ValueError('twist must give finite wheel speeds, but they overflow')
         return omega_R, omega_L
 
@@ -219,9 +215,10 @@ class Robot:
             ValueError: As `twist_covariance`.
         """
         model = self.model
-        interval = operand('interval', interval, positive)
-        if type(interval) is not float:
-            raise ValueError(f'interval must be a single number, got shape {np.shape(interval)}')
+        if type(interval) is not float or not 0.0 < interval < inf:
+            interval = operand('interval', interval, positive)
+            if type(interval) is not float:
+                raise ValueError(f'interval must be a single number, got shape {np.shape(interval)}')
         return twist_covariance_entries(
             self.twist, model.wheel_separation, model.wheel_travel_variance, interval
         )
@@ -445,7 +442,8 @@ class Robot:
         Raises:
             ValueError: As `at`.
         """
-        stamp = nanoseconds('stamp', stamp)
+        if type(stamp) is not int or stamp > MAX_NANOSECONDS:
+            stamp = nanoseconds('stamp', stamp)
         if stamp < self.stamp:
             raise ValueError(f'stamp cannot go back from {self.stamp} ns to {stamp} ns')
         expiry = self.expiry
@@ -467,19 +465,23 @@ class Robot:
             return self.pose_tuple, self.wheel_angles, self._uncertainty, truth.at_rest()
         model, (x, y, theta), (right, left) = self.model, self.pose_tuple, self.wheel_angles
         omega_R, omega_L = self.wheel_speeds
-        angles = right + omega_R * dt, left + omega_L * dt
-        if not (math.isfinite(angles[0]) and math.isfinite(angles[1])):
+        right, left = angles = right + omega_R * dt, left + omega_L * dt
+        # A finite sum has finite terms.
+        if not (isfinite(right + left) or (isfinite(right) and isfinite(left))):
             raise ValueError(f'wheel_angles must be finite, got {list(angles)}')
         L, k = model.wheel_separation, model.wheel_travel_variance
         if truth is not None:
             truth = truth.after(self.stamp, stamp, twist, L, k)
         uncertainty = self._uncertainty.after((theta, twist, dt, L, k))
         state = arc_end(x, y, theta, v, omega, dt), angles, uncertainty, truth
-        _set(self, '_ahead', (stamp, state))
+        object.__setattr__(self, '_ahead', (stamp, state))
         return state
 
 
-_set = object.__setattr__
+class _Draft:
+    """A robot while it is created: attributes of a frozen one are set in several times the time."""
+
+    __slots__ = Robot.__slots__
 
 
 def _robot(
@@ -492,20 +494,26 @@ def _robot(
     settling: Settling | None = None,
 ) -> Robot:
     """Return a robot with checked values, without checking them again for every message."""
-    robot = object.__new__(Robot)
-    pose, angles, uncertainty, truth = state
-    _set(robot, 'model', model)
-    _set(robot, 'stamp', stamp)
-    _set(robot, 'pose_tuple', pose)
-    _set(robot, '_uncertainty', uncertainty)
-    _set(robot, '_truth', truth)
-    _set(robot, 'wheel_angles', angles)
-    _set(robot, 'command', command)
-    _set(robot, 'twist', twist)
-    _set(robot, 'commanded_at', commanded_at)
-    _set(robot, '_settling', settling)
-    _set(robot, '_ahead', None)
-    return robot
+    robot: Any = _Draft()
+    robot.pose_tuple, robot.wheel_angles, robot._uncertainty, robot._truth = state
+    robot.model, robot.stamp = model, stamp
+    robot.command, robot.twist, robot.commanded_at = command, twist, commanded_at
+    robot.expiry = None if commanded_at is None else _expiry(model, stamp, commanded_at)
+    robot._settling, robot._ahead = settling, None
+    # Both classes have the same slots. Those of the arrays stay empty, see `Robot.__getattr__`.
+    robot.__class__ = Robot
+    created: Robot = robot
+    return created
+
+
+def _expiry(model: RobotModel, stamp: int, commanded_at: int | None) -> int | None:
+    """Return the time at which the timeout stops a robot (ns), see `Robot.expiry`."""
+    timeout = model.command_timeout
+    if commanded_at is None or not timeout:
+        return None
+    # If the timeout was shortened, it expires now, not in the past.
+    expiry = commanded_at + timeout
+    return expiry if expiry > stamp else stamp
 
 
 def _triple(name: str, value: ArrayLike) -> tuple[float, float, float]:

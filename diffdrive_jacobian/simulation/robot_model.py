@@ -82,9 +82,11 @@ def pair(name: str, value: Any) -> tuple[float, float]:
     Raises:
         ValueError: It is something else.
     """
-    pair = type(value) is tuple and len(value) == 2 and type(value[0]) is type(value[1]) is float
-    if pair and math.isfinite(value[0]) and math.isfinite(value[1]):
-        return value[0], value[1]
+    if type(value) is tuple and len(value) == 2:
+        first, second = value
+        # A finite sum has finite terms.
+        if type(first) is type(second) is float and math.isfinite(first + second):
+            return first, second
     first, second = components(name, value, 2)
     if type(first) is not float:
         raise ValueError(f'{name} must have shape (2,), got {np.shape(value)}')
