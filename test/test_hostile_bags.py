@@ -334,6 +334,7 @@ def parser(request, monkeypatch):
     """Load YAML by the parser that is there if ruamel.yaml.clib is, and by the other one."""
     monkeypatch.setattr(bounded_yaml, 'YAML', partial(YAML, pure=request.param))
     bounded_yaml._check_text.cache_clear()
+    bounded_yaml._pickled.cache_clear()
 
 
 @pytest.mark.usefixtures('parser')

@@ -38,6 +38,7 @@ from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.recover_run import main as recover_run
 
 PATIENCE = 20.0
+NEVER = threading.Event()
 STORAGES = ('mcap', 'sqlite3')
 STRANGE_NAMES = ('run#2', 'run?mode=memory', 'run%41', '%', 'file:x', ':memory:', 'a b', "it's", 'ü')
 
@@ -91,7 +92,7 @@ def until(condition, what):
     while not condition():
         assert time.monotonic() < deadline, f'not within {PATIENCE} s: {what}'
         # Let the thread that writes have its turn.
-        os.sched_yield()
+        NEVER.wait(0.001)
 
 
 @pytest.fixture
