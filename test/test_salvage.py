@@ -27,7 +27,6 @@ CUTS = 25
 """For each of eight kinds of bags."""
 
 
-
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch):
     """Save time: no bag needs to survive a power cut."""

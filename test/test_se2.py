@@ -205,9 +205,9 @@ def test_full_turns_return_to_the_start(pose, v, omega, circles):
     assert abs(se2.wrap_angle(end[2] - pose[2])) <= 4.0 * np.spacing(abs(circles) * TURN)
 
 
-@pytest.mark.parametrize(('steps', 'robots'), [(100_000, 0), (10_000, 100)], ids=['one', 'batch'])
+@pytest.mark.parametrize(('steps', 'robots'), [(100_000, 0), (1_000, 1_000)], ids=['one', 'batch'])
 def test_a_million_steps_keep_the_heading_wrapped_and_the_pose_finite(steps, robots):
-    """A hundred thousand steps of one robot, and a million of a hundred robots."""
+    """A hundred thousand steps of one robot, and a thousand of each of a thousand robots."""
     dt, batch = 0.1, (robots,) if robots else ()
     twists = np.random.default_rng(1).normal(0.0, [1.0, 5.0], (steps, *batch, 2))
     pose, path = np.zeros((*batch, 3)), np.empty((steps, *batch, 3))

@@ -13,11 +13,11 @@ The node go_to_goal calls it with one pose at a time. Batches and sweeps call it
 
 from __future__ import annotations
 
-import math
 import re
 import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -196,15 +196,17 @@ class Controller:
         def bound(pose: Any, goal: Any) -> tuple[float, float]:
             if not accepts_tuples:
                 pose, goal = np.asarray(pose), np.asarray(goal)
+            if len(goal) != size:
+                goal = goal[:size]
             try:
-                twist = law(pose, goal if len(goal) == size else goal[:size], *values)
+                twist = law(pose, goal, *values)
             except Exception as error:
                 raise LawError(
                     f'the law of controller {self.name!r} failed: {_reason(error)}'
                 ) from error
             try:
                 v, omega = twist
-                if type(v) is type(omega) is float and math.isfinite(v + omega):
+                if type(v) is type(omega) is float and isfinite(v + omega):
                     return v, omega
                 v, omega = _number(v), _number(omega)
             except (TypeError, ValueError) as error:
@@ -212,7 +214,7 @@ class Controller:
                     f'the law of controller {self.name!r} must return (v, omega), two numbers, '
                     f'got {short(twist)}'
                 ) from error
-            if not (math.isfinite(v) and math.isfinite(omega)):
+            if not (isfinite(v) and isfinite(omega)):
                 raise LawError(
                     f'the law of controller {self.name!r} must return finite (v, omega), '
                     f'got ({v:g}, {omega:g})'
