@@ -9,7 +9,7 @@ Source: document A, equations (9)-(11); doc/mathematics.md, "Control laws".
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from math import isfinite
 from typing import Any
 
@@ -55,10 +55,13 @@ def go_to_goal(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any) -> tuple[Any
         state if isinstance(state, tuple) and len(state) == 3 else components('state', state, 3)
     )
     x_goal, y_goal = goal if isinstance(goal, tuple) and len(goal) == 2 else components('goal', goal, 2)
-    if type(x) is type(y) is type(theta) is type(x_goal) is type(y_goal) is type(Kp) is type(
-        Kv
-    ) is float and isfinite(x + y + theta + x_goal + y_goal + Kp + Kv):
-        v, omega = _law(x, y, theta, x_goal, y_goal, Kp, Kv, _FLOATS)
+    if (
+        type(x) is type(y) is type(theta) is type(x_goal) is type(y_goal) is float
+        and type(Kp) is type(Kv) is float
+        and isfinite(x + y + theta + x_goal + y_goal + Kp + Kv)
+    ):
+        # Functions of floats, which need not look up the types of their arguments.
+        v, omega = _law(x, y, theta, x_goal, y_goal, Kp, Kv, math.cos, math.sin, math.atan2)
         if isfinite(v + omega):
             return v, omega
     if isinstance(state, tuple):
@@ -71,23 +74,28 @@ def go_to_goal(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any) -> tuple[Any
     return v, omega
 
 
-_ANY = cos, sin, arctan2
-_FLOATS = math.cos, math.sin, math.atan2
-"""The same for floats only, which saves the look-up of their types."""
-
-
 def _law(
-    x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any, Kp: Any, Kv: Any, functions: Any = _ANY
+    x: Any,
+    y: Any,
+    theta: Any,
+    x_goal: Any,
+    y_goal: Any,
+    Kp: Any,
+    Kv: Any,
+    cos: Callable[[Any], Any] = cos,
+    sin: Callable[[Any], Any] = sin,
+    arctan2: Callable[[Any, Any], Any] = arctan2,
 ) -> tuple[Any, Any]:
-    cos, sin, arctan2 = functions
     dx, dy = x_goal - x, y_goal - y
     c, s = cos(theta), sin(theta)
     # d cos(e) and d sin(e): the goal's position in the body frame. It needs no wrapping. Without
     # negative zeros the angle of (0, 0) is 0.
-    return steer(c * dx + s * dy + 0.0, c * dy - s * dx + 0.0, 0.0, Kp, Kv, arctan2)
+    x, y = c * dx + s * dy + 0.0, c * dy - s * dx + 0.0
+    # As `steer`, whose call would take as long as the formula.
+    return Kv * x, Kp * arctan2(y, x)
 
 
-def steer(x: Any, y: Any, turn: Any, Kp: Any, Kv: Any, arctan2: Any = arctan2) -> tuple[Any, Any]:
+def steer(x: Any, y: Any, turn: Any, Kp: Any, Kv: Any) -> tuple[Any, Any]:
     """Compute the law for a goal at `[x, y]` in the body frame (m), unchecked; `turn` is ignored."""
     return Kv * x, Kp * arctan2(y, x)
 
