@@ -12,6 +12,8 @@ import time
 # types, and nothing is written into the home directory.
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
+# Threads of BLAS would compete with the other workers.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 os.environ.setdefault('ROS_LOG_DIR', os.path.join(os.environ.get('TMPDIR', '/tmp'), 'ros_test_log'))
 
 import pytest

@@ -126,7 +126,7 @@ def test_a_wrong_shape_is_named(state, goal, name):
 
 
 def test_the_sampled_loop_arrives_from_every_start():
-    here, goals, _, _ = random_states(4)
+    here, goals, _, _ = random_states(4, 2_000)
     # The farthest goal, 10 m away, comes near like exp(-kv t); the 3 s on top are for the first turn.
     for _ in range(int(RATE * (math.log(10.0 / 0.02) / KV + 3.0))):
         here = integrate(here, np.stack(go_to_goal(here, goals, KP, KV), -1), 1.0 / RATE)
@@ -135,8 +135,8 @@ def test_the_sampled_loop_arrives_from_every_start():
 
 def test_turning_in_place_takes_the_smaller_angle_and_ends_at_the_heading():
     rng = np.random.default_rng(5)
-    here = start = rng.uniform(-np.pi, np.pi, (10_000, 3))
-    heading, turned = rng.uniform(-np.pi, np.pi, 10_000), np.zeros(10_000)
+    here = start = rng.uniform(-np.pi, np.pi, (2_000, 3))
+    heading, turned = rng.uniform(-np.pi, np.pi, 2_000), np.zeros(2_000)
     for _ in range(500):
         v, omega = turn_in_place(here[:, 2], heading, KP)
         here = integrate(here, np.stack([v, omega], -1), 1.0 / RATE)

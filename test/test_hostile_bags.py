@@ -334,6 +334,7 @@ def parser(request, monkeypatch):
     """Load YAML by the parser that is there if ruamel.yaml.clib is, and by the other one."""
     monkeypatch.setattr(bounded_yaml, 'YAML', partial(YAML, pure=request.param))
     bounded_yaml._check_text.cache_clear()
+    bounded_yaml._pickled.cache_clear()
 
 
 @pytest.mark.usefixtures('parser')
@@ -343,6 +344,30 @@ def test_a_few_aliases_are_read():
         'b': [1, 2],
         'c': {'d': [1, 2], 'e': {'d': [1, 2]}},
     }
+
+
+def test_values_that_were_changed_are_not_loaded_again():
+    loaded = load_yaml('a: &x [1, 2]\nb: *x\n')
+    loaded['a'].append(3)
+    assert loaded['b'] == [1, 2, 3]
+    assert load_yaml('a: &x [1, 2]\nb: *x\n') == {'a': [1, 2], 'b': [1, 2]}
+
+
+def test_metadata_is_parsed_once_to_open_a_bag_again_and_again(tmp_path, monkeypatch):
+    write_bag(tmp_path / 'run', 'mcap', make_messages(5, 30))
+    parsed = []
+
+    class Counting(YAML):
+        def load(self, stream):
+            parsed.append(stream)
+            return super().load(stream)
+
+    monkeypatch.setattr(bounded_yaml, 'YAML', Counting)
+    bounded_yaml._pickled.cache_clear()
+    for _ in range(3):
+        with open_bag(tmp_path / 'run'):
+            pass
+    assert parsed.count((tmp_path / 'run' / 'metadata.yaml').read_text()) == 1
 
 
 @pytest.mark.usefixtures('parser')

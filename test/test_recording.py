@@ -38,6 +38,7 @@ from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.recover_run import main as recover_run
 
 PATIENCE = 20.0
+NEVER = threading.Event()
 STORAGES = ('mcap', 'sqlite3')
 STRANGE_NAMES = ('run#2', 'run?mode=memory', 'run%41', '%', 'file:x', ':memory:', 'a b', "it's", 'ü')
 
@@ -91,7 +92,7 @@ def until(condition, what):
     while not condition():
         assert time.monotonic() < deadline, f'not within {PATIENCE} s: {what}'
         # Let the thread that writes have its turn.
-        os.sched_yield()
+        NEVER.wait(0.001)
 
 
 @pytest.fixture
@@ -490,6 +491,23 @@ def test_more_than_the_readers_unpack_at_once_can_be_recorded_at_one_time(
 
 
 # --- File systems that lack something
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_all_files_are_synchronized_before_the_bag_gets_its_name(tmp_path, monkeypatch, storage):
+    synced, rename = [], os.rename
+    before: list[list[str]] = []
+    monkeypatch.setattr(
+        os, 'fsync', lambda descriptor: synced.append(os.readlink(f'/proc/self/fd/{descriptor}'))
+    )
+    monkeypatch.setattr(os, 'rename', lambda *paths: before.append(list(synced)) or rename(*paths))
+    recording = Recording(tmp_path / 'run', storage)
+    add_all(recording, channel(), *messages(3))
+    recording.finish()
+    assert len(before) == 1
+    names = {Path(path).name for path in before[0] if Path(path).parent.name == 'run'}
+    assert names == {path.name for path in (tmp_path / 'run').iterdir()}
+    assert len(names) == 2
 
 
 def test_a_directory_that_cannot_be_synchronized_does_not_matter(tmp_path, monkeypatch):

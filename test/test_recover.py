@@ -6,6 +6,7 @@ import os
 import random
 import shutil
 import sqlite3
+from functools import cache
 from itertools import product
 from pathlib import Path
 
@@ -39,16 +40,21 @@ CUSTOM = {'parameters of /robot': '{"wheel_radius": 0.033}', 'é': 'ü\n'}
 
 
 def make_messages(count, most):
-    """Make topic, time and bytes: alike each time, random in their length and content."""
+    """Return topic, time and bytes: alike each time, random in their length and content."""
+    return list(_random_messages(count, most))
+
+
+@cache
+def _random_messages(count, most):
     chance = random.Random(f'{count} {most}')
-    return [
+    return tuple(
         (
             chance.choice(list(TOPICS)),
             START + 1_000_000 * index,
             b'\0\1\0\0' + chance.randbytes(chance.randrange(most // 2, most)),
         )
         for index in range(count)
-    ]
+    )
 
 
 def write_bag(path, storage, messages, mode=CompressionMode.NONE, told=None):

@@ -52,10 +52,16 @@ def size(*vectors) -> float:
 
 
 def arc_by_series(way: float, turn: float) -> tuple[Fraction, Fraction]:
-    """Give `way [sin(a)/a, (1 - cos a)/a]` in rational numbers, to 40 digits for |a| <= 1."""
-    a = Fraction(turn)
-    along = sum((-1) ** n * a ** (2 * n) / math.factorial(2 * n + 1) for n in range(17))
-    across = sum((-1) ** n * a ** (2 * n + 1) / math.factorial(2 * n + 2) for n in range(17))
+    """Return `way [sin(a)/a, (1 - cos a)/a]` in rational numbers, to 40 digits for |a| <= 1."""
+    a, n = Fraction(turn), 1
+    along = across = Fraction(0)
+    term = Fraction(1)
+    while abs(term) > 1e-40:
+        along += term / n
+        across += term * a / (n * (n + 1))
+        # a^(n - 1) / (n - 1)! with alternating signs.
+        term *= -a * a / (n * (n + 1))
+        n += 2
     return Fraction(way) * along, Fraction(way) * across
 
 
@@ -199,19 +205,23 @@ def test_full_turns_return_to_the_start(pose, v, omega, circles):
     assert abs(se2.wrap_angle(end[2] - pose[2])) <= 4.0 * np.spacing(abs(circles) * TURN)
 
 
-def test_a_million_steps_keep_the_heading_wrapped_and_the_pose_finite():
-    steps, dt = 1_000_000, 0.1
-    twists = np.random.default_rng(1).normal(0.0, [1.0, 5.0], (steps, 2))
-    pose, path = np.zeros(3), np.empty((steps, 3))
+@pytest.mark.parametrize(('steps', 'robots'), [(100_000, 0), (1_000, 1_000)], ids=['one', 'batch'])
+def test_a_million_steps_keep_the_heading_wrapped_and_the_pose_finite(steps, robots):
+    """A hundred thousand steps of one robot, and a thousand of each of a thousand robots."""
+    dt, batch = 0.1, (robots,) if robots else ()
+    twists = np.random.default_rng(1).normal(0.0, [1.0, 5.0], (steps, *batch, 2))
+    pose, path = np.zeros((*batch, 3)), np.empty((steps, *batch, 3))
     for index, twist in enumerate(twists):
         path[index] = pose = se2.integrate(pose, twist, dt)
     assert np.isfinite(path).all()
-    assert path[:, 2].min() > -np.pi
-    assert path[:, 2].max() <= np.pi
-    # Rounding moves the heading by half an ulp of pi per step at most; no step is longer than its way.
-    assert abs(math.remainder(pose[2] - math.fsum(twists[:, 1] * dt), TURN)) < steps * EPS
-    moved = np.hypot(*np.diff(path[:, :2], axis=0).T)
-    assert np.all(moved <= np.abs(twists[1:, 0] * dt) + 1e-12)
+    assert path[..., 2].min() > -np.pi
+    assert path[..., 2].max() <= np.pi
+    # Rounding moves the heading by half an ulp of pi per step at most. No step is longer than v dt.
+    turned = [math.fsum(turns) for turns in (twists[..., 1] * dt).reshape(steps, -1).T]
+    for heading, turn in zip(np.atleast_1d(pose[..., 2]), turned, strict=True):
+        assert abs(math.remainder(heading - turn, TURN)) < steps * EPS
+    moved = np.hypot(*np.moveaxis(np.diff(path[..., :2], axis=0), -1, 0))
+    assert np.all(moved <= np.abs(twists[1:, ..., 0] * dt) + 1e-12)
 
 
 # --- Shapes

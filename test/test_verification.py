@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -44,22 +44,42 @@ def rows(series, keep):
     )
 
 
+DRIVES: dict[frozenset, Run] = {}
+"""Runs that several tests verify, by the parameters of the robot."""
+LIMITS = {'linear__x__max_velocity': 0.1, 'angular__z__max_velocity': 0.5, 'max_wheel_velocity': 3.0}
+
+
 @pytest.fixture
-def drive(lockstep, tmp_path):
-    """Record a drive to two waypoints."""
+def drive(request, tmp_path):
+    """Record a drive to two waypoints, once for each robot."""
 
     def drive(**parameters):
-        wheels = parameters.get('command_interface') == 'wheels'
+        key = frozenset(parameters.items())
+        if key in DRIVES:
+            return DRIVES[key]
+        lockstep = request.getfixturevalue('lockstep')
         lockstep.add(make(VirtualRobot, **parameters))
-        if wheels:
+        if parameters.get('command_interface') == 'wheels':
             lockstep.add(make(WheelBridge))
         lockstep.add(make(GoToGoal))
         with recorded(lockstep, tmp_path / 'run') as made:
             lockstep.publish('goals', goals(goal(0.5, 0.2), goal(-0.3, 0.4)))
-            lockstep.run_for(6.0)
-        return made.run
+            lockstep.run_for(300.0 / parameters.get('publish_rate', 50.0))
+        DRIVES[key] = _frozen(made.run)
+        return DRIVES[key]
 
     return drive
+
+
+def _frozen(run):
+    """Make the arrays of a run read-only, because tests share it."""
+    for field in fields(run):
+        value = getattr(run, field.name)
+        is_series = isinstance(value, Series)
+        for array in (value.received, value.stamps, value.values) if is_series else (value,):
+            if isinstance(array, np.ndarray):
+                array.setflags(write=False)
+    return run
 
 
 @pytest.mark.parametrize(
@@ -67,7 +87,7 @@ def drive(lockstep, tmp_path):
     [
         {},
         {'command_interface': 'wheels'},
-        {'linear__x__max_velocity': 0.1, 'angular__z__max_velocity': 0.5, 'max_wheel_velocity': 3.0},
+        LIMITS,
         {'publish_rate': 333.0, 'x': 4.0, 'y': -1.0, 'theta': 2.0},
     ],
     ids=['twist', 'wheels', 'limits', 'placed'],
@@ -82,7 +102,7 @@ def test_a_run_is_driven_again_exactly(drive, parameters):
 
 @pytest.mark.parametrize(
     'parameters',
-    [{}, {'command_interface': 'wheels'}, {'linear__x__max_velocity': 0.1, 'max_wheel_velocity': 3.0}],
+    [{}, {'command_interface': 'wheels'}, LIMITS],
     ids=['twist', 'wheels', 'limits'],
 )
 def test_without_cmd_vel_out_the_commands_are_taken_by_their_recording(drive, parameters):

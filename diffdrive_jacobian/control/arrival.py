@@ -7,7 +7,7 @@ document B's law the distance is measured from the offset point (doc/mathematics
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import isfinite
 from typing import Any
 
@@ -47,6 +47,8 @@ class Arrival:
     """Whether the heading of the last goal counts."""
     offset: Any = 0.0
     """X coordinate in the body frame of the point that is to arrive (m), a number or an array."""
+    _centre: bool = field(init=False, repr=False)
+    """Whether that is the axle centre."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -55,6 +57,7 @@ class Arrival:
         object.__setattr__(self, 'use_heading', boolean('use_heading', self.use_heading))
         offset = operand('offset', self.offset)
         object.__setattr__(self, 'offset', offset if type(offset) is float else read_only(offset))
+        object.__setattr__(self, '_centre', type(offset) is float and offset == 0.0)
 
     def __eq__(self, other: object) -> bool:
         """Compare every field, arrays by shape and entries."""
@@ -89,7 +92,10 @@ class Arrival:
             theta
         ):
             # It is not finite if one of the positions or the offset is not.
-            distance = self._distance(x, y, theta, x_goal, y_goal)
+            if self._centre:
+                distance = math.hypot(x_goal - x, y_goal - y)
+            else:
+                distance = self._distance(x, y, theta, x_goal, y_goal)
             if type(distance) is float and isfinite(distance):
                 return distance
         x, y, theta = operand('x', x), operand('y', y), operand('theta', theta)
@@ -104,15 +110,13 @@ class Arrival:
         return distance
 
     def _distance(self, x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any) -> Any:
-        offset = self.offset
-        if type(offset) is not float or offset != 0.0:
-            x, y = x + offset * cos(theta), y + offset * sin(theta)
+        if not self._centre:
+            x, y = x + self.offset * cos(theta), y + self.offset * sin(theta)
         return hypot(x_goal - x, y_goal - y)
 
     def reached(self, x: float, y: float, theta: float, x_goal: float, y_goal: float) -> bool:
         """Return whether the distance to a goal is within the tolerance, without checks."""
-        offset = self.offset
-        if type(offset) is float and offset == 0.0:
+        if self._centre:
             return math.hypot(x_goal - x, y_goal - y) <= self.xy_tolerance
         return bool(self._distance(x, y, theta, x_goal, y_goal) <= self.xy_tolerance)
 

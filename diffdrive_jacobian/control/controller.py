@@ -13,11 +13,11 @@ The node go_to_goal calls it with one pose at a time. Batches and sweeps call it
 
 from __future__ import annotations
 
-import math
 import re
 import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -190,6 +190,8 @@ class Controller:
             not return two finite numbers.
         """
         law, values, size = self.law, self.values(gains), 3 if self.takes_heading else 2
+        two = len(values) == 2
+        first, second = values if two else (0.0, 0.0)
         # The laws of this package accept tuples, which take less time. Others may index arrays.
         accepts_tuples = str(getattr(law, '__module__', '')).startswith(f'{__package__}.')
 
@@ -197,14 +199,17 @@ class Controller:
             if not accepts_tuples:
                 pose, goal = np.asarray(pose), np.asarray(goal)
             try:
-                twist = law(pose, goal if len(goal) == size else goal[:size], *values)
+                if len(goal) != size:
+                    goal = goal[:size]
+                # Unpacking the gains would take a tenth of the call.
+                twist = law(pose, goal, first, second) if two else law(pose, goal, *values)
             except Exception as error:
                 raise LawError(
                     f'the law of controller {self.name!r} failed: {_reason(error)}'
                 ) from error
             try:
                 v, omega = twist
-                if type(v) is type(omega) is float and math.isfinite(v + omega):
+                if type(v) is type(omega) is float and isfinite(v + omega):
                     return v, omega
                 v, omega = _number(v), _number(omega)
             except (TypeError, ValueError) as error:
@@ -212,7 +217,7 @@ class Controller:
                     f'the law of controller {self.name!r} must return (v, omega), two numbers, '
                     f'got {short(twist)}'
                 ) from error
-            if not (math.isfinite(v) and math.isfinite(omega)):
+            if not (isfinite(v) and isfinite(omega)):
                 raise LawError(
                     f'the law of controller {self.name!r} must return finite (v, omega), '
                     f'got ({v:g}, {omega:g})'

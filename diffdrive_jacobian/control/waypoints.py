@@ -45,6 +45,8 @@ class Waypoints:
     """Whether the last position was reached and only the heading remains."""
     _goal: tuple[float, float, float] = field(init=False, repr=False)
     """The waypoint that is driven to."""
+    _row: NDArray[np.float64] = field(init=False, repr=False)
+    """Likewise, as an array."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -58,7 +60,8 @@ class Waypoints:
         if not 0 <= index < len(poses):
             raise ValueError(f'index must be in 0 to {len(poses) - 1}, got {short(index)}')
         object.__setattr__(self, 'index', int(index))
-        object.__setattr__(self, '_goal', tuple(self.poses[index].tolist()))
+        object.__setattr__(self, '_row', self.poses[index])
+        object.__setattr__(self, '_goal', tuple(self._row.tolist()))
         object.__setattr__(self, 'turning', boolean('turning', self.turning))
 
     def follow(
@@ -79,8 +82,9 @@ class Waypoints:
         Raises:
             ValueError: An argument is of another class or shape, or not finite.
         """
-        # Tuples are unpacked here, because a call would take as long as the rest.
-        x, y, theta = pose if type(pose) is tuple and len(pose) == 3 else components('pose', pose, 3)
+        is_tuple = type(pose) is tuple
+        # Tuples are unpacked here, because a call would take as long as the law.
+        x, y, theta = pose if is_tuple and len(pose) == 3 else components('pose', pose, 3)
         if not (type(x) is type(y) is type(theta) is float and isfinite(x + y + theta)):
             x, y, theta = components('pose', pose, 3)
             if type(theta) is not float:
@@ -97,8 +101,9 @@ class Waypoints:
         while not here.turning:
             goal = here._goal
             if not arrival.reached(x, y, theta, goal[0], goal[1]):
-                floats = type(pose) is tuple and hasattr(law, 'accepts_tuples')
-                return here, law(pose, goal if floats else here.poses[here.index])
+                if is_tuple and hasattr(law, 'accepts_tuples'):
+                    return here, law(pose, goal)
+                return here, law(pose, here._row)
             if here.index + 1 < len(here.poses):
                 here = here._progressed(here.index + 1, turning=False)
             elif arrival.use_heading:
@@ -120,8 +125,9 @@ class Waypoints:
     def _progressed(self, index: int, *, turning: bool) -> Waypoints:
         # Without checks and copies, which would cost time in proportion to the number of poses.
         progressed = object.__new__(Waypoints)
-        goal = tuple(self.poses[index].tolist())
-        values = (('poses', self.poses), ('index', index), ('turning', turning), ('_goal', goal))
-        for name, value in values:
+        row = self.poses[index]
+        values = {'poses': self.poses, 'index': index, 'turning': turning, '_row': row}
+        for name, value in values.items():
             object.__setattr__(progressed, name, value)
+        object.__setattr__(progressed, '_goal', tuple(row.tolist()))
         return progressed

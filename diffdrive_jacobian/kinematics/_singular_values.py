@@ -29,6 +29,8 @@ TINY = float(np.finfo(np.float64).tiny)
 """Smaller numbers have no inverse."""
 LARGE = 400
 """Entries below `2**LARGE` have squares, and sums of their squares, that do not overflow."""
+SHORT = 8192
+"""Elements that BLAS adds up in one thread."""
 
 Array = NDArray[np.float64]
 
@@ -157,7 +159,9 @@ def manipulability(J: Array) -> Array:
 
 def is_large(J: Array) -> bool:
     """Return whether singular values of finite Jacobians, or products with them, may overflow."""
-    return not np.vdot(J, J) < 4.0**LARGE
+    # BLAS would split longer arrays among threads, which takes more CPU than the sum itself.
+    squares = np.vdot(J, J) if J.size <= SHORT else np.einsum('i,i->', J.ravel(), J.ravel())
+    return not squares < 4.0**LARGE
 
 
 def large_exponent(values: Array, axes: int) -> NDArray[np.int32]:

@@ -151,6 +151,8 @@ class MobileManipulator:
         twist = (v, omega) if type(v) is float else vector(v, omega)
         driven = se2.integrate(pose, twist, dt)
         moved = [joint + speed * dt for joint, speed in zip(joints, speeds, strict=True)]
+        if driven.ndim == 1:
+            return np.array([*driven.tolist(), *moved])
         return vector(*components('q', driven, 3), *moved)
 
     def _split(self, q: ArrayLike) -> tuple[list[Any], list[Any]]:

@@ -231,10 +231,11 @@ class PlanarArm:
         cosine, sine = (math.cos, math.sin) if of_floats else (np.cos, np.sin)
         x: Any = 0.0
         y: Any = 0.0
-        for length, angle in zip(self._links[::-1], directions[::-1], strict=True):
+        for length, angle in zip(reversed(self._links), reversed(directions), strict=True):
             x, y = x + length * cosine(angle), y + length * sine(angle)
             levers.append((x, y))
-        return levers[::-1]
+        levers.reverse()
+        return levers
 
     def _determinant(self, q_2: Any) -> Any:
         first, second = self._links

@@ -189,14 +189,18 @@ def _saturated(
         v, omega, divisor = _scaled_down(v, omega, limits, r, L, divisor, maximum)
     # The quotient may round to one unit in the last place beyond the limit.
     v_low, v_high, omega_low, omega_high = limits._bounds
-    v = minimum(maximum(v / divisor, v_low), v_high)
-    omega = minimum(maximum(omega / divisor, omega_low), omega_high)
+    v, omega = v / divisor, omega / divisor
+    if type(v) is not float or not (v_low <= v <= v_high and omega_low <= omega <= omega_high):
+        v = minimum(maximum(v, v_low), v_high)
+        omega = minimum(maximum(omega, omega_low), omega_high)
     if limits._wheels:
         # So may the wheel speeds. Shrink by one unit in the last place, then by two, four, and so on.
         step = 2.0**-53
         most = limits.max_wheel_speed
-        while _any(above := _fastest(v, omega, r, L) > most):
+        above = _fastest(v, omega, r, L) > most
+        while above is not False and _any(above):
             v, omega = where(above, v - step * v, v), where(above, omega - step * omega, omega)
+            above = _fastest(v, omega, r, L) > most
             step *= 2.0
     return v, omega
 
