@@ -14,6 +14,7 @@ from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.conversion import MessageError, from_twist_values
 from diffdrive_jacobian.ros.graph_faults import publishers_of
 from diffdrive_jacobian.ros.serialization import reader
+from diffdrive_jacobian.ros.shared_graph import SharedGraph
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 PERIOD = NANOSECONDS
@@ -38,6 +39,7 @@ class OtherDrivers:
             callback: Receives the names of the other nodes that publish commands.
         """
         self._node = node
+        self._graph = SharedGraph(node)
         self._publisher = publisher
         self._callback = callback
         self._active = False
@@ -78,8 +80,11 @@ class OtherDrivers:
             self._search()
 
     def _search(self) -> None:
+        if self._subscribed:
+            return
+        self._graph.refresh()
         topic = self._publisher.topic_name
-        if self._subscribed or self._node.count_publishers(topic) < 2:
+        if self._graph.count_publishers(topic) < 2:
             return
         self._subscribed = True
         # Best effort matches every publisher, whatever its quality of service.
