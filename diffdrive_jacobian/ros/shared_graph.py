@@ -7,7 +7,9 @@ that. rcl signals changes, so nothing is queried while the graph stays the same.
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from collections.abc import Callable
 from weakref import WeakKeyDictionary
 
@@ -15,6 +17,10 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from diffdrive_jacobian.ros.rclpy_internals import graph_changed
+
+
+MAX_AGE = 0.1
+"""`max_age` of periodic checks that need not be reproducible (s)."""
 
 
 class Snapshot:
@@ -35,6 +41,7 @@ class _Latest:
 
     def __init__(self) -> None:
         self.snapshot = Snapshot()
+        self.refreshed = -math.inf
 
 
 class SharedGraph:
@@ -55,12 +62,20 @@ class SharedGraph:
         with _lock:
             self._latest = _latest_of.setdefault(node.context, _Latest())
 
-    def refresh(self) -> Snapshot:
-        """Discard the snapshot if the graph has changed. Return the valid one."""
-        if graph_changed(self._node):
-            # Replaced, not cleared: another thread may still add a result to the previous one.
-            self._latest.snapshot = Snapshot()
-        return self._latest.snapshot
+    def refresh(self, max_age: float = 0.0) -> Snapshot:
+        """Discard the snapshot if the graph has changed. Return the valid one.
+
+        Args:
+            max_age: For how long a snapshot is valid without looking for changes (wall time, s). To look
+                for them takes 0.03 to 0.15 ms.
+        """
+        latest, now = self._latest, time.monotonic()
+        if now - latest.refreshed >= max_age:
+            latest.refreshed = now
+            if graph_changed(self._node):
+                # Replaced, not cleared: another thread may still add a result to the previous one.
+                latest.snapshot = Snapshot()
+        return latest.snapshot
 
     def count_publishers(self, topic: str) -> int:
         """Return the number of publishers of a topic."""
