@@ -18,7 +18,6 @@ from rclpy.node import Node
 
 from diffdrive_jacobian.ros.rclpy_internals import graph_changed
 
-
 MAX_AGE = 0.1
 """`max_age` of periodic checks that need not be reproducible (s)."""
 
