@@ -29,7 +29,7 @@ def queries(monkeypatch):
 
     def counted(name, query):
         def method(node, *args):
-            counts[name, *args] += 1
+            counts[(name, *args)] += 1
             return query(node, *args)
 
         return method
