@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import forked
 import pytest
 from nav_msgs.msg import Odometry
 from processes import open_world
 from std_srvs.srv import Trigger
 
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.ros.runner import ros_context
+
+NODES = {'virtual_robot': VirtualRobot, 'wheel_bridge': WheelBridge, 'go_to_goal': GoToGoal}
 FLOOD = """
 import rclpy
 from geometry_msgs.msg import Twist
@@ -46,6 +54,36 @@ def test_a_flooded_robot_answers_and_stops_when_the_flood_ends(world):
             flood.kill()
             flood.wait()
     world.harness.until(lambda: not moves(odometry[-1]), 'the robot stops')
+
+
+@pytest.fixture
+def benchmark(monkeypatch):
+    """The module `benchmark/flood.py`."""
+    monkeypatch.syspath_prepend(str(Path(__file__).with_name('benchmark')))
+    import flood
+
+    return flood
+
+
+def test_the_benchmark_floods_topics_and_services_that_exist(benchmark):
+    for node_name, arguments in {(one.node, one.arguments) for one in benchmark.CASES}:
+        cases = [one for one in benchmark.CASES if (one.node, one.arguments) == (node_name, arguments)]
+        with ros_context(['test', '--ros-args', *arguments]) as context:
+            node = NODES[node_name](context=context)
+            topics = {one.topic_name for one in node.subscriptions}
+            services = {one.service_name for one in node.services}
+            node.destroy_node()
+        for case in cases:
+            name = case.flooded.removesuffix('_stamped')
+            assert {f'/{name}', f'/{node_name}/{name}'} & (topics | services), case
+
+
+def test_the_benchmark_names_what_misses_its_goal(benchmark):
+    figures = {'flood': 1e5, 'odometry': 49.5, 'gap': 300.0, 'stop': 100.0, 'memory': 2.0}
+    assert benchmark.missed(figures) == []
+    assert 'MISSED' not in benchmark.line(figures)
+    figures |= {'odometry': 49.4, 'service': 101.0}
+    assert benchmark.line(figures).endswith('service  101 ms,  +2.0 MB MISSED: odometry, service')
 
 
 def moves(message):

@@ -12,7 +12,6 @@ from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.ros import node as ros_node
-from diffdrive_jacobian.ros import type_mismatches
 from diffdrive_jacobian.ros.runner import make_executor, ros_context
 
 
@@ -22,7 +21,6 @@ def test_other_type_in_another_process_is_reported_once(monkeypatch, capfd, endp
 
     # Two contexts are two participants, as two processes are; they meet on this machine only.
     monkeypatch.setattr(ros_node, 'WATCH_PERIOD', 0.2)
-    monkeypatch.setattr(type_mismatches, 'MAX_AGE', 0.1)
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     monkeypatch.setenv('ROS_DOMAIN_ID', str(domain_id()))
     with ros_context(['test']) as context, ros_context(['other']) as other:

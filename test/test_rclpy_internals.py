@@ -82,6 +82,37 @@ def test_services_that_rclpy_provides_are_known(ros):
     assert all(types[0].startswith(internals.SERVICES_OF_RCLPY) for _, types in services)
 
 
+# --- Graph
+
+
+def test_each_change_of_the_graph_is_signaled_once(ros):
+    node = ros.add(Node, node_name='watching')
+    internals.graph_changed(node)
+    assert not internals.graph_changed(node)
+    publisher = ros.peer.create_publisher(String, 'word', 1)
+    # For all nodes of the context together.
+    assert internals.graph_changed(node)
+    assert not internals.graph_changed(ros.peer)
+    # Also the same publisher once more.
+    ros.peer.create_publisher(String, 'word', 1)
+    assert internals.graph_changed(node)
+    assert not internals.graph_changed(node)
+    ros.peer.destroy_publisher(publisher)
+    assert node.count_publishers('word') == 1
+    assert internals.graph_changed(node)
+
+
+def test_without_functions_of_rcl_the_graph_counts_as_changed(ros, monkeypatch):
+    internals._graph_functions.cache_clear()
+    monkeypatch.setattr(internals.ctypes, 'CDLL', lambda _: object())
+    assert internals._graph_functions() is None
+    assert internals.graph_changed(ros.peer)
+    internals._graph_functions.cache_clear()
+    monkeypatch.undo()
+    internals.graph_changed(ros.peer)
+    assert not internals.graph_changed(ros.peer)
+
+
 # --- Inputs that rclpy parses itself
 
 

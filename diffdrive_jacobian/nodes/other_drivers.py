@@ -14,6 +14,7 @@ from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.conversion import MessageError, from_twist_values
 from diffdrive_jacobian.ros.graph_faults import publishers_of
 from diffdrive_jacobian.ros.serialization import reader
+from diffdrive_jacobian.ros.shared_graph import MAX_AGE, SharedGraph
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 PERIOD = NANOSECONDS
@@ -38,6 +39,8 @@ class OtherDrivers:
             callback: Receives the names of the other nodes that publish commands.
         """
         self._node = node
+        self._graph = SharedGraph(node)
+        self._clock = node.get_clock()
         self._publisher = publisher
         self._callback = callback
         self._active = False
@@ -75,11 +78,15 @@ class OtherDrivers:
         """
         if not 0 <= now - self._searched < PERIOD:
             self._searched = now
-            self._search()
+            # Runs in simulated time must be reproducible.
+            self._search(0.0 if self._clock.ros_time_is_active else MAX_AGE)
 
-    def _search(self) -> None:
+    def _search(self, max_age: float = 0.0) -> None:
+        if self._subscribed:
+            return
+        self._graph.refresh(max_age)
         topic = self._publisher.topic_name
-        if self._subscribed or self._node.count_publishers(topic) < 2:
+        if self._graph.count_publishers(topic) < 2:
             return
         self._subscribed = True
         # Best effort matches every publisher, whatever its quality of service.

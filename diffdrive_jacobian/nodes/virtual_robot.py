@@ -84,7 +84,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             wheels = self.subscribe(
                 JointState, source, self._on_joint_command, fields=wire.JOINT_STATE, numbers=numbers
             )
-            self.watch(unpublished(wheels, source, self.count_publishers))
+            self.watch(unpublished(self, wheels, source))
         elif self.parameters.enable_stamped_cmd_vel:
             fields = wire.TWIST_STAMPED
             self.subscribe(TwistStamped, source, self._on_twist_stamped, fields=fields, numbers=numbers)

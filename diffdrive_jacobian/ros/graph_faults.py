@@ -1,7 +1,8 @@
 """Faults of the graph around a node: topics that nobody reads or publishes, and several publishers.
 
-Each function returns a check for `ParameterizedNode.watch`, which calls it once a second. It returns
-a description with the remedy, or None, and costs microseconds unless there is a fault.
+Each function returns a check for `ParameterizedNode.watch`, which refreshes the `SharedGraph` and calls
+it once a second. It returns a description with the remedy, or None, and costs microseconds unless there
+is a fault.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from diffdrive_jacobian.diagnosis.remedies import (
     START_PUBLISHER,
     START_READER,
 )
+from diffdrive_jacobian.ros.shared_graph import SharedGraph
 from diffdrive_jacobian.text import listed, printable
 
 Check: TypeAlias = Callable[[], str | None]
@@ -49,19 +51,19 @@ def unread(publisher: Publisher, name: str, own: Callable[[], int] = lambda: 0) 
     return check
 
 
-def unpublished(subscription: Subscription, name: str, count: Callable[[str], int]) -> Check:
+def unpublished(node: Node, subscription: Subscription, name: str) -> Check:
     """Return a check whether nobody publishes a topic.
 
     Args:
-        subscription: The subscription of the node.
+        node: The node.
+        subscription: Its subscription.
         name: Name of the topic as the node gives it, before it is remapped.
-        count: Returns the number of publishers of a topic.
     """
-    topic = subscription.topic_name
+    graph, topic = SharedGraph(node), subscription.topic_name
     start = START_PUBLISHER[name]
 
     def check() -> str | None:
-        if count(topic):
+        if graph.count_publishers(topic):
             return None
         return f'no node publishes {topic}: {start} {SAME_NAMES.format(name)}'
 
@@ -70,10 +72,10 @@ def unpublished(subscription: Subscription, name: str, count: Callable[[str], in
 
 def several_publishers(node: Node, name: str) -> Check:
     """Return a check whether several nodes publish a topic that must have one publisher."""
-    topic, remedy = node.resolve_topic_name(name), ONE_PUBLISHER[name]
+    graph, topic, remedy = SharedGraph(node), node.resolve_topic_name(name), ONE_PUBLISHER[name]
 
     def check() -> str | None:
-        if node.count_publishers(topic) < 2:
+        if graph.count_publishers(topic) < 2:
             return None
         names = publishers_of(node, topic)
         # The graph keeps a node that was killed for 20 s, also beside its successor.
@@ -91,10 +93,10 @@ def alternating_commands(node: Node, topic: str, commands: Interleaving) -> Chec
         topic: Name of the topic.
         commands: Counts the commands of the node that are not zero.
     """
-    topic = node.resolve_topic_name(topic)
+    graph, topic = SharedGraph(node), node.resolve_topic_name(topic)
 
     def check() -> str | None:
-        if commands.falls() < MIN_FALLS or node.count_publishers(topic) < 2:
+        if commands.falls() < MIN_FALLS or graph.count_publishers(topic) < 2:
             return None
         return (
             f'{listed(publishers_of(node, topic))} publish {topic}, and their commands alternate: stop '
@@ -106,11 +108,11 @@ def alternating_commands(node: Node, topic: str, commands: Interleaving) -> Chec
 
 def goals_without_controller(node: Node, *names: str) -> Check:
     """Return a check whether goals are published that no controller receives."""
-    resolved = {name: node.resolve_topic_name(name) for name in names}
+    graph, resolved = SharedGraph(node), {name: node.resolve_topic_name(name) for name in names}
 
     def check() -> str | None:
         for name, topic in resolved.items():
-            if node.count_publishers(topic) and not node.count_subscribers(topic):
+            if graph.count_publishers(topic) and not graph.count_subscriptions(topic):
                 return (
                     f'{listed(publishers_of(node, topic))} publishes {topic}, but no controller is '
                     f'subscribed to it, so that goals are lost: {START_READER[name]} '

@@ -37,8 +37,8 @@ from diffdrive_jacobian.ros.rclpy_internals import (
 
 LATEST = 0.02
 """Longest time that an event may wait behind others in the queue of the EventsExecutor (s)."""
-SAMPLE_EVENTS = 32
-"""The wait is measured once for this many events,"""
+SAMPLE_EVENTS = 64
+"""The wait is measured once for this many events, since a task takes as long as an event,"""
 SAMPLE_PERIOD = 0.1
 """or for the events of this time, whichever comes first (s)."""
 FEWEST = 8

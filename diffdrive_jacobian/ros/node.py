@@ -33,6 +33,7 @@ from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.rate_limit import RateLimit
 from diffdrive_jacobian.ros.rclpy_internals import log_info, time_reader
 from diffdrive_jacobian.ros.serialization import decoding
+from diffdrive_jacobian.ros.shared_graph import MAX_AGE, SharedGraph
 from diffdrive_jacobian.ros.topic_errors import explaining_failure, type_name
 from diffdrive_jacobian.ros.type_mismatches import TypeMismatches
 
@@ -83,11 +84,12 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         self.add_pre_set_parameters_callback(self._convert_parameters)
         self.add_on_set_parameters_callback(self._validate_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
+        self._graph = SharedGraph(self)
         self._types = TypeMismatches(self)
         self._checks_without_clock = 0
         self._faults: list[tuple[LastingFault, Callable[[], str | None]]] = []
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(WATCH_PERIOD, self._check_graph, clock=steady)
+        self.create_timer(WATCH_PERIOD, lambda: self._check_graph(MAX_AGE), clock=steady)
 
     def advertise(self, message: type, topic: str, *, latched: bool = False) -> Publisher:
         """Create a publisher with reliable QoS, keep last 10.
@@ -238,12 +240,13 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         if self.parameters is not previous:
             self.parameters_changed(previous)
 
-    def _check_graph(self) -> None:
+    def _check_graph(self, max_age: float = 0.0) -> None:
         self._check_clock()
+        snapshot = self._graph.refresh(max_age)
         for fault, check in self._faults:
             if report := fault.check(check()):
                 self.get_logger().warning(report)
-        self._types.check()
+        self._types.check(snapshot)
 
     def _check_clock(self) -> None:
         if self.now() != 0:

@@ -9,11 +9,13 @@ each, so that a release of rclpy that differs fails there first. Tried with rclp
 
 from __future__ import annotations
 
+import ctypes
 import inspect
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import redirect_stderr
+from functools import cache
 from typing import Any, Protocol
 
 from rclpy.client import Client
@@ -86,6 +88,51 @@ def declared_parameters(node: Node) -> set[str]:
     Relies on `Node._parameters`.
     """
     return set(node._parameters)
+
+
+# --- Graph
+
+
+def graph_changed(node: Node) -> bool:
+    """Return whether the graph has changed since the last call for any node of the same context.
+
+    That is, whether nodes, publishers, subscriptions, services or clients appeared or disappeared. What
+    is queried after the call contains all changes that it reported.
+    Relies on `WaitSet.pointer`, and on two functions of rcl that rclpy does not offer. Where they are
+    not found, it returns True.
+    """
+    functions = _graph_functions()
+    if functions is None:
+        return True
+    guard_condition, add_guard_condition = functions
+    context = node.context.handle
+    with node.handle, context:
+        wait_set = rclpy_implementation.WaitSet(0, 1, 0, 0, 0, 0, context)
+        wait_set.clear_entities()
+        # RCL_RET_OK is 0.
+        if add_guard_condition(wait_set.pointer, guard_condition(node.handle.pointer), None):
+            return True
+        wait_set.wait(0)
+        return bool(wait_set.is_ready('guard_condition', 0))
+
+
+@cache
+def _graph_functions() -> tuple[Callable[..., int | None], Callable[..., int]] | None:
+    """Return `rcl_node_get_graph_guard_condition` and `rcl_wait_set_add_guard_condition`.
+
+    They are looked up in the libraries with which rclpy is linked, of which only the linkers of POSIX
+    search those they depend on.
+    """
+    try:
+        library = ctypes.CDLL(rclpy_implementation.__file__)
+        guard_condition = library.rcl_node_get_graph_guard_condition
+        add_guard_condition = library.rcl_wait_set_add_guard_condition
+    except (AttributeError, OSError):
+        return None
+    guard_condition.argtypes, guard_condition.restype = [ctypes.c_void_p], ctypes.c_void_p
+    add_guard_condition.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p]
+    add_guard_condition.restype = ctypes.c_int
+    return guard_condition, add_guard_condition
 
 
 # --- Inputs that rclpy parses itself

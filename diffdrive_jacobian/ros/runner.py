@@ -197,12 +197,12 @@ class Runner(NodeRunner):
         self._executor.add_node(node)
 
     def _spin(self, until: Callable[[], bool]) -> bool:
-        # The condition is checked after every callback and at least every CHECK_PERIOD.
+        # The condition is checked after every callback and at least every CHECK_PERIOD. Whether the
+        # context was shut down is checked by the executor.
+        spin_once = self._executor.spin_once
         try:
             while not until():
-                if not self.context.ok():
-                    return False
-                self._executor.spin_once(timeout_sec=CHECK_PERIOD)
+                spin_once(timeout_sec=CHECK_PERIOD)
         except ExternalShutdownException:
             return False
         return True

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import math
-import time
 from typing import Any
-from weakref import WeakKeyDictionary
 
-from rclpy.context import Context
 from rclpy.node import Node
 
+from diffdrive_jacobian.ros.shared_graph import SharedGraph, Snapshot
 from diffdrive_jacobian.text import printable
 
 NAME_PATIENCE = 3
 """Number of checks for the name of a node before it is reported without one."""
-MAX_AGE = 0.5
-"""Longest time for which the nodes of a context share the result of a query (s)."""
 
 
 class TypeMismatches:
@@ -28,6 +23,8 @@ class TypeMismatches:
             node: The node that has the topics.
         """
         self._node = node
+        self._graph = SharedGraph(node)
+        self._matching: Snapshot | None = None
         self._topics: list[tuple[str, str, bool]] = []
         self._mismatches: dict[tuple[str, str, str], int] = {}
         self._reported: set[tuple[str, str, str]] = set()
@@ -36,11 +33,18 @@ class TypeMismatches:
         """Add a topic with its type, to which the node is subscribed, or which it publishes."""
         self._topics.append((topic, kind, subscribed))
 
-    def check(self) -> None:
-        """Compare the types with those in the graph, and log mismatches that are new."""
+    def check(self, snapshot: Snapshot) -> None:
+        """Compare the types with those in the graph, and log mismatches that are new.
+
+        Args:
+            snapshot: That of the graph at present. Nothing is compared twice with the same one, unless
+                there are mismatches.
+        """
+        if snapshot is self._matching:
+            return
         node = self._node
         mismatches: dict[tuple[str, str, str], int] = {}
-        types = _topic_types(node)
+        types = self._graph.types()
         for topic, wanted, subscribed in self._topics:
             name = node.resolve_topic_name(topic)
             if types.get(name) == [wanted]:
@@ -58,6 +62,7 @@ class TypeMismatches:
                 if named and mismatch not in self._reported:
                     self._reported.add(mismatch)
                     self._report(mismatch, other, subscribed)
+        self._matching = None if mismatches else snapshot
         self._mismatches = mismatches
         self._reported &= mismatches.keys()
 
@@ -74,20 +79,3 @@ class TypeMismatches:
             f'{node} {they_do} {name} as {printable(theirs)}, but this node {this_does} it as {wanted}: '
             f'no message will arrive{hint}'
         )
-
-
-def _topic_types(node: Node) -> dict[str, list[str]]:
-    """Return the types of all topics in the graph, by name.
-
-    The nodes of a context share the result. A query takes time proportional to the number of topics, so
-    with many nodes in a process the queries would cost more than the nodes.
-    """
-    now = time.monotonic()
-    queried, types = _topic_types_of.get(node.context, (-math.inf, {}))
-    if now - queried > MAX_AGE:
-        types = dict(node.get_topic_names_and_types())
-        _topic_types_of[node.context] = now, types
-    return types
-
-
-_topic_types_of: WeakKeyDictionary[Context, tuple[float, dict[str, list[str]]]] = WeakKeyDictionary()

@@ -1,7 +1,8 @@
 """Floods: other processes send on one input of a node as fast as they can.
 
-Run as `python test/benchmark/flood.py`. Each node runs as its entry point starts it, and once more on
-rclpy's SingleThreadedExecutor. For each input of each node are printed, during the flood:
+Run as `python test/benchmark/flood.py` on an idle machine (40 minutes), or with `--quick` to see whether
+it works (a minute and a half). Each node runs as its entry point starts it, and once more on rclpy's
+SingleThreadedExecutor. For each input of each node are printed, during the flood:
 
 - the rate of the odometry and the longest time between two messages, by their stamps;
 - how late the timeout of commands or odometry stops the robot, the longest of several times. If that
@@ -9,10 +10,13 @@ rclpy's SingleThreadedExecutor. For each input of each node are printed, during 
 - the longest time until a request of `get_parameters` is answered;
 - the growth of the resident memory.
 
+What misses a goal (`LEAST`, `MOST`) is repeated at the end of its line and counted. The exit code is 1
+if our nodes miss one.
+
 Under a flood the middleware drops packets before they reach a node, and repeats them at the next
 heartbeat. The observer sends heartbeats every 0.1 s. A client with the default of Fast DDS may wait 3 s.
 
-A flood is serialized before it begins, and published as bytes. `--processes 2` floods from two.
+`--processes 2` floods from two processes.
 """
 
 from __future__ import annotations
@@ -20,7 +24,6 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import struct
 import subprocess
 import sys
 import time
@@ -29,23 +32,20 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-os.environ.setdefault('ROS_DOMAIN_ID', str(os.getpid() % 100 + 1))
-
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist, TwistStamped
-from nav_msgs.msg import Goals, Odometry
-from rcl_interfaces.msg import Parameter, ParameterValue
-from rcl_interfaces.srv import GetParameters, SetParameters
+from flooding import message
+from geometry_msgs.msg import PoseStamped, Twist
+from nav_msgs.msg import Odometry
+from rcl_interfaces.srv import GetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.serialization import serialize_message
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
-from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.ros.fastdds_profiles import announce_frequently, fast_heartbeats
 from diffdrive_jacobian.ros.runner import ros_context
 
+FLOODING = str(Path(__file__).with_name('flooding.py'))
+SHORTEST = 4.0
+"""Shortest flood (s). It takes two seconds to begin."""
 TIMEOUT = 0.5
 """Timeout of commands and of odometry (s)."""
 ON = {
@@ -58,7 +58,7 @@ ON = {
 }
 ENTRY = 'import sys; {0}from diffdrive_jacobian.tools.entry_points import {1}; sys.exit({1}())'
 STAMPED = ('-p', 'enable_stamped_cmd_vel:=true')
-WHEELS = ('-p', 'command_interface:=joint_command')
+WHEELS = ('-p', 'command_interface:=wheels')
 
 
 class Case(NamedTuple):
@@ -90,77 +90,21 @@ CASES = (
     Case('go_to_goal', 'set_parameters'),
     Case('go_to_goal', 'cancel_goal'),
 )
+QUICK = ('virtual_robot/initialpose', 'wheel_bridge/cmd_vel_', 'go_to_goal/cancel')
+"""Beginnings of the cases of a short run."""
+QUICK_SECONDS = 6.0
 
-
-# --- The flood
-
-
-def message(kind: str) -> Any:
-    """Return the message of a flood. A robot that receives it moves; a goal is far away."""
-    if kind == 'joint_command':
-        return JointState(name=['left_wheel_joint', 'right_wheel_joint'], velocity=[1.0, 1.0])
-    if kind == 'initialpose':
-        placement = PoseWithCovarianceStamped()
-        placement.header.frame_id = 'odom'
-        placement.pose.pose.orientation.w = 1.0
-        return placement
-    if kind == 'odom':
-        odometry = Odometry(child_frame_id='base_link')
-        odometry.header.frame_id = 'odom'
-        odometry.pose.pose.orientation.w = 1.0
-        return odometry
-    if kind in ('goal_pose', 'goals'):
-        goal = PoseStamped()
-        goal.header.frame_id = 'odom'
-        goal.pose.position.x = 1e4
-        goal.pose.orientation.w = 1.0
-        return goal if kind == 'goal_pose' else Goals(header=goal.header, goals=[goal])
-    twist = Twist()
-    twist.linear.x = 0.2
-    return TwistStamped(twist=twist) if kind == 'cmd_vel_stamped' else twist
-
-
-def flood(node_name: str, kind: str, seconds: float) -> None:
-    """Send as fast as it goes; print how many per second, and the time of the end (s, monotonic)."""
-    with ros_context(['flood']) as context:
-        node = Node('flood', context=context, start_parameter_services=False)
-        send = sender(node, node_name, kind)
-        end, count = time.monotonic() + seconds, 0
-        while time.monotonic() < end:
-            for _ in range(100):
-                send()
-            count += 100
-        print(count / seconds, time.monotonic(), flush=True)
-        node.destroy_node()
-
-
-def sender(node: Node, node_name: str, kind: str) -> Callable[[], object]:
-    """Return a function that sends one message or request."""
-    if kind in ('set_parameters', 'reset_odometry', 'cancel_goal'):
-        service, request, name = Trigger, Trigger.Request(), kind
-        if kind == 'set_parameters':
-            service, name = SetParameters, f'{node_name}/{kind}'
-            request = SetParameters.Request(
-                parameters=[
-                    Parameter(name='wheel_radius', value=ParameterValue(type=3, double_value=0.05))
-                ]
-            )
-        client = node.create_client(service, name)
-        client.wait_for_service(10.0)
-        return lambda: client.remove_pending_request(client.call_async(request))
-    if kind == 'clock':
-        publisher, buffer = node.create_publisher(Clock, '/clock', 10), bytearray(12)
-        buffer[1] = 1
-
-        def tick() -> None:
-            struct.pack_into('<iI', buffer, 4, *divmod(time.time_ns(), 1_000_000_000))
-            publisher.publish(bytes(buffer))
-
-        return tick
-    sample = message(kind)
-    publisher = node.create_publisher(type(sample), kind.removesuffix('_stamped'), 10)
-    data = serialize_message(sample)
-    return lambda: publisher.publish(data)
+LEAST = {'odometry': 49.5}
+MOST = {'stop': 100.0, 'service': 100.0, 'memory': 2.0}
+"""Goals by the name of the figure: rate of the odometry (Hz), lateness, response (ms), growth (MB)."""
+FORMATS = {
+    'flood': '{:7.0f}/s:',
+    'odometry': '{:5.2f} Hz,',
+    'gap': 'gap {:4.0f} ms,',
+    'stop': 'stop {:4.0f} ms late,',
+    'service': 'service {:4.0f} ms,',
+    'memory': '{:+5.1f} MB',
+}
 
 
 # --- What is measured
@@ -243,8 +187,8 @@ def resident(process: subprocess.Popen) -> float:
     return int(status.split('VmRSS:')[1].split()[0]) / 1024.0
 
 
-def measure(case: Case, executor: str, seconds: float, processes: int) -> str:
-    """Flood a node; return what was measured."""
+def measure(case: Case, executor: str, seconds: float, processes: int) -> dict[str, float]:
+    """Flood a node; return what was measured, by the names of `FORMATS`."""
     timeout = 'odom_timeout' if case.node == 'go_to_goal' else 'cmd_vel_timeout'
     arguments = ['--ros-args', '-p', f'{timeout}:={TIMEOUT}', *case.arguments]
     program = ENTRY.format(ON[executor], case.node)
@@ -253,12 +197,13 @@ def measure(case: Case, executor: str, seconds: float, processes: int) -> str:
     try:
         with fast_heartbeats(), ros_context(['observer']) as context:
             observer = Observer(context, case)
-            observer.spin(20.0, observer.client.service_is_ready)
+            if not observer.spin(20.0, observer.client.service_is_ready):
+                raise RuntimeError(f'not ready within 20 s: {case.node} {" ".join(arguments)}')
             observer.spin(2.0)
             observer.response()
             observer.goal.publish(message('goal_pose'))
             before = resident(node)
-            command = [sys.executable, __file__, '--flood', case.node, case.flooded, str(seconds)]
+            command = [sys.executable, FLOODING, case.node, case.flooded, str(seconds)]
             floods += [
                 subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(processes)
             ]
@@ -284,35 +229,62 @@ def measure(case: Case, executor: str, seconds: float, processes: int) -> str:
         for process in (*floods, node):
             process.kill()
             process.wait()
-    gaps = [b - a for a, b in pairwise(stamps)]
-    odometry = f'{len(gaps) / sum(gaps):5.2f} Hz, gap {max(gaps) * 1e3:4.0f} ms, ' if gaps else ''
-    stop = f'stop {max(stops) * 1e3:4.0f} ms late, ' if stops else ''
-    return (
-        f'{sum(float(rate) for rate, _ in results):7.0f}/s: {odometry}{stop}'
-        f'service {max(responses) * 1e3:4.0f} ms, {grown:+5.1f} MB'
+    figures = {
+        'flood': sum(float(rate) for rate, _ in results),
+        'service': max(responses) * 1e3,
+        'memory': grown,
+    }
+    if case.node == 'virtual_robot':
+        gaps = [b - a for a, b in pairwise(stamps)] or [math.inf]
+        figures |= {'odometry': len(gaps) / sum(gaps), 'gap': max(gaps) * 1e3}
+    if stops:
+        figures['stop'] = max(stops) * 1e3
+    return figures
+
+
+def missed(figures: dict[str, float]) -> list[str]:
+    """Return the names of the figures that miss their goal."""
+    few = [name for name, least in LEAST.items() if figures.get(name, least) < least]
+    return few + [name for name, most in MOST.items() if figures.get(name, 0.0) > most]
+
+
+def line(figures: dict[str, float]) -> str:
+    """Return figures as a line."""
+    parts = [form.format(figures[name]) for name, form in FORMATS.items() if name in figures]
+    if failures := missed(figures):
+        parts.append(f'MISSED: {", ".join(failures)}')
+    return ' '.join(parts)
+
+
+def main() -> int:
+    """Flood the nodes, and return the exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--flood', nargs=3, help=argparse.SUPPRESS)
-    parser.add_argument('--seconds', type=float, default=60.0, help='of each flood')
-    parser.add_argument('--processes', type=int, default=1, help='that flood')
-    parser.add_argument('cases', nargs='*', help='beginnings of NODE/INPUT; none: all')
+    parser.add_argument('--quick', action='store_true', help='short and noisy, to try it')
+    parser.add_argument('--seconds', type=float, help='duration of each flood (s) (default: 60.0)')
+    parser.add_argument('--processes', type=int, default=1, help='processes that flood (default: 1)')
+    parser.add_argument('cases', nargs='*', help='beginnings of NODE/INPUT (default: all)')
     options = parser.parse_args()
+    seconds = options.seconds or (QUICK_SECONDS if options.quick else 60.0)
+    wanted = tuple(options.cases) or (QUICK if options.quick else ('',))
+    cases = [case for case in CASES if f'{case.node}/{case.flooded}'.startswith(wanted)]
+    if not cases or seconds < SHORTEST:
+        parser.error(f'cases must name inputs, and --seconds must be at least {SHORTEST:g}')
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    os.environ.setdefault('ROS_DOMAIN_ID', str(os.getpid() % 100 + 1))
     announce_frequently()
-    if options.flood:
-        name, kind, seconds = options.flood
-        flood(name, kind, float(seconds))
-        return
-    for case in CASES:
-        name = f'{case.node}/{case.flooded}'
-        if options.cases and not name.startswith(tuple(options.cases)):
-            continue
+    failures = dict.fromkeys(ON, 0)
+    for case in cases:
         for executor in ON:
-            result = measure(case, executor, options.seconds, options.processes)
-            print(f'{name:30s} {executor:6s} {result}', flush=True)
+            figures = measure(case, executor, seconds, options.processes)
+            failures[executor] += len(missed(figures))
+            name = f'{case.node}/{case.flooded}'
+            print(f'{name:30s} {executor:6s} {line(figures)}', flush=True)
+    counts = ', '.join(f'{executor} {count}' for executor, count in failures.items())
+    print(f'goals missed in {len(cases)} floods of {seconds:g} s: {counts}')
+    return int(failures['ours'] > 0)
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(main())

@@ -1,0 +1,210 @@
+"""The graph is queried after changes only, once for all nodes of a context."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from collections import Counter
+
+import pytest
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from std_msgs.msg import String
+
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.ros import rclpy_internals
+from diffdrive_jacobian.ros.node import FAULT_PATIENCE
+from diffdrive_jacobian.ros.runner import ros_context
+from diffdrive_jacobian.ros.shared_graph import SharedGraph
+
+QUERIES = ('count_publishers', 'count_subscribers', 'get_topic_names_and_types')
+
+
+@pytest.fixture
+def queries(monkeypatch):
+    """Numbers of queries of the graph, by method."""
+    counts = Counter()
+
+    def counted(name, query):
+        def method(node, *args):
+            counts[(name, *args)] += 1
+            return query(node, *args)
+
+        return method
+
+    for name in QUERIES:
+        monkeypatch.setattr(Node, name, counted(name, getattr(Node, name)))
+    return counts
+
+
+@pytest.fixture
+def context():
+    with ros_context(['test']) as context:
+        yield context
+
+
+@pytest.fixture
+def create(context):
+    """Create a node, which is destroyed at the end."""
+    nodes = []
+
+    def create(node_class, name='', context=context, **kwargs):
+        if node_class is Node:
+            kwargs['node_name'] = name
+        else:
+            kwargs['namespace'] = name
+        nodes.append(node_class(context=context, **kwargs))
+        return nodes[-1]
+
+    yield create
+    for node in nodes:
+        node.destroy_node()
+
+
+def check(*nodes, times=FAULT_PATIENCE):
+    """Let nodes check the graph, as their timers do once a second."""
+    for _ in range(times):
+        for node in nodes:
+            node._check_graph()
+
+
+def test_nothing_is_queried_while_the_graph_stays_the_same(create, queries):
+    team = [create(one, f'robot_{n}') for n in range(3) for one in (VirtualRobot, GoToGoal)]
+    check(*team, times=1)
+    assert queries['get_topic_names_and_types',] == 1
+    # Also where robot and controller check the same topic.
+    assert {queries['count_publishers', f'/robot_{n}/odom'] for n in range(3)} == {1}
+    assert queries['count_publishers', '/robot_0/goal_pose'] == 1
+    assert set(queries.values()) == {1}
+    queries.clear()
+    check(*team, times=3)
+    assert queries == {}
+    team[0].create_publisher(String, 'word', 1)
+    check(*team, times=3)
+    assert set(queries.values()) == {1}
+
+
+def test_a_fault_that_appears_after_many_checks_is_reported(create, capfd):
+    robot, other = create(VirtualRobot, 'a'), create(Node, 'other')
+    check(robot, times=200)
+    publisher = other.create_publisher(Odometry, '/a/odom', 1)
+    check(robot, times=FAULT_PATIENCE - 1)
+    assert 'publish /a/odom' not in capfd.readouterr().err
+    check(robot, times=1)
+    assert '/a/virtual_robot and /other publish /a/odom' in capfd.readouterr().err
+    other.destroy_publisher(publisher)
+    check(robot, times=200)
+    other.create_publisher(Odometry, '/a/odom', 1)
+    check(robot)
+    assert '/a/virtual_robot and /other publish /a/odom' in capfd.readouterr().err
+
+
+def test_each_node_of_a_context_notices_a_change(create, capfd):
+    robots = [create(VirtualRobot, name) for name in ('a', 'b')]
+    other = create(Node, 'other')
+    check(*robots, times=1)
+    for name in ('a', 'b'):
+        other.create_publisher(Odometry, f'/{name}/odom', 1)
+    # The first one of them takes the signal.
+    check(*robots)
+    text = capfd.readouterr().err
+    assert 'publish /a/odom' in text
+    assert 'publish /b/odom' in text
+
+
+def test_contexts_have_graphs_of_their_own(create, queries, capfd):
+    with ros_context(['other']) as second:
+        robots = [create(VirtualRobot, 'a'), create(VirtualRobot, 'a', context=second)]
+        other = create(Node, 'other', context=second)
+        check(*robots, times=1)
+        queries.clear()
+        other.create_publisher(Odometry, '/a/odom', 1)
+        check(robots[0])
+        assert queries == {}
+        assert 'publish /a/odom' not in capfd.readouterr().err
+        check(robots[1])
+        assert 'publish /a/odom' in capfd.readouterr().err
+        for node in (other, robots[1]):
+            node.destroy_node()
+
+
+def test_nodes_notice_changes_after_another_one_was_destroyed(create, context, capfd):
+    first = VirtualRobot(namespace='first', context=context)
+    robot, other = create(VirtualRobot, 'a'), create(Node, 'other')
+    check(first, robot, times=1)
+    first.destroy_node()
+    other.create_publisher(Odometry, '/a/odom', 1)
+    check(robot)
+    assert 'publish /a/odom' in capfd.readouterr().err
+
+
+def test_a_context_is_released():
+    with ros_context(['test']) as context:
+        robot = VirtualRobot(context=context)
+        check(robot)
+        robot.destroy_node()
+    reference = weakref.ref(context)
+    del context, robot
+    gc.collect()
+    assert reference() is None
+
+
+def test_for_a_maximum_age_changes_are_not_looked_for(create):
+    node = create(Node, 'node')
+    graph, another = SharedGraph(node), SharedGraph(node)
+    graph.refresh()
+    snapshot = graph.refresh()
+    assert graph.refresh() is snapshot
+    assert graph.count_publishers('/word') == 0
+    node.create_publisher(String, 'word', 1)
+    assert graph.refresh(1e6) is snapshot
+    assert graph.count_publishers('/word') == 0
+    changed = another.refresh()
+    assert changed is not snapshot
+    assert graph.count_publishers('/word') == 1
+    assert graph.refresh() is changed
+
+
+def test_without_the_signal_of_rcl_every_check_queries(monkeypatch, create, queries, capfd):
+    monkeypatch.setattr(rclpy_internals, '_graph_functions', lambda: None)
+    robot, other = create(VirtualRobot, 'a'), create(Node, 'other')
+    check(robot, times=3)
+    assert queries['count_publishers', '/a/odom'] == 3
+    other.create_publisher(Odometry, '/a/odom', 1)
+    check(robot)
+    assert 'publish /a/odom' in capfd.readouterr().err
+
+
+def test_an_idle_driver_that_came_later_is_found(create, queries):
+    controller, other = create(GoToGoal, 'a'), create(Node, 'other')
+    drivers = controller._others
+    drivers.start()
+    for second in range(1, 4):
+        drivers.search(second * 1_000_000_000)
+    assert queries['count_publishers', '/a/cmd_vel'] == 1
+    other.create_publisher(Twist, '/a/cmd_vel', 1)
+    drivers.start()
+    assert drivers.subscriptions == 1
+
+
+def test_a_mismatch_is_compared_again_until_it_is_gone(create, queries, capfd, monkeypatch):
+    controller = create(GoToGoal, 'a')
+    check(controller)
+    queries.clear()
+    matching = controller._graph.refresh()
+    kinds = {'/a/cmd_vel': ['geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistStamped']}
+    matching.types.update(kinds)
+    # A matching graph is not compared again.
+    check(controller, times=2)
+    assert queries == {}
+    controller._types._matching = None
+    infos = controller.get_publishers_info_by_topic('/a/cmd_vel')
+    infos[0].topic_type = 'geometry_msgs/msg/TwistStamped'
+    monkeypatch.setattr(controller, 'get_subscriptions_info_by_topic', lambda _: infos)
+    check(controller)
+    assert capfd.readouterr().err.count('but this node publishes it as geometry_msgs/msg/Twist') == 1
+    infos.clear()
+    check(controller, times=2)
+    assert controller._types._matching is matching
