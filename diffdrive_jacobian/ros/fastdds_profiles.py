@@ -3,7 +3,7 @@
 Fast DDS announces a participant to others five times when it is created, and then every 3 s. An older
 one answers the first announcement of a new one at once. The new one often discards this answer, because
 it does not receive yet, and then hears the older one only at its next announcement. Nodes that announce
-themselves every 0.2 s are discovered by any new process in that time.
+themselves every 0.15 s are discovered by any new process in that time.
 
 Before the first message through shared memory Fast DDS checks whether the receiver is alive. Where
 nothing was sent to the receiver for a while, the check often takes 0.33 s, and blocks the sender that
@@ -43,7 +43,7 @@ _FILES = ('DEFAULT_FASTRTPS_PROFILES.xml', 'DEFAULT_FASTDDS_PROFILES.xml')
 
 
 def announce_frequently() -> bool:
-    """Announce the participants of this process every 0.2 s. Receive messages through UDP.
+    """Announce the participants of this process every 0.15 s. Receive messages through UDP.
 
     Nothing happens if the user has chosen otherwise, see the module, or by the variable SWITCH.
 
@@ -68,7 +68,7 @@ def fast_heartbeats() -> Iterator[None]:
 
 
 def open_to_others() -> None:
-    """Announce the participants of this process every 0.2 s, and send heartbeats every 0.1 s.
+    """Announce the participants of this process every 0.15 s, and send heartbeats every 0.1 s.
 
     Messages are received through UDP. The conditions are those of `announce_frequently`.
     """
