@@ -8,12 +8,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import forked
 import pytest
+from domains import domain_id
 from rclpy.node import Node
 
 from diffdrive_jacobian.ros import fastdds_profiles
 from diffdrive_jacobian.ros.fastdds_profiles import (
     SWITCH,
+    TRANSPORTS,
     VARIABLE,
     announce_frequently,
     fast_heartbeats,
@@ -25,9 +28,26 @@ CHOICES = {
     'another file': {VARIABLE: '/own.xml'},
     'another file by its new name': {'FASTDDS_DEFAULT_PROFILES_FILE': '/own.xml'},
     'no files': {'SKIP_DEFAULT_XML_FILE': '1'},
+    'shared memory only': {TRANSPORTS: 'SHM'},
+    'transports with options': {TRANSPORTS: 'LARGE_DATA?max_msg_size=1MB'},
     'a discovery server': {'ROS_DISCOVERY_SERVER': '127.0.0.1:11811'},
     'another middleware': {'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'},
 }
+# The shared memory through which a node receives.
+RECEIVING = """
+import contextlib, os, sys
+from diffdrive_jacobian.ros.fastdds_profiles import announce_frequently
+
+announce_frequently()
+import rclpy
+from rclpy.node import Node
+
+rclpy.init()
+node = Node('receiver')
+for number in os.listdir('/proc/self/fd'):
+    with contextlib.suppress(FileNotFoundError):
+        print(os.path.basename(os.readlink(f'/proc/self/fd/{number}')))
+"""
 # The entry point runs in an empty folder; what it would give to Fast DDS is printed.
 PRINTING = f"""
 import os, sys, types
@@ -43,7 +63,7 @@ virtual_robot()
 @pytest.fixture(autouse=True)
 def environment(monkeypatch, tmp_path):
     """An environment without choices of the user, in an empty folder."""
-    for name in (*fastdds_profiles._CHOICES, SWITCH, 'RMW_IMPLEMENTATION'):
+    for name in (*fastdds_profiles._CHOICES, SWITCH, TRANSPORTS, 'RMW_IMPLEMENTATION'):
         # Set first, so that it is restored in any case.
         monkeypatch.setenv(name, '')
         monkeypatch.delenv(name)
@@ -55,10 +75,27 @@ def profile():
     return Path(os.environ[VARIABLE]).read_text(encoding='utf-8')
 
 
-def test_participants_are_announced_every_fifth_of_a_second():
+def test_participants_are_announced_frequently():
     assert announce_frequently()
-    assert re.search(r'<leaseAnnouncement><sec>0</sec><nanosec>200000000</nanosec>', profile())
+    assert re.search(r'<leaseAnnouncement><sec>0</sec><nanosec>150000000</nanosec>', profile())
     assert 'heartbeatPeriod' not in profile()
+
+
+@pytest.mark.parametrize('transports', ['DEFAULT', 'UDPv4', 'UDPv4?max_msg_size=1MB'])
+def test_transports_with_udp_are_no_other_choice(transports, monkeypatch):
+    monkeypatch.setenv(TRANSPORTS, transports)
+    assert announce_frequently()
+
+
+@pytest.mark.parametrize(('switch', 'expected'), [('1', False), ('0', True)])
+def test_messages_are_received_through_udp(switch, expected, monkeypatch):
+    """A sender then needs no check of shared memory, which often takes 0.33 s."""
+    monkeypatch.setenv(SWITCH, switch)
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(domain_id()))
+    ended = forked.run(RECEIVING, timeout=60)
+    assert ended.returncode == 0
+    assert bool(re.search(r'^fastrtps_port\d+_el$', ended.stdout, re.MULTILINE)) == expected
 
 
 @pytest.mark.parametrize('announced', [False, True])

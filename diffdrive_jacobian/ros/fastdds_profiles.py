@@ -1,8 +1,14 @@
-"""Profiles of Fast DDS for the process of an entry point: frequent announcements and heartbeats.
+"""Profiles of Fast DDS for the process of an entry point: announcements, transport and heartbeats.
 
-Fast DDS announces a participant to others five times when it is created, and then every 3 s. One that
-is older than half a second also answers a new one only then. Nodes that announce themselves every 0.2 s
-are discovered by any new process in that time.
+Fast DDS announces a participant to others five times when it is created, and then every 3 s. An older
+one answers the first announcement of a new one at once. The new one often discards this answer, because
+it does not receive yet, and then hears the older one only at its next announcement. Nodes that announce
+themselves every 0.15 s are discovered by any new process in that time.
+
+Before the first message through shared memory Fast DDS checks whether the receiver is alive. Where
+nothing was sent to the receiver for a while, the check often takes 0.33 s, and blocks the sender that
+long. Nodes that receive through UDP are spared that. They still send through shared memory to those
+that receive so.
 
 A reliable writer of Fast DDS sends its readers a heartbeat every 3 s. A reader that has received all
 messages acknowledges them only in reply to a heartbeat. `Publisher.wait_for_all_acked` therefore takes
@@ -10,7 +16,7 @@ up to 3 s after the messages were received, unless heartbeats are more frequent.
 
 Fast DDS reads the file that an environment variable names, when the first participant of a process is
 created. A choice of the user is left as it is: a file of profiles in the environment or in the working
-directory, a discovery server, or another middleware.
+directory, transports without UDP over IPv4, a discovery server, or another middleware.
 """
 
 from __future__ import annotations
@@ -30,11 +36,14 @@ _CHOICES = (
     *(VARIABLE, 'FASTDDS_DEFAULT_PROFILES_FILE', 'SKIP_DEFAULT_XML', 'SKIP_DEFAULT_XML_FILE'),
     *('ROS_DISCOVERY_SERVER', 'ROS_SUPER_CLIENT', 'ROS2_EASY_MODE'),
 )
+TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
+"""Environment variable of Fast DDS that names its transports."""
+_WITH_UDP = ('', 'DEFAULT', 'UDPv4')
 _FILES = ('DEFAULT_FASTRTPS_PROFILES.xml', 'DEFAULT_FASTDDS_PROFILES.xml')
 
 
 def announce_frequently() -> bool:
-    """Announce the participants of this process every 0.2 s.
+    """Announce the participants of this process every 0.15 s. Receive messages through UDP.
 
     Nothing happens if the user has chosen otherwise, see the module, or by the variable SWITCH.
 
@@ -59,9 +68,9 @@ def fast_heartbeats() -> Iterator[None]:
 
 
 def open_to_others() -> None:
-    """Announce the participants of this process and send heartbeats every 0.2 s and 0.1 s.
+    """Announce the participants of this process every 0.15 s, and send heartbeats every 0.1 s.
 
-    The conditions are those of `announce_frequently`.
+    Messages are received through UDP. The conditions are those of `announce_frequently`.
     """
     if announce_frequently():
         _use('heartbeats')
@@ -98,8 +107,11 @@ def _own() -> list[str] | None:
 
 def _user_has_chosen() -> bool:
     middleware = os.environ.get('RMW_IMPLEMENTATION', '')
+    # The name of the transports may be followed by options, "UDPv4?max_msg_size=1MB".
+    transports = os.environ.get(TRANSPORTS, '').partition('?')[0]
     return (
         any(os.environ.get(name) for name in _CHOICES)
+        or transports not in _WITH_UDP
         or not (not middleware or middleware.startswith('rmw_fastrtps'))
         or any(os.path.exists(file) for file in _FILES)
     )

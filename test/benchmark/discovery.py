@@ -1,10 +1,13 @@
 """Discovery: how long a new listener waits for the first odometry of a running robot, and what it costs.
 
 Run as `python test/benchmark/discovery.py`. The robot is started as its entry point does it, with
-frequent announcements and without them. Each try is a new participant, a plain node of rclpy that
-subscribes to odometry at 50 Hz, at a random time after the start of the robot. Printed are the times
-(s), and the packets per second on the loopback interface while only the robot runs. They are those of
-the whole machine, so run it in a network namespace of its own (`unshare -rn`), or on an idle machine.
+the profile of this package and with the default of Fast DDS. Each try is a new participant, a plain
+node of rclpy that subscribes to odometry at 50 Hz, at a random time after the start of the robot.
+Printed are the times (s) and how they are distributed. While only the robot runs, its CPU time and the
+packets per second on the loopback interface are measured. The packets are those of the whole machine,
+so run it in a network namespace of its own (`unshare -rn`), or on an idle machine.
+
+`ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET` measures that range instead of LOCALHOST.
 """
 
 from __future__ import annotations
@@ -16,7 +19,9 @@ import statistics
 import subprocess
 import sys
 import time
+from collections import Counter
 from pathlib import Path
+from typing import NamedTuple
 
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 os.environ.setdefault('ROS_DOMAIN_ID', str(os.getpid() % 100 + 1))
@@ -39,6 +44,31 @@ LATE = 0.5
 """What counts as late (s)."""
 PATIENCE = 10.0
 """Longest wait for odometry (s)."""
+WIDTH = 0.1
+"""Width of a class of the distribution (s)."""
+
+
+class Robot(NamedTuple):
+    """A robot and what its listeners waited for."""
+
+    times: list[float]
+    """Times until the first odometry (s)."""
+    packets: float
+    """Packets per second, before there are listeners."""
+    cpu: float
+    """CPU time per time, before there are listeners."""
+
+
+def cpu_time(pid):
+    """Return the CPU time of a process and its threads (s)."""
+    files = Path(f'/proc/{pid}/task').glob('*/schedstat')
+    return 1e-9 * sum(int(file.read_text().split()[0]) for file in files)
+
+
+def distribution(times):
+    """Return how many times are in each class, as text."""
+    counts = Counter(int(time / WIDTH) for time in times)
+    return ', '.join(f'{counts[k]} from {k * WIDTH:.1f} s' for k in sorted(counts))
 
 
 def packets():
@@ -67,15 +97,16 @@ def first_odometry():
 
 
 def measure(fast, tries, seconds):
-    """Start a robot; return the times (s) and its packets per second."""
+    """Start a robot, and listeners one after the other."""
     environment = {**os.environ, SWITCH: '1' if fast else '0'}
     robot = subprocess.Popen([sys.executable, '-c', ENTRY], env=environment, stderr=subprocess.DEVNULL)
     try:
         first_odometry()
         time.sleep(AGE)
-        before = packets()
+        before, used, begin = packets(), cpu_time(robot.pid), time.monotonic()
         time.sleep(seconds)
-        rate = (packets() - before) / seconds
+        elapsed = time.monotonic() - begin
+        rate, cpu = (packets() - before) / elapsed, (cpu_time(robot.pid) - used) / elapsed
         times = []
         for _ in range(tries):
             time.sleep(random.uniform(0.0, 0.5))
@@ -83,13 +114,13 @@ def measure(fast, tries, seconds):
     finally:
         robot.terminate()
         robot.wait(10)
-    return times, rate
+    return Robot(times, rate, cpu)
 
 
 def times_of(fast, tries):
     """Return the times of so many tries (s), as a child of run.py."""
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    return measure(fast, tries, 0.5)[0]
+    return measure(fast, tries, 0.5).times
 
 
 def rows(quick):
@@ -100,7 +131,7 @@ def rows(quick):
     return [
         Row(
             group='discovery',
-            ours='robot that is announced every 0.2 s',
+            ours='robot with the profile of this package',
             beside='the same robot with the default of Fast DDS',
             quantity='time until the first odometry at a new listener (s)',
             pairs=list(zip(fast, slow, strict=True)),
@@ -119,12 +150,14 @@ def main():
     parser.add_argument('--seconds', type=float, default=10.0, help='for which packets are counted')
     options = parser.parse_args()
     for fast in (False, True):
-        times, rate = measure(fast, options.tries, options.seconds)
+        robot = measure(fast, options.tries, options.seconds)
+        times = robot.times
         late = sum(time > LATE for time in times)
         print(
-            f'{"announced every 0.2 s" if fast else "default of Fast DDS":22s} first odometry after '
+            f'{"profile of this package" if fast else "default of Fast DDS":23s} first odometry after '
             f'{min(times):.2f} to {max(times):.2f} s, median {statistics.median(times):.2f} s, '
-            f'{late} of {len(times)} later than 0.5 s; {rate:.0f} packets/s',
+            f'{late} of {len(times)} later than {LATE:g} s ({distribution(times)}); '
+            f'{robot.packets:.0f} packets/s, {100.0 * robot.cpu:.2f} % of a core',
             flush=True,
         )
 
