@@ -14,6 +14,7 @@ os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 os.environ.setdefault('ROS_LOG_DIR', os.path.join(os.environ.get('TMPDIR', '/tmp'), 'ros_test_log'))
 
+import forked
 import pytest
 
 pytest_plugins = ['pytester']
@@ -44,7 +45,15 @@ def pytest_xdist_auto_num_workers():
     return len(os.sched_getaffinity(0)) + 1
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node):
+    """Let the workers of pytest-xdist share their servers of forks."""
+    node.workerinput['forks'] = forked.share()
+
+
 def pytest_configure(config):
+    if hasattr(config, 'workerinput'):
+        forked.use(config.workerinput['forks'])
     if getattr(config.option, 'maxschedchunk', CHUNK) is None:
         config.option.maxschedchunk = CHUNK
 
