@@ -48,6 +48,8 @@ SETS = (EVERYTHING, LIBRARIES, ())
 """What servers import: each of these sets has a server of its own."""
 LARGEST = 1 << 20
 """Size of the largest request (bytes)."""
+RESERVED = 100
+"""Number of descriptors, from 0, that children can inherit."""
 SERVER = """
 import sys
 sys.path.append(sys.argv[1])
@@ -68,6 +70,9 @@ def serve(descriptor: int, listening: int, modules: list[str]) -> None:
         listening: The socket at which commands connect, see `make_commands`.
         modules: Names of what is to be imported.
     """
+    # Children get descriptors of these numbers. Libraries must not have them.
+    for _ in range(RESERVED):
+        os.open(os.devnull, os.O_RDONLY)
     # Ctrl-C ends the tests, which close the socket.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     starter = socket.socket(fileno=descriptor)
@@ -84,7 +89,7 @@ def serve(descriptor: int, listening: int, modules: list[str]) -> None:
             if ready is listener:
                 children[listener.accept()[0]] = set()
                 continue
-            data, received, _, _ = socket.recv_fds(ready, LARGEST, 3)
+            data, received, _, _ = socket.recv_fds(ready, LARGEST, RESERVED)
             if not data:
                 ready.close()
                 if ready is starter:
@@ -110,10 +115,13 @@ def serve(descriptor: int, listening: int, modules: list[str]) -> None:
             if pid == 0:
                 for each in (listener, *children):
                     each.close()
-                for target, source in enumerate(received):
-                    os.dup2(source, target)
+                numbers, *program = request
+                assert not numbers or max(numbers) < RESERVED <= min(received)
+                os.closerange(0, RESERVED)
+                for number, source in zip(numbers, received, strict=True):
+                    os.dup2(source, number)
                     os.close(source)
-                _run(*request)
+                _run(*program)
                 return
             signal.pthread_sigmask(signal.SIG_SETMASK, ())
             for each in received:
@@ -194,10 +202,11 @@ def _import(name: str) -> None:
                 check_for_type_support(each)
 
 
-def _run(code: str, argv: list[str], directory: str, environment: dict[str, str]) -> None:
+def _run(python: str, code: str, argv: list[str], directory: str, environment: dict[str, str]) -> None:
     """Run a program, as `python -c CODE ARGUMENTS` does, or `python FILE ARGUMENTS`.
 
     Args:
+        python: `sys.executable`. Empty: that of the server.
         code: Text of the program.
         argv: `-c` or the name of its file, and its arguments.
         directory: Its working directory.
@@ -211,6 +220,7 @@ def _run(code: str, argv: list[str], directory: str, environment: dict[str, str]
     inherited = _python_path(os.environ, os.getcwd())
     os.chdir(directory)
     sys.argv[:] = argv
+    sys.executable = python or sys.executable
     own = '' if argv[0] == '-c' else os.path.dirname(os.path.abspath(argv[0]))
     added = _python_path(environment, directory)
     sys.path[:] = [own, *added, *(path for path in sys.path[1:] if path not in inherited)]
@@ -415,7 +425,7 @@ class Popen:
         self.stdout, out = self._output(stdout, 1)
         self.stderr, error = self._output(stderr, 2)
         self._server = _server(modules, os.getpid())
-        request = (code, argv, os.fspath(cwd or os.getcwd()), dict(env or os.environ))
+        request = ([0, 1, 2], '', code, argv, os.fspath(cwd or os.getcwd()), dict(env or os.environ))
         self.pid = self._server.ask(request, (null, out, error))
         for each in (null, *self._opened):
             os.close(each)
@@ -497,15 +507,17 @@ def make_commands(folder, scripts):
 
     Args:
         folder: Where to make them.
-        scripts: Files of the scripts. A command has the name of its script. `-c` makes the command
-            `python_c`, whose first argument is a program.
+        scripts: Files of the scripts. A command has the name of its script. `python` makes one that
+            takes a file, `-c` or `-m` as the interpreter does, and with which the scripts start
+            processes.
     """
     folder.mkdir()
     server = _server(EVERYTHING, os.getpid())
     client = Path(__file__).with_name('forked_command.py')
+    python = folder / 'python' if 'python' in scripts else ''
     for script in scripts:
-        path = folder / ('python_c' if script == '-c' else Path(script).name)
-        words = (sys.executable, '-IS', client, server.path, script)
+        path = folder / Path(script).name
+        words = (sys.executable, '-IS', client, server.path, python, script)
         path.write_text(f'#!/bin/sh\nexec {shlex.join(map(str, words))} "$@"\n')
         path.chmod(0o755)
     return folder

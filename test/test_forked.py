@@ -147,8 +147,9 @@ def commands(tmp_path):
     scripts = tmp_path / 'scripts'
     scripts.mkdir()
     (scripts / 'state').write_text(STATE)
+    (scripts / 'state.py').write_text(STATE)
     (scripts / 'waits').write_text(WAITS)
-    return forked.make_commands(tmp_path / 'commands', ['-c', scripts / 'state', scripts / 'waits'])
+    return forked.make_commands(tmp_path / 'commands', ['python', scripts / 'state', scripts / 'waits'])
 
 
 def test_a_command_runs_a_script_as_the_interpreter_does(tmp_path, commands):
@@ -161,7 +162,24 @@ def test_a_command_runs_a_script_as_the_interpreter_does(tmp_path, commands):
 
     script = tmp_path / 'scripts' / 'state'
     assert run(commands / 'state', 'x y', '$z') == run(sys.executable, script, 'x y', '$z')
-    assert run(commands / 'python_c', STATE, 'x') == run(sys.executable, '-c', STATE, 'x')
+    for words in (['-c', STATE, 'x'], [script, 'x'], ['-m', 'scripts.state', 'x']):
+        assert run(commands / 'python', *words) == run(sys.executable, *words)
+
+
+def test_a_command_starts_python_in_a_fork(commands):
+    code = 'import sys; print("numpy" in sys.modules)'
+    starting = f'import subprocess, sys; subprocess.run([sys.executable, "-c", {code!r}])'
+    ended = subprocess.run([commands / 'python', '-c', starting], capture_output=True, text=True)
+    assert results(ended) == (0, 'True\n', '')
+
+
+def test_a_command_inherits_descriptors(commands):
+    read, write = os.pipe()
+    with open(read) as stream:
+        code = 'import os, sys; os.write(int(sys.argv[1]), b"from the child")'
+        subprocess.run([commands / 'python', '-c', code, str(write)], pass_fds=[write], check=True)
+        os.close(write)
+        assert stream.read() == 'from the child'
 
 
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGINT])
