@@ -160,6 +160,12 @@ def ros(request):
         harness.close()
 
 
+@pytest.fixture(scope='session')
+def forked_python(tmp_path_factory):
+    """Return a command that is used like the Python interpreter, and has done its imports."""
+    return forked.make_commands(tmp_path_factory.mktemp('forked') / 'commands', ['python']) / 'python'
+
+
 @pytest.fixture
 def no_display(monkeypatch):
     """Ask matplotlib for a window, where there is none. `matplotlib.pyplot`, which obeys, is absent."""
