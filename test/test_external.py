@@ -7,11 +7,10 @@ import math
 import random
 import signal
 import socket
+import subprocess
 import sys
-from pathlib import Path
 
 import external_nodes
-import forked
 import pytest
 from domains import domain_id
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
@@ -57,7 +56,7 @@ def gallery():
     }
     environment.pop(external_process.VARIABLE, None)
     names = [name for name in external_nodes.NODES if name != 'mortal']
-    process = forked.Popen(Path(SCRIPT).read_text(), names, env=environment)
+    process = subprocess.Popen([sys.executable, SCRIPT, *names], env=environment)
     yield domain
     process.kill()
     process.wait()
