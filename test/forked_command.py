@@ -5,14 +5,16 @@
 
 PYTHON is what the script finds as `sys.executable`, empty: the interpreter of the server.
 
-This is what a shell starts instead of the script, so it imports as little as possible.
+This is what a shell starts instead of the script, so it imports as little as possible: `signal` and
+`socket` take longer to import, for their enumerations, than all that is done here.
 """
 
+import _signal as signal
+import _socket as socket
 import marshal
 import os
 import select
-import signal
-import socket
+import struct
 import sys
 
 FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -55,7 +57,8 @@ def main(path, python, script, *arguments):
     request = marshal.dumps(
         (inherited, python, code, [script, *arguments], os.getcwd(), dict(os.environ))
     )
-    socket.send_fds(server, [request], inherited)
+    descriptors = struct.pack(f'{len(inherited)}i', *inherited)
+    server.sendmsg([request], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, descriptors)])
     pid = marshal.loads(server.recv(1000))
     # As if this process were the program: who reads its output sees its end.
     null = os.open(os.devnull, os.O_RDWR)
