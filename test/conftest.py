@@ -16,6 +16,7 @@ os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 os.environ.setdefault('ROS_LOG_DIR', os.path.join(os.environ.get('TMPDIR', '/tmp'), 'ros_test_log'))
 
+import forked
 import pytest
 
 pytest_plugins = ['pytester']
@@ -46,7 +47,15 @@ def pytest_xdist_auto_num_workers():
     return len(os.sched_getaffinity(0)) + 1
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node):
+    """Let the workers of pytest-xdist share their servers of forks."""
+    node.workerinput['forks'] = forked.share()
+
+
 def pytest_configure(config):
+    if hasattr(config, 'workerinput'):
+        forked.use(config.workerinput['forks'])
     if getattr(config.option, 'maxschedchunk', CHUNK) is None:
         config.option.maxschedchunk = CHUNK
 
@@ -151,6 +160,12 @@ def ros(request):
         harness = Harness(context, executor)
         yield harness
         harness.close()
+
+
+@pytest.fixture(scope='session')
+def forked_python(tmp_path_factory):
+    """Return a command that is used like the Python interpreter, and has done its imports."""
+    return forked.make_commands(tmp_path_factory.mktemp('forked') / 'commands', ['python']) / 'python'
 
 
 @pytest.fixture

@@ -10,9 +10,11 @@ done already. Tests of the start itself use `subprocess`.
 from __future__ import annotations
 
 import atexit
+import builtins
 import ctypes
 import gc
 import importlib
+import inspect
 import io
 import marshal
 import math
@@ -42,8 +44,12 @@ LIBRARIES = (
 """What programs without ROS import."""
 EVERYTHING = (*LIBRARIES, 'pytest', 'rclpy.executors', 'rclpy.node', PACKAGE)
 """What all programs import. A package is imported with its modules, and the messages are loaded."""
+SETS = (EVERYTHING, LIBRARIES, ())
+"""What servers import: each of these sets has a server of its own."""
 LARGEST = 1 << 20
 """Size of the largest request (bytes)."""
+RESERVED = 100
+"""Number of descriptors, from 0, that children can inherit."""
 SERVER = """
 import sys
 sys.path.append(sys.argv[1])
@@ -64,6 +70,9 @@ def serve(descriptor: int, listening: int, modules: list[str]) -> None:
         listening: The socket at which commands connect, see `make_commands`.
         modules: Names of what is to be imported.
     """
+    # Children get descriptors of these numbers. Libraries must not have them.
+    for _ in range(RESERVED):
+        os.open(os.devnull, os.O_RDONLY)
     # Ctrl-C ends the tests, which close the socket.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     starter = socket.socket(fileno=descriptor)
@@ -80,7 +89,7 @@ def serve(descriptor: int, listening: int, modules: list[str]) -> None:
             if ready is listener:
                 children[listener.accept()[0]] = set()
                 continue
-            data, received, _, _ = socket.recv_fds(ready, LARGEST, 3)
+            data, received, _, _ = socket.recv_fds(ready, LARGEST, RESERVED)
             if not data:
                 ready.close()
                 if ready is starter:
@@ -106,10 +115,13 @@ def serve(descriptor: int, listening: int, modules: list[str]) -> None:
             if pid == 0:
                 for each in (listener, *children):
                     each.close()
-                for target, source in enumerate(received):
-                    os.dup2(source, target)
+                numbers, *program = request
+                assert not numbers or max(numbers) < RESERVED <= min(received)
+                os.closerange(0, RESERVED)
+                for number, source in zip(numbers, received, strict=True):
+                    os.dup2(source, number)
                     os.close(source)
-                _run(*request)
+                _run(*program)
                 return
             signal.pthread_sigmask(signal.SIG_SETMASK, ())
             for each in received:
@@ -180,6 +192,8 @@ def _import(name: str) -> None:
         # that were imported before it.
         if not each.name.startswith((f'{name}.testing', f'{name}.exploration')):
             importlib.import_module(each.name)
+    # The first message to a log looks up the files of all modules.
+    inspect.getmodule(sys._getframe())
     from rclpy.type_support import check_for_type_support
 
     for package in [name for name in sys.modules if name.endswith('_msgs.msg')]:
@@ -188,10 +202,11 @@ def _import(name: str) -> None:
                 check_for_type_support(each)
 
 
-def _run(code: str, argv: list[str], directory: str, environment: dict[str, str]) -> None:
+def _run(python: str, code: str, argv: list[str], directory: str, environment: dict[str, str]) -> None:
     """Run a program, as `python -c CODE ARGUMENTS` does, or `python FILE ARGUMENTS`.
 
     Args:
+        python: `sys.executable`. Empty: that of the server.
         code: Text of the program.
         argv: `-c` or the name of its file, and its arguments.
         directory: Its working directory.
@@ -205,10 +220,13 @@ def _run(code: str, argv: list[str], directory: str, environment: dict[str, str]
     inherited = _python_path(os.environ, os.getcwd())
     os.chdir(directory)
     sys.argv[:] = argv
+    sys.executable = python or sys.executable
     own = '' if argv[0] == '-c' else os.path.dirname(os.path.abspath(argv[0]))
     added = _python_path(environment, directory)
     sys.path[:] = [own, *added, *(path for path in sys.path[1:] if path not in inherited)]
-    sys.path_importer_cache.clear()
+    # A directory that was missing may be there now.
+    for path in [path for path, finder in sys.path_importer_cache.items() if finder is None]:
+        del sys.path_importer_cache[path]
     os.environ.clear()
     os.environ.update(environment)
     main = sys.modules['__main__'] = types.ModuleType('__main__')
@@ -216,7 +234,48 @@ def _run(code: str, argv: list[str], directory: str, environment: dict[str, str]
         main.__file__ = argv[0]
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
-    exec(compile(code, '<string>' if argv[0] == '-c' else argv[0], 'exec'), vars(main))
+    with _QuickExit():
+        exec(compile(code, '<string>' if argv[0] == '-c' else argv[0], 'exec'), vars(main))
+
+
+class _QuickExit:
+    """Ends the process once the interpreter has cleared all modules, which is the last that can be seen.
+
+    What remains, to release each string and type that the server had imported, would copy the memory
+    that is shared with it: half the CPU time of a short program.
+    """
+
+    def __init__(self) -> None:
+        """Prepare that."""
+        self._code: int | None = None
+        self._exit = ctypes.CDLL(None).exit
+        # Called last: registered first.
+        atexit.register(self._flush)
+        # Builtins are cleared last.
+        builtins._quick_exit = self  # type: ignore[attr-defined]
+
+    def __enter__(self) -> None:
+        """Run the program."""
+
+    def __exit__(self, kind: object, error: BaseException | None, _: object) -> None:
+        """Find out the exit code."""
+        if isinstance(error, SystemExit):
+            code = 0 if error.code is None else error.code
+            self._code = code if isinstance(code, int) else 1
+        elif not isinstance(error, KeyboardInterrupt):
+            self._code = 0 if error is None else 1
+
+    def _flush(self) -> None:
+        try:
+            sys.stdout.flush()
+        except (OSError, ValueError):
+            # The interpreter reports that, with another exit code.
+            self._code = None
+
+    def __del__(self) -> None:
+        """End the process."""
+        if self._code is not None:
+            self._exit(self._code)
 
 
 def _python_path(environment: Mapping[str, str], directory: str) -> list[str]:
@@ -243,47 +302,102 @@ def _text_stream(original: TextIO, descriptor: int, *, unbuffered: bool) -> io.T
 
 
 class _Server:
-    """A process that forks children. Threads may share it."""
+    """A process that forks children for all who connect to its socket."""
 
-    def __init__(self, modules: tuple[str, ...]) -> None:
-        """Start it."""
-        self._lock = threading.Lock()
-        self._folder = tempfile.TemporaryDirectory()
-        self.path = os.path.join(self._folder.name, 'socket')
-        self._connection, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        listener.bind(self.path)
-        listener.listen(100)
-        passed = [theirs.fileno(), listener.fileno()]
-        self._process = subprocess.Popen(
-            [sys.executable, '-c', SERVER, str(Path(__file__).parent), *map(str, passed), *modules],
+    def __init__(self, modules: tuple[str, ...], folder: str) -> None:
+        """Create its socket.
+
+        Args:
+            modules: Names of what it is to import.
+            folder: Where its socket is to be.
+        """
+        self._modules = modules
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._listener.bind(_path(modules, folder))
+        self._listener.listen(100)
+
+    def start(self) -> None:
+        """Start it. It ends with this process."""
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        passed = [theirs.fileno(), self._listener.fileno()]
+        here, numbers = str(Path(__file__).parent), map(str, passed)
+        process = subprocess.Popen(
+            [sys.executable, '-c', SERVER, here, *numbers, *self._modules],
             stdin=subprocess.DEVNULL,
             pass_fds=passed,
             # NumPy starts a thread for every core otherwise.
             env={**os.environ, 'OPENBLAS_NUM_THREADS': '1', 'ROS_PYTHON_CHECK_FIELDS': '1'},
         )
-        listener.close()
+        self._listener.close()
         theirs.close()
-        atexit.register(self._close)
+        atexit.register(process.wait)
+        atexit.register(ours.close)
+
+    def start_when_used(self) -> None:
+        """Start it as soon as somebody connects."""
+        select.select([self._listener], [], [])
+        self.start()
+
+
+class _Connection:
+    """A connection to a server. Threads may share it."""
+
+    def __init__(self, path: str) -> None:
+        """Connect to the server at a socket."""
+        self.path = path
+        self._lock = threading.Lock()
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._socket.connect(path)
+        atexit.register(self._socket.close)
 
     def ask(self, request: object, descriptors: tuple[int, ...] = ()) -> int:
         """Send a request; return the answer."""
         with self._lock:
-            socket.send_fds(self._connection, [marshal.dumps(request)], descriptors)
-            answer = self._connection.recv(LARGEST)
+            socket.send_fds(self._socket, [marshal.dumps(request)], descriptors)
+            answer = self._socket.recv(LARGEST)
         assert answer, 'the server of forks has ended'
         number: int = marshal.loads(answer)
         return number
 
-    def _close(self) -> None:
-        self._connection.close()
-        self._process.wait()
-        self._folder.cleanup()
+
+def _path(modules: tuple[str, ...], folder: str) -> str:
+    return os.path.join(folder, str(SETS.index(modules)))
+
+
+def _folder() -> str:
+    """Create a folder for sockets, which is removed when this process ends; return it."""
+    folder = tempfile.TemporaryDirectory()
+    atexit.register(folder.cleanup)
+    return folder.name
+
+
+_shared: list[str] = []
 
 
 @lru_cache
-def _server(modules: tuple[str, ...], process: int) -> _Server:
-    return _Server(modules)
+def share() -> str:
+    """Let other processes use the servers of this one; return what they must pass to `use`.
+
+    A server starts when it is used first.
+    """
+    folder = _folder()
+    for modules in SETS:
+        threading.Thread(target=_Server(modules, folder).start_when_used, daemon=True).start()
+    return folder
+
+
+def use(folder: str) -> None:
+    """Use the servers of the process that has called `share`."""
+    _shared.append(folder)
+
+
+@lru_cache
+def _server(modules: tuple[str, ...], process: int) -> _Connection:
+    if _shared:
+        return _Connection(_path(modules, _shared[-1]))
+    folder = _folder()
+    _Server(modules, folder).start()
+    return _Connection(_path(modules, folder))
 
 
 class Popen:
@@ -311,7 +425,7 @@ class Popen:
         self.stdout, out = self._output(stdout, 1)
         self.stderr, error = self._output(stderr, 2)
         self._server = _server(modules, os.getpid())
-        request = (code, argv, os.fspath(cwd or os.getcwd()), dict(env or os.environ))
+        request = ([0, 1, 2], '', code, argv, os.fspath(cwd or os.getcwd()), dict(env or os.environ))
         self.pid = self._server.ask(request, (null, out, error))
         for each in (null, *self._opened):
             os.close(each)
@@ -393,15 +507,17 @@ def make_commands(folder, scripts):
 
     Args:
         folder: Where to make them.
-        scripts: Files of the scripts. A command has the name of its script. `-c` makes the command
-            `python_c`, whose first argument is a program.
+        scripts: Files of the scripts. A command has the name of its script. `python` makes one that
+            takes a file, `-c` or `-m` as the interpreter does, and with which the scripts start
+            processes.
     """
     folder.mkdir()
     server = _server(EVERYTHING, os.getpid())
     client = Path(__file__).with_name('forked_command.py')
+    python = folder / 'python' if 'python' in scripts else ''
     for script in scripts:
-        path = folder / ('python_c' if script == '-c' else Path(script).name)
-        words = (sys.executable, '-IS', client, server.path, script)
+        path = folder / Path(script).name
+        words = (sys.executable, '-IS', client, server.path, python, script)
         path.write_text(f'#!/bin/sh\nexec {shlex.join(map(str, words))} "$@"\n')
         path.chmod(0o755)
     return folder

@@ -1,22 +1,42 @@
 """A command that runs a Python script in a fork of the server, see `forked.make_commands`.
 
-    python -IS forked_command.py SOCKET SCRIPT ARGUMENT ...
+    python -IS forked_command.py SOCKET PYTHON SCRIPT ARGUMENT ...
+    python -IS forked_command.py SOCKET PYTHON python (FILE | -c CODE | -m MODULE) ARGUMENT ...
 
-This is what a shell starts instead of the script, so it imports as little as possible.
+PYTHON is what the script finds as `sys.executable`, empty: the interpreter of the server.
+
+This is what a shell starts instead of the script, so it imports as little as possible: `signal` and
+`socket` take longer to import, for their enumerations, than all that is done here.
 """
 
+import _signal as signal
+import _socket as socket
 import marshal
 import os
 import select
-import signal
-import socket
+import struct
 import sys
 
 FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+MODULE = """
+import os, runpy, sys
+sys.path[0] = os.getcwd()
+runpy.run_module({!r}, run_name='__main__', alter_sys=True)
+"""
 
 
-def main(path, script, *arguments):
+def is_open(number):
+    """Return whether a descriptor is open."""
+    try:
+        os.fstat(number)
+    except OSError:
+        return False
+    return True
+
+
+def main(path, python, script, *arguments):
     """Run the script, and end as it does."""
+    inherited = [number for number in map(int, os.listdir('/proc/self/fd')) if is_open(number)]
     caught = []
     for number in FORWARDED:
         signal.signal(number, lambda number, _: caught.append(number))
@@ -25,18 +45,25 @@ def main(path, script, *arguments):
     signal.set_wakeup_fd(writer)
     server = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     server.connect(path)
-    if script == '-c':
+    if script == 'python':
+        script, *arguments = arguments
+    if script in ('-c', '-m'):
         code, *arguments = arguments
+        code = code if script == '-c' else MODULE.format(code)
+        script = '-c'
     else:
         with open(script, encoding='utf-8') as file:
             code = file.read()
-    request = marshal.dumps((code, [script, *arguments], os.getcwd(), dict(os.environ)))
-    socket.send_fds(server, [request], [0, 1, 2])
+    request = marshal.dumps(
+        (inherited, python, code, [script, *arguments], os.getcwd(), dict(os.environ))
+    )
+    descriptors = struct.pack(f'{len(inherited)}i', *inherited)
+    server.sendmsg([request], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, descriptors)])
     pid = marshal.loads(server.recv(1000))
     # As if this process were the program: who reads its output sees its end.
     null = os.open(os.devnull, os.O_RDWR)
-    for stream in range(3):
-        os.dup2(null, stream)
+    for number in inherited:
+        os.dup2(null, number)
     ended = os.pidfd_open(pid)
     while True:
         while caught:

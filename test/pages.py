@@ -4,7 +4,8 @@
     python test/pages.py outputs [PAGE ...]    run pages and write the outputs that they quote
 
 A page is run from top to bottom in one empty directory. A `python` block is a program and a `bash` block
-a script. Programs of this package run in forks, see `forked`.
+a script. Programs of this package, `pytest` and `python` run in forks, see `forked`. `python3` is a new
+interpreter.
 A block of any language whose first line is `# NAME.EXTENSION` is a file. HTML comments before
 a block say what differs:
 
@@ -117,13 +118,15 @@ class Session:
         (directory / 'config').symlink_to(ROOT / 'config')
         scripts = Path(sysconfig.get_path('scripts'))
         ours = [scripts / name for name in ('pytest', *NODES, *tools())]
-        self._commands = forked.make_commands(commands, ['-c', *ours])
+        self._commands = forked.make_commands(commands, ['python', *ours])
         self._environment = {
             **os.environ,
             'PATH': os.pathsep.join([str(commands), str(scripts), os.environ['PATH']]),
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
             'ROS_DOMAIN_ID': str(domain_id()),
             'PYTHONUNBUFFERED': '1',
+            # They take longer to import than most tests of the pages run.
+            'PYTEST_ADDOPTS': '-p no:hypothesispytest -p no:xdist',
         }
 
     def run(self, block: Block) -> str:
@@ -143,7 +146,7 @@ class Session:
         beside = [one.strip() for one in block.notes.get('beside', '').split(';') if one.strip()]
         command = ['bash', '-euo', 'pipefail', '-c', block.notes.get('instead', block.code)]
         if block.language == 'python':
-            command = [str(self._commands / 'python_c'), block.code]
+            command = ['python', '-c', block.code]
         elif 'processes' in block.notes:
             *beside, last = [line for line in block.code.splitlines() if not line.startswith('#')]
             command = ['bash', '-c', f'exec {last}']

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import multiprocessing
+import multiprocessing.spawn
 import re
 import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -24,6 +24,15 @@ from diffdrive_jacobian.sweeps import Setup, Sweep, sweep
 
 LOSSES = fault_schedules(['speed'], kinds=[Loss], duration=1.2)
 SETUP = Setup(grid=5, starts=3, rate=20.0)
+
+
+PYTHON = sys.executable
+
+
+@pytest.fixture(autouse=True)
+def forked_children(monkeypatch, forked_python):
+    """Start processes of worlds as forks. Those of multiprocessing are new interpreters."""
+    monkeypatch.setattr(sys, 'executable', str(forked_python))
 
 
 def follow_on(executor):
@@ -77,8 +86,10 @@ def test_the_same_results_on_another_executor(expected, monkeypatch, local, kind
             same_results(executor, expected, monkeypatch)
 
 
-def test_processes_of_worlds_import_little(local):
-    found = explore(loaded, worlds=1, executor=local)
+def test_processes_of_worlds_import_little(monkeypatch):
+    monkeypatch.setattr(sys, 'executable', PYTHON)
+    with LocalExecutor(1) as executor:
+        found = explore(loaded, worlds=1, executor=executor)
     assert not found.findings, str(found)
 
 

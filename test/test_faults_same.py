@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import random
-import subprocess
-import sys
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
 
+import forked
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
@@ -105,13 +104,6 @@ def test_twenty_random_schedules_are_the_same_each_time_also_in_another_process(
     assert len({digest for digest, _ in first}) == 20
     assert all(count > 3 for _, count in first)
     program = 'import test_faults_same as t; print(*[t.drive(seed)[0] for seed in range(20)])'
-    run = subprocess.run(
-        [sys.executable, '-c', program],
-        cwd=Path(__file__).parent,
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=120,
-    )
+    run = forked.run(program, cwd=Path(__file__).parent, timeout=120)
     assert run.stdout.split() == [digest for digest, _ in first]
     assert [drive(seed) for seed in (3, 1)] == [first[3], first[1]]

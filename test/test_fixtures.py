@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 
+import forked
 import pytest
 from geometry_msgs.msg import Twist
 from inner_sessions import OPTIONS, SETTING, draw_quickly, run_inner
@@ -257,12 +258,12 @@ def test_parallel_worlds_do_not_hear_each_other(pytester):
     """
     pytester.makeconftest(f"pytest_plugins = ['{PLUGIN}']")
     pytester.makepyfile(SETTING + tests)
-    command = [sys.executable, '-m', 'pytest', '-q', *OPTIONS]
+    session = 'import sys, pytest; sys.exit(pytest.main(sys.argv[1:]))'
     processes = []
     for me, other, speed in (('a', 'b', '1.0'), ('b', 'a', '-1.0')):
         environment = {**os.environ, 'SPEED': speed, 'ME': me, 'OTHER': other}
         environment.pop('ROS_AUTOMATIC_DISCOVERY_RANGE')
-        processes.append(subprocess.Popen(command, cwd=pytester.path, env=environment))
+        processes.append(forked.Popen(session, ['-q', *OPTIONS], cwd=pytester.path, env=environment))
     assert [process.wait(timeout=60) for process in processes] == [0, 0]
 
 

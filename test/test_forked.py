@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import forked
 import pytest
@@ -52,14 +53,9 @@ rclpy.shutdown()
 
 def interpreter(code, *arguments, **kwargs):
     """Run a program in an interpreter of its own."""
-    return subprocess.run(
-        [sys.executable, '-c', code, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        stdin=subprocess.DEVNULL,
-        **kwargs,
-    )
+    command = [sys.executable, '-c', code, *map(str, arguments)]
+    streams = {'stdin': subprocess.DEVNULL, 'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE}
+    return subprocess.run(command, text=True, timeout=60, **{**streams, **kwargs})
 
 
 def results(ended):
@@ -79,6 +75,37 @@ def test_the_interpreter_exits_as_usual():
     expected = results(interpreter(EXITS, env=environment))
     assert expected == (0, 'thread atexit printed cleared ', '')
     assert results(forked.run(EXITS, env=environment)) == expected
+
+
+@pytest.mark.parametrize('end', ['sys.exit("text")', 'sys.exit(True)', 'raise KeyboardInterrupt', ''])
+def test_the_exit_code_is_that_of_an_interpreter(end):
+    code = f'import sys; print(1); {end}'
+    buffered = {'env': {**os.environ, 'PYTHONUNBUFFERED': ''}}
+    # What was printed cannot be written.
+    with open('/dev/full', 'w') as full:
+        expected = interpreter(code, stdout=full, **buffered).returncode
+        assert expected == (-signal.SIGINT if 'Keyboard' in end else 120)
+        assert forked.run(code, stdout=full, **buffered).returncode == expected
+    expected = results(interpreter(code))
+    got = results(forked.run(code))
+    assert got[:2] == expected[:2]
+    assert got[2].splitlines()[-1:] == expected[2].splitlines()[-1:]
+
+
+SHARED = """
+import os, sys
+sys.path.append(sys.argv[1])
+import forked
+forked.use(sys.argv[2])
+print(forked.run('import os; print(os.getppid())', modules=()).stdout.strip())
+"""
+
+
+def test_processes_share_a_server():
+    arguments = [Path(forked.__file__).parent, forked.share()]
+    one, other = (forked.run(SHARED, arguments, modules=()) for _ in range(2))
+    assert one.stdout == other.stdout
+    assert int(one.stdout) != os.getpid()
 
 
 def test_an_error_is_printed_with_its_traceback():
@@ -120,8 +147,9 @@ def commands(tmp_path):
     scripts = tmp_path / 'scripts'
     scripts.mkdir()
     (scripts / 'state').write_text(STATE)
+    (scripts / 'state.py').write_text(STATE)
     (scripts / 'waits').write_text(WAITS)
-    return forked.make_commands(tmp_path / 'commands', ['-c', scripts / 'state', scripts / 'waits'])
+    return forked.make_commands(tmp_path / 'commands', ['python', scripts / 'state', scripts / 'waits'])
 
 
 def test_a_command_runs_a_script_as_the_interpreter_does(tmp_path, commands):
@@ -134,7 +162,24 @@ def test_a_command_runs_a_script_as_the_interpreter_does(tmp_path, commands):
 
     script = tmp_path / 'scripts' / 'state'
     assert run(commands / 'state', 'x y', '$z') == run(sys.executable, script, 'x y', '$z')
-    assert run(commands / 'python_c', STATE, 'x') == run(sys.executable, '-c', STATE, 'x')
+    for words in (['-c', STATE, 'x'], [script, 'x'], ['-m', 'scripts.state', 'x']):
+        assert run(commands / 'python', *words) == run(sys.executable, *words)
+
+
+def test_a_command_starts_python_in_a_fork(commands):
+    code = 'import sys; print("numpy" in sys.modules)'
+    starting = f'import subprocess, sys; subprocess.run([sys.executable, "-c", {code!r}])'
+    ended = subprocess.run([commands / 'python', '-c', starting], capture_output=True, text=True)
+    assert results(ended) == (0, 'True\n', '')
+
+
+def test_a_command_inherits_descriptors(commands):
+    read, write = os.pipe()
+    with open(read) as stream:
+        code = 'import os, sys; os.write(int(sys.argv[1]), b"from the child")'
+        subprocess.run([commands / 'python', '-c', code, str(write)], pass_fds=[write], check=True)
+        os.close(write)
+        assert stream.read() == 'from the child'
 
 
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGINT])

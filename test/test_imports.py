@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import re
 import subprocess
 import sys
+from functools import lru_cache
 from pathlib import Path
 
 import pytest
@@ -39,6 +41,8 @@ DOORS = {
 # Modules beside the layers that every layer may import.
 COMMON = ('text', 'time_units', 'bounded_yaml', 'errors', 'signals')
 
+LOUD = re.compile('print|stdout|stderr')
+
 LOAD = """
 import importlib, sys
 import numpy
@@ -58,17 +62,26 @@ def place(path) -> str:
     return first if rest else path.stem
 
 
-def imported(path) -> set[str]:
+def statements(node):
+    """Yield the statements in a node of a syntax tree, anywhere in it."""
+    for field in ('body', 'orelse', 'handlers', 'finalbody', 'cases'):
+        for each in getattr(node, field, ()):
+            yield each
+            yield from statements(each)
+
+
+@lru_cache
+def imported(path) -> frozenset[str]:
     """Collect what a file imports, anywhere in it: `a`, `a.b` or, of `from a import b`, also `a.b`."""
     package = '.'.join((PACKAGE, *path.parent.relative_to(HOUSE).parts))
     names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+    for node in statements(ast.parse(path.read_text(encoding='utf-8'))):
         if isinstance(node, ast.Import):
             names.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             module = importlib.util.resolve_name('.' * node.level + (node.module or ''), package)
             names.update({module, *(f'{module}.{alias.name}' for alias in node.names)})
-    return names
+    return frozenset(names)
 
 
 def test_every_directory_of_the_house_has_its_place():
@@ -136,7 +149,8 @@ def test_only_the_tools_print():
     """Neither `print` nor a standard stream is named below the tools."""
     loud = set()
     for path in HOUSE.rglob('*.py'):
-        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        text = path.read_text(encoding='utf-8')
+        for node in ast.walk(ast.parse(text)) if LOUD.search(text) else ():
             named = getattr(node, 'id', None) == 'print' or getattr(node, 'attr', None) in (
                 'stdout',
                 'stderr',

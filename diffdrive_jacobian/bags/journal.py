@@ -13,6 +13,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import re
 import struct
 import tempfile
 import threading
@@ -41,6 +42,7 @@ BLOCK = 8 << 20
 """Approximate number of bytes per write."""
 OVERHEAD = 250
 """Approximate memory of a record without its payload (bytes)."""
+_SURROGATE = re.compile('[\ud800-\udfff]')
 _TEXT_FIELDS: dict[str, type] = {'key': str, 'value': str}
 _CHANNEL_FIELDS: dict[str, type] = {
     'id': int,
@@ -326,6 +328,6 @@ def _fields(content: object, types: dict[str, type]) -> dict[str, Any]:
         if type(value) is not kind:
             got = printable(repr(value), 40)
             raise JournalError(f'{name} must be of type {kind.__name__}, got {got}')
-        if isinstance(value, str) and any('\ud800' <= one <= '\udfff' for one in value):
+        if isinstance(value, str) and _SURROGATE.search(value):
             raise JournalError(f'{name} must be valid Unicode, got {printable(repr(value), 40)}')
     return content
