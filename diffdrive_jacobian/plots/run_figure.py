@@ -6,7 +6,6 @@ the wheel speeds with their limits. matplotlib is imported when it is drawn. No 
 
 from __future__ import annotations
 
-import io
 import os
 import warnings
 from collections.abc import Sequence
@@ -19,7 +18,8 @@ import numpy as np
 from diffdrive_jacobian.plots.fault_marks import ViolationMark, mark_faults
 from diffdrive_jacobian.plots.ground_truth import draw_ground_truth, ground_truth_mark
 from diffdrive_jacobian.plots.output_files import FORMATS, create
-from diffdrive_jacobian.plots.style import DPI, styled
+from diffdrive_jacobian.plots.rendering import render
+from diffdrive_jacobian.plots.style import styled
 from diffdrive_jacobian.plots.uncertainty import draw_uncertainty, uncertainty_marks
 from diffdrive_jacobian.reading.run import Run
 from diffdrive_jacobian.reading.time_series import commanded, limits, line, measured
@@ -91,14 +91,13 @@ def draw(
         raise ValueError(f'{path} must end in .{", .".join(FORMATS)}')
     if path.exists() and not replace:
         raise FileExistsError(f'{path} exists already')
-    drawn = io.BytesIO()
     with warnings.catch_warnings(), styled():
         # The font may lack a letter of a bag's name.
         warnings.filterwarnings('ignore', message='Glyph')
         # With many runs there may be no room for their names.
         warnings.filterwarnings('ignore', message='constrained_layout not applied')
-        figure(runs, violations).savefig(drawn, format=ending, dpi=DPI)
-    create(path, drawn.getvalue(), replace=replace)
+        content = render(figure(runs, violations), ending)
+    create(path, content, replace=replace)
 
 
 def names(paths: Sequence[Path]) -> list[str]:
