@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from diffdrive_jacobian.plots.style import DPI
 
@@ -29,17 +29,21 @@ def render(drawing: Figure, ending: str) -> bytes:
     """
     content = io.BytesIO()
     drawing.set_dpi(DPI)
+    # Their methods have no type hints.
+    canvas: Any
     if ending == 'png':
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-        compression = {'compress_level': COMPRESSION}
-        FigureCanvasAgg(drawing).print_png(content, pil_kwargs=compression)
+        canvas = FigureCanvasAgg(drawing)
+        canvas.print_png(content, pil_kwargs={'compress_level': COMPRESSION})
     elif ending == 'svg':
         from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-        FigureCanvasSVG(drawing).print_svg(content)
+        canvas = FigureCanvasSVG(drawing)
+        canvas.print_svg(content)
     else:
         from matplotlib.backends.backend_pdf import FigureCanvasPdf
 
-        FigureCanvasPdf(drawing).print_pdf(content)
+        canvas = FigureCanvasPdf(drawing)
+        canvas.print_pdf(content)
     return content.getvalue()

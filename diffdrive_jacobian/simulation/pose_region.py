@@ -182,7 +182,8 @@ def region_distance(region: Region, positions: ArrayLike) -> Array:
             error *= error
             distance += error
         least[block] = _least(distance)
-    return np.maximum(least, 0.0).reshape(offsets.shape)
+    distances: Array = np.maximum(least, 0.0).reshape(offsets.shape)
+    return distances
 
 
 def _least(values: Array) -> Array:
@@ -198,16 +199,19 @@ def _least(values: Array) -> Array:
         bent = before - 2.0 * least + after
         lower = least - (after - before) ** 2 / (8.0 * bent)
     inside = (middle == place) & (bent > 0.0) & np.isfinite(lower)
-    return np.where(inside, lower, least)
+    refined: Array = np.where(inside, lower, least)
+    return refined
 
 
 def _chord(turns: Array) -> Array:
     """Return the ratios of chord and arc of turns (rad), to 5e-11."""
+    ratio: Array
     if np.abs(turns).max(initial=0.0) > 0.5:
-        return np.sinc(turns / (2.0 * np.pi))
+        ratio = np.sinc(turns / (2.0 * np.pi))
+        return ratio
     square = turns * turns
     # The Taylor series takes a tenth of the time.
-    ratio: Array = 1.0 - square / 24.0 * (1.0 - square / 80.0 * (1.0 - square / 168.0))
+    ratio = 1.0 - square / 24.0 * (1.0 - square / 80.0 * (1.0 - square / 168.0))
     return ratio
 
 
