@@ -67,11 +67,11 @@ def test_arrives_with_the_same_output_each_time(capsys, goals):
 def test_duration_is_that_of_the_control_law(capsys):
     """Straight ahead the distance decays as exp(-kv t), in steps of the odometry's period."""
     assert (
-        drive_to.main(['1', '0', '--lockstep', '--no-record', '--ros-args', '-p', 'kv:=0.5'], Signals())
+        drive_to.main(['1', '0', '--lockstep', '--no-record', '--ros-args', '-p', 'kv:=2.0'], Signals())
         == 0
     )
     seconds = float(re.search(r'after (\S+) s of simulated time', last_line(capsys)).group(1))
-    period, kv = 0.02, 0.5
+    period, kv = 0.02, 2.0
     steps = math.ceil(math.log(0.02) / math.log(1.0 - kv * period))
     assert seconds == pytest.approx(steps * period, abs=0.1)
 
@@ -96,7 +96,8 @@ def test_every_controller_arrives_and_takes_the_heading_that_is_asked_for(tmp_pa
 
 
 def test_without_a_heading_any_will_do(capsys):
-    assert drive_to.main(['0', '1', '--lockstep', '--no-record'], Signals()) == 0
+    gains = ['--ros-args', '-p', 'kp:=12.0', '-p', 'kv:=2.0']
+    assert drive_to.main(['0', '1', '--lockstep', '--no-record', *gains], Signals()) == 0
     theta = float(re.search(r'heading (\S+) rad', last_line(capsys)).group(1))
     assert theta == pytest.approx(math.pi / 2.0, abs=0.2)
 
@@ -146,12 +147,12 @@ def test_a_full_disk_is_reported(tmp_path, capsys, monkeypatch):
 
 def test_a_stuck_callback_fails_and_the_recording_is_kept(tmp_path, capsys, monkeypatch):
     """That run is the one to look at."""
-    on_odometry = GoToGoal._on_odometry
+    on_odometry, never = GoToGoal._on_odometry, threading.Event()
 
     def stuck(self, *args):
         on_odometry(self, *args)
         while self.get_clock().now().nanoseconds > 2_000_000_000:
-            pass
+            never.wait(0.01)
 
     monkeypatch.setattr(GoToGoal, '_on_odometry', stuck)
     monkeypatch.setattr(testing_runner, 'Lockstep', partial(Lockstep, patience=0.5))

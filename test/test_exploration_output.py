@@ -9,10 +9,10 @@ from dataclasses import replace
 import pytest
 from exploration_scenarios import Follower, Sensor, follow, robot
 from hypothesis import strategies as st
-from matplotlib.figure import Figure
 
 from diffdrive_jacobian.exploration import SerialExecutor, explore, fault_schedules
 from diffdrive_jacobian.faults import Hang, Loss
+from diffdrive_jacobian.plots import run_figure
 from diffdrive_jacobian.plots.fault_marks import VIOLATION
 from diffdrive_jacobian.properties import NeverFasterThan
 
@@ -81,7 +81,7 @@ def test_an_exception_is_described_by_its_first_line(tmp_path):
 def test_the_picture_marks_the_violation(tmp_path, monkeypatch):
     """At its time since the first odometry, with the name of the property."""
     drawn = []
-    monkeypatch.setattr(Figure, 'savefig', lambda self, *args, **options: drawn.append(self))
+    monkeypatch.setattr(run_figure, 'render', lambda one, ending: drawn.append(one) or b'')
     fast = NeverFasterThan(0.2, 1.0)
     (finding,) = serial(robot, [fast], worlds=1, output=tmp_path).findings
     (drawing,) = drawn

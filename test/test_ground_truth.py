@@ -109,7 +109,7 @@ def test_the_same_stamped_commands_give_the_same_truth_at_each_publish_rate():
     """Bit for bit, except for messages that were sent before a late command came."""
     odometry, truth = drive(10.0)
     last = SECOND + round(0.6 * SECOND)
-    for rate in (50.0, 1000.0):
+    for rate in (50.0, 250.0):
         other_odometry, other = drive(rate)
         common = [stamp for stamp in sorted(truth.keys() & other.keys()) if stamp >= last]
         assert len(common) >= 9

@@ -20,6 +20,7 @@ from test_reading import REAL, SECOND, changed, odom, start, status, write_bag
 from diffdrive_jacobian.kinematics.se2 import integrate, wrap_angle
 from diffdrive_jacobian.plots import output_files
 from diffdrive_jacobian.plots import run_figure as _figure
+from diffdrive_jacobian.plots.rendering import render
 from diffdrive_jacobian.plots.run_figure import LABELS, figure, names
 from diffdrive_jacobian.plots.run_table import COLUMNS, decimal_seconds
 from diffdrive_jacobian.reading import time_series as _lines
@@ -59,16 +60,51 @@ def sample(extra=(), **how):
     return sorted([*drive(**how), *extra], key=lambda one: one[0])
 
 
-@pytest.fixture
-def bag(tmp_path):
-    """A run with a goal, commands and limits."""
+@pytest.fixture(scope='module')
+def recorded(tmp_path_factory):
+    """A run with a goal, commands and limits. It is not changed."""
     extra = [
         (10.5, '/goal_pose', goal(1.0, 0.5)),
         (10.5, '/cmd_vel', twist(0.5, 0.5)),
         (12.0, '/cmd_vel', twist(0.25, 1.5)),
         (12.0, '/joint_command', joint_command(1, 2)),
     ]
-    return write_bag(tmp_path / 'bag', sample(extra), parameters=PARAMETERS)
+    path = tmp_path_factory.mktemp('recorded') / 'bag'
+    return write_bag(path, sample(extra), parameters=PARAMETERS)
+
+
+@pytest.fixture
+def bag(recorded, tmp_path):
+    """A copy of it."""
+    return shutil.copytree(recorded, tmp_path / 'bag')
+
+
+@pytest.fixture(scope='module')
+def recorded_plain(tmp_path_factory):
+    """A run with odometry alone, which is drawn faster. It is not changed."""
+    return write_bag(tmp_path_factory.mktemp('plain') / 'bag', odometry_only())
+
+
+@pytest.fixture
+def plain(recorded_plain, tmp_path):
+    """A copy of it."""
+    return shutil.copytree(recorded_plain, tmp_path / 'bag')
+
+
+@pytest.fixture(scope='module')
+def run(recorded):
+    return read_run(recorded)
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Files are written without drawing their picture."""
+    monkeypatch.setattr(_figure, 'figure', lambda *_: None)
+    monkeypatch.setattr(_figure, 'render', lambda *_: b'picture')
+
+
+def odometry_only(**how):
+    return [one for one in sample(**how) if one[1] == '/odom']
 
 
 def run_of(tmp_path, extra=(), *, parameters=None, **how):
@@ -109,9 +145,11 @@ def drawn(axes, color=_figure.COLORS[0]):
     ('ending', 'magic'),
     [('png', b'\x89PNG\r\n'), ('svg', b'<?xml'), ('pdf', b'%PDF-'), ('PNG', b'\x89PNG')],
 )
-def test_the_picture_is_of_the_format_of_its_ending(bag, tmp_path, capsys, ending, magic):
+def test_the_picture_is_of_the_format_of_its_ending(
+    recorded, recorded_plain, tmp_path, capsys, ending, magic
+):
     picture = tmp_path / f'picture.{ending}'
-    assert plot(bag, '-o', picture) == 0
+    assert plot(recorded if ending in ('svg', 'pdf') else recorded_plain, '-o', picture) == 0
     assert picture.read_bytes().startswith(magic)
     assert capsys.readouterr() == (f'{picture}\n', '')
 
@@ -122,28 +160,29 @@ def test_the_picture_lies_beside_the_bag(bag, tmp_path, monkeypatch):
     assert (tmp_path / 'bag.png').stat().st_size > 10_000
 
 
-def test_two_runs_lie_in_one_picture(bag, tmp_path):
-    other = write_bag(tmp_path / 'other', sample(v=0.2))
+@pytest.mark.usefixtures('undrawn')
+def test_two_runs_lie_in_one_picture(bag, recorded_plain, tmp_path):
+    other = shutil.copytree(recorded_plain, tmp_path / 'other')
     assert plot(bag, other) == 0
     assert (tmp_path / 'bag_and_other.png').exists()
 
 
 @pytest.mark.usefixtures('no_display')
-def test_no_display_is_needed(bag, tmp_path):
-    assert plot(bag, '-o', tmp_path / 'a.png') == 0
+def test_no_display_is_needed(recorded_plain, tmp_path):
+    assert plot(recorded_plain, '-o', tmp_path / 'a.png') == 0
 
 
 @pytest.mark.parametrize('name', ['_hidden', 'cost $5', '$x^$', 'läuft 走行', 'a' * 200])
-def test_a_bag_may_have_any_name(bag, tmp_path, capsys, name):
-    assert plot(bag.rename(tmp_path / name), '-o', tmp_path / 'a.png') == 0
+def test_a_bag_may_have_any_name(plain, tmp_path, capsys, name):
+    assert plot(plain.rename(tmp_path / name), '-o', tmp_path / 'a.png') == 0
     assert capsys.readouterr().err == ''
 
 
-def test_the_users_style_does_not_matter(bag):
+def test_the_users_style_does_not_matter(run):
     import matplotlib
 
     with matplotlib.rc_context({'figure.figsize': (1, 1), 'text.usetex': True, 'axes.grid': False}):
-        made = figure([read_run(bag)])
+        made = figure([run])
         assert matplotlib.rcParams['text.usetex'] is True
     assert made.get_size_inches().tolist() == [11.0, 7.0]
 
@@ -151,8 +190,7 @@ def test_the_users_style_does_not_matter(bag):
 # --- What is in the picture
 
 
-def test_the_axes_show_the_run_with_units(bag):
-    run = read_run(bag)
+def test_the_axes_show_the_run_with_units(run):
     made = figure([run])
     plane, axes = made.axes[0], by_label(made)
     assert plane.get_aspect() == 1.0
@@ -176,10 +214,9 @@ def test_the_axes_show_the_run_with_units(bag):
     assert shown[:, 1] == pytest.approx(error[:until], abs=1e-12)
 
 
-def test_everything_drawn_lies_inside_the_picture(bag):
-    run = read_run(bag)
+def test_everything_drawn_lies_inside_the_picture(run):
     made = figure([run, replace(run, path=Path('second'))])
-    made.savefig('/dev/null', format='png')
+    render(made, 'png')
     width, height = made.get_size_inches() * made.dpi
     for axes in made.axes:
         box = axes.get_tightbbox()
@@ -189,8 +226,7 @@ def test_everything_drawn_lies_inside_the_picture(bag):
         assert box.y1 <= height
 
 
-def test_runs_differ_by_colour_and_by_style(bag):
-    run = read_run(bag)
+def test_runs_differ_by_colour_and_by_style(run):
     made = figure([replace(run, path=Path(name)) for name in 'abcde'])
     plane = made.axes[0]
     labelled = [one for one in plane.lines if not one.get_label().startswith('_')]
@@ -202,8 +238,7 @@ def test_runs_differ_by_colour_and_by_style(bag):
     assert len(by_label(made)[LABELS['v']].lines) == 5 + 5 + 2 * 5
 
 
-def test_only_a_single_run_shows_its_commands(bag):
-    run = read_run(bag)
+def test_only_a_single_run_shows_its_commands(run):
 
     def lines(made):
         axes = by_label(made)[LABELS['v']]
@@ -216,9 +251,8 @@ def test_only_a_single_run_shows_its_commands(bag):
     assert lines(figure([run, replace(run, path=Path('b'))])) == []
 
 
-def test_without_goals_and_wheels_their_axes_are_left_out(tmp_path):
-    sent = [one for one in sample() if one[1] == '/odom']
-    made = figure([read_run(write_bag(tmp_path / 'bag', sent))])
+def test_without_goals_and_wheels_their_axes_are_left_out(recorded_plain):
+    made = figure([read_run(recorded_plain)])
     assert set(by_label(made)) == {'y [m]', LABELS['v'], LABELS['omega']}
 
 
@@ -232,8 +266,8 @@ def test_a_robot_that_stands_is_drawn(tmp_path, count):
 # --- Limits
 
 
-def test_limits_are_the_narrowest_of_the_nodes(bag):
-    found = {name: bounds[:, 0, 1].tolist() for name, bounds in limits(trace(read_run(bag))).items()}
+def test_limits_are_the_narrowest_of_the_nodes(run):
+    found = {name: bounds[:, 0, 1].tolist() for name, bounds in limits(trace(run)).items()}
     assert found == {
         'v': [-0.1, 0.22],
         'omega': [-1.0, 1.0],
@@ -400,8 +434,8 @@ def test_odometry_of_the_instant_of_a_new_beginning_may_be_from_before(tmp_path)
     assert trace(read_run(write_bag(tmp_path / 'bag', sent))).breaks.tolist() == [51]
 
 
-def test_many_runs_are_drawn(bag, tmp_path):
-    run = read_run(bag)
+def test_many_runs_are_drawn(recorded_plain, tmp_path):
+    run = read_run(recorded_plain)
     _figure.draw([replace(run, path=Path(f'run_{index}')) for index in range(40)], tmp_path / 'a.png')
     assert (tmp_path / 'a.png').exists()
 
@@ -444,10 +478,10 @@ def read_csv(path):
     return header, np.array([[float(value or 'nan') for value in row] for row in rows])
 
 
-def test_csv_holds_the_numbers_of_the_run(bag, tmp_path):
-    assert plot(bag, '-o', tmp_path / 'a.png', '--csv', tmp_path / 'a.csv') == 0
+@pytest.mark.usefixtures('undrawn')
+def test_csv_holds_the_numbers_of_the_run(recorded, run, tmp_path):
+    assert plot(recorded, '-o', tmp_path / 'a.png', '--csv', tmp_path / 'a.csv') == 0
     header, rows = read_csv(tmp_path / 'a.csv')
-    run = read_run(bag)
     one = trace(run)
     assert header == list(COLUMNS)
     columns = dict(zip(header, rows.T, strict=True))
@@ -462,6 +496,7 @@ def test_csv_holds_the_numbers_of_the_run(bag, tmp_path):
     np.testing.assert_array_equal(columns['v_command_mps'], held)
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_csv_has_exact_times_and_no_artefacts_of_floats(tmp_path):
     begin = 1_795_213_077
     sent = [
@@ -490,6 +525,7 @@ def test_csv_times_are_exact(nanoseconds, text):
     assert decimal_seconds(nanoseconds) == text
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_csv_prefers_the_commands_that_were_applied(tmp_path):
     extra = [(10.0, '/cmd_vel', twist(9, 9)), (10.5, '/cmd_vel_out', twist_stamped(1, 2, 10 * SECOND))]
     bag = write_bag(tmp_path / 'bag', sample(extra))
@@ -498,6 +534,7 @@ def test_csv_prefers_the_commands_that_were_applied(tmp_path):
     assert (rows[:, 8:10] == [1.0, 2.0]).all()
 
 
+@pytest.mark.usefixtures('undrawn')
 @pytest.mark.parametrize('there', [True, False])
 def test_several_runs_get_a_file_each(bag, tmp_path, there):
     (tmp_path / 'x').mkdir()
@@ -527,6 +564,7 @@ def noted(tmp_path, name, count=1):
     return write_bag(tmp_path / name, sorted(sent, key=lambda one: one[0]))
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_messages_that_were_skipped_are_reported_in_picture_and_terminal(tmp_path, capsys):
     bag = noted(tmp_path, 'bag', 3)
     note = '3 of 3 messages on /joint_command hold invalid or implausible values and were skipped'
@@ -536,14 +574,15 @@ def test_messages_that_were_skipped_are_reported_in_picture_and_terminal(tmp_pat
 
 
 def test_notes_of_several_runs_name_them_and_are_not_too_many(tmp_path):
-    runs = [read_run(noted(tmp_path, f'r{index}$')) for index in range(6)]
+    run = read_run(noted(tmp_path, 'bag'))
+    runs = [replace(run, path=Path(f'r{index}$')) for index in range(6)]
     lines = figure(runs).get_supxlabel().splitlines()
     assert [one[:5] for one in lines[:3]] == [r'r0\$:', r'r1\$:', r'r2\$:']
     assert lines[3:] == ['and 3 more notes']
 
 
-def test_without_notes_nothing_is_written_below(bag):
-    assert figure([read_run(bag)]).get_supxlabel() == ''
+def test_without_notes_nothing_is_written_below(run):
+    assert figure([run]).get_supxlabel() == ''
 
 
 # --- Mistakes
@@ -587,6 +626,7 @@ def test_a_file_that_appears_meanwhile_is_not_overwritten(tmp_path):
         output_files.create(Path('/dev/null'), b'x')
 
 
+@pytest.mark.usefixtures('undrawn')
 @pytest.mark.parametrize('option', ['-o', '--csv'])
 def test_where_nobody_may_write_is_told(bag, tmp_path, capsys, option):
     # For root, too, there is no such place.
@@ -597,6 +637,14 @@ def test_where_nobody_may_write_is_told(bag, tmp_path, capsys, option):
     assert last.startswith(f'plot_run: error: {place} cannot be written: ')
 
 
+@pytest.mark.parametrize('option', ['-o', '--csv'])
+def test_a_missing_directory_is_reported_before_anything_is_read(tmp_path, capsys, option):
+    file = tmp_path / 'none' / 'deeper' / ('a.png' if option == '-o' else 'a.csv')
+    assert plot(tmp_path / 'no_bag', option, file) == 1
+    refuses(capsys, 1, f'{file} cannot be written: No such file or directory')
+
+
+@pytest.mark.usefixtures('undrawn')
 def test_a_file_that_cannot_be_finished_is_taken_away(bag, tmp_path, capsys, monkeypatch):
     def full(self, data):
         raise OSError(28, 'No space left on device')
@@ -616,12 +664,12 @@ def test_a_file_that_cannot_be_finished_is_taken_away(bag, tmp_path, capsys, mon
 
 
 @pytest.mark.parametrize('unbuffered', ['', '1'])
-def test_output_that_cannot_be_written_is_not_blamed_on_the_picture(bag, tmp_path, unbuffered):
+def test_output_that_cannot_be_written_is_not_blamed_on_the_picture(plain, tmp_path, unbuffered):
     picture = tmp_path / 'a.png'
     with open('/dev/full', 'w') as full:
         done = forked.run(
             PROGRAM.format('plot_run'),
-            (bag, '-o', picture),
+            (plain, '-o', picture),
             env={**os.environ, 'PYTHONUNBUFFERED': unbuffered},
             stdout=full,
         )
@@ -630,6 +678,7 @@ def test_output_that_cannot_be_written_is_not_blamed_on_the_picture(bag, tmp_pat
     assert picture.exists()
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_paths_are_printed_without_control_characters(bag, tmp_path, capsys):
     place = tmp_path / os.fsdecode(b'\x1b]0;x\x07 \xff')
     place.mkdir()
@@ -657,6 +706,7 @@ def test_a_topic_must_be_known(bag, capsys, topic):
     refuses(capsys, 2, 'NAME=TOPIC')
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_a_topic_may_have_another_name(tmp_path, capsys):
     sent = [(at, f'/{robot}{topic}', one) for robot in 'ab' for at, topic, one in sample()]
     bag = write_bag(tmp_path / 'bag', sent)
@@ -700,8 +750,7 @@ def test_a_signal_ends_it_before_anything_is_written(bag, tmp_path, capsys):
     assert not (tmp_path / 'bag.png').exists()
 
 
-def test_draw_checks_by_itself(bag, tmp_path):
-    run = read_run(bag)
+def test_draw_checks_by_itself(run, bag, tmp_path):
     with pytest.raises(ValueError, match=r'must end in \.png, \.svg, \.pdf'):
         _figure.draw([run], tmp_path / 'a.gif')
     with pytest.raises(FileExistsError):

@@ -20,6 +20,7 @@ from diffdrive_jacobian.simulation.exact_moments import gaussian, propagate_mome
 from diffdrive_jacobian.simulation.pose_region import (
     ELLIPSE_LEVEL,
     Region,
+    _chord,
     log_about,
     region_distance,
     region_of,
@@ -57,6 +58,12 @@ def test_drawn_runs_have_the_exact_second_moment():
     deviations = np.sqrt(np.diag(moments.second_moment))
     # The standard error of an entry is sqrt(2 / 4000) of the deviations' product.
     assert np.all(np.abs(second - moments.second_moment) < 0.1 * np.outer(deviations, deviations))
+
+
+@pytest.mark.parametrize('largest', [0.0, 1e-9, 0.01, 0.5, 0.51, 7.0])
+def test_the_ratio_of_chord_and_arc_is_that_of_sinc(largest):
+    turns = np.linspace(-largest, largest, 101)
+    np.testing.assert_allclose(_chord(turns), np.sinc(turns / math.tau), rtol=0.0, atol=5e-11)
 
 
 def test_exponential_coordinates_are_those_of_log():
@@ -179,7 +186,7 @@ def test_the_figure_has_the_region_and_the_ellipse():
 
 @pytest.mark.parametrize('entry', [math.nan, math.inf, -1.0, 0.0])
 def test_covariances_that_are_not_of_wheels_are_not_drawn(entry):
-    run = driven([((0.22, 0.0), 4.0)])
+    run = driven([((0.22, 0.0), 1.0)])
     for column in range(9):
         covariances = run.odometry_covariances.copy()
         covariances[:, column] = entry

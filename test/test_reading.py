@@ -190,16 +190,16 @@ def test_wheel_speeds_are_plausible_up_to_a_limit(tmp_path, speed):
 
 
 def test_a_run_and_a_series_are_printed_in_short(tmp_path):
-    sent = [(index / 50, '/odom', odom(index, 0, 0)) for index in range(2000)]
+    sent = [(index / 50, '/odom', odom(index, 0, 0)) for index in range(200)]
     run = read_run(write_bag(tmp_path / 'bag', sent, parameters={'/go_to_goal': {'kp': 3.0}}))
     assert repr(run.odometry) == (
-        'Series(2000 messages of [x, y, theta, v, omega], recorded over 39.980 s)'
+        'Series(200 messages of [x, y, theta, v, omega], recorded over 3.980 s)'
     )
     assert repr(run.goals) == 'Series(0 messages of [x, y, theta])'
     assert str(run) == '\n'.join(
         [
             f"Run('{tmp_path / 'bag'}':",
-            '  odometry: 2000 messages of [x, y, theta, v, omega], recorded over 39.980 s',
+            '  odometry: 200 messages of [x, y, theta, v, omega], recorded over 3.980 s',
             '  parameters of /go_to_goal',
             ')',
         ]
@@ -277,12 +277,18 @@ def test_parameters_name_the_wheels(tmp_path):
 # --- What is no bag
 
 
-@pytest.fixture
-def good(tmp_path):
+@pytest.fixture(scope='module')
+def written(tmp_path_factory):
+    """Directories of a bag in each storage. They are not changed."""
+    folder = tmp_path_factory.mktemp('written')
     sent = [(index / 50, '/odom', odom(index, 0, 0)) for index in range(200)]
-    return {
-        storage: write_bag(tmp_path / storage, sent, storage=storage) for storage in ('mcap', 'sqlite3')
-    }
+    return [write_bag(folder / storage, sent, storage=storage) for storage in ('mcap', 'sqlite3')]
+
+
+@pytest.fixture
+def good(written, tmp_path):
+    """Copies of them by storage."""
+    return {path.name: shutil.copytree(path, tmp_path / path.name) for path in written}
 
 
 def test_there_must_be_a_bag(tmp_path):

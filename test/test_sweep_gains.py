@@ -448,7 +448,7 @@ def test_everything_drawn_lies_inside_the_picture(changes):
         min_v=-0.1, max_v=0.306, min_omega=-1.9, max_omega=1.9, max_wheel_speed=8.559
     )
     made = figure(sweep(replace(SMALL, robot=RobotModel(limits=limits), **changes)))
-    made.draw_without_rendering()
+    made.get_layout_engine().execute(made)
     width, height = made.get_size_inches() * made.dpi
     boxes = [one.get_tightbbox() for one in made.axes]
     for box in [*boxes, made._suptitle.get_window_extent()]:

@@ -5,7 +5,6 @@ matplotlib is imported when it is drawn. No display is needed.
 
 from __future__ import annotations
 
-import io
 import warnings
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +12,8 @@ import numpy as np
 
 from diffdrive_jacobian.calibration.calibrate import Calibration
 from diffdrive_jacobian.calibration.errors import Track, compared_distance, rms, tracks
-from diffdrive_jacobian.plots.style import DPI, styled
+from diffdrive_jacobian.plots.rendering import render
+from diffdrive_jacobian.plots.style import styled
 from diffdrive_jacobian.reading.time_series import line
 
 if TYPE_CHECKING:
@@ -41,11 +41,9 @@ def draw(result: Calibration, ending: str) -> bytes:
     Raises:
         ModuleNotFoundError: matplotlib is not installed.
     """
-    drawn = io.BytesIO()
     with warnings.catch_warnings(), styled():
         warnings.filterwarnings('ignore', message='Glyph')
-        figure(result).savefig(drawn, format=ending, dpi=DPI)
-    return drawn.getvalue()
+        return render(figure(result), ending)
 
 
 def figure(result: Calibration) -> Figure:

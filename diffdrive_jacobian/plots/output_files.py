@@ -100,16 +100,22 @@ def new_file(name: str, formats: Sequence[str], what: str, *, replace: bool = Fa
         raise ValueError(f'the {what} must end in .{", .".join(formats)}, got {name!r}')
     try:
         exists = _is_entry(path)
-        if not exists and not path.parent.is_dir():
-            raise OSError(errno.ENOENT, os.strerror(errno.ENOENT))
-        if not exists and not os.access(path.parent, os.W_OK | os.X_OK):
-            raise OSError(errno.EACCES, os.strerror(errno.EACCES))
+        if not exists:
+            check_directory(path.parent)
     except OSError as error:
         error.filename = str(path)
         raise
     if exists and not (replace and path.is_file()):
         raise FileExistsError(f'{path} exists already; {NOT_OVERWRITTEN}')
     return path
+
+
+def check_directory(path: Path) -> None:
+    """Raise OSError if files cannot be created in a directory."""
+    if not path.is_dir():
+        raise OSError(errno.ENOENT, os.strerror(errno.ENOENT))
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise OSError(errno.EACCES, os.strerror(errno.EACCES))
 
 
 def _is_entry(path: Path) -> bool:

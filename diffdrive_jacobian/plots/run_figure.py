@@ -6,10 +6,9 @@ the wheel speeds with their limits. matplotlib is imported when it is drawn. No 
 
 from __future__ import annotations
 
-import io
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import cycle, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +18,8 @@ import numpy as np
 from diffdrive_jacobian.plots.fault_marks import ViolationMark, mark_faults
 from diffdrive_jacobian.plots.ground_truth import draw_ground_truth, ground_truth_mark
 from diffdrive_jacobian.plots.output_files import FORMATS, create
-from diffdrive_jacobian.plots.style import DPI, styled
+from diffdrive_jacobian.plots.rendering import render
+from diffdrive_jacobian.plots.style import styled
 from diffdrive_jacobian.plots.uncertainty import draw_uncertainty, uncertainty_marks
 from diffdrive_jacobian.reading.run import Run
 from diffdrive_jacobian.reading.time_series import commanded, limits, line, measured
@@ -91,14 +91,13 @@ def draw(
         raise ValueError(f'{path} must end in .{", .".join(FORMATS)}')
     if path.exists() and not replace:
         raise FileExistsError(f'{path} exists already')
-    drawn = io.BytesIO()
     with warnings.catch_warnings(), styled():
         # The font may lack a letter of a bag's name.
         warnings.filterwarnings('ignore', message='Glyph')
         # With many runs there may be no room for their names.
         warnings.filterwarnings('ignore', message='constrained_layout not applied')
-        figure(runs, violations).savefig(drawn, format=ending, dpi=DPI)
-    create(path, drawn.getvalue(), replace=replace)
+        content = render(figure(runs, violations), ending)
+    create(path, content, replace=replace)
 
 
 def names(paths: Sequence[Path]) -> list[str]:
@@ -146,6 +145,8 @@ def figure(runs: Sequence[Run], violations: Sequence[ViolationMark] = ()) -> Fig
             draw_ground_truth(plane, one.run, *([color] if len(runs) > 1 else []))
             for quantity, panel in panels.items():
                 _draw_over_time(panel, one, quantity, color, style, alone=len(runs) == 1)
+        if len(runs) == 1:
+            _draw_goal_changes(panels.values(), traces[0])
         _draw_goals(plane, traces)
         _finish(plane, traces)
         below = drawing.add_subplot(grid[-1, :])
@@ -253,7 +254,7 @@ def _free_corner(places: Array, place: tuple[float, float]) -> tuple[int, int]:
 def _draw_over_time(
     panel: Axes, one: Trace, quantity: str, color: str, style: Any, *, alone: bool
 ) -> None:
-    """Draw a quantity and its limits, and for a single run its commands and the changes of goals."""
+    """Draw a quantity and its limits, and for a single run its commands."""
     panel.axhline(0.0, color='#bbbbbb', lw=0.8, zorder=1)
     command, measurement = commanded(one, quantity), measured(one, quantity)
     if not len(measurement):
@@ -263,8 +264,15 @@ def _draw_over_time(
     panel.plot(*measurement.T, color=color, ls=style, lw=1.5)
     for bound in limits(one).get(quantity, ()):
         panel.plot(*bound.T, color='black', ls=LIMIT, lw=1.0, drawstyle='steps-post', zorder=3)
+
+
+def _draw_goal_changes(panels: Iterable[Axes], one: Trace) -> None:
+    """Draw the changes of goals into axes over time, whose lines are complete.
+
+    After a new line, `axvline` computes the limits of all axes that share their time.
+    """
     changes = np.flatnonzero(np.diff(one.goal)) + 1
-    if alone and len(changes) <= MARKED:
+    for panel in panels if len(changes) <= MARKED else ():
         for change in changes:
             panel.axvline(one.time[change], color=GREY, lw=0.9, ls=':', zorder=1)
 

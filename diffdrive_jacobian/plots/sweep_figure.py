@@ -5,13 +5,13 @@ matplotlib is imported when something is drawn; no display is needed.
 
 from __future__ import annotations
 
-import io
 import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from diffdrive_jacobian.plots.style import DPI, styled
+from diffdrive_jacobian.plots.rendering import render
+from diffdrive_jacobian.plots.style import styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,10 +50,8 @@ def draw(swept: Sweep, ending: str) -> bytes:
     Raises:
         ModuleNotFoundError: matplotlib is not installed.
     """
-    drawn = io.BytesIO()
     with styled():
-        figure(swept).savefig(drawn, format=ending, dpi=DPI)
-    return drawn.getvalue()
+        return render(figure(swept), ending)
 
 
 def figure(swept: Sweep) -> Figure:

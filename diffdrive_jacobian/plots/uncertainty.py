@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 PLACES = 6
 """Number of regions along a path."""
-TURN, PIECES = 0.2, 300
+TURN, PIECES = 0.2, 120
 """Largest turn of one piece of the path that is sampled (rad), and least number of its pieces."""
 GRID = 121
 """Number of points along each side of the grid on which the outline of a region is found."""

@@ -39,6 +39,8 @@ _THINNEST = 1e-4
 _STEPS = 0.25
 """Step of the headings that are tried, in their standard deviations at a given position."""
 _MOST_HEADINGS = 4001
+_BLOCK = 1 << 16
+"""Number of distances that are computed at once."""
 _STRAIGHTEST = 1e-9
 """Least ratio of chord and arc, so that a full turn divides by no zero."""
 
@@ -90,11 +92,11 @@ def sampled_errors(
         draws = rng.normal(size=(count, 2)) @ _root(np.array([[vv, vw], [vw, ww]]))
         bent = turn + draws[:, 1]
         # The arc of the disturbed twist from the true heading, in complex numbers.
-        heading = np.exp(1j * (before[2] + turned + bent / 2.0)) * np.sinc(bent / (2.0 * np.pi))
+        heading = np.exp(1j * (before[2] + turned + bent / 2.0)) * _chord(bent)
         moved = (along + draws[:, 0] + 1j * across) * heading
         dx, dy = (after[:2] - before[:2]).tolist()
         x, y, turned = x + moved.real - dx, y + moved.imag - dy, turned + draws[:, 1]
-        yield np.column_stack([x, y, turned])
+        yield np.array([x, y, turned]).T
 
 
 def region_of(pose: ArrayLike, errors: ArrayLike) -> Region:
@@ -154,30 +156,63 @@ def region_distance(region: Region, positions: ArrayLike) -> Array:
     values, vectors = np.linalg.eigh(rest)
     if not values[1] > 0.0:
         return np.where(offsets == 0.0, 0.0, np.inf)
-    inverted = vectors / np.maximum(values, values[1] * _THINNEST**2) @ vectors.T
-    a, b, c = inverted[0, 0], inverted[0, 1], inverted[1, 1]
+    # Of a position at a given heading: `|whitening @ error|^2` is the squared distance.
+    whitening = (vectors / np.sqrt(np.maximum(values, values[1] * _THINNEST**2))).T
+    slope = whitening @ line
     reach = math.sqrt(2.0 * max(region.level, ELLIPSE_LEVEL) * s)
-    precision = (a * line[0] ** 2 + 2.0 * b * line[0] * line[1] + c * line[1] ** 2) + 1.0 / max(
-        s, 1e-300
-    )
+    precision = float(slope @ slope) + 1.0 / max(s, 1e-300)
     half = min(math.ceil(reach * math.sqrt(precision) / _STEPS), _MOST_HEADINGS // 2)
-    least = np.full(offsets.shape, np.inf)
-    previous, before = least, least
-    for turn in np.linspace(-reach, reach, 2 * half + 1).tolist() if half else [0.0]:
-        bend = np.exp(0.5j * turn) * np.sinc(turn / (2.0 * np.pi))
-        rho = offsets / (bend if abs(bend) > _STRAIGHTEST else _STRAIGHTEST)
-        along, across = rho.real - line[0] * turn, rho.imag - line[1] * turn
-        distance = a * along**2 + 2.0 * b * along * across + c * across**2
-        distance += turn * turn / s if s > 0.0 else 0.0
-        np.minimum(least, distance, out=least)
-        # Between three headings the least of a parabola.
-        with np.errstate(all='ignore'):
-            bent = before - 2.0 * previous + distance
-            lower = previous - (distance - before) ** 2 / (8.0 * bent)
-        inside = (previous <= before) & (previous <= distance) & (bent > 0.0) & np.isfinite(lower)
-        np.minimum(least, np.where(inside, lower, np.inf), out=least)
-        before, previous = previous, distance
-    return np.maximum(least, 0.0)
+    turns = np.linspace(-reach, reach, 2 * half + 1) if half else np.zeros(1)
+    bend = np.exp(0.5j * turns) * np.sinc(turns / (2.0 * np.pi))
+    straightened = 1.0 / np.where(np.abs(bend) > _STRAIGHTEST, bend, _STRAIGHTEST)
+    turned = turns * turns / s if s > 0.0 else turns
+    flat = offsets.reshape(-1)
+    least = np.empty(flat.shape)
+    size = max(1, _BLOCK // len(turns))
+    for begin in range(0, len(flat), size):
+        block = slice(begin, begin + size)
+        along, across = flat.real[block].copy(), flat.imag[block].copy()
+        distance = np.repeat(turned[:, None], len(along), axis=1)
+        for row, offset in zip(whitening.tolist(), slope.tolist(), strict=True):
+            # The real part of a product is a linear form of x and y.
+            weights = complex(row[0], -row[1]) * straightened
+            error = weights.real[:, None] * along
+            error -= weights.imag[:, None] * across
+            error -= (offset * turns)[:, None]
+            error *= error
+            distance += error
+        least[block] = _least(distance)
+    distances: Array = np.maximum(least, 0.0).reshape(offsets.shape)
+    return distances
+
+
+def _least(values: Array) -> Array:
+    """Return the least of each column, between three values that of a parabola, shape (n,)."""
+    count, width = values.shape
+    columns, place = np.arange(width), values.argmin(axis=0)
+    least: Array = values[place, columns]
+    if count < 3:
+        return least
+    middle = np.clip(place, 1, count - 2)
+    before, after = values[middle - 1, columns], values[middle + 1, columns]
+    with np.errstate(all='ignore'):
+        bent = before - 2.0 * least + after
+        lower = least - (after - before) ** 2 / (8.0 * bent)
+    inside = (middle == place) & (bent > 0.0) & np.isfinite(lower)
+    refined: Array = np.where(inside, lower, least)
+    return refined
+
+
+def _chord(turns: Array) -> Array:
+    """Return the ratios of chord and arc of turns (rad), to 5e-11."""
+    ratio: Array
+    if np.abs(turns).max(initial=0.0) > 0.5:
+        ratio = np.sinc(turns / (2.0 * np.pi))
+        return ratio
+    square = turns * turns
+    # The Taylor series takes a tenth of the time.
+    ratio = 1.0 - square / 24.0 * (1.0 - square / 80.0 * (1.0 - square / 168.0))
+    return ratio
 
 
 def _root(covariance: Array) -> Array:

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
-from diffdrive_jacobian.plots.output_files import FORMATS, NOT_OVERWRITTEN
+from diffdrive_jacobian.plots.output_files import FORMATS, NOT_OVERWRITTEN, check_directory
 from diffdrive_jacobian.plots.run_figure import draw, names
 from diffdrive_jacobian.plots.run_table import DECIMALS, write_csv
 from diffdrive_jacobian.reading.reader import read_run
@@ -55,6 +55,13 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             raise UsageError(f'--topic can be given once for each name, got {repeated[0]} again')
         picture = _picture(options, bags)
         tables = [] if options.csv is None else _tables(options, bags)
+        # A bag that does not exist is reported when it is read.
+        beside = options.output is None and not bags[0].exists()
+        for path in (*([] if beside else [picture]), *tables):
+            try:
+                _check_writable(path, makes_directory=path in tables)
+            except OSError as error:
+                return _not_written(path, error)
         runs: list[Run] = []
         for bag in bags:
             with busy(PROGRAM, f'reading {printable(bag, PATH_LIMIT)}'):
@@ -100,8 +107,7 @@ def _write(
             with busy(PROGRAM, f'writing {printable(path, PATH_LIMIT)}'):
                 write()
         except OSError as error:
-            message = f'{path} cannot be written: {error.strerror or error}'
-            return _cli.complain(PROGRAM, printable(message, PATH_LIMIT), _cli.FAILED)
+            return _not_written(path, error)
         try:
             print(printable(path, PATH_LIMIT))
         except BrokenPipeError:
@@ -110,6 +116,18 @@ def _write(
             # It is not buffered.
             return _cli.complain(PROGRAM, f'{OUTPUT_ERROR}: {error.strerror}', _cli.FAILED)
     return _cli.DONE
+
+
+def _not_written(path: Path, error: OSError) -> int:
+    message = f'{path} cannot be written: {error.strerror or error}'
+    return _cli.complain(PROGRAM, printable(message, PATH_LIMIT), _cli.FAILED)
+
+
+def _check_writable(path: Path, *, makes_directory: bool) -> None:
+    """Raise OSError, before a picture is drawn, if a file cannot be created."""
+    parent = path.parent
+    if not path.exists():
+        check_directory(parent.parent if makes_directory and not parent.exists() else parent)
 
 
 def _write_table(run: Run, path: Path, *, replace: bool) -> None:

@@ -1,0 +1,50 @@
+"""Files of figures: those that `Figure.savefig` writes, drawn once instead of twice."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+
+from diffdrive_jacobian.plots.rendering import render
+from diffdrive_jacobian.plots.style import DPI
+
+
+def sample():
+    """Return a figure with a layout, whose axes change their limits with their size."""
+    drawing = Figure(figsize=(3.0, 2.0), layout='constrained')
+    plane, over_time = drawing.subplots(1, 2)
+    plane.plot([0.0, 1000.0], [0.0, 0.5])
+    plane.set_aspect('equal', adjustable='datalim')
+    plane.set(xlabel='x [m]', title='plane')
+    over_time.plot([0.0, 1.0, 2.0], [3.0, 1.0, 2.0], label='speed')
+    over_time.set(ylabel=r'$\omega$')
+    drawing.legend(loc='outside upper right')
+    return drawing
+
+
+@pytest.mark.parametrize('ending', ['png', 'svg', 'pdf'])
+def test_a_file_is_that_of_savefig(monkeypatch, ending):
+    monkeypatch.setenv('SOURCE_DATE_EPOCH', '0')
+    expected = io.BytesIO()
+    with rc_context({'svg.hashsalt': 'salt'}):
+        sample().savefig(expected, format=ending, dpi=DPI)
+        content = render(sample(), ending)
+    if ending == 'png':
+        np.testing.assert_array_equal(
+            imread(io.BytesIO(content)), imread(io.BytesIO(expected.getvalue()))
+        )
+    else:
+        assert content == expected.getvalue()
+
+
+def test_a_figure_is_drawn_once(monkeypatch):
+    drawn = []
+    draw = Figure.draw
+    monkeypatch.setattr(Figure, 'draw', lambda self, *given: drawn.append(1) or draw(self, *given))
+    render(sample(), 'png')
+    assert len(drawn) == 1
