@@ -66,12 +66,18 @@ def add_nodes(world, start):
                 simulate_slip=True,
                 slip_seed=1,
                 **pose,
-            )
+            ),
+            start_parameter_services=False,
         )
     )
-    world.create(WheelBridge)
+    world.create(lambda: WheelBridge(start_parameter_services=False))
     limits = {'linear__x__max_velocity': MAX_V, 'angular__z__max_velocity': MAX_OMEGA}
-    world.create(lambda: GoToGoal(parameter_overrides=parameters(odom_timeout=TIMEOUT, **limits)))
+    world.create(
+        lambda: GoToGoal(
+            parameter_overrides=parameters(odom_timeout=TIMEOUT, **limits),
+            start_parameter_services=False,
+        )
+    )
 
 
 class Operator:
