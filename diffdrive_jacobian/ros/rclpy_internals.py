@@ -287,7 +287,8 @@ class SimulatedClock:
     """The clock of a node whose time is set directly, instead of by a message on /clock.
 
     Does what `TimeSource.clock_callback` does. Relies on `Node._time_source`, `TimeSource._clock_sub`,
-    `TimeSource._last_time_set` and `TimeSource._associated_clocks`.
+    `TimeSource._last_time_set` and `TimeSource._associated_clocks`, and on the handles of `ROSClock` and
+    `Time`, with which to set the time takes half as long.
     """
 
     __slots__ = ('_source', 'subscription')
@@ -303,7 +304,7 @@ class SimulatedClock:
         source = self._source
         source._last_time_set = now
         for clock in source._associated_clocks:
-            clock.set_ros_time_override(now)
+            clock.handle.set_ros_time_override(now._time_handle)
 
 
 # --- Messages
