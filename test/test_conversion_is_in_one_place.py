@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,11 @@ MESSAGES = {'stamp', 'clock', 'message', '_message', '_states'}
 
 def writers():
     for path in PACKAGE.rglob('*.py'):
-        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        text = path.read_text(encoding='utf-8')
+        words = set(re.findall(r'\w+', text))
+        if not (words & FIELDS and words & MESSAGES):
+            continue
+        for node in ast.walk(ast.parse(text)):
             if (
                 isinstance(node, ast.Attribute)
                 and isinstance(node.ctx, ast.Store)

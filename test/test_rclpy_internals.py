@@ -588,8 +588,8 @@ def _uses_rclpy(tree):
 
 def _internals_in(path):
     """Return the accesses to internals of rclpy in a file."""
-    tree = ast.parse(path.read_text(encoding='utf-8'))
-    if not _uses_rclpy(tree):
+    text = path.read_text(encoding='utf-8')
+    if 'rclpy' not in text or not _uses_rclpy(tree := ast.parse(text)):
         return set()
     own = {
         *(node.name for node in ast.walk(tree) if isinstance(node, (ast.ClassDef, ast.FunctionDef))),
