@@ -81,14 +81,6 @@ def parameter_overrides(node: Node) -> Mapping[str, Parameter]:
     return overrides
 
 
-def declared_parameters(node: Node) -> set[str]:
-    """Return the names of the declared parameters of a node.
-
-    Relies on `Node._parameters`.
-    """
-    return set(node._parameters)
-
-
 def declare_together(
     node: Node, parameters: Sequence[tuple[str, bool | float | str, ParameterDescriptor]]
 ) -> None:
@@ -156,6 +148,14 @@ def declare_qos(node: Node, topic: str, kind: str, profile: QoSProfile) -> bool:
         ],
     )
     return True
+
+
+def declared_parameters(node: Node) -> set[str]:
+    """Return the names of the declared parameters of a node.
+
+    Relies on `Node._parameters`.
+    """
+    return set(node._parameters)
 
 
 # --- Inputs that rclpy parses itself
