@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
-from lockstep_nodes import make_complete
+from lockstep_nodes import make_complete as make
 from rclpy.parameter import Parameter
 from recorded import recorded
 from ros_messages import goal, goals, twist, twist_stamped
@@ -50,10 +50,10 @@ def drive(lockstep, tmp_path):
 
     def drive(**parameters):
         wheels = parameters.get('command_interface') == 'wheels'
-        lockstep.add(make_complete(VirtualRobot, **parameters))
+        lockstep.add(make(VirtualRobot, **parameters))
         if wheels:
-            lockstep.add(make_complete(WheelBridge))
-        lockstep.add(make_complete(GoToGoal))
+            lockstep.add(make(WheelBridge))
+        lockstep.add(make(GoToGoal))
         with recorded(lockstep, tmp_path / 'run') as made:
             lockstep.publish('goals', goals(goal(0.5, 0.2), goal(-0.3, 0.4)))
             lockstep.run_for(6.0)
