@@ -3,6 +3,7 @@ per test that no other test can hear, and waiting for conditions instead of slee
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -58,6 +59,18 @@ def pytest_configure(config):
         forked.use(config.workerinput['forks'])
     if getattr(config.option, 'maxschedchunk', CHUNK) is None:
         config.option.maxschedchunk = CHUNK
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_collection():
+    """Collect the tests without garbage collection, which afterwards leaves them alone.
+
+    They are a million objects that stay until the end.
+    """
+    gc.disable()
+    yield
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(trylast=True)
@@ -195,6 +208,16 @@ def pytest_terminal_summary(terminalreporter):
             text = 'NOT TESTED: the live page in a browser. Install chromium (apt install chromium).'
             terminalreporter.write_line(f'\n{text}\n', red=True, bold=True)
             break
+
+
+@pytest.fixture
+def add_complete(lockstep):
+    """Put one of our nodes into the world; see `lockstep_nodes.make_complete`."""
+    from lockstep_nodes import make_complete
+
+    return lambda node_class, namespace='', **parameters: lockstep.add(
+        make_complete(node_class, namespace, **parameters)
+    )
 
 
 @pytest.fixture

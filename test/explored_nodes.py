@@ -53,8 +53,11 @@ def parameters(**values):
     return [Parameter(name.replace('__', '.'), value=value) for name, value in values.items()]
 
 
-def add_nodes(world, start):
-    """Add the three nodes. They are created again if they are killed."""
+def add_nodes(world, start, *, services=False):
+    """Add the three nodes. They are created again if they are killed.
+
+    Without services for parameters, which only send_goal calls, a world takes a fifth less time.
+    """
     x, y, theta = map(float, start)
     pose = {'x': x, 'y': y, 'theta': theta}
     world.create(
@@ -66,12 +69,18 @@ def add_nodes(world, start):
                 simulate_slip=True,
                 slip_seed=1,
                 **pose,
-            )
+            ),
+            start_parameter_services=services,
         )
     )
-    world.create(WheelBridge)
+    world.create(lambda: WheelBridge(start_parameter_services=services))
     limits = {'linear__x__max_velocity': MAX_V, 'angular__z__max_velocity': MAX_OMEGA}
-    world.create(lambda: GoToGoal(parameter_overrides=parameters(odom_timeout=TIMEOUT, **limits)))
+    world.create(
+        lambda: GoToGoal(
+            parameter_overrides=parameters(odom_timeout=TIMEOUT, **limits),
+            start_parameter_services=services,
+        )
+    )
 
 
 class Operator:
@@ -163,7 +172,7 @@ class Progress:
 
 def client(world, case):
     """A goal that send_goal sends and follows, under faults: what it reports is true."""
-    add_nodes(world, case['start'])
+    add_nodes(world, case['start'], services=True)
     status = world.listen(GoalStatus, 'goal_status')
     signals = Signals()
     if case['interrupted'] is not None:

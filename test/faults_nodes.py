@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from lockstep_nodes import LEAN
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Int64
@@ -17,7 +18,7 @@ class Source(Node):
     """Publishes 0, 1, 2, ... every 100 ms, 0 when it is added."""
 
     def __init__(self, name='source', topic='count', profile=10, period=0.1):
-        super().__init__(name)
+        super().__init__(name, **LEAN)
         self.publisher = self.create_publisher(Int64, topic, profile)
         self.number = 0
         self.timer = self.create_timer(period, self.on_tick)
@@ -31,7 +32,7 @@ class Sink(Node):
     """Keeps what it receives and when, by its own clock since the start (ms)."""
 
     def __init__(self, name='sink', topic='count', profile=10):
-        super().__init__(name)
+        super().__init__(name, **LEAN)
         self.received = []
         self.create_subscription(Int64, topic, self.on_message, profile)
 

@@ -27,8 +27,17 @@ def _parameters(values):
     return [Parameter(name.replace('__', '.'), value=value) for name, value in values.items()]
 
 
+LEAN = {'start_parameter_services': False, 'enable_rosout': False}
+"""Arguments of nodes without what few tests use, and what costs a third of the time to create a node."""
+
+
 def make(node_class, namespace='', **parameters):
-    """Make a node with these parameters; `__` stands for a dot in their names."""
+    """Make a LEAN node with these parameters; `__` stands for a dot in their names."""
+    return node_class(namespace=namespace, parameter_overrides=_parameters(parameters), **LEAN)
+
+
+def make_complete(node_class, namespace='', **parameters):
+    """Make a node with these parameters, as `make`, with its services for parameters and /rosout."""
     return node_class(namespace=namespace, parameter_overrides=_parameters(parameters))
 
 

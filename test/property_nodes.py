@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import cos, sin
 
 from geometry_msgs.msg import PoseStamped, Twist
+from lockstep_nodes import LEAN
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from std_srvs.srv import Trigger
@@ -34,7 +35,7 @@ class Student(Node):
     """A controller that answers odometry with the command that it is told."""
 
     def __init__(self, name='student', timeout=0.0):
-        super().__init__(name)
+        super().__init__(name, **LEAN)
         self.command = twist(0.2)
         self.commands = self.create_publisher(Twist, 'cmd_vel', 10)
         self.create_subscription(Odometry, 'odom', self.on_odometry, 10)

@@ -8,6 +8,7 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, PoseStamped, PoseWithCovarianceStamped, Twist, TwistStamped
 from nav_msgs.msg import Goals, Odometry
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
 from diffdrive_jacobian.messages.conversion import from_pose, from_time, set_pose
@@ -109,3 +110,9 @@ def spoiled(message, path, value):
     else:
         setattr(target, last, value)
     return message
+
+
+def receive(node, topic, message):
+    """Call the callback of a raw subscription of a node with a message."""
+    (callback,) = (one.callback for one in node.subscriptions if one.topic_name == topic)
+    callback(serialize_message(message))

@@ -163,8 +163,8 @@ def test_long_and_many_joint_names_are_quoted_in_short(lockstep, add, capfd):
 
 
 @pytest.mark.parametrize('name', ['odom_frame_id', 'base_frame_id', 'left_wheel_name'])
-def test_long_strings_are_refused_as_parameters(lockstep, add, name):
-    robot = add(VirtualRobot)
+def test_long_strings_are_refused_as_parameters(lockstep, add_complete, name):
+    robot = add_complete(VirtualRobot)
     value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=10 * MEGABYTE)
     request = SetParameters.Request(parameters=[ParameterMessage(name=name, value=value)])
     (result,) = lockstep.call(SetParameters, 'virtual_robot/set_parameters', request).results

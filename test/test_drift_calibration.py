@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from calibration_data import umbmark
-from lockstep_nodes import make
+from lockstep_nodes import make_complete
 from recorded import recorded
 from ros_messages import twist
 
@@ -33,10 +33,10 @@ def driven(path, **multipliers):
         drift = {'simulate_slip': True, 'slip_seed': 5, **WRONG}
         names = {'command_interface': 'wheels', 'cmd_vel_timeout': 0.0, 'publish_rate': 25.0}
         ends = []
-        robot = make(VirtualRobot, **names, **drift)
+        robot = make_complete(VirtualRobot, **names, **drift)
         with recorded(world, path) as made:
             world.add(robot)
-            world.add(make(WheelBridge, cmd_vel_timeout=0.0, **multipliers))
+            world.add(make_complete(WheelBridge, cmd_vel_timeout=0.0, **multipliers))
             made.look()
             for duration, v, omega in COMMANDS:
                 if v == omega == 0.0:

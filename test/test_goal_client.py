@@ -9,7 +9,7 @@ import pytest
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Goals, Odometry
-from ros_messages import odometry
+from ros_messages import odometry, receive
 
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.parameters.declaration import ParameterError
@@ -84,7 +84,7 @@ def test_distance_is_that_of_the_point_the_controller_drives(ros, controller, ex
     ros.until(reported, 'the parameters are reported')
     assert watch.values == {'/go_to_goal': {'controller': controller, 'offset': 0.25}}
     client.set_controller_parameters(watch.values['/go_to_goal'])
-    client._on_odometry(odometry(0.0, 0.0, 0.0))
+    receive(client, '/odom', odometry(0.0, 0.0, 0.0))
     assert client.distance == expected
     assert node.arrival.offset == driven_offset(watch.values['/go_to_goal'])
 

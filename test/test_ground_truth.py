@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lockstep_nodes import QUICK, SECOND, Topics, arrives, change, make
+from lockstep_nodes import QUICK, SECOND, Topics, arrives, change, make, make_complete
 from nav_msgs.msg import Odometry
 from recorded import recorded
 from ros_messages import goal, instants, placement, pose_of, twist, twist_stamped
@@ -219,7 +219,7 @@ def run(tmp_path_factory):
     """Record a drive with a placement, a reset and a timeout."""
     robot = {'cmd_vel_timeout': 0.3, **SLIPPING, **MULTIPLIERS}
     with Lockstep() as world, recorded(world, tmp_path_factory.mktemp('bags') / 'run') as made:
-        world.add(make(VirtualRobot, **robot))
+        world.add(make_complete(VirtualRobot, **robot))
         made.look()
         for index in range(20):
             world.publish('cmd_vel', twist(0.3, (-1) ** index * 1.3))

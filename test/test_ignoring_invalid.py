@@ -8,10 +8,11 @@ import pytest
 from action_msgs.msg import GoalStatus
 from nav_msgs.msg import Goals, Odometry
 from rclpy.serialization import serialize_message
-from ros_messages import goal, goals
+from ros_messages import goal, goals, odometry
 
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
 from diffdrive_jacobian.ros import serialization
+from diffdrive_jacobian.ros.goal_client import ODOMETRY
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
 
 
@@ -25,6 +26,21 @@ def test_invalid_messages_are_ignored_without_a_word(kind, capfd):
     assert received == []
     callback(data)
     assert received == [kind()]
+    assert capfd.readouterr() == ('', '')
+
+
+def test_fields_of_invalid_messages_are_not_read(capfd):
+    received = []
+    callback = ignoring_invalid(Odometry, lambda *values: received.append(values), ODOMETRY)
+    message = odometry(1.0, 2.0, 0.0)
+    data = serialize_message(message)
+    for invalid in (b'', b'\0\1', b'\0\1\0\0', data[:60], b'\xff' * len(data)):
+        callback(invalid)
+    message.child_frame_id = 'a' * serialization.MAX_SIZE
+    callback(serialize_message(message))
+    assert received == []
+    callback(data)
+    assert received == [(0, 0, 0.0, 0.0, 1.0, 2.0, 0.0, 0.0, 0.0, 1.0)]
     assert capfd.readouterr() == ('', '')
 
 

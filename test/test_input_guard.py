@@ -16,7 +16,7 @@ from rcl_interfaces.srv import (
 )
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from ros_messages import odometry
+from ros_messages import odometry, receive
 from rosgraph_msgs.msg import Clock
 from type_description_interfaces.srv import GetTypeDescription
 
@@ -51,8 +51,10 @@ def clock(sec, nanosec):
 
 @pytest.mark.parametrize('number', [10, 42, 255])
 @pytest.mark.parametrize('name', NODES)
-def test_value_of_an_unknown_type_is_refused_and_the_others_are_set(lockstep, add, name, number):
-    node, changed = add(NODES[name]), CHANGEABLE[name]
+def test_value_of_an_unknown_type_is_refused_and_the_others_are_set(
+    lockstep, add_complete, name, number
+):
+    node, changed = add_complete(NODES[name]), CHANGEABLE[name]
     parameters = [of_type(changed, number), double(changed, 2.5), of_type('no such', number)]
     request = SetParameters.Request(parameters=parameters)
     results = lockstep.call(SetParameters, f'{name}/set_parameters', request).results
@@ -62,8 +64,8 @@ def test_value_of_an_unknown_type_is_refused_and_the_others_are_set(lockstep, ad
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_atomic_request_with_a_value_of_an_unknown_type_is_refused_whole(lockstep, add, name):
-    node, changed = add(NODES[name]), CHANGEABLE[name]
+def test_atomic_request_with_a_value_of_an_unknown_type_is_refused_whole(lockstep, add_complete, name):
+    node, changed = add_complete(NODES[name]), CHANGEABLE[name]
     before = node.parameters
     request = SetParametersAtomically.Request(
         parameters=[double(changed, 2.5), of_type('kv', 10), double(changed, 3.5)]
@@ -126,16 +128,16 @@ def test_type_description_is_still_provided(ros):
     assert future.result().type_description.type_description.type_name == 'nav_msgs/msg/Odometry'
 
 
-def test_parameter_without_a_name_is_not_set(lockstep, add):
-    node = add(GoToGoal)
+def test_parameter_without_a_name_is_not_set(lockstep, add_complete):
+    node = add_complete(GoToGoal)
     request = SetParameters.Request(parameters=[double('', 1.0)])
     (result,) = lockstep.call(SetParameters, 'go_to_goal/set_parameters', request).results
     assert (result.successful, result.reason) == (False, 'a parameter must have a name, got none')
     assert not node.has_parameter('')
 
 
-def test_refused_name_is_quoted_in_short_and_without_control_characters(lockstep, add, capfd):
-    add(GoToGoal)
+def test_refused_name_is_quoted_in_short_and_without_control_characters(lockstep, add_complete, capfd):
+    add_complete(GoToGoal)
     request = SetParameters.Request(parameters=[of_type('\x1b[2J' + 100_000 * 'n', 10)])
     (result,) = lockstep.call(SetParameters, 'go_to_goal/set_parameters', request).results
     lines = capfd.readouterr().err.splitlines()
@@ -155,8 +157,8 @@ SERVICES = {
 ODD_NAMES = ['', '.', '..', ' ', '\n', 'kp.', 'kp.kp', 'ü', '%s', '\x00', 1_000 * 'n']
 
 
-def test_other_parameter_services_answer_odd_requests(lockstep, add):
-    add(GoToGoal)
+def test_other_parameter_services_answer_odd_requests(lockstep, add_complete):
+    add_complete(GoToGoal)
     for name in ODD_NAMES:
         for service, request in (
             ('describe_parameters', DescribeParameters.Request(names=[name])),
@@ -217,11 +219,11 @@ def test_goal_client_drops_odometry_with_a_negative_stamp(capfd, make):
         node = runner.add(lambda: make(context))
         message = odometry(1.0, 2.0, 0.5)
         message.header.stamp.sec = -1
-        node._on_odometry(message)
+        receive(node, '/odom', message)
         assert node.robot is None
         assert 'odometry dropped: its stamp must have sec of at least 0' in capfd.readouterr().err
         message.header.stamp.sec = 7
-        node._on_odometry(message)
+        receive(node, '/odom', message)
         assert node.robot.stamp == 7_000_000_000
 
 
@@ -247,8 +249,8 @@ def test_runner_guards_the_nodes_of_the_tools(capfd, make, isolated):
         assert not future.result().results[0].successful
 
 
-def test_exception_of_our_own_callbacks_is_not_caught(lockstep, add):
-    node = add(GoToGoal)
+def test_exception_of_our_own_callbacks_is_not_caught(lockstep, add_complete):
+    node = add_complete(GoToGoal)
 
     def fail(_):
         raise ZeroDivisionError('of the node itself')

@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from lockstep_nodes import QUICK, make
+from lockstep_nodes import QUICK, make_complete
 from ros_messages import twist
 
 from diffdrive_jacobian.bags.bag_reader import BagError
@@ -141,7 +141,7 @@ def test_curves_and_parameters_of_the_whole_bag(player):
 def test_several_robots(lockstep, tmp_path):
     recording = Recording(tmp_path / 'two', 'mcap', lossless=True)
     for name, y in (('/one', 0.0), ('/two', 1.0)):
-        lockstep.add(make(VirtualRobot, name, y=y))
+        lockstep.add(make_complete(VirtualRobot, name, y=y))
     lockstep.add(Recorder(Selection(everything=True), recording)).discover()
     lockstep.settle()
     lockstep.publish('/one/cmd_vel', twist(0.5, 0.0))

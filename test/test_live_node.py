@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from geometry_msgs.msg import Twist
-from lockstep_nodes import QUICK, make
+from lockstep_nodes import QUICK, make_complete
 
 from diffdrive_jacobian.live import hand
 from diffdrive_jacobian.live import node as live_node
@@ -89,7 +89,7 @@ def driven(live):
     """A robot with controller and wheel bridge, known to the page."""
     for node in (VirtualRobot, WheelBridge, GoToGoal):
         parameters = {'command_interface': 'wheels'} if node is VirtualRobot else {}
-        live.world.add(make(node, **parameters, **(QUICK if node is GoToGoal else {})))
+        live.world.add(make_complete(node, **parameters, **(QUICK if node is GoToGoal else {})))
     live.until(lambda: live.robot() and len(live.settings()) > 8)
     return live
 
@@ -257,8 +257,8 @@ def test_changes_of_others_are_followed(driven):
 
 def test_robots_in_namespaces(live):
     for name in ('/one', '/two'):
-        live.world.add(make(VirtualRobot, name))
-        live.world.add(make(GoToGoal, name, **QUICK))
+        live.world.add(make_complete(VirtualRobot, name))
+        live.world.add(make_complete(GoToGoal, name, **QUICK))
     live.until(lambda: live.robot('/one') and live.robot('/two'))
     live.pass_time(0.1)
     live.send(goal(0.3, 0.0, robot='/two'))
@@ -270,7 +270,7 @@ def test_robots_in_namespaces(live):
 
 
 def test_a_robot_without_a_controller(live):
-    live.world.add(make(VirtualRobot))
+    live.world.add(make_complete(VirtualRobot))
     live.until(lambda: live.robot())
     live.send(goal(1.0, 0.0), CancelGoal('/'), SetParameter('/', 'controller/kp', 1.0))
     live.send(Pause(paused=True))
@@ -283,14 +283,14 @@ def test_a_robot_without_a_controller(live):
 
 
 def test_a_robot_that_takes_stamped_commands(live):
-    live.world.add(make(VirtualRobot, enable_stamped_cmd_vel=True))
+    live.world.add(make_complete(VirtualRobot, enable_stamped_cmd_vel=True))
     live.until(lambda: live.robot())
     live.send(Drive('/', 0.3, 0.0))
     live.until(lambda: live.robot()['twist'][0] == pytest.approx(0.3), timeout=2.0)
 
 
 def test_without_a_page_nothing_is_computed(live):
-    live.world.add(make(VirtualRobot))
+    live.world.add(make_complete(VirtualRobot))
     live.session.leave(live.page)
     live.pass_time(0.2)
     assert live.node.robots
@@ -298,7 +298,7 @@ def test_without_a_page_nothing_is_computed(live):
 
 
 def test_robots_that_are_silent_and_gone(live, monkeypatch):
-    robot = live.world.add(make(VirtualRobot))
+    robot = live.world.add(make_complete(VirtualRobot))
     live.until(lambda: live.robot())
     live.world.remove(robot)
     monkeypatch.setattr(live_node, 'LOST', 0.0)

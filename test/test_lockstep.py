@@ -16,9 +16,18 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
 from users_nodes import Blinker
 
-from diffdrive_jacobian.testing import LockstepError
+from diffdrive_jacobian.testing import Lockstep, LockstepError
 
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def test_the_type_description_service_exists_only_if_it_is_asked_for():
+    name, asked = 'start_type_description_service', ['--ros-args', '-p']
+    for args, provided in (([], False), ([*asked, f'{name}:=true'], True)):
+        with Lockstep(args) as world:
+            node = world.add(Node('described', start_parameter_services=False))
+            names = [service.service_name for service in node.services]
+            assert names == provided * ['/described/get_type_description']
 
 
 # --- Time

@@ -180,7 +180,7 @@ def test_names_that_are_no_namespace(text):
 def robots(tmp_path_factory):
     """A bag of two robots with different limits; the second one stands elsewhere."""
     from geometry_msgs.msg import Twist
-    from lockstep_nodes import make
+    from lockstep_nodes import make_complete
     from recorded import LockstepRecording
     from ros_messages import twist
 
@@ -189,8 +189,8 @@ def robots(tmp_path_factory):
 
     path = tmp_path_factory.mktemp('bags') / 'two'
     with Lockstep() as world:
-        world.add(make(VirtualRobot, 'one'))
-        world.add(make(VirtualRobot, 'two', x=5.0, linear__x__max_velocity=0.5))
+        world.add(make_complete(VirtualRobot, 'one'))
+        world.add(make_complete(VirtualRobot, 'two', x=5.0, linear__x__max_velocity=0.5))
         made = LockstepRecording(world, path, everything=True)
         for robot in ('one', 'two'):
             world.node.create_publisher(Twist, f'/{robot}/cmd_vel', 10)

@@ -8,7 +8,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 from geometry_msgs.msg import Twist
-from lockstep_nodes import make
+from lockstep_nodes import make_complete
 from nav_msgs.msg import Goals
 from processes import open_world
 from rclpy.serialization import serialize_message
@@ -34,8 +34,8 @@ def bag(tmp_path_factory):
     """A run of two seconds: a goal, its commands, the odometry."""
     path = tmp_path_factory.mktemp('bags') / 'run'
     with Lockstep() as world:
-        world.add(make(VirtualRobot, **{'linear__x__max_velocity': 0.5}))
-        world.add(make(GoToGoal))
+        world.add(make_complete(VirtualRobot, **{'linear__x__max_velocity': 0.5}))
+        world.add(make_complete(GoToGoal))
         with recorded(world, path) as made:
             world.listen(Goals, 'goals')
             world.node.create_publisher(Goals, 'goals', 10)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
-from lockstep_nodes import make
+from lockstep_nodes import make_complete as make
 from rclpy.parameter import Parameter
 from recorded import recorded
 from ros_messages import goal, goals, twist, twist_stamped

@@ -64,6 +64,7 @@ class QuiescentExecutor:
         self._served: dict[Node, Served] = {}
         self._changed = False
         self._has_actions = False
+        self._has_events = False
         self.isolated = True
         """Whether there are no messages from other processes."""
         self.unserved: set[Subscription] = set()
@@ -230,7 +231,7 @@ class QuiescentExecutor:
                 if is_due(handle) and (keeper is None or keeper.may_tick(node, timer)):
                     called = True
                     self.call_timer(handle, timer, node)
-                    self.handle_all()
+                    self.handle_all(after_callback=True)
 
     def task_creator(self, node: Node) -> Callable[..., Task]:
         """Return a function that schedules functions and coroutines of a node for the current time."""
@@ -240,10 +241,16 @@ class QuiescentExecutor:
 
         return create_task
 
-    def handle_all(self) -> None:
-        """Process messages, service calls and tasks until none is left that can continue."""
+    def handle_all(self, *, after_callback: bool = False) -> None:
+        """Process messages, service calls and tasks until none is left that can continue.
+
+        Args:
+            after_callback: Whether nothing but a callback was executed since the last call. What it has
+                sent is known.
+        """
+        events = not after_callback or self._has_events or not self.isolated
         while True:
-            self._drain()
+            self._drain(events)
             if not (self._register_changed() or self._run_tasks()):
                 return
 
@@ -258,17 +265,22 @@ class QuiescentExecutor:
         self._handle_events()
         self._register_changed()
 
-    def _drain(self) -> None:
-        """Process messages and events until none is left."""
+    def _drain(self, events: bool = True) -> None:
+        """Process messages and events until none is left.
+
+        Args:
+            events: Whether the EventsExecutor may have events although no request or response was sent.
+        """
         pending, poll = self.deliveries.pending, self.deliveries.poll
         take = pending.popleft
         while True:
             while pending:
                 if (reader := take()) is None:
                     self._handle_events()
+                    events = True
                 else:
                     reader.deliver()
-            if not (self._handle_events() or pending or poll() or pending):
+            if not ((events and self._handle_events()) or pending or poll() or pending):
                 return
 
     def _handle_events(self) -> bool:
@@ -343,11 +355,9 @@ class QuiescentExecutor:
             self.deliveries.admit(reader)
             self._drain()
         # Actions, or a user's own entities. Who sends them something is not known.
-        self._has_actions = any(
-            not isinstance(waitable, EventHandler)
-            for node in self._served
-            for waitable in node.waitables
-        )
+        waitables = [waitable for node in self._served for waitable in node.waitables]
+        self._has_actions = any(not isinstance(waitable, EventHandler) for waitable in waitables)
+        self._has_events = not all(map(_is_of_discovery, waitables))
         self.update_timers()
 
     def update_timers(self) -> None:
@@ -360,6 +370,14 @@ class QuiescentExecutor:
 
 def _nothing() -> None:
     """Do nothing, as a task."""
+
+
+def _is_of_discovery(waitable: Any) -> bool:
+    """Return whether a waitable has events only when a publisher or subscription is created.
+
+    Those of rclpy itself, which report that two do not match.
+    """
+    return isinstance(waitable, EventHandler) and 'INCOMPATIBLE' in waitable.event_type.name
 
 
 def _release(served: Served) -> None:

@@ -12,7 +12,6 @@ from rclpy.timer import Timer
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._gated_reader import GatedReader
 from diffdrive_jacobian.lockstep._gates import Gate, Gates
-from diffdrive_jacobian.lockstep._timers import follows_sim_time
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
@@ -67,12 +66,15 @@ class Keeper:
         That of a timer on wall time takes no simulated time, because nobody knows when it comes.
         """
         gate = self.gate(node)
-        return gate.run(timer.callback) if follows_sim_time(timer) else timer.callback()
+        simulated = self._executor.timers.is_simulated(timer)
+        return gate.run(timer.callback) if simulated else timer.callback()
 
     def may_tick(self, node: Node, timer: Timer) -> bool:
         """Return whether a timer that is due ticks now. Otherwise it does later."""
         gate = self.gate(node)
-        return self.gates.may_tick(gate, timer) if follows_sim_time(timer) else not gate.closed
+        if self._executor.timers.is_simulated(timer):
+            return self.gates.may_tick(gate, timer)
+        return not gate.closed
 
     def update_timers(self) -> None:
         """Find the timers that may tick."""

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+import rclpy
 from rclpy.executors import ExternalShutdownException
 
 from diffdrive_jacobian.lockstep._errors import LockstepError, PropertyViolation
@@ -18,10 +19,12 @@ from diffdrive_jacobian.lockstep._external import External
 from diffdrive_jacobian.lockstep._guard import Guard, Stuck
 from diffdrive_jacobian.lockstep._report import Traffic
 from diffdrive_jacobian.lockstep._requirement import Required, Requirement
+from diffdrive_jacobian.ros.rclpy_internals import RCLError
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 MAX_SECONDS = 2**31 - 1
 """Largest time that fits into a stamp (s)."""
+SHUT_DOWN = 'rclpy was shut down: only lockstep may do that'
 CONNECTION = 30.0
 """Longest wall time for the discovery of external nodes (s)."""
 
@@ -241,8 +244,10 @@ class SimulatedTime:
         try:
             yield
         except ExternalShutdownException:
-            raise LockstepError('rclpy was shut down: only lockstep may do that') from None
+            raise LockstepError(SHUT_DOWN) from None
         except (Stuck, RuntimeError) as error:
+            if isinstance(error, RCLError) and not rclpy.ok():
+                raise LockstepError(SHUT_DOWN) from None
             # pybind11 replaces an exception that is raised while it converts an argument.
             stuck = error if isinstance(error, Stuck) else self._guard.raised
             if stuck is None:

@@ -22,6 +22,7 @@ class Timers:
         # With their handles, whose methods take a third of the time of those of the timers.
         self._sim_timers: list[Entry] = []
         self._wall_timers: list[Entry] = []
+        self._simulated: set[Timer] = set()
 
     def update(self, nodes: Iterable[Node], without: Container[Timer] = ()) -> None:
         """Find the timers of the nodes.
@@ -37,7 +38,12 @@ class Timers:
             if timer not in without
         ]
         self._sim_timers = [pair for pair in timers if follows_sim_time(pair[1])]
-        self._wall_timers = [pair for pair in timers if not follows_sim_time(pair[1])]
+        self._simulated = {timer for _, timer, _ in self._sim_timers}
+        self._wall_timers = [pair for pair in timers if pair[1] not in self._simulated]
+
+    def is_simulated(self, timer: Timer) -> bool:
+        """Return whether a timer of the nodes expires by simulated time, as of the last `update`."""
+        return timer in self._simulated
 
     def due(self) -> tuple[list[Entry], int | None]:
         """Return the due timers, the most overdue first, and the time until the next one (ns)."""
@@ -65,7 +71,7 @@ class Timers:
         """
         due, _ = self.due()
         for handle, timer, owner in due:
-            if owner is node and follows_sim_time(timer):
+            if owner is node and timer in self._simulated:
                 return -(handle.time_until_next_call() or 0), handle, timer
         return None
 

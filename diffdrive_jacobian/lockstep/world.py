@@ -29,6 +29,9 @@ from diffdrive_jacobian.ros.fastdds_profiles import withdraw
 from diffdrive_jacobian.ros.rclpy_internals import wrap_sleep
 from diffdrive_jacobian.ros.runner import UserError, environment, ros_context
 
+ISOLATED = ('--ros-args', '-p', 'start_type_description_service:=false')
+"""ROS arguments of a world without external nodes, before those of the user: only tools in other
+processes call that service, and it takes time to create."""
 N = TypeVar('N', bound=Node)
 
 
@@ -36,7 +39,8 @@ class Lockstep(Requirements, Processes):
     """Executes nodes in the default context of rclpy, in simulated time.
 
     Nodes are created as usual, after the `Lockstep`, and added to it. `use_sim_time` is true for all of
-    them. They are isolated: no other process receives their messages.
+    them. They are isolated: no other process receives their messages. Without external nodes
+    `start_type_description_service` is false, unless `args` say otherwise.
 
         with Lockstep() as world:
             controller = world.add(MyController())
@@ -88,7 +92,8 @@ class Lockstep(Requirements, Processes):
         self._on_new: list[Callable[[], None]] = []
         self._closing = ExitStack()
         try:
-            self._enter(args, patience, self._variables(external, domain_id))
+            defaults = ISOLATED if external is None else ()
+            self._enter([*defaults, *args], patience, self._variables(external, domain_id))
             if external is not None:
                 self._open_to(external)
         except BaseException:

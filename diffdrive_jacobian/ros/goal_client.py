@@ -20,6 +20,7 @@ from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.control import Arrival
 from diffdrive_jacobian.messages import conversion as messages
+from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.ros.node import THROTTLE
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
@@ -31,6 +32,8 @@ DRIVEN_POINT_PARAMETERS = ('controller', 'offset')
 """Parameters of a controller that determine which point of the robot it drives."""
 ENDED = (GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED)
 """Status of goals that are not driven to any more."""
+ODOMETRY = (*wire.STAMP, 'twist.twist.linear.x', 'twist.twist.angular.z', *wire.ODOMETRY[1:])
+"""Fields of an Odometry: stamp, v and omega, and the pose for `from_pose_values`."""
 MESSAGES: dict[str, type] = {'goal_pose': PoseStamped, 'goals': Goals}
 """Topic of goals to its type."""
 
@@ -105,7 +108,7 @@ class GoalClient(Node):  # type: ignore[misc]
             received = ignoring_invalid(GoalStatus, self._on_status)
             self.create_subscription(GoalStatus, 'goal_status', received, latched, raw=True)
         with explaining_failure(self, Odometry, 'odom'):
-            moved = ignoring_invalid(Odometry, self._on_odometry)
+            moved = ignoring_invalid(Odometry, self._on_odometry, ODOMETRY)
             self.create_subscription(Odometry, 'odom', moved, 10, raw=True)
         # rclpy reports a name that is too long only here.
         self.resolve_service_name('cancel_goal')
@@ -214,16 +217,16 @@ class GoalClient(Node):  # type: ignore[misc]
         if self._message is not None and message.goal_info.stamp == self._message.header.stamp:
             self.status = message.status
 
-    def _on_odometry(self, message: Odometry) -> None:
+    def _on_odometry(self, *values: Any) -> None:
         # Other processes may publish, and anything.
+        sec, nanosec, v, omega, *pose_values = values
         try:
-            pose = messages.from_pose(message.pose.pose)
-            stamp = messages.from_time(message.header.stamp)
+            pose = np.array(messages.from_pose_values(*pose_values))
+            stamp = messages.from_time_values(sec, nanosec)
         except MessageError as error:
             self.get_logger().warning(f'odometry dropped: {error}', throttle_duration_sec=THROTTLE)
             return
-        twist = message.twist.twist
-        self.robot = RobotState(pose, (twist.linear.x, twist.angular.z) != (0.0, 0.0), stamp)
+        self.robot = RobotState(pose, (v, omega) != (0.0, 0.0), stamp)
         self.seen = self._monotonic()
         if self._send_on_odometry:
             self.send()

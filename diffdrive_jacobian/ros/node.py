@@ -31,7 +31,7 @@ from diffdrive_jacobian.ros import parameters as ros_parameters
 from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.rate_limit import RateLimit
-from diffdrive_jacobian.ros.rclpy_internals import log_info, time_reader
+from diffdrive_jacobian.ros.rclpy_internals import declare_qos, log_info, time_reader
 from diffdrive_jacobian.ros.serialization import decoding
 from diffdrive_jacobian.ros.shared_graph import MAX_AGE, SharedGraph
 from diffdrive_jacobian.ros.topic_errors import explaining_failure, type_name
@@ -111,7 +111,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
                 message,
                 topic,
                 profile,
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+                qos_overriding_options=self._qos_options('publisher', topic, profile),
             )
 
     def subscribe(
@@ -146,15 +146,22 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
             self.get_logger().warning(f'{topic} dropped: {error}', throttle_duration_sec=THROTTLE)
 
         self._types.add(topic, type_name(message), subscribed=True)
+        profile = QoSProfile(depth=10)
         with explaining_failure(self, message, topic):
             return self.create_subscription(
                 message,
                 topic,
                 callback if raw else decoding(message, fields, callback, dropped, numbers),
-                QoSProfile(depth=10),
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+                profile,
+                qos_overriding_options=self._qos_options('subscription', topic, profile),
                 raw=True,
             )
+
+    def _qos_options(self, kind: str, topic: str, profile: QoSProfile) -> QoSOverridingOptions | None:
+        """Return the options with which users override the QoS of a topic. None: nobody does."""
+        if declare_qos(self, self.resolve_topic_name(topic), kind, profile):
+            return None
+        return QoSOverridingOptions.with_default_policies()
 
     def provide(self, service: Any, name: str, callback: Callable[[Any, Any], Any]) -> Service:
         """Create a service.

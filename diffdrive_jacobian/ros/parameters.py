@@ -26,6 +26,7 @@ from diffdrive_jacobian.parameters.declaration import (
 )
 from diffdrive_jacobian.ros.rclpy_internals import (
     PARAMETERS_OF_RCLPY,
+    declare_together,
     declared_parameters,
     parameter_overrides,
 )
@@ -69,8 +70,8 @@ def declare(node: Node, parameters: type[P]) -> P:
     """
     overrides = parameter_overrides(node)
     initial = from_ros(parameters, {name: given.value for name, given in overrides.items()})
-    node.declare_parameters(
-        '',
+    declare_together(
+        node,
         [
             (
                 name,
@@ -79,7 +80,6 @@ def declare(node: Node, parameters: type[P]) -> P:
             )
             for name, (field, specification) in specifications(parameters).items()
         ],
-        ignore_override=True,
     )
     return initial
 

@@ -39,15 +39,19 @@ def deserialized(data: bytes, message_type: type[T]) -> T:
     return message
 
 
-def ignoring_invalid(message_type: type[T], callback: Callable[[T], object]) -> Callable[[bytes], None]:
+def ignoring_invalid(
+    message_type: type[Any], callback: Callable[..., object], fields: Sequence[str] | None = None
+) -> Callable[[bytes], None]:
     """Return a callback for serialized messages that ignores invalid ones and those beyond `MAX_SIZE`.
 
     For each message that it cannot decode, the middleware would write several lines to standard error.
 
     Args:
         message_type: Type of the messages.
-        callback: Called with each message.
+        callback: Called with each message, or with the fields, one argument each.
+        fields: Paths of the fields that are read; None: the message as a whole.
     """
+    read = _values_reader(message_type, fields)
 
     def decode(data: bytes) -> None:
         if len(data) > MAX_SIZE:
@@ -56,10 +60,10 @@ def ignoring_invalid(message_type: type[T], callback: Callable[[T], object]) -> 
             # Our controller refuses more. rclpy writes a line for each that is longer than its message.
             if message_type is Goals and goals_header(data)[1] > MAX_WAYPOINTS:
                 return
-            message = deserialized(data, message_type)
+            values = read(data)
         except DecodingError:
             return
-        callback(message)
+        callback(*values)
 
     # Reports name a callback.
     decode.__qualname__ = getattr(callback, '__qualname__', decode.__qualname__)
@@ -71,6 +75,15 @@ def reader(
 ) -> Callable[[bytes], tuple[Any, ...]]:
     """Return a Reader of these fields, to which rclpy reads the encapsulations that it does not."""
     return Reader(message_type, fields, whole=whole, deserialize=deserialize_message)
+
+
+def _values_reader(
+    message_type: type[Any], fields: Sequence[str] | None
+) -> Callable[[bytes], tuple[Any, ...]]:
+    """Return a function that reads these fields of serialized messages; None: the message itself."""
+    if fields is None:
+        return lambda data: (deserialized(data, message_type),)
+    return reader(message_type, fields)
 
 
 def decoding(
@@ -89,11 +102,7 @@ def decoding(
         refused: Called instead if the bytes are not a message of this type.
         numbers: Receives the sequence number of each message.
     """
-    read: Callable[[bytes], tuple[Any, ...]] = (
-        (lambda data: (deserialized(data, message_type),))
-        if fields is None
-        else reader(message_type, fields)
-    )
+    read = _values_reader(message_type, fields)
 
     def decode(data: bytes) -> None:
         try:
