@@ -141,7 +141,7 @@ def test_quality_of_service_is_declared_as_rclpy_does(ros):
     assert not internals.declare_qos(ours, '/odom', 'publisher', profile)
     options = QoSOverridingOptions.with_default_policies
     theirs.create_publisher(String, 'odom', profile, qos_overriding_options=options())
-    theirs.create_subscription(String, 'odom', print, profile, qos_overriding_options=options())
+    theirs.create_subscription(String, 'odom', [].append, profile, qos_overriding_options=options())
     assert described(ours) == described(theirs)
 
 
@@ -530,11 +530,11 @@ def test_entities_of_a_node_are_counted(ros):
     node.create_timer(1.0, lambda: None)
     node.create_client(GetParameters, 'get')
     assert internals.entity_count(node) == before + 2
-    node.create_subscription(String, 'words', print, 2000)
+    node.create_subscription(String, 'words', [].append, 2000)
     # With its QoS events.
     assert internals.entity_count(node) > before + 2
     assert internals.queue_depth(node) == 2000
-    node.create_subscription(String, 'all', print, QoSProfile(history=HistoryPolicy.KEEP_ALL))
+    node.create_subscription(String, 'all', [].append, QoSProfile(history=HistoryPolicy.KEEP_ALL))
     assert internals.queue_depth(node) == math.inf
     node.destroy_node()
 
