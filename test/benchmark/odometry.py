@@ -15,7 +15,7 @@ import time
 from typing import Any, NamedTuple
 
 import child
-from table import Row, interleave
+from table import Goal, Row, interleave
 
 WARM_UP = 1.0
 """How long the nodes run before anything counts (s)."""
@@ -31,6 +31,14 @@ class Side(NamedTuple):
     def __str__(self) -> str:
         what = 'three nodes' if self.bridge else 'two nodes'
         return f'{self.nodes} {what}, {self.executor}'
+
+
+_OURS, _BARE = str(Side('our', 'events')), str(Side('bare', 'events'))
+GOALS = {
+    ('cpu', _OURS, _BARE, 500.0): Goal(0.5),
+    ('latency', _OURS, _BARE, 500.0): Goal(0.6),
+}
+"""Goals by function, side, reference and rate."""
 
 
 def cpu(nodes: str, executor: str, bridge: bool, rate: float, seconds: float) -> float:
@@ -164,6 +172,7 @@ def rows(quick: bool) -> list[Row]:
                     beside=str(beside),
                     quantity=f'{quantity} at {rate:g} Hz',
                     pairs=list(zip(figures[ours], figures[beside], strict=True)),
+                    goal=GOALS.get((function, str(ours), str(beside), rate)),
                 )
                 for ours, beside in comparisons
             ]

@@ -2,7 +2,7 @@
 
 ROW is one or more of odometry, three_processes, lockstep, identity, many_robots, start_up, discovery,
 closed_loops, jacobians, single_calls; without any all are measured (about forty minutes; with --quick,
-to see whether it works, two). Nothing else should run meanwhile. --page writes the rows into
+to see whether it works, two). Nothing else should run meanwhile. --page writes what was measured into
 doc/performance.md. closed_loops also measures packages that pip
 installs, if they are there (pip install ir-sim roboticstoolbox-python). flood.py and
 inverse_kinematics.py in this folder are benchmarks of their own.
@@ -14,11 +14,12 @@ import argparse
 import importlib
 import os
 import platform
+import re
 import time
 from pathlib import Path
 
 from rich.console import Console
-from table import WIDTH, Row, markdown, show
+from table import WIDTH, Row, sections, show
 
 PAGE = Path(__file__).parents[2] / 'doc' / 'performance.md'
 BEGIN, END = '<!-- measured -->', '<!-- end -->'
@@ -67,11 +68,15 @@ def main() -> None:
 
 
 def write(rows: list[Row], machine: str) -> None:
-    """Write rows and machine into the page, in the place of those before."""
+    """Write rows into the page, in the place of those of the same groups, and what machine it was."""
     before, _, rest = PAGE.read_text().partition(BEGIN)
-    _, _, after = rest.partition(END)
-    lines = '\n'.join([f'Measured on {time.strftime("%Y-%m-%d")}: {machine}.', *markdown(rows)])
-    PAGE.write_text(f'{before}{BEGIN}\n{lines.rstrip()}\n\n{END}{after}')
+    measured, _, after = rest.partition(END)
+    _, *parts = re.split('^(### .*)$', measured, flags=re.MULTILINE)
+    groups = {heading: text.strip() for heading, text in zip(parts[::2], parts[1::2], strict=True)}
+    new = sections(rows, f'Measured on {time.strftime("%Y-%m-%d")}: {machine}.')
+    groups.update((heading, '\n'.join(lines)) for heading, lines in new.items())
+    text = '\n\n'.join(f'{heading}\n\n{lines}' for heading, lines in groups.items())
+    PAGE.write_text(f'{before}{BEGIN}\n{text}\n\n{END}{after}')
 
 
 if __name__ == '__main__':

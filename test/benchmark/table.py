@@ -100,25 +100,33 @@ def show(rows: Sequence[Row], console: Console, *, judged: bool) -> None:
         console.print(f'- {note}', highlight=False)
 
 
-def markdown(rows: Sequence[Row]) -> list[str]:
-    """Return the lines of the table for a page."""
-    lines = []
-    group = None
+def sections(rows: Sequence[Row], measured: str) -> dict[str, list[str]]:
+    """Return the lines of a page for each group of rows, by its heading.
+
+    Args:
+        rows: The rows.
+        measured: When and where they were measured.
+    """
+    groups: dict[str, list[Row]] = {}
     for row in rows:
-        if row.group != group:
-            group = row.group
-            lines += [
-                '',
-                f'### {group[:1].upper()}{group[1:]}',
-                '',
-                '| | what | ours | reference | ratio | goal |',
-                '|---|---|---:|---:|---:|---|',
-            ]
-        cells = [cell.replace('[dim]', '').replace('[/dim]', '') for cell in row.cells(judged=True)]
-        cells[4] = cells[4].removeprefix('[bold]').removesuffix('[/bold]')
-        lines.append(f'| {" | ".join(cell.replace(chr(10), " ") for cell in cells)} |')
-    notes = dict.fromkeys(note for row in rows for note in row.notes)
-    return [*lines, '', *(f'- {note}' for note in notes)]
+        groups.setdefault(f'### {row.group[:1].upper()}{row.group[1:]}', []).append(row)
+    found = {}
+    for heading, members in groups.items():
+        notes = dict.fromkeys(note for row in members for note in row.notes)
+        found[heading] = [
+            '| | what | ours | reference | ratio | goal |',
+            '|---|---|---:|---:|---:|---|',
+            *map(_line, members),
+            '',
+            *(f'- {note}' for note in [*notes, measured]),
+        ]
+    return found
+
+
+def _line(row: Row) -> str:
+    cells = [cell.replace('[dim]', '').replace('[/dim]', '') for cell in row.cells(judged=True)]
+    cells[4] = cells[4].removeprefix('[bold]').removesuffix('[/bold]')
+    return f'| {" | ".join(cell.replace(chr(10), " ") for cell in cells)} |'
 
 
 def interleave(sides: Iterable[Any], rounds: int, measure: Callable[[Any], Any]) -> dict[Any, list[Any]]:
