@@ -285,6 +285,24 @@ def test_what_is_made_in_a_callback_is_served_from_then_on(lockstep):
         lockstep.publish('b', Vector3())
 
 
+def test_what_a_timer_creates_and_calls_at_once_answers_before_time_passes(lockstep):
+    node, called = lockstep.add(Node('calling')), []
+
+    def respond(_, response):
+        called.append(('request', lockstep.elapsed))
+        return response
+
+    def call():
+        timer.cancel()
+        node.create_service(Trigger, 'new', respond)
+        future = node.create_client(Trigger, 'new').call_async(Trigger.Request())
+        future.add_done_callback(lambda _: called.append(('response', lockstep.elapsed)))
+
+    timer = node.create_timer(0.5, call)
+    lockstep.run_for(0.5)
+    assert called == [('request', 0.5), ('response', 0.5)]
+
+
 def test_removed_node_is_gone(lockstep):
     blinker = lockstep.add(Blinker())
     blinks = lockstep.listen(Time, 'blink')

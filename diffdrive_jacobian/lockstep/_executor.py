@@ -251,7 +251,10 @@ class QuiescentExecutor:
         events = not after_callback or self._has_events or not self.isolated
         while True:
             self._drain(events)
-            if not (self._register_changed() or self._run_tasks()):
+            if self._register_changed():
+                # A new client or service may already have been called.
+                events = True
+            elif not self._run_tasks():
                 return
 
     def _run_tasks(self) -> bool:
