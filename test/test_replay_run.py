@@ -125,7 +125,13 @@ def test_fast_playback_is_acknowledged_before_the_usual_heartbeat(world, bag):
     commands = world.harness.listen(Twist, 'cmd_vel')
     child = world.start('replay_run', str(path), '-w', '1', '-r', '20', '--wait-for-all-acked', '2900')
     world.harness.until(lambda: len(commands) == len(run.cmd_vel), 'all have come')
-    assert (child.exit(), child.stderr) == (0, '')
+    assert child.exit() == 0
+    # On a busy machine its executor may report that it is late.
+    assert not [
+        line
+        for line in child.stderr.splitlines()
+        if 'messages and requests' not in line and 'messages or requests' not in line
+    ]
     assert child.last_line == f'{len(run.cmd_vel)} messages played'
 
 
