@@ -644,6 +644,14 @@ def test_a_missing_directory_is_reported_before_anything_is_read(tmp_path, capsy
     refuses(capsys, 1, f'{file} cannot be written: No such file or directory')
 
 
+@pytest.mark.parametrize('option', ['-o', '--csv'])
+def test_a_file_in_the_place_of_a_directory_is_told(tmp_path, capsys, option):
+    (tmp_path / 'notes').write_text('precious')
+    file = tmp_path / 'notes' / ('a.png' if option == '-o' else 'tables')
+    assert plot(tmp_path / 'no_bag', option, file) == 1
+    refuses(capsys, 1, 'cannot be written: Not a directory')
+
+
 @pytest.mark.usefixtures('undrawn')
 def test_a_file_that_cannot_be_finished_is_taken_away(bag, tmp_path, capsys, monkeypatch):
     def full(self, data):

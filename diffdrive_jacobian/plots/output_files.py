@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import secrets
+import stat
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from datetime import datetime
@@ -112,8 +113,8 @@ def new_file(name: str, formats: Sequence[str], what: str, *, replace: bool = Fa
 
 def check_directory(path: Path) -> None:
     """Raise OSError if files cannot be created in a directory."""
-    if not path.is_dir():
-        raise OSError(errno.ENOENT, os.strerror(errno.ENOENT))
+    if not stat.S_ISDIR(os.stat(path).st_mode):
+        raise OSError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
     if not os.access(path, os.W_OK | os.X_OK):
         raise OSError(errno.EACCES, os.strerror(errno.EACCES))
 
