@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 
 import external_nodes
 import pytest
@@ -143,6 +144,28 @@ def test_a_chain_of_processes_is_awaited_to_its_end(world_of):
         world.publish('echo/odom', odometry(number))
     # In the order of the declarations, although the echo was first.
     assert order == [('follower', 2.0), ('echo', 1.0), ('follower', 4.0), ('echo', 2.0)]
+
+
+def test_an_answer_that_arrives_while_it_is_counted_what_is_due_is_answered_first(world_of, monkeypatch):
+    update = AnswersDue.update
+
+    def update_late(due, now, published):
+        update(due, now, published)
+        end = time.monotonic() + 10.0
+        while due.topic == '/echo/cmd_vel' and published(due.topic) < due.due:
+            assert time.monotonic() < end
+
+    monkeypatch.setattr(AnswersDue, 'update', update_late)
+    world = world_of(
+        Answers('follower/cmd_vel', to='echo/cmd_vel'), Answers('echo/cmd_vel', to='echo/odom')
+    )
+    order = []
+    for name in ('echo', 'follower'):
+        world.node.create_subscription(
+            TwistStamped, f'{name}/cmd_vel', lambda _, name=name: order.append(name), 10
+        )
+    world.publish('echo/odom', odometry(1.0))
+    assert order == ['follower', 'echo']
 
 
 def test_a_node_without_parameter_services_answers(world_of):

@@ -101,15 +101,16 @@ class External(Connection):
             LockstepError: More was received than is due.
         """
         now, found = self._now(), []
+        # Before it is updated what is due: what arrives meanwhile may itself have to be answered.
+        received = [topic.count() for topic in self._topics.values()]
         for one in self._expectations.due():
             one.update(now, self._published)
-        for topic in self._topics.values():
+        for topic, count in zip(self._topics.values(), received, strict=True):
             those = self._expectations.due(topic.topic_name)
-            received = topic.count()
             if not those:
                 # Of an idle node.
                 continue
-            left = sum(one.due for one in those) - received
+            left = sum(one.due for one in those) - count
             if left < 0:
                 raise LockstepError(self._surplus(topic, -left))
             if left:

@@ -190,6 +190,11 @@ class Connection:
             topic = ExternalTopic(self._node, name, infos, self._traffic)
             self._executor.unserved.add(topic.subscription)
             self._topics[name] = topic
+            # In the order of the declarations, not of their discovery; then those of idle nodes.
+            declared = [one.topic for one in self._expectations.due()]
+            names = sorted(self._topics, key=lambda one: (one not in declared, one))
+            ordered = dict.fromkeys([one for one in declared if one in self._topics] + names)
+            self._topics = {one: self._topics[one] for one in ordered}
 
     def _not_discovered(self, waited: float, missing: Sequence[str]) -> str:
         topics = ', '.join(self.graph.published_topics()) or 'none'
