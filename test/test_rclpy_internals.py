@@ -152,6 +152,13 @@ def test_quality_of_service_that_a_user_overrides_is_left_to_rclpy(ros):
     assert not node.has_parameter('qos_overrides./odom.publisher.depth')
 
 
+@pytest.mark.parametrize(('policy', 'value'), [('history', 'keep_last'), ('depth', 7)])
+def test_quality_of_service_that_was_declared_before_is_left_to_rclpy(ros, policy, value):
+    node = ros.add(Node, node_name='declared')
+    node.declare_parameter(f'qos_overrides./odom.publisher.{policy}', value)
+    assert not internals.declare_qos(node, '/odom', 'publisher', QoSProfile(depth=7))
+
+
 def test_services_that_rclpy_provides_are_known(ros):
     node = ros.add(Node, node_name='bare')
     services = node.get_service_names_and_types_by_node('bare', '/')

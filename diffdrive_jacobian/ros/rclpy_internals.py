@@ -127,15 +127,15 @@ def declare_qos(node: Node, topic: str, kind: str, profile: QoSProfile) -> bool:
         declared before.
     """
     prefix = f'qos_overrides.{topic}.{kind}.'
-    if f'{prefix}depth' in node._parameters or any(
-        name.startswith('qos_overrides.') for name in node._parameter_overrides
-    ):
-        return False
     values = {
         'history': profile.history.name.lower(),
         'depth': profile.depth,
         'reliability': profile.reliability.name.lower(),
     }
+    if any(prefix + policy in node._parameters for policy in values) or any(
+        name.startswith('qos_overrides.') for name in node._parameter_overrides
+    ):
+        return False
     declare_together(
         node,
         [
