@@ -12,7 +12,7 @@ _GENERATOR = 'rosidl_generator_py.generate_py_impl'
 
 
 def without_message_generator() -> None:
-    """Let message classes be loaded without the generator that wrote them.
+    """Skip the import of the message generator when message classes are loaded.
 
     A message class imports rosidl_generator_py for one function. That package also imports its generator
     and the parser of message definitions, which takes longer than to create a node. It does without them
@@ -23,7 +23,7 @@ def without_message_generator() -> None:
 
 
 def without_blas_threads() -> None:
-    """Let NumPy start no threads for linear algebra, unless the user has chosen their number.
+    """Set the number of threads of OpenBLAS to one, unless the user has chosen it.
 
     OpenBLAS starts one for each further core when NumPy is imported. Each is busy for milliseconds until
     it sleeps. The matrices of a robot are too small for threads.
