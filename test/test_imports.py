@@ -19,14 +19,14 @@ PACKAGE = diffdrive_jacobian.__name__
 HOUSE = Path(diffdrive_jacobian.__file__).parent
 # From the ground up: each layer may import itself and what stands before it.
 LAYERS = (
-    *('kinematics', 'control', 'simulation', 'calibration', 'sweeps'),
+    *('numerics', 'kinematics', 'control', 'simulation', 'calibration', 'sweeps'),
     *('messages', 'parameters', 'bags'),
     *('recovery', 'reading', 'diagnosis'),
     *('plots', 'ros', 'nodes', 'recording', 'replay', 'lockstep', 'faults', 'properties'),
     *('exploration', 'drives'),
     *('live', 'testing', 'tools'),
 )
-PURE = LAYERS[:4]
+PURE = LAYERS[:5]
 # These may load rosbags and what it needs, but nothing of ROS, and matplotlib only when they draw.
 WITHOUT_ROS = ('messages', 'parameters', 'bags', 'recovery', 'reading', 'diagnosis', 'plots')
 # Modules beside the layers, and the layers they may import.

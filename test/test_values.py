@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from diffdrive_jacobian.control import Arrival, StraightLine, VelocityLimits
-from diffdrive_jacobian.kinematics._checks import equal, hashable
+from diffdrive_jacobian.numerics.checks import equal, hashable
 from diffdrive_jacobian.simulation import RobotModel
 
 CASES = [(VelocityLimits, 'max_v'), (VelocityLimits, 'max_wheel_speed'), (Arrival, 'offset')]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from math import isfinite
 from typing import Any
 
-from diffdrive_jacobian.kinematics._checks import (
+from diffdrive_jacobian.numerics.checks import (
     boolean,
     equal,
     hashable,
@@ -19,7 +19,7 @@ from diffdrive_jacobian.kinematics._checks import (
     number,
     read_only,
 )
-from diffdrive_jacobian.kinematics._elementary import (
+from diffdrive_jacobian.numerics.elementary import (
     agree,
     cos,
     evaluated,

@@ -24,8 +24,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffdrive_jacobian.kinematics._checks import boolean, function, instance, number, positive, short
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
+from diffdrive_jacobian.numerics.checks import boolean, function, instance, number, positive, short
 
 Law = Callable[..., tuple[Any, Any]]
 """`law(poses, goals, *gains) -> (v, omega)`, as described above."""

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from diffdrive_jacobian.control.controller import Controller, Law
-from diffdrive_jacobian.kinematics._checks import instance, short
+from diffdrive_jacobian.numerics.checks import instance, short
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint

@@ -16,7 +16,8 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.control.controller import Boundary, Controller, GainValues, ReferenceGains
-from diffdrive_jacobian.kinematics._elementary import (
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits
+from diffdrive_jacobian.numerics.elementary import (
     agree,
     arctan2,
     components,
@@ -26,7 +27,6 @@ from diffdrive_jacobian.kinematics._elementary import (
     sin,
     wrapped,
 )
-from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 
 
 def go_to_goal(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any) -> tuple[Any, Any]:

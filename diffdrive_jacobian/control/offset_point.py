@@ -19,9 +19,9 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.control.controller import Controller, GainValues
-from diffdrive_jacobian.kinematics._checks import offset
-from diffdrive_jacobian.kinematics._elementary import agree, components, cos, evaluated, operand, sin
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
+from diffdrive_jacobian.numerics.checks import offset
+from diffdrive_jacobian.numerics.elementary import agree, components, cos, evaluated, operand, sin
 
 
 def offset_point(state: ArrayLike, goal: ArrayLike, k: Any, d: Any) -> tuple[Any, Any]:

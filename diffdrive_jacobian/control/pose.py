@@ -23,8 +23,9 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.control.controller import Boundary, Controller, GainValues
-from diffdrive_jacobian.kinematics._checks import positive
-from diffdrive_jacobian.kinematics._elementary import (
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits
+from diffdrive_jacobian.numerics.checks import positive
+from diffdrive_jacobian.numerics.elementary import (
     agree,
     arctan2,
     components,
@@ -36,7 +37,6 @@ from diffdrive_jacobian.kinematics._elementary import (
     sinc,
     wrapped,
 )
-from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 
 FASTER = 2.0
 """Ratio of the default rates at which heading and distance converge [-]."""

@@ -18,7 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import (
+from diffdrive_jacobian.kinematics._task_checks import finite_result
+from diffdrive_jacobian.kinematics.inverse_velocity import (
+    damped_least_squares,
+    limit_velocity,
+    redundant,
+)
+from diffdrive_jacobian.numerics.checks import (
     array,
     finite,
     floats,
@@ -29,19 +35,13 @@ from diffdrive_jacobian.kinematics._checks import (
     positive_or_infinite,
     read_only,
 )
-from diffdrive_jacobian.kinematics._elementary import (
+from diffdrive_jacobian.numerics.elementary import (
     agree,
     components,
     maximum,
     operand,
     sqrt,
     vector,
-)
-from diffdrive_jacobian.kinematics._task_checks import finite_result
-from diffdrive_jacobian.kinematics.inverse_velocity import (
-    damped_least_squares,
-    limit_velocity,
-    redundant,
 )
 
 

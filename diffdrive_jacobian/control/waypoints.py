@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.go_to_goal import turn_in_place
-from diffdrive_jacobian.kinematics._checks import (
+from diffdrive_jacobian.numerics.checks import (
     array,
     boolean,
     function,
@@ -20,7 +20,7 @@ from diffdrive_jacobian.kinematics._checks import (
     read_only,
     short,
 )
-from diffdrive_jacobian.kinematics._elementary import components, operand
+from diffdrive_jacobian.numerics.elementary import components, operand
 
 Pose: TypeAlias = NDArray[np.float64] | tuple[float, float, float]
 Law: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]

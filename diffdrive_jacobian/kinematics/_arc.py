@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from diffdrive_jacobian.kinematics._elementary import all_finite, wrapped
+from diffdrive_jacobian.numerics.elementary import all_finite, wrapped
 
 
 def arc_end(

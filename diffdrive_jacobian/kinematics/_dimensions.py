@@ -5,8 +5,8 @@ from __future__ import annotations
 from math import isfinite
 from typing import Any
 
-from diffdrive_jacobian.kinematics._checks import positive
-from diffdrive_jacobian.kinematics._elementary import agree, operand
+from diffdrive_jacobian.numerics.checks import positive
+from diffdrive_jacobian.numerics.elementary import agree, operand
 
 
 def angle_and_radius(name: str, angle: Any, r: Any) -> tuple[Any, Any]:

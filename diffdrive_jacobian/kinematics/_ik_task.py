@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import floats
+from diffdrive_jacobian.numerics.checks import floats
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.kinematics._elementary import minimum, sqrt, where
+from diffdrive_jacobian.numerics.elementary import minimum, sqrt, where
 
 CUTOFF = 1e-15
 """Without damping, singular values below `CUTOFF max(m, n)` times the largest one count as zero."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import array, leading, not_negative, positive
-from diffdrive_jacobian.kinematics._elementary import operand
+from diffdrive_jacobian.numerics.checks import array, leading, not_negative, positive
+from diffdrive_jacobian.numerics.elementary import operand
 
 Array = NDArray[np.float64]
 

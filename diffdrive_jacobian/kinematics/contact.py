@@ -17,9 +17,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import positive
 from diffdrive_jacobian.kinematics._dimensions import angle_and_radius
-from diffdrive_jacobian.kinematics._elementary import (
+from diffdrive_jacobian.numerics.checks import positive
+from diffdrive_jacobian.numerics.elementary import (
     agree,
     cos,
     matrix,

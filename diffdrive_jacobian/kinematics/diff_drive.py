@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import offset, positive
 from diffdrive_jacobian.kinematics._dimensions import (
     angle_and_radius,
     dimensions,
     heading_and_dimensions,
 )
-from diffdrive_jacobian.kinematics._elementary import (
+from diffdrive_jacobian.numerics.checks import offset, positive
+from diffdrive_jacobian.numerics.elementary import (
     agree,
     alike,
     components,

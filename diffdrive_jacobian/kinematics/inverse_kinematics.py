@@ -33,10 +33,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import array, floats, leading, not_negative, number, positive
-from diffdrive_jacobian.kinematics._elementary import agree, components, vector, wrapped
 from diffdrive_jacobian.kinematics._ik_search import Search
 from diffdrive_jacobian.kinematics._ik_task import Difference, Floats, Function, Task
+from diffdrive_jacobian.numerics.checks import array, floats, leading, not_negative, number, positive
+from diffdrive_jacobian.numerics.elementary import agree, components, vector, wrapped
 
 METHODS = ('newton', 'transpose', 'levenberg_marquardt')
 

@@ -41,8 +41,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics import _singular_values
 from diffdrive_jacobian.kinematics._adjugate import EPS, adjugate, refuse_singular
-from diffdrive_jacobian.kinematics._checks import array, leading, not_negative, positive
-from diffdrive_jacobian.kinematics._elementary import agree, matrix, operand
 from diffdrive_jacobian.kinematics._singular_values import CUTOFF, FILTER, joint_velocities
 from diffdrive_jacobian.kinematics._task_checks import (
     checked_damping,
@@ -57,6 +55,8 @@ from diffdrive_jacobian.kinematics.secondary_tasks import (
     manipulability_gradient,
 )
 from diffdrive_jacobian.kinematics.task_priority import limit_velocity, prioritized
+from diffdrive_jacobian.numerics.checks import array, leading, not_negative, positive
+from diffdrive_jacobian.numerics.elementary import agree, matrix, operand
 
 __all__ = [
     'CUTOFF',

@@ -21,8 +21,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics import se2
-from diffdrive_jacobian.kinematics._checks import array, number, positive
-from diffdrive_jacobian.kinematics._elementary import (
+from diffdrive_jacobian.kinematics.diff_drive import (
+    wheel_to_body,
+    wheel_to_body_jacobian,
+    wheel_to_world_jacobian,
+)
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
+from diffdrive_jacobian.numerics.checks import array, number, positive
+from diffdrive_jacobian.numerics.elementary import (
     agree,
     components,
     cos,
@@ -31,12 +37,6 @@ from diffdrive_jacobian.kinematics._elementary import (
     sin,
     vector,
 )
-from diffdrive_jacobian.kinematics.diff_drive import (
-    wheel_to_body,
-    wheel_to_body_jacobian,
-    wheel_to_world_jacobian,
-)
-from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 
 
 @dataclass(frozen=True, eq=False)

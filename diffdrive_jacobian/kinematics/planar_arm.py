@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._adjugate import EPS, refuse_singular
-from diffdrive_jacobian.kinematics._checks import array, positive
-from diffdrive_jacobian.kinematics._elementary import (
+from diffdrive_jacobian.numerics.checks import array, positive
+from diffdrive_jacobian.numerics.elementary import (
     agree,
     components,
     cos,

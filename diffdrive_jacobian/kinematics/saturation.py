@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from diffdrive_jacobian.kinematics._checks import (
+from diffdrive_jacobian.numerics.checks import (
     equal,
     floats,
     hashable,
@@ -24,7 +24,7 @@ from diffdrive_jacobian.kinematics._checks import (
     positive,
     read_only,
 )
-from diffdrive_jacobian.kinematics._elementary import agree, alike, operand, where
+from diffdrive_jacobian.numerics.elementary import agree, alike, operand, where
 
 Select = Callable[..., Any]
 """`max` or `min` of floats, or of arrays element by element."""

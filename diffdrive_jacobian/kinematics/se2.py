@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics import _elementary
-from diffdrive_jacobian.kinematics._checks import array
-from diffdrive_jacobian.kinematics._elementary import (
+from diffdrive_jacobian.numerics import elementary
+from diffdrive_jacobian.numerics.checks import array
+from diffdrive_jacobian.numerics.elementary import (
     agree,
     components,
     cos,
@@ -61,7 +61,7 @@ def sinc(angle: ArrayLike) -> Any:
     Raises:
         ValueError: An angle is infinite or NaN.
     """
-    return _elementary.sinc(operand('angle', angle))
+    return elementary.sinc(operand('angle', angle))
 
 
 def exp(twist: ArrayLike) -> NDArray[np.float64]:
@@ -78,7 +78,7 @@ def exp(twist: ArrayLike) -> NDArray[np.float64]:
 
 
 def _exp(vx: Any, vy: Any, turn: Any) -> tuple[Any, ...]:
-    chord = _elementary.sinc(turn / 2.0)
+    chord = elementary.sinc(turn / 2.0)
     along, across = chord * cos(turn / 2.0), chord * sin(turn / 2.0)
     return along * vx - across * vy, across * vx + along * vy, wrapped(turn)
 
@@ -98,7 +98,7 @@ def log(pose: ArrayLike) -> NDArray[np.float64]:
 
 def _log(x: Any, y: Any, theta: Any) -> tuple[Any, ...]:
     turn = wrapped(theta)
-    along = cos(turn / 2.0) / _elementary.sinc(turn / 2.0)
+    along = cos(turn / 2.0) / elementary.sinc(turn / 2.0)
     return along * x + turn / 2.0 * y, along * y - turn / 2.0 * x, turn
 
 
@@ -192,9 +192,9 @@ def right_jacobian(twist: ArrayLike) -> NDArray[np.float64]:
 
 def _exp_coefficients(turn: Any) -> tuple[Any, ...]:
     """Compute sin(a)/a, (1 - cos(a))/a, (1 - cos(a))/a^2 and (a - sin(a))/a^2 of a turn a."""
-    chord = _elementary.sinc(turn / 2.0)
+    chord = elementary.sinc(turn / 2.0)
     across = chord * sin(turn / 2.0)
-    return chord * cos(turn / 2.0), across, chord * chord / 2.0, turn * _elementary.sinc_defect(turn)
+    return chord * cos(turn / 2.0), across, chord * chord / 2.0, turn * elementary.sinc_defect(turn)
 
 
 def homogeneous(pose: ArrayLike) -> NDArray[np.float64]:
@@ -240,6 +240,6 @@ def integrate(pose: ArrayLike, twist: ArrayLike, dt: ArrayLike) -> NDArray[np.fl
 
 def _arc(x: Any, y: Any, theta: Any, v: Any, omega: Any, dt: Any) -> tuple[Any, ...]:
     turn = omega * dt
-    chord = v * dt * _elementary.sinc(turn / 2.0)
+    chord = v * dt * elementary.sinc(turn / 2.0)
     heading = theta + turn / 2.0
     return x + chord * cos(heading), y + chord * sin(heading), wrapped(theta + turn)

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics import _singular_values
-from diffdrive_jacobian.kinematics._checks import array, leading
 from diffdrive_jacobian.kinematics._task_checks import finite_result
+from diffdrive_jacobian.numerics.checks import array, leading
 
 _STEP = float(np.finfo(np.float64).eps) ** (1.0 / 3.0)
 """Step of central differences, at which rounding and truncation errors are of the same size."""

@@ -17,8 +17,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import array, leading, number, positive, positive_or_infinite
-from diffdrive_jacobian.kinematics._elementary import operand, vector
 from diffdrive_jacobian.kinematics._singular_values import (
     gains,
     is_large,
@@ -33,6 +31,8 @@ from diffdrive_jacobian.kinematics._task_checks import (
     finite_result,
     weighted,
 )
+from diffdrive_jacobian.numerics.checks import array, leading, number, positive, positive_or_infinite
+from diffdrive_jacobian.numerics.elementary import operand, vector
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.kinematics._elementary import wrapped
+from diffdrive_jacobian.numerics.elementary import wrapped
 from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.reading.run import Run

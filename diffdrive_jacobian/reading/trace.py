@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.control.controllers import BUILT_IN
-from diffdrive_jacobian.kinematics._elementary import wrapped
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
 from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.numerics.elementary import wrapped
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.reading.reader import BagError
 from diffdrive_jacobian.reading.run import Run, Series

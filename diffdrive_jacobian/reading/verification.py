@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.kinematics._elementary import wrapped
 from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
 from diffdrive_jacobian.messages.conversion import MessageError, plausible_twist
+from diffdrive_jacobian.numerics.elementary import wrapped
 from diffdrive_jacobian.parameters.declaration import from_ros
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.reading.covariance_rule import NEITHER, recorded_model, rule, start_covariances

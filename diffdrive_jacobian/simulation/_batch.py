@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.controller import Controller, Law
 from diffdrive_jacobian.control.controllers import controller_of
-from diffdrive_jacobian.kinematics._checks import (
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits
+from diffdrive_jacobian.numerics.checks import (
     array,
     floats,
     function,
@@ -21,7 +22,6 @@ from diffdrive_jacobian.kinematics._checks import (
     number,
     positive,
 )
-from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

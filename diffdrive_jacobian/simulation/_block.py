@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from diffdrive_jacobian.kinematics._checks import floats
-from diffdrive_jacobian.kinematics._elementary import wrapped
 from diffdrive_jacobian.kinematics.saturation import saturate
+from diffdrive_jacobian.numerics.checks import floats
+from diffdrive_jacobian.numerics.elementary import wrapped
 from diffdrive_jacobian.simulation._batch import Array, Batch, Mask, Outcomes, Rows
 
 LOST = 1e6

@@ -15,7 +15,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
-from diffdrive_jacobian.kinematics._checks import not_negative, number
+from diffdrive_jacobian.numerics.checks import not_negative, number
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 STEP = 20_000_000

@@ -21,8 +21,8 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import not_negative, number, positive
-from diffdrive_jacobian.kinematics._elementary import components
+from diffdrive_jacobian.numerics.checks import not_negative, number, positive
+from diffdrive_jacobian.numerics.elementary import components
 from diffdrive_jacobian.simulation._noise_moments import (
     RADIUS,
     SHORT_NOISE,

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import floats, not_negative, positive
-from diffdrive_jacobian.kinematics._elementary import (
+from diffdrive_jacobian.numerics.checks import floats, not_negative, positive
+from diffdrive_jacobian.numerics.elementary import (
     agree,
     components,
     cos,

@@ -24,8 +24,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._checks import array
 from diffdrive_jacobian.kinematics.se2 import compose, inverse, log
+from diffdrive_jacobian.numerics.checks import array
 from diffdrive_jacobian.simulation.odometry_noise import covariance_entries
 
 Array = NDArray[np.float64]

@@ -30,7 +30,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._arc import arc_end
-from diffdrive_jacobian.kinematics._checks import (
+from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
+from diffdrive_jacobian.kinematics.saturation import saturate
+from diffdrive_jacobian.kinematics.se2 import compose
+from diffdrive_jacobian.numerics.checks import (
     MAX_NANOSECONDS,
     array,
     floats,
@@ -39,10 +42,7 @@ from diffdrive_jacobian.kinematics._checks import (
     positive,
     read_only,
 )
-from diffdrive_jacobian.kinematics._elementary import components, operand
-from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
-from diffdrive_jacobian.kinematics.saturation import saturate
-from diffdrive_jacobian.kinematics.se2 import compose
+from diffdrive_jacobian.numerics.elementary import components, operand
 from diffdrive_jacobian.simulation._uncertainty import Uncertainty
 from diffdrive_jacobian.simulation.actuators import Settling, Speeds
 from diffdrive_jacobian.simulation.exact_moments import Moments, gaussian_moments

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffdrive_jacobian.kinematics._checks import instance, nanoseconds, not_negative, number, positive
-from diffdrive_jacobian.kinematics._elementary import components
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits, saturate
+from diffdrive_jacobian.numerics.checks import instance, nanoseconds, not_negative, number, positive
+from diffdrive_jacobian.numerics.elementary import components
 from diffdrive_jacobian.simulation.actuators import Actuators
 from diffdrive_jacobian.simulation.slip import Drift
 

@@ -36,7 +36,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from diffdrive_jacobian.kinematics._arc import arc_end
-from diffdrive_jacobian.kinematics._checks import number, positive, short
+from diffdrive_jacobian.numerics.checks import number, positive, short
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 CELL = 20_000_000

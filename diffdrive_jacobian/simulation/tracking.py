@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.control.resolved_rate import StraightLine, resolved_rate
-from diffdrive_jacobian.kinematics._checks import array, leading, not_negative, number, positive
 from diffdrive_jacobian.kinematics._task_checks import weighted
 from diffdrive_jacobian.kinematics.inverse_velocity import damping as damping_factor
 from diffdrive_jacobian.kinematics.inverse_velocity import manipulability
+from diffdrive_jacobian.numerics.checks import array, leading, not_negative, number, positive
 
 Array = NDArray[np.float64]
 MAX_STEPS = 1e8

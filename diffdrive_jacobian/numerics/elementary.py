@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.kinematics._checks import FLOAT64, finite, floats, leading
+from diffdrive_jacobian.numerics.checks import FLOAT64, finite, floats, leading
 
 TURN = 2.0 * math.pi
 # Taylor coefficients of sinc_defect in the square of its argument, (-1)^n / (2n + 3)!

@@ -1,0 +1,1 @@
+"""What equations are written with: the decorator `formula`, elementary functions, and checks of arguments."""
