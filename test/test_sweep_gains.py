@@ -117,22 +117,6 @@ def final_heading_error(kp, kv):
     return low
 
 
-@pytest.mark.parametrize('name', SweptControllers())
-def test_the_fast_form_of_the_law_is_used(name):
-    """The law itself is called only to check that it accepts arrays and the gains."""
-    calls = []
-    controller = find_controller(name)
-
-    def counted(function, kind):
-        return lambda *arguments: calls.append(kind) or function(*arguments)
-
-    law, steer = counted(controller.law, 'law'), counted(controller.steer, 'steer')
-    other = replace(controller, name='counted', law=law, steer=steer)
-    sweep(replace(SMALL, grid=2, controller=other), lambda done: None)
-    assert calls.count('law') == 2
-    assert calls.count('steer') > 100
-
-
 def test_beyond_the_boundary_it_spirals_in_as_the_theory_says():
     """The distance decays as exp(-kv cos^2(e) t), with the heading error e at which it settles."""
     setup = Setup(kp=(0.5, 2.0), kv=(0.5, 2.0), grid=4, starts=4, duration=80.0)

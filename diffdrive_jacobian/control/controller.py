@@ -137,10 +137,6 @@ class Controller:
     """Line that is drawn in the picture of a sweep."""
     reference_gains: ReferenceGains | None = None
     """Gains that are marked in the picture of a sweep."""
-    steer: Law | None = None
-    """Faster form of the law for batches, `steer(x, y, turn, *gains) -> (v, omega)`. Its arguments are
-    the goal's position in the body frame (m) and its heading relative to the robot's (rad, not wrapped;
-    0 without `takes_heading`). They are finite and need not be checked."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -151,8 +147,6 @@ class Controller:
             )
         function('law', self.law)
         function('advice', self.advice)
-        if self.steer is not None:
-            function('steer', self.steer)
         instance('summary', self.summary, str)
         boolean('takes_heading', self.takes_heading)
         if not isinstance(self.gains, tuple) or not all(gain in GAINS for gain in self.gains):
@@ -189,29 +183,22 @@ class Controller:
             are arrays or tuples of floats. It raises LawError if the law raises an exception or does
             not return two finite numbers.
         """
-        law, values, size = self.law, self.values(gains), 3 if self.takes_heading else 2
-        two = len(values) == 2
-        first, second = values if two else (0.0, 0.0)
-        # The laws of this package accept tuples, which take less time. Others may index arrays.
-        accepts_tuples = str(getattr(law, '__module__', '')).startswith(f'{__package__}.')
+        # An equation is given floats that are checked already; another law may index arrays.
+        equation = getattr(self.law, 'formula', None)
+        values, size = self.values(gains), 3 if self.takes_heading else 2
 
         def bound(pose: Any, goal: Any) -> tuple[float, float]:
-            if not accepts_tuples:
-                pose, goal = np.asarray(pose), np.asarray(goal)
             try:
-                if len(goal) != size:
-                    goal = goal[:size]
-                # Unpacking the gains would take a tenth of the call.
-                twist = law(pose, goal, first, second) if two else law(pose, goal, *values)
+                if equation is None:
+                    twist = self.law(np.asarray(pose), np.asarray(goal[:size]), *values)
+                else:
+                    twist = equation(pose, goal[:size], *values)
             except Exception as error:
                 raise LawError(
                     f'the law of controller {self.name!r} failed: {_reason(error)}'
                 ) from error
             try:
-                v, omega = twist
-                if type(v) is type(omega) is float and isfinite(v + omega):
-                    return v, omega
-                v, omega = _number(v), _number(omega)
+                v, omega = map(_number, twist)
             except (TypeError, ValueError) as error:
                 raise LawError(
                     f'the law of controller {self.name!r} must return (v, omega), two numbers, '
@@ -224,7 +211,6 @@ class Controller:
                 )
             return v, omega
 
-        vars(bound)['accepts_tuples'] = True
         return bound
 
 

@@ -13,18 +13,17 @@ Source: document B, "Let's add a control point offset"; doc/mathematics.md, "Dif
 from __future__ import annotations
 
 from collections.abc import Iterator
-from math import isfinite
-from typing import Any
-
-from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.control.controller import Controller, GainValues
+from diffdrive_jacobian.kinematics import diff_drive
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import offset
-from diffdrive_jacobian.numerics.elementary import agree, components, cos, evaluated, operand, sin
+from diffdrive_jacobian.numerics.elementary import cos, sin
+from diffdrive_jacobian.numerics.formula import Number, Vector, formula
 
 
-def offset_point(state: ArrayLike, goal: ArrayLike, k: Any, d: Any) -> tuple[Any, Any]:
+@formula('(3),(2),(),() -> (),()', d=offset)
+def offset_point(state: Vector, goal: Vector, k: Number, d: Number) -> tuple[Number, Number]:
     """Compute the twist that drives the offset point along a straight line: `p_d_dot = k (goal - p_d)`.
 
     As wheel speeds the law is `w = J_d^-1 k (goal - p_d)`. Here it is the body twist `u = J_w w`:
@@ -46,39 +45,13 @@ def offset_point(state: ArrayLike, goal: ArrayLike, k: Any, d: Any) -> tuple[Any
         ValueError: d is 0, the last axis of state or goal has a wrong length, shapes do not broadcast,
             something is not finite, or the twist overflows.
     """
-    # Tuples are unpacked here, because a call would take as long as the law.
-    x, y, theta = (
-        state if isinstance(state, tuple) and len(state) == 3 else components('state', state, 3)
-    )
-    x_goal, y_goal = goal if isinstance(goal, tuple) and len(goal) == 2 else components('goal', goal, 2)
-    if (
-        type(x) is type(y) is type(theta) is type(x_goal) is type(y_goal) is float
-        and type(k) is type(d) is float
-        and d != 0.0
-        and isfinite(x + y + theta + x_goal + y_goal + k + d)
-    ):
-        v, omega = _law(x, y, theta, x_goal, y_goal, k, d)
-        if isfinite(v + omega):
-            return v, omega
-    if isinstance(state, tuple):
-        x, y, theta = components('state', state, 3)
-    if isinstance(goal, tuple):
-        x_goal, y_goal = components('goal', goal, 2)
-    k, d = operand('k', k), operand('d', d, offset)
-    single = agree(state=x, goal=x_goal, k=k, d=d)
-    v, omega = evaluated(single, 'state, goal, k and d', _law, x, y, theta, x_goal, y_goal, k, d)
-    return v, omega
-
-
-def _law(x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any, k: Any, d: Any) -> tuple[Any, Any]:
-    dx, dy = x_goal - x, y_goal - y
-    c, s = cos(theta), sin(theta)
-    return steer(c * dx + s * dy, c * dy - s * dx, 0.0, k, d)
-
-
-def steer(x: Any, y: Any, turn: Any, k: Any, d: Any) -> tuple[Any, Any]:
-    """Compute the law for a goal at `[x, y]` in the body frame (m), unchecked; `turn` is ignored."""
-    return k * (x - d), k * y / d
+    x_d, y_d = diff_drive.offset_point.formula(state, d)
+    x_goal, y_goal = goal
+    dx, dy = x_goal - x_d, y_goal - y_d
+    theta = state[2]
+    a = cos(theta) * dx + sin(theta) * dy
+    b = cos(theta) * dy - sin(theta) * dx
+    return k * a, k * b / d
 
 
 def _advice(gains: GainValues, limits: VelocityLimits) -> Iterator[str]:
@@ -96,5 +69,4 @@ CONTROLLER = Controller(
     gains=('kv', 'offset'),
     offset='offset',
     advice=_advice,
-    steer=steer,
 )

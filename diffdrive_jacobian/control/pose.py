@@ -17,32 +17,21 @@ vehicles via Lyapunov techniques", IEEE Robotics & Automation Magazine 2(1), 199
 from __future__ import annotations
 
 from collections.abc import Iterator
-from math import isfinite
-from typing import Any
-
-from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.control.controller import Boundary, Controller, GainValues
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import positive
-from diffdrive_jacobian.numerics.elementary import (
-    agree,
-    arctan2,
-    components,
-    cos,
-    evaluated,
-    minimum,
-    operand,
-    sin,
-    sinc,
-    wrapped,
-)
+from diffdrive_jacobian.numerics.elementary import atan2, cos, hypot, minimum, sinc, where, wrap
+from diffdrive_jacobian.numerics.formula import Number, Vector, formula
 
 FASTER = 2.0
 """Ratio of the default rates at which heading and distance converge [-]."""
 
 
-def go_to_pose(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any, h: Any = None) -> tuple[Any, Any]:
+@formula('(3),(3),(),(),() -> (),()', Kp=positive, Kv=positive, h=positive)
+def go_to_pose(
+    state: Vector, goal: Vector, Kp: Number, Kv: Number, h: Number = None
+) -> tuple[Number, Number]:
     """Compute the twist that drives a unicycle to a position and a heading.
 
     `v = Kv rho cos(alpha)`, as in document A's law, and
@@ -75,63 +64,24 @@ def go_to_pose(state: ArrayLike, goal: ArrayLike, Kp: Any, Kv: Any, h: Any = Non
         ValueError: A gain is not positive, the last axis of state or goal has a wrong length, shapes do
             not broadcast, something is not finite, or the twist overflows.
     """
-    # Tuples are unpacked here, because a call would take as long as the law.
-    x, y, theta = (
-        state if isinstance(state, tuple) and len(state) == 3 else components('state', state, 3)
-    )
-    x_goal, y_goal, heading = (
-        goal if isinstance(goal, tuple) and len(goal) == 3 else components('goal', goal, 3)
-    )
-    if (
-        type(x) is type(y) is type(theta) is type(x_goal) is type(y_goal) is type(heading) is float
-        and type(Kp) is type(Kv) is float
-        and Kp > 0.0 < Kv
-        and (h is None or (type(h) is float and h > 0.0))
-        and isfinite(x + y + theta + x_goal + y_goal + heading + Kp + Kv + (h or 0.0))
-    ):
-        v, omega = _law(x, y, theta, x_goal, y_goal, heading, Kp, Kv, h)
-        if isfinite(v + omega):
-            return v, omega
-    if isinstance(state, tuple):
-        x, y, theta = components('state', state, 3)
-    if isinstance(goal, tuple):
-        x_goal, y_goal, heading = components('goal', goal, 3)
-    Kp, Kv = operand('Kp', Kp, positive), operand('Kv', Kv, positive)
-    names = 'state, goal, Kp and Kv'
+    x, y, theta = state
+    x_goal, y_goal, heading = goal
     if h is None:
-        single = agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv)
-    else:
-        h, names = operand('h', h, positive), 'state, goal, Kp, Kv and h'
-        single = agree(state=x, goal=x_goal, Kp=Kp, Kv=Kv, h=h)
-    v, omega = evaluated(single, names, _law, x, y, theta, x_goal, y_goal, heading, Kp, Kv, h)
-    return v, omega
+        h = default_weight(Kp, Kv)
+    rho = hypot(x_goal - x, y_goal - y)
+    bearing = atan2(y_goal - y, x_goal - x)
+    alpha, phi = wrap(bearing - theta), wrap(bearing - heading)
+    v = Kv * rho * cos(alpha)
+    omega = Kp * alpha + Kv * cos(alpha) * sinc(alpha) * (alpha + h * phi)
+    # On the goal there is no bearing.
+    return v, where(rho > 0.0, omega, 0.0)
 
 
-def _law(
-    x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any, heading: Any, Kp: Any, Kv: Any, h: Any
-) -> tuple[Any, Any]:
-    dx, dy = x_goal - x, y_goal - y
-    c, s = cos(theta), sin(theta)
-    # Without negative zeros the angle of (0, 0) is 0.
-    return steer(c * dx + s * dy + 0.0, c * dy - s * dx + 0.0, heading - theta, Kp, Kv, h)
-
-
-def steer(x: Any, y: Any, turn: Any, Kp: Any, Kv: Any, h: Any = None) -> tuple[Any, Any]:
-    """Compute the law for a goal at `[x, y]` (m) with the heading `turn` (rad) in the body frame,
-    unchecked.
-    """
-    if h is None:
-        least = minimum(Kp, 2.0 * FASTER * Kv)
-        # The parabola is continued by its tangent. In both forms h Kv cannot overflow.
-        weight = least / (4.0 * Kv) * least + FASTER * (Kp - least)
-    else:
-        weight = h * Kv
-    alpha = arctan2(y, x)
-    # cos(alpha) sin(alpha) / alpha, defined at zero too.
-    bend = cos(alpha) * sinc(alpha)
-    away = (x != 0.0) | (y != 0.0)
-    omega = Kp * alpha + bend * (Kv * alpha + weight * wrapped(alpha - turn))
-    return Kv * x, omega * away
+def default_weight(Kp: Number, Kv: Number) -> Number:
+    """Compute the weight of the heading that `go_to_pose` takes by default, unchecked."""
+    least = minimum(Kp, 2.0 * FASTER * Kv)
+    # The parabola is continued by its tangent.
+    return (least / (2.0 * Kv)) ** 2 + FASTER * (Kp - least) / Kv
 
 
 def _advice(gains: GainValues, limits: VelocityLimits) -> Iterator[str]:
@@ -149,5 +99,4 @@ CONTROLLER = Controller(
     takes_heading=True,
     advice=_advice,
     boundary=Boundary(ratio=2.0, beyond='with a larger kv the robot turns on the spot at the goal'),
-    steer=steer,
 )

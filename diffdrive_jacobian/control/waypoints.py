@@ -101,9 +101,7 @@ class Waypoints:
         while not here.turning:
             goal = here._goal
             if not arrival.reached(x, y, theta, goal[0], goal[1]):
-                if is_tuple and hasattr(law, 'accepts_tuples'):
-                    return here, law(pose, goal)
-                return here, law(pose, here._row)
+                return here, law(pose, goal if is_tuple else here._row)
             if here.index + 1 < len(here.poses):
                 here = here._progressed(here.index + 1, turning=False)
             elif arrival.use_heading:

@@ -14,25 +14,18 @@ Source: document C, "Kinematic structure of mobile robots"; doc/mathematics.md, 
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from math import pi
 
-from diffdrive_jacobian.kinematics._dimensions import angle_and_radius
 from diffdrive_jacobian.numerics.checks import positive
-from diffdrive_jacobian.numerics.elementary import (
-    agree,
-    cos,
-    matrix,
-    operand,
-    sin,
-    vector,
-)
+from diffdrive_jacobian.numerics.elementary import cos, sin
+from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, formula
 
-AT_GROUND = np.pi
+AT_GROUND = pi
 """The angle phi of the point that touches the ground (rad)."""
 
 
-def wheel_contact_position(x: ArrayLike, phi: ArrayLike, r: ArrayLike) -> NDArray[np.float64]:
+@formula('(),(),() -> (3)', r=positive)
+def wheel_contact_position(x: Number, phi: Number, r: Number) -> Entries:
     """Return the position of a point of the rim: `[x + r sin(phi), r + r cos(phi), 0]` (C).
 
     Args:
@@ -46,12 +39,11 @@ def wheel_contact_position(x: ArrayLike, phi: ArrayLike, r: ArrayLike) -> NDArra
     Raises:
         ValueError: r is not positive and finite, or x or phi is not finite.
     """
-    x, (phi, r) = operand('x', x), angle_and_radius('phi', phi, r)
-    agree(x=x, phi=phi, r=r)
-    return vector(x + r * sin(phi), r + r * cos(phi), 0.0)
+    return [x + r * sin(phi), r + r * cos(phi), 0.0]
 
 
-def wheel_contact_jacobian(phi: ArrayLike, r: ArrayLike) -> NDArray[np.float64]:
+@formula('(),() -> (3,2)', r=positive)
+def wheel_contact_jacobian(phi: Number, r: Number) -> Rows:
     """Map `[x_dot, phi_dot]` to the velocity of the point: `[[1, r cos], [0, -r sin], [0, 0]]` (C).
 
     Args:
@@ -64,11 +56,15 @@ def wheel_contact_jacobian(phi: ArrayLike, r: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ValueError: r is not positive and finite, or phi is not finite.
     """
-    phi, r = angle_and_radius('phi', phi, r)
-    return matrix(3, 2, 1.0, r * cos(phi), 0.0, -(r * sin(phi)), 0.0, 0.0)
+    return [
+        [1.0, r * cos(phi)],
+        [0.0, -r * sin(phi)],
+        [0.0, 0.0],
+    ]
 
 
-def rolling_direction(r: ArrayLike) -> NDArray[np.float64]:
+@formula('() -> (2)', r=positive)
+def rolling_direction(r: Number) -> Entries:
     """Return the velocity of a rolling wheel: `[r, 1]` spans the null space at the ground (C).
 
     Args:
@@ -80,4 +76,4 @@ def rolling_direction(r: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ValueError: r is not positive and finite.
     """
-    return vector(operand('r', r, positive), 1.0)
+    return [r, 1.0]

@@ -15,32 +15,13 @@ Source: document A, equations (4)-(8); documents B and E; doc/mathematics.md, "D
 
 from __future__ import annotations
 
-from math import isfinite
-from typing import Any
-
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
-from diffdrive_jacobian.kinematics._dimensions import (
-    angle_and_radius,
-    dimensions,
-    heading_and_dimensions,
-)
 from diffdrive_jacobian.numerics.checks import offset, positive
-from diffdrive_jacobian.numerics.elementary import (
-    agree,
-    alike,
-    components,
-    cos,
-    evaluated,
-    matrix,
-    operand,
-    sin,
-    stack,
-)
+from diffdrive_jacobian.numerics.elementary import cos, product, sin
+from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
 
-def unicycle_jacobian(theta: ArrayLike) -> NDArray[np.float64]:
+@formula('() -> (3,2)')
+def unicycle_jacobian(theta: Number) -> Rows:
     """Map the body twist to the velocity in the world: `q_dot = S(theta) u` (A(4)-(7)).
 
     Args:
@@ -49,11 +30,15 @@ def unicycle_jacobian(theta: ArrayLike) -> NDArray[np.float64]:
     Returns:
         S, shape (..., 3, 2). Its rank is 2 and its singular values are 1, 1 for every heading.
     """
-    theta = operand('theta', theta)
-    return matrix(3, 2, cos(theta), 0.0, sin(theta), 0.0, 0.0, 1.0)
+    return [
+        [cos(theta), 0.0],
+        [sin(theta), 0.0],
+        [0.0, 1.0],
+    ]
 
 
-def wheel_to_body_jacobian(r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
+@formula('(),() -> (2,2)', r=positive, L=positive)
+def wheel_to_body_jacobian(r: Number, L: Number) -> Rows:
     """Map wheel speeds to the body twist: `u = J_w w`, `J_w = [[r/2, r/2], [r/L, -r/L]]` (A(8), E).
 
     Args:
@@ -66,14 +51,14 @@ def wheel_to_body_jacobian(r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    r, L, single = dimensions(r, L)
-    (ratio,) = evaluated(single, 'r and L', lambda r, L: (r / L,), r, L)
-    radius: Any = r
-    half = radius / 2.0
-    return matrix(2, 2, half, half, ratio, -ratio)
+    return [
+        [r / 2.0, r / 2.0],
+        [r / L, -r / L],
+    ]
 
 
-def body_to_wheel_jacobian(r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
+@formula('(),() -> (2,2)', r=positive, L=positive)
+def body_to_wheel_jacobian(r: Number, L: Number) -> Rows:
     """Map the body twist to wheel speeds: `w = J_w^-1 u`, `[[1/r, L/(2r)], [1/r, -L/(2r)]]` (A, E).
 
     Args:
@@ -86,12 +71,14 @@ def body_to_wheel_jacobian(r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    r, L, single = dimensions(r, L)
-    along, across = evaluated(single, 'r and L', lambda r, L: (1.0 / r, L / (2.0 * r)), r, L)
-    return matrix(2, 2, along, across, along, -across)
+    return [
+        [1.0 / r, L / (2.0 * r)],
+        [1.0 / r, -L / (2.0 * r)],
+    ]
 
 
-def wheel_to_world_jacobian(theta: ArrayLike, r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
+@formula('(),(),() -> (3,2)', r=positive, L=positive)
+def wheel_to_world_jacobian(theta: Number, r: Number, L: Number) -> Rows:
     """Map wheel speeds to the velocity in the world: the whole chain `q_dot = S(theta) J_w w` (A, B, E).
 
     Args:
@@ -105,17 +92,13 @@ def wheel_to_world_jacobian(theta: ArrayLike, r: ArrayLike, L: ArrayLike) -> NDA
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    theta, r, L, single = heading_and_dimensions(theta, r, L)
-    x, y, turn = evaluated(single, 'r and L', _wheel_to_world, theta, r, L)
-    return matrix(3, 2, x, x, y, y, turn, -turn)
+    S = unicycle_jacobian.formula(theta)
+    J_w = wheel_to_body_jacobian.formula(r, L)
+    return product(S, J_w)
 
 
-def _wheel_to_world(theta: Any, r: Any, L: Any) -> tuple[Any, Any, Any]:
-    half = r / 2.0
-    return cos(theta) * half, sin(theta) * half, r / L
-
-
-def single_wheel_jacobian(theta: ArrayLike, r: ArrayLike) -> NDArray[np.float64]:
+@formula('(),() -> (3,2)', r=positive)
+def single_wheel_jacobian(theta: Number, r: Number) -> Rows:
     """Map the speed of one driven wheel and the yaw rate to the velocity in the world (B, "Unicycle").
 
     Args:
@@ -128,11 +111,15 @@ def single_wheel_jacobian(theta: ArrayLike, r: ArrayLike) -> NDArray[np.float64]
     Raises:
         ValueError: r is not positive and finite.
     """
-    theta, r = angle_and_radius('theta', theta, r)
-    return matrix(3, 2, r * cos(theta), 0.0, r * sin(theta), 0.0, 0.0, 1.0)
+    return [
+        [r * cos(theta), 0.0],
+        [r * sin(theta), 0.0],
+        [0.0, 1.0],
+    ]
 
 
-def wheel_to_position_jacobian(theta: ArrayLike, r: ArrayLike, L: ArrayLike) -> NDArray[np.float64]:
+@formula('(),(),() -> (2,2)', r=positive, L=positive)
+def wheel_to_position_jacobian(theta: Number, r: Number, L: Number) -> Rows:
     """Map wheel speeds to the velocity of the axle centre alone: `[x_dot, y_dot] = S[:2] J_w w` (B).
 
     **It has rank 1 for every heading, radius and separation**: the axle centre moves along the
@@ -150,12 +137,13 @@ def wheel_to_position_jacobian(theta: ArrayLike, r: ArrayLike, L: ArrayLike) -> 
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    theta, r, L, single = heading_and_dimensions(theta, r, L)
-    x, y, _ = evaluated(single, 'r and L', _wheel_to_world, theta, r, L)
-    return matrix(2, 2, x, x, y, y)
+    S = unicycle_jacobian.formula(theta)
+    J_w = wheel_to_body_jacobian.formula(r, L)
+    return product(S[:2], J_w)
 
 
-def offset_point(pose: ArrayLike, d: ArrayLike) -> NDArray[np.float64]:
+@formula('(3),() -> (2)')
+def offset_point(pose: Vector, d: Number) -> Entries:
     """Return the point at x = d in the body frame: `[x + d cos, y + d sin]` in the world (B).
 
     Args:
@@ -168,23 +156,12 @@ def offset_point(pose: ArrayLike, d: ArrayLike) -> NDArray[np.float64]:
     Raises:
         ValueError: Something is not finite, or shapes do not broadcast.
     """
-    x, y, theta = components('pose', pose, 3)
-    d = operand('d', d)
-    single = type(x) is type(d) is float or agree(pose=x, d=d)
-    if single:
-        point = _point(x, y, theta, d)
-        if isfinite(point[0] + point[1]):
-            return np.array(point)
-    return stack(*evaluated(single, 'pose and d', _point, x, y, theta, d))
+    x, y, theta = pose
+    return [x + d * cos(theta), y + d * sin(theta)]
 
 
-def _point(x: Any, y: Any, theta: Any, d: Any) -> tuple[Any, Any]:
-    return x + d * cos(theta), y + d * sin(theta)
-
-
-def offset_point_jacobian(
-    theta: ArrayLike, r: ArrayLike, L: ArrayLike, d: ArrayLike
-) -> NDArray[np.float64]:
+@formula('(),(),(),() -> (2,2)', r=positive, L=positive, d=offset)
+def offset_point_jacobian(theta: Number, r: Number, L: Number, d: Number) -> Rows:
     """Map wheel speeds to the velocity of the offset point (B).
 
     `J_d = R(theta) [[r/2, r/2], [d r/L, -d r/L]]`. Its determinant is `-d r^2 / L`, so it is
@@ -202,24 +179,19 @@ def offset_point_jacobian(
     Raises:
         ValueError: r or L is not positive and finite, d is 0 or not finite.
     """
-    theta, r, L, single = heading_and_dimensions(theta, r, L)
-    d = operand('d', d, offset)
-    single = (single and type(d) is float) or agree(theta=theta, r=r, L=L, d=d)
-    return matrix(2, 2, *evaluated(single, 'r, L and d', _offset_jacobian, theta, r, L, d))
+    R = [
+        [cos(theta), -sin(theta)],
+        [sin(theta), cos(theta)],
+    ]
+    in_body = [
+        [r / 2.0, r / 2.0],
+        [d * r / L, -d * r / L],
+    ]
+    return product(R, in_body)
 
 
-def _offset_jacobian(theta: Any, r: Any, L: Any, d: Any) -> tuple[Any, Any, Any, Any]:
-    c, s = cos(theta), sin(theta)
-    along, across = r / 2.0, d * r / L
-    return (
-        c * along - s * across,
-        c * along + s * across,
-        s * along + c * across,
-        s * along - c * across,
-    )
-
-
-def body_to_wheel(v: Any, omega: Any, r: Any, L: Any) -> tuple[Any, Any]:
+@formula('(),(),(),() -> (),()', r=positive, L=positive)
+def body_to_wheel(v: Number, omega: Number, r: Number, L: Number) -> tuple[Number, Number]:
     """Return the wheel speeds of a body twist, `J_w^-1 u` in scalar form (A, inverse of (8)).
 
     Args:
@@ -235,27 +207,13 @@ def body_to_wheel(v: Any, omega: Any, r: Any, L: Any) -> tuple[Any, Any]:
         ValueError: r or L is not positive and finite, v or omega is not finite, shapes do not
             broadcast, or a wheel speed overflows.
     """
-    if (
-        type(v) is type(omega) is type(r) is type(L) is float
-        and r > 0.0 < L
-        and isfinite(v + omega + r + L)
-    ):
-        omega_R, omega_L = _wheel_speeds(v, omega, r, L)
-        if isfinite(omega_R + omega_L):
-            return omega_R, omega_L
-    v, omega = operand('v', v), operand('omega', omega)
-    r, L = operand('r', r, positive), operand('L', L, positive)
-    single = agree(v=v, omega=omega, r=r, L=L)
-    omega_R, omega_L = evaluated(single, 'v, omega, r and L', _wheel_speeds, v, omega, r, L)
+    omega_R = (v + omega * L / 2.0) / r
+    omega_L = (v - omega * L / 2.0) / r
     return omega_R, omega_L
 
 
-def _wheel_speeds(v: Any, omega: Any, r: Any, L: Any) -> tuple[Any, Any]:
-    half = omega * L / 2.0
-    return (v + half) / r, (v - half) / r
-
-
-def wheel_to_body(omega_R: Any, omega_L: Any, r: Any, L: Any) -> tuple[Any, Any]:
+@formula('(),(),(),() -> (),()', r=positive, L=positive)
+def wheel_to_body(omega_R: Number, omega_L: Number, r: Number, L: Number) -> tuple[Number, Number]:
     """Return the body twist of wheel speeds, `J_w w` in scalar form (A(8)).
 
     Args:
@@ -271,26 +229,13 @@ def wheel_to_body(omega_R: Any, omega_L: Any, r: Any, L: Any) -> tuple[Any, Any]
         ValueError: r or L is not positive and finite, a wheel speed is not finite, shapes do not
             broadcast, or v or omega overflows.
     """
-    if (
-        type(omega_R) is type(omega_L) is type(r) is type(L) is float
-        and r > 0.0 < L
-        and isfinite(omega_R + omega_L + r + L)
-    ):
-        v, omega = _body_twist(omega_R, omega_L, r, L)
-        if isfinite(v + omega):
-            return v, omega
-    omega_R, omega_L = operand('omega_R', omega_R), operand('omega_L', omega_L)
-    r, L = operand('r', r, positive), operand('L', L, positive)
-    single = agree(omega_R=omega_R, omega_L=omega_L, r=r, L=L)
-    v, omega = evaluated(single, 'omega_R, omega_L, r and L', _body_twist, omega_R, omega_L, r, L)
+    v = r * (omega_R + omega_L) / 2.0
+    omega = r * (omega_R - omega_L) / L
     return v, omega
 
 
-def _body_twist(omega_R: Any, omega_L: Any, r: Any, L: Any) -> tuple[Any, Any]:
-    return r * (omega_R + omega_L) / 2.0, r * (omega_R - omega_L) / L
-
-
-def no_lateral_slip_constraint(theta: ArrayLike) -> NDArray[np.float64]:
+@formula('() -> (1,3)')
+def no_lateral_slip_constraint(theta: Number) -> Rows:
     """Return the row `A(q) = [sin, -cos, 0]` with `A(q) q_dot = 0`, no lateral slip (A, E).
 
     Args:
@@ -299,13 +244,11 @@ def no_lateral_slip_constraint(theta: ArrayLike) -> NDArray[np.float64]:
     Returns:
         The constraint, shape (..., 1, 3). Its null space is the range of S(theta).
     """
-    theta = operand('theta', theta)
-    return matrix(1, 3, sin(theta), -cos(theta), 0.0)
+    return [[sin(theta), -cos(theta), 0.0]]
 
 
-def rolling_constraints(
-    theta: ArrayLike, r: ArrayLike, L: ArrayLike
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+@formula('(),(),() -> (3,3),(3,2)', r=positive, L=positive)
+def rolling_constraints(theta: Number, r: Number, L: Number) -> tuple[Rows, Rows]:
     """Return the constraints of two rolling wheels, a pair with `A_q q_dot = A_w w` (E).
 
     Rows: no lateral slip, pure rolling of the right wheel, pure rolling of the left one. `A_q` is
@@ -322,12 +265,14 @@ def rolling_constraints(
     Raises:
         ValueError: r or L is not positive and finite.
     """
-    theta, r, L, single = heading_and_dimensions(theta, r, L)
-    if not single:
-        theta, r, L = alike(theta, r, L)
-    c, s = cos(theta), sin(theta)
-    separation: Any = L
-    half = separation / 2.0
-    over_pose = matrix(3, 3, s, -c, 0.0, c, s, half, c, s, -half)
-    over_wheels = matrix(3, 2, 0.0, 0.0, r, 0.0, 0.0, r)
-    return over_pose, over_wheels
+    A_q = [
+        [sin(theta), -cos(theta), 0.0],
+        [cos(theta), sin(theta), L / 2.0],
+        [cos(theta), sin(theta), -L / 2.0],
+    ]
+    A_w = [
+        [0.0, 0.0],
+        [r, 0.0],
+        [0.0, r],
+    ]
+    return A_q, A_w

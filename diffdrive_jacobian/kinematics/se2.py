@@ -12,26 +12,13 @@ Source: doc/mathematics.md, "Motion"; document B for the homogeneous transform.
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
 from diffdrive_jacobian.numerics import elementary
-from diffdrive_jacobian.numerics.checks import array
-from diffdrive_jacobian.numerics.elementary import (
-    agree,
-    components,
-    cos,
-    evaluated,
-    operand,
-    sin,
-    stack,
-    wrapped,
-)
+from diffdrive_jacobian.numerics.elementary import cos, sin, sinc_defect, wrap
+from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
 
-def wrap_angle(angle: ArrayLike) -> Any:
+@formula('() -> ()')
+def wrap_angle(angle: Number) -> Number:
     """Wrap angles to (-pi, pi].
 
     The result is exact with respect to the double nearest to 2 pi. An angle in the interval is returned
@@ -46,10 +33,11 @@ def wrap_angle(angle: ArrayLike) -> Any:
     Raises:
         ValueError: An angle is infinite or NaN.
     """
-    return wrapped(operand('angle', angle))
+    return wrap(angle)
 
 
-def sinc(angle: ArrayLike) -> Any:
+@formula('() -> ()')
+def sinc(angle: Number) -> Number:
     """Compute sin(angle) / angle, which is 1 at zero (not NumPy's sin(pi x) / (pi x)).
 
     Args:
@@ -61,11 +49,14 @@ def sinc(angle: ArrayLike) -> Any:
     Raises:
         ValueError: An angle is infinite or NaN.
     """
-    return elementary.sinc(operand('angle', angle))
+    return elementary.sinc(angle)
 
 
-def exp(twist: ArrayLike) -> NDArray[np.float64]:
+@formula('(3) -> (3)')
+def exp(twist: Vector) -> Entries:
     """Return the pose after motion from the identity with a constant twist for unit time.
+
+    `[V [vx, vy], a]` with the turn a and `V = [[sin(a)/a, (cos(a) - 1)/a], [(1 - cos(a))/a, sin(a)/a]]`.
 
     Args:
         twist: `[vx, vy, omega]`, shape (..., 3): velocity in B times time (m, m, rad).
@@ -73,17 +64,15 @@ def exp(twist: ArrayLike) -> NDArray[np.float64]:
     Returns:
         The pose reached, shape (..., 3), theta wrapped.
     """
-    vx, vy, turn = components('twist', twist, 3)
-    return stack(*evaluated(type(turn) is float, 'twist', _exp, vx, vy, turn))
+    vx, vy, turn = twist
+    # sin(a)/a and (1 - cos(a))/a, of the half angle, so that small turns lose no digits.
+    along = elementary.sinc(turn / 2.0) * cos(turn / 2.0)
+    across = elementary.sinc(turn / 2.0) * sin(turn / 2.0)
+    return [along * vx - across * vy, across * vx + along * vy, wrap(turn)]
 
 
-def _exp(vx: Any, vy: Any, turn: Any) -> tuple[Any, ...]:
-    chord = elementary.sinc(turn / 2.0)
-    along, across = chord * cos(turn / 2.0), chord * sin(turn / 2.0)
-    return along * vx - across * vy, across * vx + along * vy, wrapped(turn)
-
-
-def log(pose: ArrayLike) -> NDArray[np.float64]:
+@formula('(3) -> (3)')
+def log(pose: Vector) -> Entries:
     """Return the twist that reaches a pose from the identity in unit time, the inverse of `exp`.
 
     Args:
@@ -92,17 +81,14 @@ def log(pose: ArrayLike) -> NDArray[np.float64]:
     Returns:
         The twist `[vx, vy, omega]`, shape (..., 3), with the turn of least magnitude.
     """
-    x, y, theta = components('pose', pose, 3)
-    return stack(*evaluated(type(theta) is float, 'pose', _log, x, y, theta))
+    x, y, theta = pose
+    half = wrap(theta) / 2.0
+    along = cos(half) / elementary.sinc(half)
+    return [along * x + half * y, along * y - half * x, wrap(theta)]
 
 
-def _log(x: Any, y: Any, theta: Any) -> tuple[Any, ...]:
-    turn = wrapped(theta)
-    along = cos(turn / 2.0) / elementary.sinc(turn / 2.0)
-    return along * x + turn / 2.0 * y, along * y - turn / 2.0 * x, turn
-
-
-def compose(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
+@formula('(3),(3) -> (3)')
+def compose(first: Vector, second: Vector) -> Entries:
     """Return the composition of two poses: `second`, given in the frame B of `first`, in the frame W.
 
     Args:
@@ -112,29 +98,24 @@ def compose(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
     Returns:
         Pose of C in W, shape (..., 3), theta wrapped.
     """
-    x, y, theta = components('first', first, 3)
-    dx, dy, turn = components('second', second, 3)
-    single = agree(first=x, second=dx)
-    return stack(*evaluated(single, 'first and second', _compose, x, y, theta, dx, dy, turn))
+    x, y, theta = first
+    dx, dy, turn = second
+    return [
+        x + cos(theta) * dx - sin(theta) * dy,
+        y + sin(theta) * dx + cos(theta) * dy,
+        wrap(theta + turn),
+    ]
 
 
-def _compose(x: Any, y: Any, theta: Any, dx: Any, dy: Any, turn: Any) -> tuple[Any, ...]:
-    c, s = cos(theta), sin(theta)
-    return x + c * dx - s * dy, y + s * dx + c * dy, wrapped(theta + turn)
-
-
-def inverse(pose: ArrayLike) -> NDArray[np.float64]:
+@formula('(3) -> (3)')
+def inverse(pose: Vector) -> Entries:
     """Return the pose of W in B for the pose of B in W, shape (..., 3), theta wrapped."""
-    x, y, theta = components('pose', pose, 3)
-    return stack(*evaluated(type(theta) is float, 'pose', _inverse, x, y, theta))
+    x, y, theta = pose
+    return [-cos(theta) * x - sin(theta) * y, sin(theta) * x - cos(theta) * y, wrap(-theta)]
 
 
-def _inverse(x: Any, y: Any, theta: Any) -> tuple[Any, ...]:
-    c, s = cos(theta), sin(theta)
-    return -c * x - s * y, s * x - c * y, wrapped(-theta)
-
-
-def adjoint(pose: ArrayLike) -> NDArray[np.float64]:
+@formula('(3) -> (3,3)')
+def adjoint(pose: Vector) -> Rows:
     """Return the adjoint of a pose: it maps a twist in B to the same motion as a twist in W.
 
     `compose(pose, exp(twist)) = compose(exp(adjoint(pose) @ twist), pose)`.
@@ -145,16 +126,16 @@ def adjoint(pose: ArrayLike) -> NDArray[np.float64]:
     Returns:
         Matrices over `[vx, vy, omega]`, shape (..., 3, 3).
     """
-    x, y, theta = components('pose', pose, 3)
-    c, s = cos(theta), sin(theta)
-    matrix = np.zeros((*np.shape(x), 3, 3))
-    matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2] = c, -s, y
-    matrix[..., 1, 0], matrix[..., 1, 1], matrix[..., 1, 2] = s, c, -x
-    matrix[..., 2, 2] = 1.0
-    return matrix
+    x, y, theta = pose
+    return [
+        [cos(theta), -sin(theta), y],
+        [sin(theta), cos(theta), -x],
+        [0.0, 0.0, 1.0],
+    ]
 
 
-def left_jacobian(twist: ArrayLike) -> NDArray[np.float64]:
+@formula('(3) -> (3,3)')
+def left_jacobian(twist: Vector) -> Rows:
     """Return the left Jacobian of `exp`: `exp(t + d) = compose(exp(J d), exp(t))` to first order in d.
 
     Source: Barfoot and Furgale, "Associating uncertainty with three-dimensional poses for use in
@@ -166,38 +147,31 @@ def left_jacobian(twist: ArrayLike) -> NDArray[np.float64]:
     Returns:
         Jacobians J, shape (..., 3, 3).
     """
-    vx, vy, turn = components('twist', twist, 3)
-    single = type(turn) is float
-    along, across, bent, bowed = evaluated(single, 'twist', _exp_coefficients, turn)
-    matrix = np.zeros((*np.shape(turn), 3, 3))
-    matrix[..., 0, 0] = matrix[..., 1, 1] = along
-    matrix[..., 0, 1], matrix[..., 1, 0] = -across, across
-    # The bowed part grows with the turn, the bent one does not vanish with it.
-    matrix[..., 0, 2], matrix[..., 1, 2] = evaluated(
-        single,
-        'twist',
-        lambda: (bowed * vx + bent * vy, bowed * vy - bent * vx),
-    )
-    matrix[..., 2, 2] = 1.0
-    return matrix
+    vx, vy, turn = twist
+    chord = elementary.sinc(turn / 2.0)
+    # sin(a)/a, (1 - cos(a))/a, (1 - cos(a))/a^2 and (a - sin(a))/a^2 of the turn a.
+    along, across = chord * cos(turn / 2.0), chord * sin(turn / 2.0)
+    bent, bowed = chord * chord / 2.0, turn * sinc_defect(turn)
+    return [
+        [along, -across, bowed * vx + bent * vy],
+        [across, along, bowed * vy - bent * vx],
+        [0.0, 0.0, 1.0],
+    ]
 
 
-def right_jacobian(twist: ArrayLike) -> NDArray[np.float64]:
+@formula('(3) -> (3,3)')
+def right_jacobian(twist: Vector) -> Rows:
     """Return the right Jacobian of `exp`: `exp(t + d) = compose(exp(t), exp(J d))` to first order in d.
 
     Arguments and results as for `left_jacobian`, which is this one at the negative twist.
     """
-    return left_jacobian(-array('twist', twist, 3))
+    vx, vy, turn = twist
+    rows: Rows = left_jacobian.formula([-vx, -vy, -turn])
+    return rows
 
 
-def _exp_coefficients(turn: Any) -> tuple[Any, ...]:
-    """Compute sin(a)/a, (1 - cos(a))/a, (1 - cos(a))/a^2 and (a - sin(a))/a^2 of a turn a."""
-    chord = elementary.sinc(turn / 2.0)
-    across = chord * sin(turn / 2.0)
-    return chord * cos(turn / 2.0), across, chord * chord / 2.0, turn * elementary.sinc_defect(turn)
-
-
-def homogeneous(pose: ArrayLike) -> NDArray[np.float64]:
+@formula('(3) -> (3,3)')
+def homogeneous(pose: Vector) -> Rows:
     """Return the homogeneous transform `H_B^W` of a pose (document B).
 
     Args:
@@ -206,16 +180,16 @@ def homogeneous(pose: ArrayLike) -> NDArray[np.float64]:
     Returns:
         Transforms, shape (..., 3, 3): they map `[x, y, 1]` in B to W.
     """
-    x, y, theta = components('pose', pose, 3)
-    c, s = cos(theta), sin(theta)
-    transform = np.zeros((*np.shape(x), 3, 3))
-    transform[..., 0, 0], transform[..., 0, 1], transform[..., 0, 2] = c, -s, x
-    transform[..., 1, 0], transform[..., 1, 1], transform[..., 1, 2] = s, c, y
-    transform[..., 2, 2] = 1.0
-    return transform
+    x, y, theta = pose
+    return [
+        [cos(theta), -sin(theta), x],
+        [sin(theta), cos(theta), y],
+        [0.0, 0.0, 1.0],
+    ]
 
 
-def integrate(pose: ArrayLike, twist: ArrayLike, dt: ArrayLike) -> NDArray[np.float64]:
+@formula('(3),(2),() -> (3)')
+def integrate(pose: Vector, twist: Vector, dt: Number) -> Entries:
     """Return the pose after a constant twist of a unicycle, the exact arc `q * Exp(u dt)`.
 
     Source: doc/mathematics.md, "Motion".
@@ -231,15 +205,9 @@ def integrate(pose: ArrayLike, twist: ArrayLike, dt: ArrayLike) -> NDArray[np.fl
     Returns:
         The pose at the end, shape (..., 3), theta wrapped.
     """
-    x, y, theta = components('pose', pose, 3)
-    v, omega = components('twist', twist, 2)
-    dt = operand('dt', dt)
-    single = agree(pose=x, twist=v, dt=dt)
-    return stack(*evaluated(single, 'pose, twist and dt', _arc, x, y, theta, v, omega, dt))
-
-
-def _arc(x: Any, y: Any, theta: Any, v: Any, omega: Any, dt: Any) -> tuple[Any, ...]:
+    x, y, theta = pose
+    v, omega = twist
     turn = omega * dt
     chord = v * dt * elementary.sinc(turn / 2.0)
     heading = theta + turn / 2.0
-    return x + chord * cos(heading), y + chord * sin(heading), wrapped(theta + turn)
+    return [x + chord * cos(heading), y + chord * sin(heading), wrap(theta + turn)]

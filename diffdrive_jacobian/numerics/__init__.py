@@ -1,1 +1,1 @@
-"""What equations are written with: the decorator `formula`, elementary functions, checks of arguments."""
+"""What equations are written with: the decorator `formula`, elementary functions and checks."""

@@ -130,11 +130,21 @@ def array(name: str, value: Any, *trailing: int | str) -> NDArray[np.float64]:
     Raises:
         ValueError: The shape differs, or an entry is infinite, NaN or not a number.
     """
+    result = shaped(name, value, *trailing)
+    finite(name, result)
+    return result
+
+
+def shaped(name: str, value: Any, *trailing: int | str) -> NDArray[np.float64]:
+    """Convert a value to a float array with given last axes. A letter is any length but zero.
+
+    Raises:
+        ValueError: The shape differs, or an entry is not a number.
+    """
     result = floats(name, value)
     if not _ends_with(result.shape, trailing):
         axes = ', '.join(['...', *map(str, trailing)])
         raise ValueError(f'{name} must have shape ({axes}), got {result.shape}')
-    finite(name, result)
     return result
 
 

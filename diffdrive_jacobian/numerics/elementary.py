@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from operator import mul
 from typing import Any
 
 import numpy as np
@@ -138,7 +139,7 @@ def alike(*values: Any) -> tuple[Any, ...]:
     return tuple(map(np.array, np.broadcast_arrays(*values)))
 
 
-def wrapped(angle: Any) -> Any:
+def wrap(angle: Any) -> Any:
     """Wrap angles to (-pi, pi], exactly with respect to the double nearest to 2 pi."""
     if type(angle) is float:
         if -math.pi < angle <= math.pi:
@@ -197,14 +198,14 @@ def cos(x: Any) -> Any:
     return math.cos(x) if type(x) is float else np.cos(x)
 
 
-def arctan2(y: Any, x: Any) -> Any:
+def atan2(y: Any, x: Any) -> Any:
     """Angle of the point (x, y) (rad)."""
     return math.atan2(y, x) if type(y) is type(x) is float else np.arctan2(y, x)
 
 
 def hypot(x: Any, y: Any) -> Any:
     """Length of the vector (x, y)."""
-    return math.hypot(x, y) if type(x) is type(y) is float else np.hypot(x, y)
+    return sqrt(x * x + y * y)
 
 
 def sinc(angle: Any) -> Any:
@@ -244,3 +245,12 @@ def where(condition: Any, x: Any, y: Any) -> Any:
     if type(condition) is bool:
         return x if condition else y
     return np.where(condition, x, y)
+
+
+def product(A: Sequence[Sequence[Any]], B: Sequence[Sequence[Any]]) -> list[list[Any]]:
+    """Multiply two matrices that are lists of rows."""
+    columns = list(zip(*B, strict=True))
+    return [[sum(map(mul, row, column)) for column in columns] for row in A]
+
+
+wrapped, arctan2 = wrap, atan2

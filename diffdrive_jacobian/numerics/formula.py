@@ -31,13 +31,17 @@ from typing import Any, ParamSpec, Protocol, TypeAlias, TypeVar, cast, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.numerics.checks import FLOAT64, array, finite, leading
+from diffdrive_jacobian.numerics.checks import FLOAT64, finite, leading, shaped
 
 Array: TypeAlias = NDArray[np.float64]
 Number: TypeAlias = Any
 """A float, or an array with one entry for each robot of a batch."""
-Vector: TypeAlias = list[Number]
-Matrix: TypeAlias = list[list[Number]]
+Vector: TypeAlias = Any
+"""The entries of a vector, or what the caller has given for it."""
+Entries: TypeAlias = list[Number]
+"""A vector as a result."""
+Rows: TypeAlias = list[list[Number]]
+"""A matrix as a result."""
 Shape: TypeAlias = tuple[int | str, ...]
 """Sizes of the axes; a letter is any size."""
 Check: TypeAlias = Callable[[str, Any], None]
@@ -60,9 +64,9 @@ class Formula(Protocol[P, R]):
 
 class _Decorator(Protocol):
     @overload
-    def __call__(self, body: Callable[P, Matrix], /) -> Formula[P, Array]: ...
+    def __call__(self, body: Callable[P, Rows], /) -> Formula[P, Array]: ...
     @overload
-    def __call__(self, body: Callable[P, Vector], /) -> Formula[P, Array]: ...
+    def __call__(self, body: Callable[P, Entries], /) -> Formula[P, Array]: ...
     @overload
     def __call__(self, body: Callable[P, R], /) -> Formula[P, R]: ...
 
@@ -82,6 +86,7 @@ def formula(signature: str, **checks: Check) -> _Decorator:
         described = inspect.signature(body)
         names = tuple(described.parameters)
         optional = tuple(described.parameters[name].default is None for name in names)
+        tests = [checks.get(name, finite) for name in names]
         restrictions = [
             (index, name, checks[name]) for index, name in enumerate(names) if name in checks
         ]
@@ -96,11 +101,12 @@ def formula(signature: str, **checks: Check) -> _Decorator:
             batch: tuple[int, ...] = ()
             values = None if whole else _single(args, inputs)
             if values is None:
-                values, batch = _several(args, inputs, names, optional)
+                values, batch = _several(args, inputs, names, tests, optional)
                 if not whole:
                     values = list(map(_components, values, inputs))
-            for index, name, check in restrictions:
-                check(name, values[index])
+            else:
+                for index, name, check in restrictions:
+                    check(name, values[index])
             try:
                 if batch or whole:
                     with np.errstate(all='ignore'):
@@ -148,15 +154,20 @@ def _single(args: tuple[Any, ...], shapes: list[Shape]) -> list[Any] | None:
 
 
 def _several(
-    args: tuple[Any, ...], shapes: list[Shape], names: tuple[str, ...], optional: tuple[bool, ...]
+    args: tuple[Any, ...],
+    shapes: list[Shape],
+    names: tuple[str, ...],
+    tests: list[Check],
+    optional: tuple[bool, ...],
 ) -> tuple[list[Any], tuple[int, ...]]:
     """Return all arguments as arrays, and the leading axes to which they broadcast."""
     values: list[Any] = []
     leads: dict[str, tuple[int, ...]] = {}
     sizes: dict[int | str, int] = {}
-    for value, shape, name, may_miss in zip(args, shapes, names, optional, strict=True):
+    for value, shape, name, test, may_miss in zip(args, shapes, names, tests, optional, strict=True):
         if value is not None or not may_miss:
-            value = array(name, value, *(sizes.get(size, size) for size in shape))
+            value = shaped(name, value, *(sizes.get(size, size) for size in shape))
+            test(name, value)
             axes = value.ndim - len(shape)
             leads[name] = value.shape[:axes]
             sizes.update(zip(shape, value.shape[axes:], strict=True))
@@ -166,8 +177,10 @@ def _several(
 
 def _components(value: Any, shape: Shape) -> Any:
     """Return a number, or the entries of a vector, as floats or arrays of the leading axes."""
-    if value is None or value.ndim == 0:
-        return value if value is None else float(value)
+    if value is None:
+        return None
+    if value.ndim == len(shape):
+        return value.tolist()
     return list(np.moveaxis(value, -1, 0)) if shape else value
 
 

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.controller import Controller, Law
-from diffdrive_jacobian.control.controllers import controller_of
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import (
     array,
@@ -55,10 +54,8 @@ class Batch:
     """A batch. Values that are equal for all robots are numbers, others have a first axis of robots."""
 
     law: Law
-    steer: Law | None
-    """Faster form of the law, as `Controller.steer`."""
-    takes_heading: bool
-    """Whether `steer` uses the goal's heading."""
+    equation: Law | None
+    """The law of components without checks, where it is a `formula`."""
     starts: Array
     goals: Array
     gains: tuple[Any, ...]
@@ -90,11 +87,9 @@ class Batch:
         """Check the arguments and flatten the batch."""
         arrival = Arrival() if arrival is None else arrival
         if isinstance(law, Controller):
-            controller: Controller | None = law
             law = law.law
         else:
             function('law', law)
-            controller = controller_of(law)
         instance('arrival', arrival, Arrival)
         instance('limits', limits, VelocityLimits)
         starts, goals = array('starts', starts, 3), array('goals', goals, 'm')
@@ -127,8 +122,7 @@ class Batch:
         }
         return cls(
             law=law,
-            steer=None if controller is None else controller.steer,
-            takes_heading=controller is not None and controller.takes_heading,
+            equation=getattr(law, 'formula', None),
             starts=np.broadcast_to(starts, (*shape, 3)).reshape(-1, 3),
             goals=np.broadcast_to(goals, (*shape, goals.shape[-1])).reshape(-1, goals.shape[-1]),
             gains=tuple(flat[f'gain {index}'] for index in range(len(gains))),

@@ -1,8 +1,7 @@
 """Robots of a batch that are advanced together, each coordinate contiguous in memory.
 
-The law of a robot and its arc both need cosine and sine of the heading, which take longer to compute
-than everything else. They are updated by rotation in every step, and computed exactly every few steps.
-Controllers with a `steer` also share the vector to the goal with the check for arrival.
+Cosine and sine of the heading take longer to compute than the rest of an arc. They are updated by rotation
+in every step, and computed exactly every few steps.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import numpy as np
 
 from diffdrive_jacobian.kinematics.saturation import saturate
 from diffdrive_jacobian.numerics.checks import floats
-from diffdrive_jacobian.numerics.elementary import wrapped
+from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.simulation._batch import Array, Batch, Mask, Outcomes, Rows
 
 LOST = 1e6
@@ -40,7 +39,7 @@ class Block:
         """
         self.batch, self.rows, count = batch, rows, len(rows)
         self.x, self.y, theta = batch.starts.T.copy()
-        self.theta: Array = wrapped(theta)
+        self.theta: Array = wrap(theta)
         self.open: Mask = np.ones(count, dtype=np.bool_)
         self.turning: Mask = np.zeros(count, dtype=np.bool_)
         # Sums of |v|, v^2 and omega^2, and the largest distance beyond the goal.
@@ -94,8 +93,7 @@ class Block:
         batch, arrival = self.batch, self.batch.arrival
         goal = batch.goals.T
         with np.errstate(over='ignore', invalid='ignore'):
-            self.dx, self.dy = goal[0] - self.x, goal[1] - self.y
-            dx, dy, offset = self.dx, self.dy, arrival.offset
+            dx, dy, offset = goal[0] - self.x, goal[1] - self.y, arrival.offset
             beyond = self.along[0] * dx + self.along[1] * dy
             np.maximum(self.beyond, -beyond, out=self.beyond)
             if type(offset) is not float or offset != 0.0:
@@ -110,13 +108,11 @@ class Block:
     def _command(self) -> tuple[Array, Array]:
         """Evaluate the law and saturate its twists."""
         batch, shape = self.batch, (len(self.rows),)
-        if batch.steer is None:
-            twist = batch.law(np.array([self.x, self.y, self.theta]).T, batch.goals, *batch.gains)
+        pose = [self.x, self.y, self.theta]
+        if batch.equation is None:
+            twist = batch.law(np.array(pose).T, batch.goals, *batch.gains)
         else:
-            # Adding 0.0 removes negative zeros, so that the angle of (0, 0) is 0.
-            x = self.c * self.dx + self.s * self.dy + 0.0
-            y = self.c * self.dy - self.s * self.dx + 0.0
-            twist = batch.steer(x, y, self._turn() if batch.takes_heading else 0.0, *batch.gains)
+            twist = batch.equation(pose, batch.goals.T, *batch.gains)
         try:
             v, omega = (np.broadcast_to(floats('law', part), shape) for part in twist)
         except (TypeError, ValueError) as error:
@@ -125,7 +121,8 @@ class Block:
             ) from error
         if batch.arrival.use_heading and self.turning.any():
             v = np.where(self.turning, 0.0, v)
-            omega = np.where(self.turning, batch.turning_gain * wrapped(self._turn()), omega)
+            turn = wrap(batch.goals[:, 2] - self.theta)
+            omega = np.where(self.turning, batch.turning_gain * turn, omega)
         if not self.open.all():
             # Finished robots stand still, whatever their law returns.
             v, omega = np.where(self.open, v, 0.0), np.where(self.open, omega, 0.0)
@@ -140,11 +137,6 @@ class Block:
             v, omega = saturate(v, omega, batch.limits, batch.r, batch.L)
         return v, omega
 
-    def _turn(self) -> Array:
-        """Return the headings of the goals relative to those of the robots, not wrapped (rad)."""
-        turn: Array = self.batch.goals[:, 2] - self.theta
-        return turn
-
     def _advance(self, v: Array, omega: Array) -> None:
         """Apply a constant twist until the next sample.
 
@@ -158,17 +150,15 @@ class Block:
             self.sums[1] += v * v
             self.sums[2] += omega * omega
             half = omega * (0.5 * dt)
-            # With a tiny angle instead of zero the chord is as long as the arc.
-            hole = (half == 0.0) * 1e-20
             c_half, s_half = np.cos(half), np.sin(half)
             c, s = self.c * c_half - self.s * s_half, self.s * c_half + self.c * s_half
-            chord = v * dt * ((s_half + hole) / (half + hole))
+            chord = v * dt * np.divide(s_half, half, out=np.ones_like(half), where=half != 0.0)
             self.x = self.x + chord * c
             self.y = self.y + chord * s
             self.c, self.s = c * c_half - s * s_half, s * c_half + c * s_half
             self.theta = self.theta + omega * dt
             if np.max(self.theta) > np.pi or np.min(self.theta) <= -np.pi:
-                self.theta = wrapped(self.theta)
+                self.theta = wrap(self.theta)
 
     def _poses(self, which: Mask) -> Array:
         return np.column_stack([self.x[which], self.y[which], self.theta[which]])

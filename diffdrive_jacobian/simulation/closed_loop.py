@@ -65,7 +65,7 @@ def closed_loops(
     """Drive every robot to its goal and return the outcomes. Memory does not grow with the duration.
 
     Args:
-        law: The control law, `law(poses, goals, *gains)`, or a `Controller`, whose faster form is used.
+        law: The control law, `law(poses, goals, *gains)`, or a `Controller`.
         starts: Poses, shape (..., 3).
         goals: Positions or poses, shape (..., 2) or (..., 3), as the law requires.
         gains: Further arguments of the law, each of shape (...).
@@ -148,8 +148,8 @@ def _drive(
     on_step: Callable[[int], object] | None = None,
 ) -> Outcomes:
     """Drive a batch block by block and return its outcomes."""
-    if batch.steer is not None:
-        # The law checks its arguments, `steer` does not.
+    if batch.equation is not None:
+        # The law checks its arguments, the equation does not.
         try:
             batch.law(batch.starts, batch.goals, *batch.gains)
         except ValueError as error:
