@@ -14,29 +14,53 @@ Source: document A, 3.2.4, "Mobile Manipulators"; doc/mathematics.md, "Manipulat
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import accumulate
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics import se2
-from diffdrive_jacobian.kinematics.diff_drive import (
-    wheel_to_body,
-    wheel_to_body_jacobian,
-    wheel_to_world_jacobian,
-)
-from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
+from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body, wheel_to_world_jacobian
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm, arm_forward_kinematics, arm_jacobian
 from diffdrive_jacobian.numerics.checks import array, number, positive
-from diffdrive_jacobian.numerics.elementary import (
-    agree,
-    components,
-    cos,
-    matrix,
-    operand,
-    sin,
-    vector,
-)
+from diffdrive_jacobian.numerics.elementary import cos, product, sin
+from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
+
+
+@formula('(),(n),(n),(2),(),() -> (3,k)')
+def mobile_manipulator_jacobian(
+    theta: Number, q: Vector, lengths: Vector, mount: Vector, r: Number, L: Number
+) -> Rows:
+    """Return the Jacobian of `MobileManipulator` with the heading, over wheels and joints.
+
+    Args:
+        theta: Heading of the base, shape (...) (rad).
+        q: Joint angles, shape (..., n) (rad).
+        lengths: Lengths of the links, shape (n,) (m).
+        mount: Position of the arm's base in the frame of the axle centre, shape (2,) (m).
+        r: Wheel radius (m).
+        L: Wheel separation (m).
+    """
+    R = [
+        [cos(theta), -sin(theta)],
+        [sin(theta), cos(theta)],
+    ]
+    p_arm = arm_forward_kinematics.formula(lengths, q)
+    p = [[mount[0] + p_arm[0]], [mount[1] + p_arm[1]]]
+    # The derivative of R by theta.
+    R_prime = [
+        [-sin(theta), -cos(theta)],
+        [cos(theta), -sin(theta)],
+    ]
+    (x_theta,), (y_theta,) = product(R_prime, p)
+    of_base = [
+        [1.0, 0.0, x_theta],
+        [0.0, 1.0, y_theta],
+        [0.0, 0.0, 1.0],
+    ]
+    of_wheels = product(of_base, wheel_to_world_jacobian.formula(theta, r, L))
+    of_joints = [*product(R, arm_jacobian.formula(lengths, q)), [1.0] * len(q)]
+    return [[*wheels, *joints] for wheels, joints in zip(of_wheels, of_joints, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +101,7 @@ class MobileManipulator:
         Returns:
             `[x, y, heading]`, shape (..., 3) (m, m, rad).
         """
-        base, joints = self._split(q)
-        return se2.compose(vector(*base), vector(*self._tip(joints)))
+        return _forward_kinematics(self._checked(q), self.arm.lengths, self.mount)
 
     def jacobian(self, q: ArrayLike, heading: bool = False) -> NDArray[np.float64]:
         """Map the velocities of wheels and joints to that of the tip.
@@ -94,21 +117,11 @@ class MobileManipulator:
             The Jacobian, shape (..., 2, 2 + n), or (..., 3, 2 + n) with the heading, over
             `[omega_R, omega_L, q_1_dot, ...]`.
         """
-        (_, _, theta), joints = self._split(q)
-        c, s = cos(theta), sin(theta)
-        directions = list(accumulate(joints))
-        levers = self.arm._levers(directions)
-        (x, y), (m_x, m_y) = levers[0], self.mount.tolist()
-        x, y = x + m_x, y + m_y
-        (half, _), (ratio, _) = wheel_to_body_jacobian(self.r, self.L).tolist()
-        # In the frame of the base: v goes along x, and omega moves the tip across its lever arm.
-        columns = [(half - y * ratio, x * ratio), (half + y * ratio, -x * ratio)]
-        columns += [(-across, along) for along, across in levers]
-        entries = [c * along - s * across for along, across in columns]
-        entries += [s * along + c * across for along, across in columns]
-        if heading:
-            entries += [ratio, -ratio] + [1.0] * self.arm.joints
-        return matrix(3 if heading else 2, len(columns), *entries)
+        q = self._checked(q)
+        J = mobile_manipulator_jacobian(
+            q[..., 2], q[..., 3:], self.arm.lengths, self.mount, self.r, self.L
+        )
+        return J if heading else J[..., :2, :]
 
     def configuration_jacobian(self, q: ArrayLike) -> NDArray[np.float64]:
         """Map the inputs to the velocity of the configuration: `q_dot = G(q) [omega_R, omega_L, ...]`.
@@ -123,11 +136,11 @@ class MobileManipulator:
         Returns:
             G, shape (..., 3 + n, 2 + n).
         """
-        (_, _, theta), _ = self._split(q)
-        jacobian = np.zeros((*np.shape(theta), 3 + self.arm.joints, 2 + self.arm.joints))
-        jacobian[..., :3, :2] = wheel_to_world_jacobian(theta, self.r, self.L)
-        jacobian[..., 3:, 2:] = np.eye(self.arm.joints)
-        return jacobian
+        theta = self._checked(q)[..., 2]
+        G = np.zeros((*theta.shape, 3 + self.arm.joints, 2 + self.arm.joints))
+        G[..., :3, :2] = wheel_to_world_jacobian(theta, self.r, self.L)
+        G[..., 3:, 2:] = np.eye(self.arm.joints)
+        return G
 
     def integrate(self, q: ArrayLike, q_dot: ArrayLike, dt: ArrayLike) -> NDArray[np.float64]:
         """Return the configuration after a time at constant input. The base follows an exact arc.
@@ -140,28 +153,23 @@ class MobileManipulator:
         Returns:
             Configurations at the end, shape (..., 3 + n), theta wrapped.
         """
-        base, joints = self._split(q)
-        right, left, *speeds = components('q_dot', q_dot, 2 + self.arm.joints)
-        dt = operand('dt', dt)
-        if not type(base[0]) is type(right) is type(dt) is float:
-            agree(q=base[0], q_dot=right, dt=dt)
-        v, omega = wheel_to_body(right, left, self.r, self.L)
-        # Tuples of floats need no arrays.
-        pose = tuple(base) if type(base[0]) is float else vector(*base)
-        twist = (v, omega) if type(v) is float else vector(v, omega)
-        driven = se2.integrate(pose, twist, dt)
-        moved = [joint + speed * dt for joint, speed in zip(joints, speeds, strict=True)]
-        if driven.ndim == 1:
-            return np.array([*driven.tolist(), *moved])
-        return vector(*components('q', driven, 3), *moved)
+        q_dot = array('q_dot', q_dot, 2 + self.arm.joints)
+        return _integrate(self._checked(q), q_dot, dt, self.r, self.L)
 
-    def _split(self, q: ArrayLike) -> tuple[list[Any], list[Any]]:
-        """Return the pose of the base and the joint angles, each entry a float or of shape (...)."""
-        entries = components('q', q, 3 + self.arm.joints)
-        return entries[:3], entries[3:]
+    def _checked(self, q: ArrayLike) -> NDArray[np.float64]:
+        return array('q', q, 3 + self.arm.joints)
 
-    def _tip(self, joints: list[Any]) -> tuple[Any, Any, Any]:
-        """Return the pose of the tip in the frame of the base."""
-        x, y, heading = self.arm._tip(list(accumulate(joints)))
-        m_x, m_y = self.mount.tolist()
-        return x + m_x, y + m_y, heading
+
+@formula('(k),(n),(2) -> (3)')
+def _forward_kinematics(q: Vector, lengths: Vector, mount: Vector) -> Entries:
+    x, y, heading = arm_forward_kinematics.formula(lengths, q[3:])
+    tip = [mount[0] + x, mount[1] + y, heading]
+    pose: Entries = se2.compose.formula(q[:3], tip)
+    return pose
+
+
+@formula('(k),(m),(),(),() -> (k)')
+def _integrate(q: Vector, q_dot: Vector, dt: Number, r: Number, L: Number) -> Entries:
+    twist = wheel_to_body.formula(q_dot[0], q_dot[1], r, L)
+    joints = [q_i + q_dot_i * dt for q_i, q_dot_i in zip(q[3:], q_dot[2:], strict=True)]
+    return [*se2.integrate.formula(q[:3], twist, dt), *joints]

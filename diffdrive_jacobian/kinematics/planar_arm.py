@@ -12,27 +12,40 @@ doc/mathematics.md, "Manipulators".
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import accumulate
-from typing import Any
+from math import pi
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._adjugate import EPS, refuse_singular
 from diffdrive_jacobian.numerics.checks import array, positive
-from diffdrive_jacobian.numerics.elementary import (
-    agree,
-    components,
-    cos,
-    matrix,
-    maximum,
-    operand,
-    sin,
-    vector,
-    wrapped,
-)
+from diffdrive_jacobian.numerics.elementary import cos, maximum, sin, wrap
+from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
+
+
+@formula('(n),(n) -> (3)')
+def arm_forward_kinematics(lengths: Vector, q: Vector) -> Entries:
+    """Return the pose of the tip, as `PlanarArm.forward_kinematics` of links of these lengths (m)."""
+    x, y = zip(*arm_links(lengths, q), strict=True)
+    return [sum(x), sum(y), wrap(sum(q))]
+
+
+@formula('(n),(n) -> (2,n)')
+def arm_jacobian(lengths: Vector, q: Vector) -> Rows:
+    """Return the Jacobian of the position, as `PlanarArm.jacobian` of links of these lengths (m)."""
+    x, y = zip(*arm_links(lengths, q), strict=True)
+    # Each joint moves the links from there to the tip.
+    return [
+        [-sum(y[joint:]) for joint in range(len(q))],
+        [sum(x[joint:]) for joint in range(len(q))],
+    ]
+
+
+def arm_links(lengths: Vector, q: Vector) -> list[tuple[Number, Number]]:
+    """Return the links as vectors `(l_i cos(q_1 + ... + q_i), l_i sin(q_1 + ... + q_i))`, unchecked."""
+    return [(l_i * cos(a), l_i * sin(a)) for l_i, a in zip(lengths, accumulate(q), strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +58,6 @@ class PlanarArm:
 
     lengths: NDArray[np.float64]
     """Distances from joint to joint, the last to the tip, shape (n,) (m). Read-only."""
-    _links: list[float] = field(init=False, repr=False)
 
     def __init__(self, lengths: ArrayLike) -> None:
         """Take the lengths of the links, shape (n,), n >= 1 (m)."""
@@ -55,7 +67,6 @@ class PlanarArm:
         positive('lengths', checked)
         checked.flags.writeable = False
         object.__setattr__(self, 'lengths', checked)
-        object.__setattr__(self, '_links', checked.tolist())
 
     @property
     def joints(self) -> int:
@@ -71,13 +82,7 @@ class PlanarArm:
         Returns:
             Positions in the frame of the arm, shape (..., n + 1, 2) (m). The first is the base, [0, 0].
         """
-        x: Any = 0.0
-        y: Any = 0.0
-        entries = [x, y]
-        for length, angle in zip(self._links, self._directions(q), strict=True):
-            x, y = x + length * cos(angle), y + length * sin(angle)
-            entries += [x, y]
-        return matrix(self.joints + 1, 2, *entries)
+        return _joint_positions(self.lengths, q)
 
     def forward_kinematics(self, q: ArrayLike) -> NDArray[np.float64]:
         """Return the pose of the tip (A, D): `x = sum l_i cos(q_1 + ... + q_i)`, y with the sine.
@@ -88,10 +93,7 @@ class PlanarArm:
         Returns:
             `[x, y, heading]`, shape (..., 3) (m, m, rad), the heading wrapped to (-pi, pi].
         """
-        if type(q) is np.ndarray and q.ndim == 2 and len(q) == 1:
-            # In floats: several times as fast as a batch of one.
-            return self.forward_kinematics(q[0])[np.newaxis]
-        return vector(*self._tip(self._directions(q)))
+        return arm_forward_kinematics(self.lengths, q)
 
     def jacobian(self, q: ArrayLike, heading: bool = False) -> NDArray[np.float64]:
         """Map joint velocities to the velocity of the tip (A, D).
@@ -106,13 +108,10 @@ class PlanarArm:
         Returns:
             The Jacobian, shape (..., 2, n), or (..., 3, n) with a last row of ones for the heading.
         """
-        if type(q) is np.ndarray and q.ndim == 2 and len(q) == 1:
-            return self.jacobian(q[0], heading)[np.newaxis]
-        levers = self._levers(self._directions(q))
-        entries = [-y for _, y in levers] + [x for x, _ in levers]
-        if heading:
-            entries += [1.0] * len(levers)
-        return matrix(3 if heading else 2, len(levers), *entries)
+        J = arm_jacobian(self.lengths, q)
+        if not heading:
+            return J
+        return np.concatenate([J, np.ones_like(J[..., :1, :])], axis=-2)
 
     def determinant(self, q: ArrayLike) -> NDArray[np.float64]:
         """Return the determinant of the Jacobian of two links: `l1 l2 sin(q_2)` (A).
@@ -127,9 +126,7 @@ class PlanarArm:
             ValueError: The arm has not two links.
         """
         self._need_two('determinant')
-        _, q_2 = components('q', q, 2)
-        determinant: NDArray[np.float64] = self._determinant(q_2) * np.float64(1.0)
-        return determinant
+        return np.asarray(_determinant(self.lengths, q))
 
     def singular_configurations(self, q_1: ArrayLike = 0.0) -> NDArray[np.float64]:
         """Return the singular configurations of two links: stretched, q_2 = 0, and folded, q_2 = pi (A).
@@ -144,8 +141,7 @@ class PlanarArm:
             ValueError: The arm has not two links.
         """
         self._need_two('singular_configurations')
-        first = operand('q_1', q_1)
-        return matrix(2, 2, first, 0.0, first, math.pi)
+        return _singular_configurations(q_1)
 
     def inverse_velocity(self, q: ArrayLike, x_dot: ArrayLike) -> NDArray[np.float64]:
         """Return joint velocities of two links for a velocity of the tip, by the adjugate (A, 3.2.1).
@@ -162,18 +158,7 @@ class PlanarArm:
             ValueError: The arm has not two links.
         """
         self._need_two('inverse_velocity')
-        q_1, q_2 = components('q', q, 2)
-        along_x, along_y = components('x_dot', x_dot, 2)
-        agree(q=q_2, x_dot=along_x)
-        determinant = self._determinant(q_2)
-        # More accurate than from the entries of J: only the rounding of q_2 itself remains.
-        blur = 4.0 * EPS * maximum(1.0, abs(q_2))
-        refuse_singular(determinant, abs(determinant) <= blur * math.prod(self._links))
-        (x, y), (x_2, y_2) = self._levers([q_1, q_1 + q_2])
-        return vector(
-            (x_2 * along_x + y_2 * along_y) / determinant,
-            (-x * along_x - y * along_y) / determinant,
-        )
+        return _inverse_velocity(self.lengths, q, x_dot)
 
     def joint_torques(self, q: ArrayLike, wrench: ArrayLike) -> NDArray[np.float64]:
         """Return the joint torques of a wrench at the tip: `tau = J^T W` (D, 5).
@@ -189,13 +174,7 @@ class PlanarArm:
         wrench = array('wrench', wrench, 'm')
         if wrench.shape[-1] not in (2, 3):
             raise ValueError(f'wrench must have shape (..., 2) or (..., 3), got {wrench.shape}')
-        directions = self._directions(q)
-        f_x, f_y, *moment = components('wrench', wrench, wrench.shape[-1])
-        agree(q=directions[0], wrench=f_x)
-        torques = [f_y * x - f_x * y for x, y in self._levers(directions)]
-        if moment:
-            torques = [torque + moment[0] for torque in torques]
-        return vector(*torques)
+        return _joint_torques(self.lengths, q, wrench)
 
     def integrate(self, q: ArrayLike, q_dot: ArrayLike, dt: ArrayLike) -> NDArray[np.float64]:
         """Return the joint angles after a time at constant velocity: `q + q_dot dt` (D, 4.1).
@@ -208,39 +187,54 @@ class PlanarArm:
         Returns:
             Joint angles at the end, shape (..., n) (rad). They are not wrapped.
         """
-        angles, speeds = components('q', q, self.joints), components('q_dot', q_dot, self.joints)
-        dt = operand('dt', dt)
-        if not type(angles[0]) is type(speeds[0]) is type(dt) is float:
-            agree(q=angles[0], q_dot=speeds[0], dt=dt)
-        return vector(*[angle + speed * dt for angle, speed in zip(angles, speeds, strict=True)])
-
-    def _directions(self, q: ArrayLike) -> list[Any]:
-        """Return the angles of the links to the x axis of the base, floats or of shape (...)."""
-        return list(accumulate(components('q', q, self.joints)))
-
-    def _tip(self, directions: list[Any]) -> tuple[Any, Any, Any]:
-        """Return position and heading of the tip, floats or of shape (...)."""
-        (x, y), *_ = self._levers(directions)
-        return x, y, wrapped(directions[-1])
-
-    def _levers(self, directions: list[Any]) -> list[tuple[Any, Any]]:
-        """Return the position of the tip relative to each joint, floats or of shape (...)."""
-        # Joint by joint, because loops of NumPy over the short last axis take longer.
-        levers = []
-        of_floats = type(directions[0]) is float
-        cosine, sine = (math.cos, math.sin) if of_floats else (np.cos, np.sin)
-        x: Any = 0.0
-        y: Any = 0.0
-        for length, angle in zip(reversed(self._links), reversed(directions), strict=True):
-            x, y = x + length * cosine(angle), y + length * sine(angle)
-            levers.append((x, y))
-        levers.reverse()
-        return levers
-
-    def _determinant(self, q_2: Any) -> Any:
-        first, second = self._links
-        return first * second * sin(q_2)
+        q = array('q', q, self.joints)
+        return _integrate(q, q_dot, dt)
 
     def _need_two(self, what: str) -> None:
         if self.joints != 2:
             raise ValueError(f'{what} is for an arm of 2 links, this one has {self.joints}')
+
+
+@formula('(n),(n) -> (j,2)')
+def _joint_positions(lengths: Vector, q: Vector) -> Rows:
+    x, y = zip(*arm_links(lengths, q), strict=True)
+    return [[sum(x[:joint], 0.0), sum(y[:joint], 0.0)] for joint in range(len(q) + 1)]
+
+
+@formula('(2),(2) -> ()')
+def _determinant(lengths: Vector, q: Vector) -> Number:
+    (l_1, l_2), (_, q_2) = lengths, q
+    return l_1 * l_2 * sin(q_2)
+
+
+@formula('() -> (2,2)')
+def _singular_configurations(q_1: Number) -> Rows:
+    return [
+        [q_1, 0.0],
+        [q_1, pi],
+    ]
+
+
+@formula('(2),(2),(2) -> (2)')
+def _inverse_velocity(lengths: Vector, q: Vector, x_dot: Vector) -> Entries:
+    (a, b), (c, d) = arm_jacobian.formula(lengths, q)
+    determinant = _determinant.formula(lengths, q)
+    # More accurate than from the entries of J: only the rounding of q_2 itself remains.
+    blur = 4.0 * EPS * maximum(1.0, abs(q[1]))
+    refuse_singular(determinant, abs(determinant) <= blur * lengths[0] * lengths[1])
+    v_x, v_y = x_dot
+    return [(d * v_x - b * v_y) / determinant, (a * v_y - c * v_x) / determinant]
+
+
+@formula('(n),(n),(m) -> (n)')
+def _joint_torques(lengths: Vector, q: Vector, wrench: Vector) -> Entries:
+    rows = [*arm_jacobian.formula(lengths, q), [1.0] * len(q)]
+    return [
+        sum(f * J_ij for f, J_ij in zip(wrench, column, strict=False))
+        for column in zip(*rows, strict=True)
+    ]
+
+
+@formula('(n),(n),() -> (n)')
+def _integrate(q: Vector, q_dot: Vector, dt: Number) -> Entries:
+    return [q_i + q_dot_i * dt for q_i, q_dot_i in zip(q, q_dot, strict=True)]

@@ -1,7 +1,7 @@
 """Robots of a batch that are advanced together, each coordinate contiguous in memory.
 
-Cosine and sine of the heading take longer to compute than the rest of an arc. They are updated by rotation
-in every step, and computed exactly every few steps.
+Cosine and sine of the heading take longer to compute than the rest of an arc. They are updated by
+rotation in every step, and computed exactly every few steps.
 """
 
 from __future__ import annotations
