@@ -12,6 +12,8 @@ import pytest
 from diffdrive_jacobian import kinematics
 from diffdrive_jacobian.kinematics import MobileManipulator, PlanarArm, contact, diff_drive, se2
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
+from diffdrive_jacobian.kinematics.mobile_manipulator import mobile_manipulator_jacobian
+from diffdrive_jacobian.kinematics.planar_arm import arm_forward_kinematics, arm_jacobian
 
 COUNT = 1000
 STEP = 1e-5
@@ -130,6 +132,24 @@ def mobile_manipulator(rng, links, heading, mount):
     return robot.jacobian(q, heading=heading), differences(tip, np.zeros((COUNT, 2 + links)))
 
 
+def arm_of_lengths(rng, links):
+    lengths, q = rng.uniform(0.1, 1.0, links), rng.uniform(-4.0, 4.0, (COUNT, links))
+    numeric = differences(lambda q: arm_forward_kinematics(lengths, q)[..., :2], q)
+    return arm_jacobian(lengths, q), numeric
+
+
+def manipulator_of_lengths(rng, links):
+    lengths, mount = rng.uniform(0.1, 1.0, links), MOUNTS[1]
+    robot = MobileManipulator(r=0.05, L=0.3, arm=PlanarArm(lengths), mount=mount)
+    q = rng.uniform(-4.0, 4.0, (COUNT, 3 + links))
+
+    def tip(q_dot):
+        return robot.forward_kinematics(robot.integrate(q[:, np.newaxis], q_dot, 1.0))
+
+    jacobian = mobile_manipulator_jacobian(q[:, 2], q[:, 3:], lengths, mount, 0.05, 0.3)
+    return jacobian, differences(tip, np.zeros((COUNT, 2 + links)))
+
+
 def configuration(rng, links):
     arm = PlanarArm(rng.uniform(0.1, 1.0, links))
     robot, q = MobileManipulator(r=0.05, L=0.3, arm=arm), rng.uniform(-3.0, 3.0, (COUNT, 3 + links))
@@ -190,6 +210,8 @@ CASES = [
         for heading in (False, True)
         for mount in MOUNTS
     ),
+    ('planar_arm.arm_jacobian', arm_of_lengths, {'links': 3}),
+    ('mobile_manipulator.mobile_manipulator_jacobian', manipulator_of_lengths, {'links': 2}),
     *(
         (
             'mobile_manipulator.MobileManipulator.configuration_jacobian',

@@ -6,11 +6,10 @@ document B's law the distance is measured from the offset point (doc/mathematics
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
-from math import isfinite
+from dataclasses import dataclass
 from typing import Any
 
+from diffdrive_jacobian.kinematics.diff_drive import offset_point
 from diffdrive_jacobian.numerics.checks import (
     boolean,
     equal,
@@ -19,15 +18,23 @@ from diffdrive_jacobian.numerics.checks import (
     number,
     read_only,
 )
-from diffdrive_jacobian.numerics.elementary import (
-    agree,
-    cos,
-    evaluated,
-    hypot,
-    operand,
-    sin,
-    wrapped,
-)
+from diffdrive_jacobian.numerics.elementary import hypot, operand, wrap
+from diffdrive_jacobian.numerics.formula import Number, formula
+
+
+@formula('(),(),(),(),(),() -> ()')
+def distance_to_goal(
+    x: Number, y: Number, theta: Number, x_goal: Number, y_goal: Number, offset: Number
+) -> Number:
+    """Compute the distance of the point at x = offset in the body frame from a goal, shape (...) (m)."""
+    x_d, y_d = offset_point.formula((x, y, theta), offset)
+    return hypot(x_goal - x_d, y_goal - y_d)
+
+
+@formula('(),() -> ()')
+def heading_error(theta: Number, heading: Number) -> Number:
+    """Compute the smaller angle from a heading to the desired one, shape (...) (rad)."""
+    return wrap(heading - theta)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -47,8 +54,6 @@ class Arrival:
     """Whether the heading of the last goal counts."""
     offset: Any = 0.0
     """X coordinate in the body frame of the point that is to arrive (m), a number or an array."""
-    _centre: bool = field(init=False, repr=False)
-    """Whether that is the axle centre."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -57,7 +62,6 @@ class Arrival:
         object.__setattr__(self, 'use_heading', boolean('use_heading', self.use_heading))
         offset = operand('offset', self.offset)
         object.__setattr__(self, 'offset', offset if type(offset) is float else read_only(offset))
-        object.__setattr__(self, '_centre', type(offset) is float and offset == 0.0)
 
     def __eq__(self, other: object) -> bool:
         """Compare every field, arrays by shape and entries."""
@@ -88,37 +92,12 @@ class Arrival:
         Raises:
             ValueError: An argument is not finite, shapes do not broadcast, or the distance overflows.
         """
-        if type(x) is type(y) is type(theta) is type(x_goal) is type(y_goal) is float and isfinite(
-            theta
-        ):
-            # It is not finite if one of the positions or the offset is not.
-            if self._centre:
-                distance = math.hypot(x_goal - x, y_goal - y)
-            else:
-                distance = self._distance(x, y, theta, x_goal, y_goal)
-            if type(distance) is float and isfinite(distance):
-                return distance
-        x, y, theta = operand('x', x), operand('y', y), operand('theta', theta)
-        x_goal, y_goal = operand('x_goal', x_goal), operand('y_goal', y_goal)
-        single = agree(x=x, y=y, theta=theta, x_goal=x_goal, y_goal=y_goal, offset=self.offset)
-        (distance,) = evaluated(
-            single,
-            'x, y, x_goal, y_goal and offset',
-            lambda *arguments: (self._distance(*arguments),),
-            *(x, y, theta, x_goal, y_goal),
-        )
-        return distance
-
-    def _distance(self, x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any) -> Any:
-        if not self._centre:
-            x, y = x + self.offset * cos(theta), y + self.offset * sin(theta)
-        return hypot(x_goal - x, y_goal - y)
+        return distance_to_goal(x, y, theta, x_goal, y_goal, self.offset)
 
     def reached(self, x: float, y: float, theta: float, x_goal: float, y_goal: float) -> bool:
         """Return whether the distance to a goal is within the tolerance, without checks."""
-        if self._centre:
-            return math.hypot(x_goal - x, y_goal - y) <= self.xy_tolerance
-        return bool(self._distance(x, y, theta, x_goal, y_goal) <= self.xy_tolerance)
+        distance = distance_to_goal.formula(x, y, theta, x_goal, y_goal, self.offset)
+        return bool(distance <= self.xy_tolerance)
 
     def faces(self, theta: Any, heading: Any) -> Any:
         """Return whether the robot has the heading of a goal.
@@ -133,15 +112,4 @@ class Arrival:
         Raises:
             ValueError: An argument is not finite, shapes do not broadcast, or the difference overflows.
         """
-        if type(theta) is type(heading) is float and isfinite(theta + heading):
-            error = wrapped(heading - theta)
-            if isfinite(error):
-                return abs(error) <= self.yaw_tolerance
-        theta, heading = operand('theta', theta), operand('heading', heading)
-        single = agree(theta=theta, heading=heading)
-        (error,) = evaluated(single, 'theta and heading', _heading_error, theta, heading)
-        return abs(error) <= self.yaw_tolerance
-
-
-def _heading_error(theta: Any, heading: Any) -> tuple[Any]:
-    return (wrapped(heading - theta),)
+        return abs(heading_error(theta, heading)) <= self.yaw_tolerance

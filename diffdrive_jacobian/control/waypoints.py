@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import isfinite
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -15,12 +14,14 @@ from diffdrive_jacobian.control.go_to_goal import turn_in_place
 from diffdrive_jacobian.numerics.checks import (
     array,
     boolean,
+    finite,
     function,
     instance,
+    number,
+    numbers,
     read_only,
     short,
 )
-from diffdrive_jacobian.numerics.elementary import components, operand
 
 Pose: TypeAlias = NDArray[np.float64] | tuple[float, float, float]
 Law: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
@@ -45,8 +46,6 @@ class Waypoints:
     """Whether the last position was reached and only the heading remains."""
     _goal: tuple[float, float, float] = field(init=False, repr=False)
     """The waypoint that is driven to."""
-    _row: NDArray[np.float64] = field(init=False, repr=False)
-    """Likewise, as an array."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -60,8 +59,7 @@ class Waypoints:
         if not 0 <= index < len(poses):
             raise ValueError(f'index must be in 0 to {len(poses) - 1}, got {short(index)}')
         object.__setattr__(self, 'index', int(index))
-        object.__setattr__(self, '_row', self.poses[index])
-        object.__setattr__(self, '_goal', tuple(self._row.tolist()))
+        object.__setattr__(self, '_goal', tuple(self.poses[index].tolist()))
         object.__setattr__(self, 'turning', boolean('turning', self.turning))
 
     def follow(
@@ -82,18 +80,10 @@ class Waypoints:
         Raises:
             ValueError: An argument is of another class or shape, or not finite.
         """
-        is_tuple = type(pose) is tuple
-        # Tuples are unpacked here, because a call would take as long as the law.
-        x, y, theta = pose if is_tuple and len(pose) == 3 else components('pose', pose, 3)
-        if not (type(x) is type(y) is type(theta) is float and isfinite(x + y + theta)):
-            x, y, theta = components('pose', pose, 3)
-            if type(theta) is not float:
-                raise ValueError(f'pose must have shape (3,), got {np.shape(pose)}')
-        if not callable(law) or type(arrival) is not Arrival:
-            function('law', law)
-            instance('arrival', arrival, Arrival)
-        if type(turning_gain) is not float or not isfinite(turning_gain):
-            turning_gain = operand('turning_gain', turning_gain)
+        x, y, theta = numbers('pose', pose, 3)
+        function('law', law)
+        instance('arrival', arrival, Arrival)
+        turning_gain = number('turning_gain', turning_gain, finite)
         here = self
         if here.turning and not arrival.use_heading:
             # The heading no longer counts, and the position was reached.
@@ -101,7 +91,7 @@ class Waypoints:
         while not here.turning:
             goal = here._goal
             if not arrival.reached(x, y, theta, goal[0], goal[1]):
-                return here, law(pose, goal if is_tuple else here._row)
+                return here, law(pose, goal if isinstance(pose, tuple) else np.array(goal))
             if here.index + 1 < len(here.poses):
                 here = here._progressed(here.index + 1, turning=False)
             elif arrival.use_heading:
@@ -123,9 +113,8 @@ class Waypoints:
     def _progressed(self, index: int, *, turning: bool) -> Waypoints:
         # Without checks and copies, which would cost time in proportion to the number of poses.
         progressed = object.__new__(Waypoints)
-        row = self.poses[index]
-        values = {'poses': self.poses, 'index': index, 'turning': turning, '_row': row}
+        goal = tuple(self.poses[index].tolist())
+        values = {'poses': self.poses, 'index': index, 'turning': turning, '_goal': goal}
         for name, value in values.items():
             object.__setattr__(progressed, name, value)
-        object.__setattr__(progressed, '_goal', tuple(row.tolist()))
         return progressed

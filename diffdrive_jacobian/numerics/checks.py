@@ -148,6 +148,18 @@ def shaped(name: str, value: Any, *trailing: int | str) -> NDArray[np.float64]:
     return result
 
 
+def numbers(name: str, value: Any, size: int) -> list[float]:
+    """Convert a single vector to finite floats.
+
+    Raises:
+        ValueError: The shape is not (size,), or an entry is infinite, NaN or not a number.
+    """
+    result = array(name, value, size)
+    if result.ndim != 1:
+        raise ValueError(f'{name} must have shape ({size},), got {result.shape}')
+    return list(result.tolist())
+
+
 def _ends_with(shape: tuple[int, ...], trailing: tuple[int | str, ...]) -> bool:
     """Return whether the last axes of a shape are those wanted."""
     if len(shape) != len(trailing):

@@ -1,0 +1,139 @@
+"""The decorator of equations: one body for one robot and for many, and errors that name the argument."""
+
+import numpy as np
+import pytest
+
+from diffdrive_jacobian.numerics.checks import positive
+from diffdrive_jacobian.numerics.elementary import cos, hypot, sin
+from diffdrive_jacobian.numerics.formula import formula
+
+
+@formula('(2),() -> (2)')
+def rotated(point, angle):
+    """Turn a point."""
+    x, y = point
+    return [cos(angle) * x - sin(angle) * y, sin(angle) * x + cos(angle) * y]
+
+
+@formula('(),() -> (),()', r=positive)
+def circle(r, angle):
+    return r * cos(angle), r * sin(angle)
+
+
+@formula('(n),(n) -> ()')
+def inner(first, second):
+    return sum(a * b for a, b in zip(first, second, strict=True))
+
+
+@formula('(m,n),(n) -> (m)')
+def mapped(J, q_dot):
+    return (J @ q_dot[..., np.newaxis])[..., 0]
+
+
+@formula('(),() -> (2,2)', weight=positive)
+def weighted(angle, weight=None):
+    w = 1.0 if weight is None else weight
+    return [[w * cos(angle), 0.0], [0.0, 1.0]]
+
+
+@formula('(),() -> ()')
+def ratio(a, b):
+    return a / b
+
+
+def test_numbers_give_floats_and_vectors_give_arrays():
+    v, omega = circle(2.0, 0.5)
+    assert type(v) is type(omega) is float
+    assert rotated([1.0, 0.0], np.pi / 2) == pytest.approx([0.0, 1.0])
+    assert rotated((1, 0), 0).dtype == np.float64
+    assert weighted(0.0).shape == (2, 2)
+
+
+@pytest.mark.parametrize(
+    ('points', 'angles', 'shape'),
+    [
+        ((4, 3, 2), (3,), (4, 3, 2)),
+        ((2,), (5,), (5, 2)),
+        ((0, 2), (), (0, 2)),
+        ((1, 2), (4, 1), (4, 1, 2)),
+    ],
+)
+def test_leading_axes_broadcast_and_each_row_is_that_of_a_single_call(points, angles, shape):
+    rng = np.random.default_rng(0)
+    points, angles = rng.normal(size=points), rng.normal(size=angles)
+    found = rotated(points, angles)
+    assert found.shape == shape
+    whole_points = np.broadcast_to(points, shape)
+    whole_angles = np.broadcast_to(angles, shape[:-1])
+    for index in np.ndindex(shape[:-1]):
+        np.testing.assert_allclose(
+            found[index], rotated(whole_points[index], float(whole_angles[index])), rtol=1e-14
+        )
+
+
+def test_a_letter_is_a_size_in_common():
+    assert inner([1.0, 2.0, 3.0], [1.0, 1.0, 1.0]) == 6.0
+    np.testing.assert_array_equal(inner(np.ones((5, 2)), [1.0, 2.0]), np.full(5, 3.0))
+    with pytest.raises(ValueError, match=r'^second must have shape \(\.\.\., 3\), got \(2,\)'):
+        inner([1.0, 2.0, 3.0], [1.0, 1.0])
+
+
+def test_matrices_come_whole():
+    J = np.arange(12.0).reshape(2, 2, 3)
+    np.testing.assert_array_equal(mapped(J, [1.0, 0.0, 0.0]), J[..., 0])
+    with pytest.raises(ValueError, match=r'^q_dot must have shape \(\.\.\., 3\)'):
+        mapped(J, [1.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ('call', 'message'),
+    [
+        (lambda: rotated([1.0, np.nan], 0.0), 'point must be finite'),
+        (lambda: rotated([1.0], 0.0), r'point must have shape \(\.\.\., 2\), got \(1,\)'),
+        (lambda: rotated([1.0, 2.0], 'east'), 'angle must be an array of real numbers'),
+        (lambda: rotated([1.0, 2.0], None), 'angle must be an array of real numbers'),
+        (
+            lambda: rotated(np.ones((2, 2)), [0.0] * 3),
+            'point and angle must have leading axes that broadc',
+        ),
+        (lambda: circle(0.0, 0.0), 'r must be positive and finite, got 0.0'),
+        (lambda: circle([1.0, -1.0], 0.0), r'r must be positive and finite, got -1.0 at index 1'),
+        (lambda: circle(np.inf, 0.0), 'r must be positive and finite, got inf'),
+        (lambda: weighted(0.0, -1.0), 'weight must be positive'),
+        (lambda: ratio(1.0, 0.0), 'a and b must give a finite result'),
+        (lambda: ratio([1.0, 1.0], [1.0, 0.0]), 'a and b must give a finite result'),
+        (lambda: ratio(1e308, 1e-308), 'a and b must give a finite result'),
+    ],
+)
+def test_a_bad_argument_is_named(call, message):
+    with pytest.raises(ValueError, match=f'^{message}'):
+        call()
+
+
+def test_arguments_may_be_given_by_name_and_missing_ones_are_a_type_error():
+    assert circle(angle=0.0, r=3.0) == (3.0, 0.0)
+    np.testing.assert_array_equal(weighted(angle=0.0, weight=2.0), [[2.0, 0.0], [0.0, 1.0]])
+    with pytest.raises(TypeError, match='angle'):
+        circle(1.0)
+    with pytest.raises(TypeError, match='too many'):
+        circle(1.0, 2.0, 3.0)
+
+
+def test_the_equation_alone_is_not_checked():
+    assert circle.formula(-1.0, 0.0) == (-1.0, 0.0)
+    assert circle.formula(np.float64(2.0), 0.0)[0] == 2.0
+    x, y = rotated.formula((np.ones(3), np.zeros(3)), 0.0)
+    np.testing.assert_array_equal((x, y), [np.ones(3), np.zeros(3)])
+
+
+def test_the_documentation_is_that_of_the_equation():
+    assert rotated.__doc__ == 'Turn a point.'
+    assert rotated.__name__ == 'rotated'
+
+
+def test_arguments_are_left_as_they_are():
+    point, angle = np.ones((3, 2)), np.zeros(3)
+    found = rotated(point, angle)
+    found[...] = 7.0
+    assert (point == 1.0).all()
+    assert hypot(3.0, 4.0) == 5.0
