@@ -1,5 +1,6 @@
 """The numbers and matrices that the documents A to E print; where one slipped, what is right and why.
 
+The slips are listed in doc/mathematics.md, "Slips in the documents".
 B and E order the wheels left, right: `[:, ::-1]` puts our columns, right and left, in their order.
 """
 
