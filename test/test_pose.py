@@ -226,9 +226,9 @@ def test_moved_to_another_place_or_mirrored_the_law_is_the_same():
     moved = go_to_pose(se2.compose(there, states), se2.compose(there, targets), KP, KV)
     np.testing.assert_allclose(moved, here, rtol=1e-8, atol=1e-8)
     mirror = np.array([1.0, -1.0, -1.0])
-    np.testing.assert_array_equal(
-        go_to_pose(mirror * states, mirror * targets, KP, KV), [here[0], -here[1]]
-    )
+    mirrored = go_to_pose(mirror * states, mirror * targets, KP, KV)
+    # Not every library's sine is exactly odd.
+    np.testing.assert_allclose(mirrored, [here[0], -here[1]], rtol=1e-12, atol=1e-12)
 
 
 # --- Closed loops
