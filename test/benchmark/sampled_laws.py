@@ -3,7 +3,7 @@
 For each law, robots with random gains, rates and starts: the share that arrives within the bounds of
 doc/mathematics.md, "Control laws", and with 1.1, 1.5 and 2 times the slope that they allow. The robots
 start from rest. Commands are held for a period and take effect at once, one period late, or up to one
-period late. The robots are simulated here, with nothing but the laws of the package. `--robots` for fewer.
+period late. The robots are simulated here, with nothing but the laws of the package.
 """
 
 from __future__ import annotations
