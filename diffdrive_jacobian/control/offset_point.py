@@ -98,5 +98,7 @@ CONTROLLER = Controller(
     gains=('kv', 'offset'),
     offset='offset',
     advice=_advice,
+    # At the goal. At a distance it is larger by kv distance / |offset|.
+    slope=lambda gains: gains.kv,
     steer=steer,
 )

@@ -48,5 +48,5 @@ def rate_warning(slope: float, rate: float) -> str:
     return (
         f'the law turns by up to {slope:.3g} rad/s per rad of heading, more than half the odometry rate '
         f'of {rate:.3g} Hz: if commands take effect up to one sample late, the robot {effect}; choose '
-        'smaller gains or a higher rate'
+        'a smaller kp or kv, or a higher rate'
     )
