@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
@@ -255,7 +254,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         if len(self._times) <= RATE_PERIODS:
             return
         # The median is not affected by a gap or by messages that arrive together.
-        period = statistics.median(b - a for a, b in pairwise(self._times))
+        period = sorted(b - a for a, b in pairwise(self._times))[RATE_PERIODS // 2]
         rate = 1e9 / period if period > 0 else math.inf
         changed = not 0.8 < rate / self._rate < 1.25
         self._rate = rate
