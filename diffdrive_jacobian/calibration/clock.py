@@ -4,9 +4,8 @@ Forward speed and yaw rate of both are compared at every offset at which they ov
 of the shorter one. With the correlations rho of the N speeds in the overlap, the log-likelihood ratio
 against independent speeds is `N g`, `g = -1/2 sum(log(1 - rho^2))`. The offset has the largest one.
 
-A motion that repeats itself, such as equal laps, agrees as well at other offsets. Then the offset must be
-the nearest one to zero, and that at which both recordings cover the same time. If these are two, it is
-ambiguous.
+A motion that repeats itself, such as equal laps, agrees as well at others. Then the offset nearest to
+zero must also be that at which both recordings cover the same time. If it is not, they are ambiguous.
 """
 
 from __future__ import annotations
@@ -46,9 +45,9 @@ def time_offset(recording: Recording, nominal: Geometry) -> float | None:
     window = max(WINDOW, *(float(np.median(np.diff(time))) for time in (wheels, poses)))
     length = max(wheels[-1] - wheels[0], poses[-1] - poses[0])
     step = max(STEP, float(length) / MOST)
-    ours, theirs = _wheel_speeds(recording, nominal, step, window), _pose_speeds(recording, step, window)
-    if min(len(ours), len(theirs)) < 2 * window / step:
+    if min(wheels[-1] - wheels[0], poses[-1] - poses[0]) < 3.0 * window:
         return None
+    ours, theirs = _wheel_speeds(recording, nominal, step, window), _pose_speeds(recording, step, window)
     lags, overlap, found = _correlations(ours, theirs)
     offsets = wheels[0] - poses[0] + lags * step
     samples = overlap * step / window
@@ -158,5 +157,5 @@ def _pose_speeds(recording: Recording, step: float, window: float) -> Array:
     dx, dy, turn = _differences(recording.pose_time, values, step, window).T
     speeds = np.column_stack([np.hypot(dx, dy), turn])
     # One glitch must not outweigh the whole drive.
-    limits = 4.0 * np.percentile(np.abs(speeds), 95, axis=0) + 1e-9 if len(speeds) else np.ones(2)
-    return np.clip(speeds, -limits, limits)
+    limits = 4.0 * np.percentile(np.abs(speeds), 95, axis=0) + 1e-9
+    return np.asarray(np.clip(speeds, -limits, limits))

@@ -31,7 +31,13 @@ LEAST_MOVE = 0.1
 """Extent of the path of a reference that moves (m)."""
 LEAST_TURN, FIXED = 1.0, 0.05
 """Turn of the robot (rad), and share of it, below which the heading of the reference is fixed."""
-UNITS = {'feet': 3.2808, 'inches': 39.370, 'centimetres': 100.0, 'millimetres': 1000.0, 'kilometres': 1e-3}
+UNITS = {
+    'feet': 3.2808,
+    'inches': 39.370,
+    'centimetres': 100.0,
+    'millimetres': 1000.0,
+    'kilometres': 1e-3,
+}
 """Units of a reference, by how many of them are a metre."""
 
 
@@ -112,7 +118,7 @@ def rough(segments: Sequence[Segment], nominal: Geometry, offsets: Array) -> Rou
     if not 0.05 <= scale <= 20.0:
         raise CalibrationError(
             f'the reference moves {scale:.4g} times as far as the wheels: its poses are not those of '
-            f'this robot, or are in {unit(scale)} instead of metres, or the nominal wheel radius is wrong'
+            f'this robot, or in {unit(scale)} instead of metres, or the nominal wheel radius is wrong'
         )
     yaw = float(np.arctan2(found[1], found[0]))
     c, s = np.cos(yaw), np.sin(yaw)
