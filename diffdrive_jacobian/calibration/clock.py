@@ -1,8 +1,9 @@
 """The offset between the clocks of the wheels and of the reference, from the motion that both show.
 
 Forward speed and yaw rate of both are compared at every offset at which they overlap for at least half
-of the shorter one. With the correlations rho of the N speeds in the overlap, the log-likelihood ratio
-against independent speeds is `N g`, `g = -1/2 sum(log(1 - rho^2))`. The offset has the largest one.
+of the shorter one, and at those near zero. With the correlations rho of the N speeds in the overlap, the
+log-likelihood ratio against independent speeds is `N g`, `g = -1/2 sum(log(1 - rho^2))`. The offset has
+the largest g.
 
 A motion that repeats itself, such as equal laps, agrees as well at others. Then the offset nearest to
 zero must also be that at which both recordings cover the same time. If it is not, they are ambiguous.
@@ -24,12 +25,14 @@ MOST = 1 << 17
 """Largest number of them."""
 LEAST_OVERLAP = 0.5
 """Overlap, as a share of the shorter recording, up to which offsets are searched."""
-LEAST = 0.5
-"""Correlation below which an offset is not found."""
+NEAR = 5.0
+"""Offset up to which they are searched whatever the overlap (s)."""
+LEAST = 0.7
+"""Value of g below which an offset is not found."""
 EVIDENCE = 20.0
 """Log-likelihood ratio below which two offsets are about as good, or one is not found."""
-CLOSE = 0.1
-"""Difference of g below which they are about as good in any case. Speeds are no independent samples."""
+CLOSE = 0.3
+"""Difference of g below which they are about as good in any case: offsets are multiples of the step."""
 PERFECT = 0.99
 """Largest squared correlation: the speeds of a sensor off the axle are not those of the wheels."""
 REMEDY = 'synchronize the clocks, or give the offset (--time-offset of calibrate_run)'
@@ -51,48 +54,52 @@ def time_offset(recording: Recording, nominal: Geometry) -> float | None:
     lags, overlap, found = _correlations(ours, theirs)
     offsets = wheels[0] - poses[0] + lags * step
     samples = overlap * step / window
-    # Swapped wheels turn the other way. That is reported later, and must not be taken for an offset.
-    either = [np.maximum(found * [1.0, sign], 0.0) for sign in (1.0, -1.0)]
-    correlations = max(either, key=lambda one: float(np.max(samples * _evidence(one))))
-    g = _evidence(correlations)
-    best = int(np.argmax(samples * g))
-    if samples[best] * g[best] < EVIDENCE or correlations[best].max() < LEAST:
+    allowed = (overlap >= LEAST_OVERLAP * overlap.max()) | (np.abs(offsets) <= NEAR)
+    either = (_ratio(np.maximum(found * [1.0, sign], 0.0)) for sign in (1.0, -1.0))
+    g, turned = (np.where(allowed & (samples * one >= EVIDENCE), one, 0.0) for one in either)
+    largest = int(np.argmax(g))
+    if g[largest] < LEAST:
         return None
-    if best in (0, len(g) - 1):
-        raise CalibrationError(
-            f'{recording.name}: the motions of the wheels and of the reference agree best at a time '
-            f'offset of {offsets[best]:.3f} s, the end of the range that is searched, from '
-            f'{offsets[0]:.3f} to {offsets[-1]:.3f} s: {REMEDY}'
-        )
-    close = max(CLOSE, EVIDENCE / samples[best])
-    good = _good(g, float(g[best]), close)
-    fair = [index for index in good if overlap[best] - overlap[index] <= abs(index - best) / 2.0]
+    close = max(CLOSE, EVIDENCE / samples[largest])
+    good = _maxima(g, g[largest] - close, close)
+    widest = max(good, key=lambda index: overlap[index])
+    fair = [index for index in good if overlap[widest] - overlap[index] <= abs(index - widest) / 2.0]
     best = min(fair, key=lambda index: abs(offsets[index]))
     if any(abs(offsets[index]) < abs(offsets[best]) for index in good):
         listed = ', '.join(
-            f'{offsets[index]:.3f} s (correlation {correlations[index].max():.2f}, overlap '
-            f'{overlap[index] * step:.0f} s)'
+            f'{offsets[index]:.3f} s (overlap {overlap[index] * step:.0f} s)'
             for index in sorted(good, key=lambda index: abs(offsets[index]))[:4]
         )
         raise CalibrationError(
             f'{recording.name}: the motion repeats itself, and the wheels and the reference agree about '
             f'as well at several time offsets: {listed}: {REMEDY}'
         )
+    if not (allowed[max(best - 1, 0)] and allowed[min(best + 1, len(g) - 1)]):
+        raise CalibrationError(
+            f'{recording.name}: the wheels and the reference agree best at a time offset of '
+            f'{offsets[best]:.3f} s, the end of the range that is searched: {REMEDY}'
+        )
+    # Swapped wheels turn the other way. That is reported later, and must not be taken for an offset.
+    other = int(np.argmax(samples * turned))
+    if samples[other] * turned[other] > samples[best] * g[best] and abs(offsets[other]) < abs(
+        offsets[best]
+    ):
+        return float(offsets[other])
     low, middle, high = g[best - 1 : best + 2]
     bend = low - 2.0 * middle + high
     fine = 0.5 * (low - high) / bend if bend < 0.0 else 0.0
     return float(offsets[best] + np.clip(fine, -1.0, 1.0) * step)
 
 
-def _good(g: Array, best: float, close: float) -> list[int]:
-    """Return where g is about as large as the best one: the maxima between valleys."""
-    high = np.flatnonzero(g > best - 2.0 * close)
-    hills = np.split(high, np.flatnonzero(np.diff(high) > 1) + 1)
+def _maxima(g: Array, least: float, close: float) -> list[int]:
+    """Return the maxima of g that are at least `least`, with values lower by `close` between them."""
+    high = np.flatnonzero(g > least - close)
+    hills = np.split(high, np.flatnonzero(np.diff(high) > 1) + 1) if len(high) else []
     peaks = [int(hill[np.argmax(g[hill])]) for hill in hills]
-    return [peak for peak in peaks if g[peak] >= best - close]
+    return [peak for peak in peaks if g[peak] >= least]
 
 
-def _evidence(correlations: Array) -> Array:
+def _ratio(correlations: Array) -> Array:
     """Return g, shape (l,), of correlations, shape (l, k)."""
     return np.asarray(-0.5 * np.log(1.0 - PERFECT * correlations**2).sum(axis=1))
 
@@ -110,7 +117,7 @@ def _correlations(ours: Array, theirs: Array) -> tuple[NDArray[np.int64], Array,
     m, n = len(ours), len(theirs)
     lags = np.arange(1 - n, m)
     first, last = np.maximum(0, lags), np.minimum(m, n + lags)
-    use = last - first >= LEAST_OVERLAP * min(m, n)
+    use = last - first >= 2
     lags, first, last = lags[use], first[use], last[use]
     count = last - first
     size = 1 << int(m + n).bit_length()

@@ -40,7 +40,6 @@ from diffdrive_jacobian.kinematics._checks import (
     read_only,
 )
 from diffdrive_jacobian.kinematics._elementary import components, operand
-from diffdrive_jacobian.kinematics.saturation import saturate
 from diffdrive_jacobian.kinematics.se2 import compose
 from diffdrive_jacobian.simulation._uncertainty import Uncertainty
 from diffdrive_jacobian.simulation.actuators import Settling, Speeds
@@ -246,7 +245,7 @@ class Robot:
         """
         v, omega = pair('command', command)
         model = self.model
-        twist = saturate(v, omega, model.limits, model.smaller_radius, model.wheel_separation)
+        twist = model.limited((v, omega))
         if model.actuators is not None:
             here = self._changed_until(stamp)
             commanded_at = None if v == omega == 0.0 else here.stamp

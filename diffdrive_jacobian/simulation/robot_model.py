@@ -69,15 +69,21 @@ class RobotModel:
             ValueError: It has another shape or is not finite.
         """
         v, omega = saturate(
-            *pair('command', command), self.limits, self.smaller_radius, self.wheel_separation
+            *pair('command', command), self.limits, max(self.radii), self.wheel_separation
         )
+        if self.limits.max_wheel_speed < math.inf:
+            # The smaller wheel may still be too fast.
+            fastest = max(map(abs, self.wheel_speeds(v, omega)))
+            excess = max(1.0, fastest / self.limits.max_wheel_speed)
+            v, omega = v / excess, omega / excess
         return v, omega
 
     @property
-    def smaller_radius(self) -> float:
-        """Radius of the smaller wheel (m). The limit of the wheel speeds is met for two such wheels."""
-        return self.wheel_radius * min(
-            self.right_wheel_radius_multiplier, self.left_wheel_radius_multiplier
+    def radii(self) -> tuple[float, float]:
+        """Radii of the right and the left wheel (m)."""
+        return (
+            self.wheel_radius * self.right_wheel_radius_multiplier,
+            self.wheel_radius * self.left_wheel_radius_multiplier,
         )
 
     def wheel_speeds(self, v: float, omega: float) -> Speeds:
