@@ -24,6 +24,13 @@ from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 
+UNEQUAL = {
+    'left_wheel_radius_multiplier': 0.9,
+    'right_wheel_radius_multiplier': 1.05,
+    'wheel_separation_multiplier': 1.2,
+}
+"""Multipliers of the assumed dimensions, as a calibration finds them."""
+
 
 @pytest.mark.parametrize(
     ('left', 'right'),
@@ -66,14 +73,6 @@ def test_the_faster_of_unequal_wheels_has_the_limit(lockstep, robot_at, command)
     assert max(map(abs, topics.states[-1].velocity)) == pytest.approx(9.0)
     v, omega = twists(topics.applied)[-1]
     assert v * command[1] == pytest.approx(omega * command[0], abs=1e-12)
-
-
-UNEQUAL = {
-    'left_wheel_radius_multiplier': 0.9,
-    'right_wheel_radius_multiplier': 1.05,
-    'wheel_separation_multiplier': 1.2,
-}
-"""Multipliers of the assumed dimensions, as a calibration finds them."""
 
 
 @pytest.mark.parametrize('multipliers', [{}, UNEQUAL], ids=['nominal', 'calibrated'])
