@@ -313,6 +313,14 @@ def test_without_parameters_the_odometry_alone_is_verified(run):
     assert any(note.startswith('ground_truth was not compared') for note in verification.notes)
 
 
+def test_a_run_whose_assumed_dimensions_changed_is_verified_by_its_odometry_alone(run):
+    (name,) = run.parameters
+    changed = (run.odometry.received[50], name, {'left_wheel_radius_multiplier': 1.1})
+    verification = verify(replace(run, parameter_events=(changed,)))
+    assert verification.truth is None
+    assert verification.holds(1e-9, 1e-9)
+
+
 def truths_in(drawn):
     """The paths of the truth in a figure."""
     return [one for one in drawn.axes[0].lines if one.get_color() == COLOR and len(one.get_xydata()) > 1]
