@@ -160,7 +160,7 @@ class Robot:
     def true_twist(self) -> tuple[float, float]:
         """The true twist `(v, omega)` from this time on, the slip included (m/s, rad/s)."""
         truth, model = self._truth, self.model
-        if truth is None or self.twist == STANDSTILL:
+        if truth is None:
             return self.twist
         return truth.twist(self.stamp, self.twist, model.wheel_separation, model.wheel_travel_variance)
 
@@ -441,7 +441,8 @@ class Robot:
         expiry = self.expiry
         if expiry is None or expiry > stamp:
             return stamp, self._state(stamp), False
-        return stamp, self._state(expiry), True
+        stopped = _robot(self.model, expiry, self._state(expiry), STANDSTILL, STANDSTILL)
+        return stamp, stopped._state(stamp), True
 
     def _state(self, stamp: int) -> _State:
         """Compute the state at a time up to the timeout."""
@@ -450,20 +451,20 @@ class Robot:
             return ahead[1]
         dt = (stamp - self.stamp) / NANOSECONDS
         twist = v, omega = self.twist
-        truth = self._truth
-        if dt == 0.0 or twist == STANDSTILL:
-            if truth is None or dt == 0.0:
-                return self._present
-            return self.pose_tuple, self.wheel_angles, self._uncertainty, truth.at_rest()
-        model, (x, y, theta), (right, left) = self.model, self.pose_tuple, self.wheel_angles
+        truth, model = self._truth, self.model
+        if dt == 0.0 or (truth is None and twist == STANDSTILL):
+            return self._present
+        L, k = model.wheel_separation, model.wheel_travel_variance
+        if truth is not None:
+            truth = truth.after(self.stamp, stamp, twist, L, k)
+        if twist == STANDSTILL:
+            return self.pose_tuple, self.wheel_angles, self._uncertainty, truth
+        (x, y, theta), (right, left) = self.pose_tuple, self.wheel_angles
         omega_R, omega_L = self.wheel_speeds
         right, left = angles = right + omega_R * dt, left + omega_L * dt
         # A finite sum has finite terms.
         if not (isfinite(right + left) or (isfinite(right) and isfinite(left))):
             raise ValueError(f'wheel_angles must be finite, got {list(angles)}')
-        L, k = model.wheel_separation, model.wheel_travel_variance
-        if truth is not None:
-            truth = truth.after(self.stamp, stamp, twist, L, k)
         uncertainty = self._uncertainty.after((theta, twist, dt, L, k))
         state = arc_end(x, y, theta, v, omega, dt), angles, uncertainty, truth
         object.__setattr__(self, '_ahead', (stamp, state))
