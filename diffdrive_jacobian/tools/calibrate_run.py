@@ -209,9 +209,9 @@ def _parser() -> _cli.Parser:
         description='Estimate the wheel radii and the wheel separation of a robot from recorded drives '
         'with a reference of its pose, such as motion capture or SLAM. Writes the multipliers of '
         'virtual_robot, wheel_bridge and diff_drive_controller as a parameter file, and a picture. '
-        'Existing files are not overwritten. Exit code 0: calibrated; 1: the drives do not determine the parameters, '
-        'contradict each other, or a file cannot be written; 2: wrong arguments, or a bag cannot be '
-        'read; 130: interrupted.',
+        'Existing files are not overwritten. Exit code 0: calibrated; 1: the drives do not determine '
+        'the parameters, contradict each other, or a file cannot be written; 2: wrong arguments, or a '
+        'bag cannot be read; 130: interrupted.',
     )
     parser.add_argument('bags', metavar='BAG', nargs='+', help='directory of a bag')
     parser.add_argument(
