@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_data import NOISE, NOMINAL, TRUE, Drive, Simulation, umbmark
+from calibration_data import NOISE, NOMINAL, TRUE, Drive, Simulation, square, umbmark
 
 from diffdrive_jacobian.calibration import CalibrationError, Given, Noise, calibrate, preparation
 from diffdrive_jacobian.calibration.errors import compared_distance, rms, tracks
@@ -133,7 +135,7 @@ def test_umbmark_recovers_the_true_multipliers(given):
 
 
 def test_errors_are_those_of_the_cramer_rao_bound_and_of_the_stated_covariance():
-    """A small form of `benchmark/calibration.py`: mean squares of 16 robots, within 3.5 deviations."""
+    """A small form of `benchmark/calibration_cases.py`: mean squares of 16 robots."""
     errors, nees, bounds = [], [], []
     count = 16
     for seed in range(count):
@@ -192,13 +194,66 @@ def test_a_sensor_that_is_wrongly_given_makes_worse_estimates():
     assert wrong.estimate.noise.position > 1.5 * result.estimate.noise.position
 
 
-@pytest.mark.parametrize('delay', [0.08, -1.7, 12.3])
+@pytest.mark.parametrize('delay', [0.08, -1.7, 12.3, 40.0, -60.0, 1e4])
 def test_the_offset_between_the_clocks_is_estimated(delay):
     recording = replace(ROBOT, delay=delay).recording(np.random.default_rng(7))
     result = calibrate([recording], NOMINAL)
     assert_true(result)
     assert result.time_offsets[0] == pytest.approx(delay, abs=0.02)
     assert any('clock of the reference' in note for note in result.notes) == (abs(delay) > 1.0)
+
+
+LAPS = replace(ROBOT, drive=Drive.of(square(side=1.0) * 5))
+SIDE = 5.0 + np.pi / 2.0
+"""Time after which these laps repeat themselves (s)."""
+
+
+@pytest.mark.parametrize('delay', [0.0, 2.0, -2.0])
+def test_equal_laps_have_the_offset_that_is_nearest_to_zero(delay):
+    recording = replace(LAPS, delay=delay).recording(np.random.default_rng(7))
+    result = calibrate([recording], NOMINAL)
+    assert_true(result)
+    assert result.time_offsets[0] == pytest.approx(delay, abs=0.05)
+
+
+@pytest.mark.parametrize('delay', [0.7 * SIDE, -SIDE, 4.2 * SIDE])
+def test_an_offset_is_refused_where_the_motion_agrees_with_a_nearer_one(delay):
+    recording = replace(LAPS, delay=delay).recording(np.random.default_rng(7))
+    with pytest.raises(CalibrationError, match=r'several time offsets.*--time-offset') as refused:
+        calibrate([recording], NOMINAL)
+    named = [float(one) for one in re.findall(r'(-?[\d.]+) s \(overlap', str(refused.value))]
+    assert named[0] == pytest.approx(math.remainder(delay, SIDE), abs=0.1)
+    result = calibrate([recording], NOMINAL, Given(time_offset=delay))
+    assert_true(result)
+
+
+def test_a_part_of_the_drive_is_placed_by_its_motion():
+    """The reference has another clock, and began later and ended earlier than the wheels."""
+    recording = replace(ROBOT, delay=-40.0).recording(np.random.default_rng(7))
+    kept = slice(40, -25)
+    part = replace(recording, pose_time=recording.pose_time[kept], poses=recording.poses[kept])
+    assert calibrate([part], NOMINAL).time_offsets[0] == pytest.approx(-40.0, abs=0.02)
+
+
+def test_recordings_that_overlap_little_are_compared_by_their_stamps():
+    """Offsets near zero are searched at any overlap."""
+    recording = ROBOT.recording(np.random.default_rng(7))
+    wheels, poses = recording.wheel_time < 45.0, recording.pose_time > 28.0
+    parts = replace(
+        recording,
+        wheel_time=recording.wheel_time[wheels],
+        wheel_angles=recording.wheel_angles[wheels],
+        pose_time=recording.pose_time[poses] - 1.0,
+        poses=recording.poses[poses],
+    )
+    assert calibrate([parts], NOMINAL).time_offsets[0] == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_drive_at_constant_speed_does_not_show_the_offset():
+    recording = replace(ROBOT, drive=Drive.of([(40.0, 0.2, 0.5)])).recording(np.random.default_rng(7))
+    result = calibrate([recording], NOMINAL)
+    assert 'do not show the offset between their clocks' in result.notes[0]
+    assert abs(result.time_offsets[0]) < 1.0
 
 
 def test_nominal_dimensions_may_be_far_off():
@@ -318,13 +373,47 @@ def spoiled(recording, what):
         angles = angles * [0.0, 1.0]
     elif what == 'positions only':
         poses[:, 2] = 0.0
-    elif what == 'no overlap':
-        time = time + 1e4
     elif what == 'NaN':
         poses[3] = np.nan
     elif what == 'backward':
         time = time[::-1]
     return replace(recording, poses=poses, wheel_angles=angles, pose_time=time)
+
+
+def test_recordings_without_a_time_in_common_are_refused():
+    with pytest.raises(CalibrationError, match='no time in common'):
+        calibrate([replace(ROBOT, delay=1e4).recording(np.random.default_rng(13))], NOMINAL, SENSOR)
+
+
+def test_swapped_wheels_are_not_taken_for_an_offset():
+    """On laps in alternating directions they turn as the lap before."""
+    laps = [square(side=1.0, clockwise=bool(number % 2)) for number in range(6)]
+    robot = replace(ROBOT, drive=Drive.of([one for lap in laps for one in lap]))
+    with pytest.raises(CalibrationError, match='swapped'):
+        calibrate([spoiled(robot.recording(np.random.default_rng(13)), 'swapped')], NOMINAL)
+
+
+@pytest.mark.parametrize(
+    ('scale', 'name'), [(3.2808, 'feet'), (1.4, 'another unit'), (39.37, 'inches'), (1e3, 'millimetres')]
+)
+def test_a_reference_in_another_unit_is_noted_or_refused(scale, name):
+    recording = base()
+    scaled = replace(recording, poses=recording.poses * [scale, scale, 1.0])
+    try:
+        notes = calibrate([scaled], NOMINAL).notes
+    except CalibrationError as error:
+        notes = (str(error),)
+    (note,) = notes
+    assert f'in {name} instead of metres' in note
+
+
+def test_wheels_that_may_be_swapped_and_negated_are_noted():
+    recording = base()
+    angles = -recording.wheel_angles[:, ::-1]
+    (note,) = calibrate([replace(recording, wheel_angles=angles)], NOMINAL).notes
+    assert 'the sensor looks backwards' in note
+    backward = Given(yaw_offset=np.pi)
+    assert calibrate([replace(recording, wheel_angles=angles)], NOMINAL, backward).notes == ()
 
 
 @pytest.mark.parametrize(
@@ -337,7 +426,6 @@ def spoiled(recording, what):
         ('mirrored', 'mirrored'),
         ('other robot', 'reference'),
         ('still', 'times as far as the wheels'),
-        ('no overlap', 'no time in common'),
         ('NaN', 'must be finite'),
         ('backward', 'must increase'),
     ],

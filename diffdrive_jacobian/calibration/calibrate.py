@@ -29,7 +29,7 @@ from diffdrive_jacobian.calibration.preparation import (
     without_jumps,
 )
 from diffdrive_jacobian.calibration.rest import merged
-from diffdrive_jacobian.calibration.rough import rough
+from diffdrive_jacobian.calibration.rough import rough, unit
 
 PARAMETERS = (
     'left_wheel_radius_multiplier',
@@ -54,6 +54,10 @@ SAME = 0.005
 ROUNDS = 3
 LONG_DELAY = 0.2
 """Time offset that is worth a note (s)."""
+UNUSUAL = 1.15
+"""Factor beyond which multipliers are not explained by manufacturing."""
+BACKWARD = 0.3
+"""Angle from straight back within which a sensor looks backwards (rad)."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -141,6 +145,11 @@ def calibrate(
     for index, one in enumerate(recordings):
         found = given.time_offset if given.time_offset is not None else time_offset(one, nominal)
         offsets[index] = 0.0 if found is None else found
+        if found is None:
+            notes.append(
+                f'{one.name}: the speeds of the wheels and of the reference do not show the offset '
+                'between their clocks, which is assumed to be about 0 s'
+            )
     segments = [
         segment
         for index, one in enumerate(recordings)
@@ -176,7 +185,7 @@ def calibrate(
         motions=tuple(motions),
     )
     _check_result(result)
-    notes += _noise_notes(estimate.noise)
+    notes += [*_noise_notes(estimate.noise), *_size_notes(result, given)]
     if len(recordings) > 1:
         _check_agreement(result, given)
     for one, offset in zip(recordings, result.time_offsets.tolist(), strict=True):
@@ -215,6 +224,25 @@ def _noise_notes(noise: Noise) -> list[str]:
     return []
 
 
+def _size_notes(result: Calibration, given: Given) -> list[str]:
+    notes = []
+    values = result.multipliers
+    if (np.abs(np.log(values)) > np.log(UNUSUAL)).any():
+        listed = ', '.join(f'{value:.4g}' for value in values.tolist())
+        notes.append(
+            f'the multipliers {listed} (left, right, separation) are beyond what manufacturing '
+            'explains: are the nominal dimensions wrong, or is the reference in '
+            f'{unit(float(np.exp(np.log(values).mean())))} instead of metres?'
+        )
+    yaw = float(result.estimate.sensor[2])
+    if given.yaw_offset is None and np.cos(yaw) < -np.cos(BACKWARD):
+        notes.append(
+            'the sensor looks backwards. If it is not mounted so, the left and the right wheel are '
+            'swapped and both turn in the wrong sense: the multipliers of the radii are exchanged then'
+        )
+    return notes
+
+
 def _free(given: Given, count: int) -> np.typing.NDArray[np.bool_]:
     free = np.ones(TIME_OFFSETS + count, dtype=bool)
     free[3:5] = given.lever_arm is None
@@ -249,7 +277,8 @@ def _check_result(result: Calibration) -> None:
         found = ', '.join(f'{value:.3g}' for value in values.tolist())
         raise CalibrationError(
             f'multipliers must be from {BOUNDS[0]:g} to {BOUNDS[1]:g}, got {found} (left, right, '
-            'separation): are the nominal dimensions right, and is the reference of this robot?'
+            'separation): are the nominal dimensions wrong, or is the reference of another robot, or in '
+            f'{unit(float(np.exp(np.log(values).mean())))} instead of metres?'
         )
     noise = result.estimate.noise
     if noise.wheel > LARGE_WHEEL_NOISE:

@@ -11,7 +11,7 @@ from diffdrive_jacobian.calibration.errors import compared_distance, rms, tracks
 
 
 def parameter_file(result: Calibration, source: str) -> str:
-    """Return a ROS parameter file (YAML) for `wheel_bridge` and diff_drive_controller.
+    """Return a ROS parameter file (YAML) for the nodes of this package and for diff_drive_controller.
 
     Args:
         result: The calibration.
@@ -20,7 +20,8 @@ def parameter_file(result: Calibration, source: str) -> str:
     deviations = np.sqrt(np.diag(result.covariance)).tolist()
     lines = [
         f'# Estimated by calibrate_run from {source}.',
-        '# For wheel_bridge and diff_drive_controller. Behind each value: its standard deviation.',
+        '# For virtual_robot, wheel_bridge and diff_drive_controller. Behind each value: its standard '
+        'deviation.',
         '/**:',
         '  ros__parameters:',
         f'    wheel_radius: {result.nominal.wheel_radius!r}',

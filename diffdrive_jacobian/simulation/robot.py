@@ -40,8 +40,6 @@ from diffdrive_jacobian.kinematics._checks import (
     read_only,
 )
 from diffdrive_jacobian.kinematics._elementary import components, operand
-from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
-from diffdrive_jacobian.kinematics.saturation import saturate
 from diffdrive_jacobian.kinematics.se2 import compose
 from diffdrive_jacobian.simulation._uncertainty import Uncertainty
 from diffdrive_jacobian.simulation.actuators import Settling, Speeds
@@ -193,12 +191,7 @@ class Robot:
     @property
     def wheel_speeds(self) -> tuple[float, float]:
         """`(omega_R, omega_L)` (rad/s), by the inverse wheel Jacobian."""
-        (v, omega), r, L = self.twist, self.model.wheel_radius, self.model.wheel_separation
-        half = omega * L / 2.0
-        omega_R, omega_L = (v + half) / r, (v - half) / r
-        if not (isfinite(omega_R) and isfinite(omega_L)):
-            raise ValueError('twist must give finite wheel speeds, but they overflow')
-        return omega_R, omega_L
+        return self.model.wheel_speeds(*self.twist)
 
     def twist_covariance(self, interval: float) -> NDArray[np.float64]:
         """Compute the covariance of the twist as measured over an interval (s), shape (2, 2).
@@ -252,7 +245,7 @@ class Robot:
         """
         v, omega = pair('command', command)
         model = self.model
-        twist = saturate(v, omega, model.limits, model.wheel_radius, model.wheel_separation)
+        twist = model.limited((v, omega))
         if model.actuators is not None:
             here = self._changed_until(stamp)
             commanded_at = None if v == omega == 0.0 else here.stamp
@@ -338,8 +331,7 @@ class Robot:
         here = self.at(stamp)
         command = here.command
         if wheels_commanded:
-            speeds = body_to_wheel(*command, self.model.wheel_radius, self.model.wheel_separation)
-            command = wheel_to_body(*speeds, model.wheel_radius, model.wheel_separation)
+            command = model.twist(*self.model.wheel_speeds(*command))
         limited = model.limited(command)
         pose, angles, uncertainty, truth = here._present
         if truth is None or model.drift is None:
@@ -416,16 +408,16 @@ class Robot:
         """
         actuators = model.actuators
         assert actuators is not None
-        r, L, stamp = model.wheel_radius, model.wheel_separation, self.stamp
-        demanded: Speeds = body_to_wheel(*twist, r, L)
+        stamp = self.stamp
+        demanded = model.wheel_speeds(*twist)
         speeds, reached = self._motor_speeds, actuators.limited(demanded)
         settling = None
         if actuators.settled(speeds, reached):
             if reached != demanded:
-                twist = wheel_to_body(*reached, r, L)
+                twist = model.twist(*reached)
         else:
             settling = Settling(stamp if since is None else since, stamp, speeds, reached)
-            twist = wheel_to_body(*actuators.mean(settling), r, L)
+            twist = model.twist(*actuators.mean(settling))
         return _robot(model, stamp, state, command, twist, commanded_at, settling)
 
     @property

@@ -1,7 +1,7 @@
 """The true motion of a robot whose wheels slip, and whose wheels are not as its odometry assumes.
 
-Model: the wheels turn as commanded, and the odometry is computed from their nominal radius and
-separation. The true radii and the true separation may differ. In addition each wheel slips: the distance
+Model: the wheels turn as commanded, and the odometry is computed from the radii and the separation that
+the robot assumes. The true ones may differ. In addition each wheel slips: the distance
 that it travels over the ground has a random error whose variance is `k |ds|`, as `odometry_noise` has
 it, where `ds` is the distance that its true rim rolls.
 
@@ -65,11 +65,11 @@ class Drift:
     seed: int | None = None
     """Seed of the random slip. None: the wheels do not slip."""
     right_wheel_radius_multiplier: float = 1.0
-    """True radius of the right wheel, relative to the nominal one [-]."""
+    """True radius of the right wheel, relative to the one that the odometry assumes [-]."""
     left_wheel_radius_multiplier: float = 1.0
-    """True radius of the left wheel, relative to the nominal one [-]."""
+    """True radius of the left wheel, relative to the one that the odometry assumes [-]."""
     wheel_separation_multiplier: float = 1.0
-    """True wheel separation, relative to the nominal one [-]."""
+    """True wheel separation, relative to the one that the odometry assumes [-]."""
 
     def __post_init__(self) -> None:
         """Check every value."""
