@@ -3,10 +3,10 @@
 A reading is constant while the wheel turns by one step, so that only its changes tell where the wheel is.
 In between, the wheel is taken to turn at the speed that the changes show. Where the reading is constant for
 longer, the wheel may be anywhere within the step: the angle is its middle, and the reading error that of a
-uniform distribution. An encoder that changes with each sample is taken at its word.
+uniform distribution.
 
-So an angle is about its mean given the readings, and the error does not correlate with it: it acts like
-noise of the reference. Differences of the readings themselves would bias the estimate.
+So an angle is about its mean given all readings, and the error does not correlate with it. Differences of
+the readings themselves have errors that do, which would bias the estimate.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from diffdrive_jacobian.calibration.measurements import Array
 INTO_REST = 2.0 / 3.0
 """Time from a change of the reading to the middle of a step in which the wheel stops, relative to the
 duration of the step before. On average a wheel that may stop anywhere within the step follows that line."""
+LONG = 1.25
+"""Duration of a step in which the wheel stops, relative to those before and after together."""
 PERIOD = 0.025
 """Period to which the angles are interpolated where they are recorded less often (s)."""
 
@@ -25,9 +27,8 @@ PERIOD = 0.025
 def located(time: Array, readings: Array) -> tuple[Array, Array]:
     """Return the angles of a wheel at the times of its readings, and their standard deviations.
 
-    Both have shape (m,). Readings that change with each sample are returned as they are, with the deviation
-    of the step if other readings show one, else 0. Angles are those of the middle of a step if the readings
-    are.
+    Both have shape (m,). Readings that change with each sample are returned as they are. The deviation is
+    0 but where the wheel stops or turns back within a step.
 
     Args:
         time: Increasing, shape (m,) (s).
@@ -36,24 +37,26 @@ def located(time: Array, readings: Array) -> tuple[Array, Array]:
     changes = np.flatnonzero(np.diff(readings))
     first, last = np.append(0, changes + 1), np.append(changes, len(time) - 1)
     level = readings[first]
-    edges = (time[changes] + time[changes + 1]) / 2.0
-    at_edges = (level[:-1] + level[1:]) / 2.0
-    bounds = np.concatenate([time[:1], edges, time[-1:]])
-    durations = np.where(first == last, 0.0, np.diff(bounds))
-    steps = np.abs(np.diff(level))[(durations[:-1] > 0.0) & (durations[1:] > 0.0)]
+    bounds = np.concatenate([time[:1], (time[changes] + time[changes + 1]) / 2.0, time[-1:]])
+    single = first == last
+    jumps, duration = np.diff(level), np.diff(bounds)
+    steps = np.abs(jumps)[~single[:-1] & ~single[1:]]
     deviation = float(np.median(steps)) / 12.0**0.5 if len(steps) else 0.0
-    inset = np.concatenate([[0.0], INTO_REST * durations, [0.0]])
-    begin = np.maximum(time[first], bounds[:-1] + inset[:-2])
-    end = np.minimum(time[last], bounds[1:] - inset[2:])
-    rest = begin <= end
-    knots = np.concatenate([edges, begin[rest], end[rest]])
-    angles = np.concatenate([at_edges, level[rest], level[rest]])
-    known = np.concatenate([np.zeros(len(edges)), np.full(2 * np.count_nonzero(rest), deviation)])
+    before, after = np.append(0.0, duration[:-1]), np.append(duration[1:], 0.0)
+    stops = single | (duration > LONG * (before + after))
+    # Where the wheel turns back it ends up somewhere within the step, too.
+    stops[1:-1] |= jumps[:-1] * jumps[1:] < 0.0
+    inset = np.concatenate([[0.0], np.where(single, 0.5, INTO_REST) * duration, [0.0]])
+    middle = (time[first] + time[last]) / 2.0
+    begin = np.clip(bounds[:-1] + inset[:-2], time[first], middle)[stops]
+    end = np.clip(bounds[1:] - inset[2:], middle, time[last])[stops]
+    unknown = np.where(single, 0.0, deviation)[stops]
+    knots = np.concatenate([bounds[1:-1], begin, end])
+    angles = np.concatenate([(level[:-1] + level[1:]) / 2.0, level[stops], level[stops]])
+    deviations = np.concatenate([0.0 * jumps, unknown, unknown])
     order = np.argsort(knots, kind='stable')
-    return (
-        np.interp(time, knots[order], angles[order]),
-        np.interp(time, knots[order], known[order]),
-    )
+    knots = knots[order]
+    return np.interp(time, knots, angles[order]), np.interp(time, knots, deviations[order])
 
 
 def densified(time: Array, angles: Array) -> tuple[Array, Array]:

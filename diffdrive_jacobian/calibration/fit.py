@@ -28,7 +28,7 @@ from diffdrive_jacobian.calibration.measurements import (
 from diffdrive_jacobian.calibration.motion import Geometry, composed, inverted
 
 MAX_STEPS = 40
-FULL_STEPS = 10
+FULL_STEPS = 5
 """Steps after which they are halved."""
 WINDOW = 4.0
 """Half of the time over which wheel speeds are means, in units of the last change of the time offset:
@@ -63,6 +63,11 @@ class _Prior:
     pull: Array
     reading: Array
     """What reading errors of one standard deviation do at each pose, as of `linearized`."""
+
+    @property
+    def misread(self) -> NDArray[np.intp]:
+        """Indices of the poses with reading errors."""
+        return np.flatnonzero(self.reading.any(axis=(1, 2)))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -159,23 +164,26 @@ def _solved(groups: tuple[Group, Group, Group], weights: Array, prior: _Prior) -
     """Return the Gauss-Newton step for given weights of the groups."""
     free = prior.free
 
-    def total(name: str, kinds: Sequence[int] = (0, 1, 2)) -> Array:
-        return np.asarray(sum(weights[kind] * getattr(groups[kind], name) for kind in kinds))
+    def total(name: str, kinds: slice = slice(None), here: slice | Array = slice(None)) -> Array:
+        pairs = zip(weights[kinds], groups[kinds], strict=True)
+        return np.asarray(sum(weight * getattr(one, name)[here] for weight, one in pairs))
 
-    # The reading errors, whose prior has unit weight, only act on what the reference observes.
-    B, H = prior.reading, total('diagonal', (1, 2))
+    def right_side(*where: slice | Array) -> Array:
+        border, gradient = total('border', *where)[:, :, free], total('gradient', *where)
+        return np.concatenate([border, gradient[:, :, None]], axis=2)
+
+    diagonal, right = total('diagonal'), right_side()
+    # The reading errors, with a prior of unit weight, act on the reference only. They are eliminated.
+    reference, at = slice(1, None), prior.misread
+    B, H, b = prior.reading[at], total('diagonal', reference, at), right_side(reference, at)
     back = np.swapaxes(B, 1, 2)
     inner = np.eye(2) + back @ H @ B
     G = B @ np.linalg.solve(inner, back)
-    observed = np.concatenate(
-        [total('border', (1, 2))[:, :, free], total('gradient', (1, 2))[:, :, None]], axis=2
-    )
-    explained = G @ observed
-    border = total('border')[:, :, free]
-    right = np.concatenate([border, total('gradient')[:, :, None]], axis=2) - H @ explained
-    solved, logarithm = _block_tridiagonal.solve(total('diagonal') - H @ G @ H, total('upper'), right)
+    diagonal[at] -= H @ G @ H
+    right[at] -= H @ G @ b
+    solved, logarithm = _block_tridiagonal.solve(diagonal, total('upper'), right)
     eliminated = np.einsum('nip,niq->pq', right[:, :, :-1], solved)
-    eliminated += np.einsum('nip,niq->pq', observed[:, :, :-1], explained)
+    eliminated += np.einsum('nip,niq->pq', b[:, :, :-1], G @ b)
     information = total('corner')[np.ix_(free, free)] - eliminated[:, :-1]
     information = (information + information.T) / 2.0
     damped = information + np.diag(prior_deviations(len(free))[free] ** -2.0)
@@ -183,16 +191,16 @@ def _solved(groups: tuple[Group, Group, Group], weights: Array, prior: _Prior) -
         damped, total('gradient_corner')[free] + prior.pull[free] - eliminated[:, -1]
     )
     step = -solved[:, :, -1] - solved[:, :, :-1] @ change
-    reading = -explained[:, :, -1] - explained[:, :, :-1] @ change
-    reading -= np.einsum('nij,nj->ni', G @ H, step)
+    observed = step.copy()
+    observed[at] -= (G @ (H @ step[at, :, None] + b @ np.append(change, 1.0)[:, None]))[:, :, 0]
     if not (np.isfinite(change).all() and np.isfinite(step).all()):
         raise CalibrationError('the estimate diverges: the poses do not fit the motion of the wheels')
     return _Solution(
         step=step,
-        observed=step + reading,
+        observed=observed,
         change=change,
         information=information,
-        logarithm=logarithm + float((np.linalg.slogdet(inner)[1]).sum() + np.linalg.slogdet(damped)[1]),
+        logarithm=logarithm + float(np.linalg.slogdet(inner)[1].sum() + np.linalg.slogdet(damped)[1]),
     )
 
 
