@@ -9,6 +9,7 @@ import pytest
 from calibration_data import NOISE, NOMINAL, TRUE, Drive, Simulation, umbmark
 
 from diffdrive_jacobian.calibration import CalibrationError, Given, Noise, calibrate, preparation
+from diffdrive_jacobian.calibration.encoder import PERIOD, densified, located
 from diffdrive_jacobian.calibration.errors import compared_distance, rms, tracks
 from diffdrive_jacobian.calibration.estimate import Estimate
 from diffdrive_jacobian.calibration.fit import information
@@ -233,6 +234,73 @@ def test_several_recordings_count_together():
     np.testing.assert_allclose(all_of_them.time_offsets, [0.0, 0.5, 1.0], atol=0.02)
 
 
+# --- Encoders with few steps, and wheels that are recorded rarely
+
+
+def with_stops(commands, pause=0.6):
+    return [one for command in commands for one in (command, (pause, 0.0, 0.0))]
+
+
+def stepped(readings, steps, random):
+    """Return readings of encoders with some steps per turn, from random angles."""
+    step = 2.0 * np.pi / steps
+    return np.floor(readings / step + random.uniform(0.0, 1.0, 2)) * step
+
+
+def test_angles_that_change_with_each_sample_are_taken_as_they_are():
+    drive = Drive.of(with_stops(umbmark(runs=1)))
+    for angles in drive.angles.T:
+        found, deviations = located(drive.time, angles)
+        np.testing.assert_allclose(found, angles, atol=1e-12)
+        assert not deviations.any()
+
+
+@pytest.mark.parametrize('steps', [16, 32])
+def test_wheels_are_located_between_the_steps_of_their_encoders(steps):
+    random = np.random.default_rng(20)
+    drive = Drive.of(with_stops(umbmark(runs=4)))
+    errors, deviations = [], []
+    for readings, angles in zip(stepped(drive.angles, steps, random).T, drive.angles.T, strict=True):
+        found, deviation = located(drive.time, readings)
+        assert deviation.max() == pytest.approx(2.0 * np.pi / steps / 12.0**0.5)
+        moves = deviation == 0.0
+        errors.append(found - angles - np.mean((found - angles)[moves]))
+        deviations.append(deviation)
+    error, deviation = np.concatenate(errors), np.concatenate(deviations)
+    rest = deviation == deviation.max()
+    assert 0.8 < (error[rest] / deviation[rest]).std() < 1.2
+    assert error[deviation == 0.0].std() < 0.5 * deviation.max()
+
+
+def test_few_steps_make_the_multipliers_uncertain_and_not_wrong():
+    random = np.random.default_rng(21)
+    robot = replace(ROBOT, drive=Drive.of(with_stops(umbmark(side=1.0, runs=1))), rate=5)
+    errors, nees, widths = [], [], []
+    count = 6
+    for _ in range(count):
+        exact = robot.recording(random)
+        coarse = replace(exact, wheel_angles=stepped(exact.wheel_angles, 16, random))
+        known, found = (calibrate([one], NOMINAL) for one in (exact, coarse))
+        widths.append(deviations(found) / deviations(known))
+        errors.append((found.multipliers - known.multipliers) / deviations(found))
+        error = found.multipliers - TRUE
+        nees.append(error @ np.linalg.solve(found.covariance, error))
+    assert np.mean(widths, axis=0)[2] > 1.02
+    assert (np.abs(np.mean(errors, axis=0)) < 0.8).all()
+    assert np.mean(nees) < 3.0 + 3.5 * np.sqrt(6.0 / count)
+
+
+def test_wheels_at_4_hz_are_interpolated():
+    """The rates of a robot with finite accelerations change little between the samples."""
+    time = np.arange(0.0, 20.0, 0.25)
+    angles = np.column_stack([-np.cos(time), np.sin(0.7 * time) / 0.7])
+    dense, found = densified(time, angles)
+    assert np.diff(dense).max() <= PERIOD * (1.0 + 1e-9)
+    true = np.column_stack([-np.cos(dense), np.sin(0.7 * dense) / 0.7])
+    linear = np.column_stack([np.interp(dense, time, one) for one in angles.T])
+    assert np.std(found - true) < 0.3 * np.std(linear - true)
+
+
 # --- What a drive does not determine
 
 
@@ -354,9 +422,9 @@ def test_wheels_at_a_low_rate_and_slip_are_noted():
         wheel_time=recording.wheel_time[::50],
         wheel_angles=recording.wheel_angles[::50],
     )
-    notes = calibrate([rare], NOMINAL).notes
-    assert any('every 1 s' in note for note in notes)
-    assert any('m after 1 m: they slip' in note for note in notes)
+    assert any('every 1 s' in note for note in calibrate([rare], NOMINAL).notes)
+    slips = replace(ROBOT, noise=replace(NOISE, wheel=2e-3)).recording(np.random.default_rng(13))
+    assert any('m after 1 m: they slip' in note for note in calibrate([slips], NOMINAL).notes)
 
 
 @pytest.mark.parametrize('overlap', ['reference first', 'wheels first'])

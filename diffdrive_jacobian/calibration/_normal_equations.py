@@ -57,8 +57,8 @@ def linearized(
 ) -> tuple[tuple[Group, Group, Group], Array]:
     """Return the normal equations of the motion, the positions and the headings.
 
-    And how far the reading errors of both wheels, each of one standard deviation, seem to move the body at
-    each pose: twists in its frame, shape (n, 3, 2).
+    And how far the reading errors of both wheels, each of one standard deviation, seem to move the body
+    at each pose: twists in its frame, shape (n, 3, 2).
 
     Args:
         segments: Continuous motions.

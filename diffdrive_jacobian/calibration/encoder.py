@@ -1,12 +1,12 @@
 """Angles of a wheel from the readings of an encoder with finite steps, sampled at finite rate.
 
 A reading is constant while the wheel turns by one step, so that only its changes tell where the wheel is.
-In between, the wheel is taken to turn at the speed that the changes show. Where the reading is constant for
-longer, the wheel may be anywhere within the step: the angle is its middle, and the reading error that of a
-uniform distribution.
+In between, the wheel is taken to turn at the speed that the changes show. Where the reading is constant
+for longer, the wheel may be anywhere within the step: the angle is its middle, and the reading error
+that of a uniform distribution.
 
-So an angle is about its mean given all readings, and the error does not correlate with it. Differences of
-the readings themselves have errors that do, which would bias the estimate.
+So an angle is about its mean given all readings, and the error does not correlate with it. Differences
+of the readings themselves have errors that do, which would bias the estimate.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from diffdrive_jacobian.calibration.measurements import Array
 
 INTO_REST = 2.0 / 3.0
 """Time from a change of the reading to the middle of a step in which the wheel stops, relative to the
-duration of the step before. On average a wheel that may stop anywhere within the step follows that line."""
+duration of the step before. It is the straight line nearest to the mean of wheels that stop anywhere."""
 LONG = 1.25
 """Duration of a step in which the wheel stops, relative to those before and after together."""
 PERIOD = 0.025
@@ -27,8 +27,8 @@ PERIOD = 0.025
 def located(time: Array, readings: Array) -> tuple[Array, Array]:
     """Return the angles of a wheel at the times of its readings, and their standard deviations.
 
-    Both have shape (m,). Readings that change with each sample are returned as they are. The deviation is
-    0 but where the wheel stops or turns back within a step.
+    Both have shape (m,). Readings that change with each sample are returned as they are. The deviation
+    is 0 except where the wheel stops or turns back within a step.
 
     Args:
         time: Increasing, shape (m,) (s).

@@ -67,9 +67,7 @@ def overlapping(recording: Recording, index: int, offset: float, radius: float) 
         if np.count_nonzero(here) >= FEWEST:
             readings = recording.wheel_angles[first:last].T
             both = [located(wheels[first:last], one) for one in readings]
-            time, angles = densified(
-                wheels[first:last], np.column_stack([angles for angles, _ in both])
-            )
+            time, angles = densified(wheels[first:last], np.column_stack([angles for angles, _ in both]))
             errors = [np.interp(time, wheels[first:last], deviations) for _, deviations in both]
             found.append(
                 Segment(
