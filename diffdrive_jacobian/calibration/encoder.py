@@ -1,7 +1,7 @@
 """Angles of a wheel from the readings of an encoder with finite steps, sampled at finite rate.
 
-A reading is constant while the wheel turns by one step, so that only its changes tell where the wheel is.
-In between, the wheel is taken to turn at the speed that the changes show. Where the reading is constant
+A reading is constant while the wheel turns by one step. Only its changes show where the
+wheel is. In between, the wheel is taken to turn at the speed that they show. Where the reading is constant
 for longer, the wheel may be anywhere within the step: the angle is its middle, and the reading error
 that of a uniform distribution.
 

@@ -164,18 +164,17 @@ def _solved(groups: tuple[Group, Group, Group], weights: Array, prior: _Prior) -
     """Return the Gauss-Newton step for given weights of the groups."""
     free = prior.free
 
-    def total(name: str, kinds: slice = slice(None), here: slice | Array = slice(None)) -> Array:
-        pairs = zip(weights[kinds], groups[kinds], strict=True)
-        return np.asarray(sum(weight * getattr(one, name)[here] for weight, one in pairs))
+    def total(name: str, kinds: Sequence[int] = (0, 1, 2)) -> Array:
+        return np.asarray(sum(weights[kind] * getattr(groups[kind], name) for kind in kinds))
 
-    def right_side(*where: slice | Array) -> Array:
-        border, gradient = total('border', *where)[:, :, free], total('gradient', *where)
+    def right_side(kinds: Sequence[int] = (0, 1, 2)) -> Array:
+        border, gradient = total('border', kinds)[:, :, free], total('gradient', kinds)
         return np.concatenate([border, gradient[:, :, None]], axis=2)
 
     diagonal, right = total('diagonal'), right_side()
     # The reading errors, with a prior of unit weight, act on the reference only. They are eliminated.
-    reference, at = slice(1, None), prior.misread
-    B, H, b = prior.reading[at], total('diagonal', reference, at), right_side(reference, at)
+    at = prior.misread
+    B, H, b = prior.reading[at], total('diagonal', (1, 2))[at], right_side((1, 2))[at]
     back = np.swapaxes(B, 1, 2)
     inner = np.eye(2) + back @ H @ B
     G = B @ np.linalg.solve(inner, back)
