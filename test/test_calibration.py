@@ -88,11 +88,15 @@ def test_covariance_of_the_motion_is_that_of_simulated_wheels():
 # --- Estimate
 
 
-def test_information_equals_that_of_a_dense_model():
-    """Of the increments of the whole drive, without the poses as unknowns."""
+@pytest.mark.parametrize('steps', [None, 16])
+def test_information_equals_that_of_a_dense_model(steps):
+    """Of the increments of the whole drive and the reading errors, without the poses as unknowns."""
     random = np.random.default_rng(4)
     robot = replace(ROBOT, drive=Drive.of([(3.0, 0.2, 0.0), (2.0, 0.0, 0.8), (2.0, 0.2, -0.4)]))
-    result = calibrate([robot.recording(random)], NOMINAL)
+    recording = robot.recording(random)
+    if steps:
+        recording = replace(recording, wheel_angles=stepped(recording.wheel_angles, steps, random))
+    result = calibrate([recording], NOMINAL)
     motion, estimate = result.motions[0], result.estimate
     at = motion.time + result.time_offsets[0]
     found = increments(motion.wheel_time, motion.wheel_angles, at, result.geometry)
@@ -100,13 +104,20 @@ def test_information_equals_that_of_a_dense_model():
     # Each pose of the body, as the start (3 unknowns), the multipliers and the noise of the steps.
     truth = replace(estimate, states=(composed(estimate.states[0][0], found.poses),))
     states = truth.states[0]
-    by = np.zeros((n, 3, 3 * n + 3))
+    by = np.zeros((n, 3, 5 * n + 3))
     by[0, :, :3] = np.eye(3)
     for i in range(1, n):
         back = adjoint(inverted(relative(states[i - 1], states[i])))
         by[i] = back @ by[i - 1]
         by[i, :, 3 * i : 3 * i + 3] += np.eye(3)
-        by[i, :, 3 * n :] += found.jacobian[i - 1]
+        by[i, :, 5 * n :] += found.jacobian[i - 1]
+    errors = np.column_stack([np.interp(at, motion.wheel_time, one) for one in motion.wheel_errors.T])
+    assert errors.any() == (steps is not None)
+    right, left = result.geometry.radii
+    L = result.geometry.separation
+    for i, (of_right, of_left) in enumerate(errors * [right, left]):
+        by[i, :, 3 * n + 2 * i] = [of_right / 2.0, 0.0, of_right / L]
+        by[i, :, 3 * n + 2 * i + 1] = [of_left / 2.0, 0.0, -of_left / L]
     x, y, _ = estimate.sensor
     J = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
     noise = estimate.noise
@@ -115,6 +126,8 @@ def test_information_equals_that_of_a_dense_model():
     for i in range(1, n):
         block = slice(3 * i, 3 * i + 3)
         normal[block, block] += np.linalg.inv(found.covariance[i - 1] * noise.wheel)
+    readings = np.arange(3 * n, 5 * n)
+    normal[readings, readings] += 1.0
     free = np.zeros(7, dtype=bool)
     free[:3] = True
     expected = np.linalg.inv(normal)[-3:, -3:]

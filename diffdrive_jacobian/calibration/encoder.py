@@ -1,9 +1,9 @@
 """Angles of a wheel from the readings of an encoder with finite steps, sampled at finite rate.
 
-A reading is constant while the wheel turns by one step. Only its changes show where the
-wheel is. In between, the wheel is taken to turn at the speed that they show. Where the reading is constant
-for longer, the wheel may be anywhere within the step: the angle is its middle, and the reading error
-that of a uniform distribution.
+A reading is constant while the wheel turns by one step. Only its changes show where the wheel is. In
+between, the wheel is taken to turn at the speed that they show. Where the reading is constant for
+longer, the wheel may be anywhere within the step: the angle is its middle, and the reading error that of
+a uniform distribution.
 
 So an angle is about its mean given all readings, and the error does not correlate with it. Differences
 of the readings themselves have errors that do, which would bias the estimate.
