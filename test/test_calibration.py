@@ -11,6 +11,7 @@ import pytest
 from calibration_data import NOISE, NOMINAL, TRUE, Drive, Simulation, square, umbmark
 
 from diffdrive_jacobian.calibration import CalibrationError, Given, Noise, calibrate, preparation
+from diffdrive_jacobian.calibration.encoder import PERIOD, densified, located
 from diffdrive_jacobian.calibration.errors import compared_distance, rms, tracks
 from diffdrive_jacobian.calibration.estimate import Estimate
 from diffdrive_jacobian.calibration.fit import information
@@ -89,11 +90,15 @@ def test_covariance_of_the_motion_is_that_of_simulated_wheels():
 # --- Estimate
 
 
-def test_information_equals_that_of_a_dense_model():
-    """Of the increments of the whole drive, without the poses as unknowns."""
+@pytest.mark.parametrize('steps', [None, 16])
+def test_information_equals_that_of_a_dense_model(steps):
+    """Of the increments of the whole drive and the reading errors, without the poses as unknowns."""
     random = np.random.default_rng(4)
     robot = replace(ROBOT, drive=Drive.of([(3.0, 0.2, 0.0), (2.0, 0.0, 0.8), (2.0, 0.2, -0.4)]))
-    result = calibrate([robot.recording(random)], NOMINAL)
+    recording = robot.recording(random)
+    if steps:
+        recording = replace(recording, wheel_angles=stepped(recording.wheel_angles, steps, random))
+    result = calibrate([recording], NOMINAL)
     motion, estimate = result.motions[0], result.estimate
     at = motion.time + result.time_offsets[0]
     found = increments(motion.wheel_time, motion.wheel_angles, at, result.geometry)
@@ -101,13 +106,20 @@ def test_information_equals_that_of_a_dense_model():
     # Each pose of the body, as the start (3 unknowns), the multipliers and the noise of the steps.
     truth = replace(estimate, states=(composed(estimate.states[0][0], found.poses),))
     states = truth.states[0]
-    by = np.zeros((n, 3, 3 * n + 3))
+    by = np.zeros((n, 3, 5 * n + 3))
     by[0, :, :3] = np.eye(3)
     for i in range(1, n):
         back = adjoint(inverted(relative(states[i - 1], states[i])))
         by[i] = back @ by[i - 1]
         by[i, :, 3 * i : 3 * i + 3] += np.eye(3)
-        by[i, :, 3 * n :] += found.jacobian[i - 1]
+        by[i, :, 5 * n :] += found.jacobian[i - 1]
+    errors = np.column_stack([np.interp(at, motion.wheel_time, one) for one in motion.wheel_errors.T])
+    assert errors.any() == (steps is not None)
+    right, left = result.geometry.radii
+    L = result.geometry.separation
+    for i, (of_right, of_left) in enumerate(errors * [right, left]):
+        by[i, :, 3 * n + 2 * i] = [of_right / 2.0, 0.0, of_right / L]
+        by[i, :, 3 * n + 2 * i + 1] = [of_left / 2.0, 0.0, -of_left / L]
     x, y, _ = estimate.sensor
     J = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
     noise = estimate.noise
@@ -116,6 +128,8 @@ def test_information_equals_that_of_a_dense_model():
     for i in range(1, n):
         block = slice(3 * i, 3 * i + 3)
         normal[block, block] += np.linalg.inv(found.covariance[i - 1] * noise.wheel)
+    readings = np.arange(3 * n, 5 * n)
+    normal[readings, readings] += 1.0
     free = np.zeros(7, dtype=bool)
     free[:3] = True
     expected = np.linalg.inv(normal)[-3:, -3:]
@@ -288,6 +302,73 @@ def test_several_recordings_count_together():
     np.testing.assert_allclose(all_of_them.time_offsets, [0.0, 0.5, 1.0], atol=0.02)
 
 
+# --- Encoders with few steps, and wheels that are recorded rarely
+
+
+def with_stops(commands, pause=0.6):
+    return [one for command in commands for one in (command, (pause, 0.0, 0.0))]
+
+
+def stepped(readings, steps, random):
+    """Return readings of encoders with some steps per turn, from random angles."""
+    step = 2.0 * np.pi / steps
+    return np.floor(readings / step + random.uniform(0.0, 1.0, 2)) * step
+
+
+def test_angles_that_change_with_each_sample_are_taken_as_they_are():
+    drive = Drive.of(with_stops(umbmark(runs=1)))
+    for angles in drive.angles.T:
+        found, deviations = located(drive.time, angles)
+        np.testing.assert_allclose(found, angles, atol=1e-12)
+        assert not deviations.any()
+
+
+@pytest.mark.parametrize('steps', [16, 32])
+def test_wheels_are_located_between_the_steps_of_their_encoders(steps):
+    random = np.random.default_rng(20)
+    drive = Drive.of(with_stops(umbmark(runs=4)))
+    errors, deviations = [], []
+    for readings, angles in zip(stepped(drive.angles, steps, random).T, drive.angles.T, strict=True):
+        found, deviation = located(drive.time, readings)
+        assert deviation.max() == pytest.approx(2.0 * np.pi / steps / 12.0**0.5)
+        moves = deviation == 0.0
+        errors.append(found - angles - np.mean((found - angles)[moves]))
+        deviations.append(deviation)
+    error, deviation = np.concatenate(errors), np.concatenate(deviations)
+    rest = deviation == deviation.max()
+    assert 0.8 < (error[rest] / deviation[rest]).std() < 1.2
+    assert error[deviation == 0.0].std() < 0.5 * deviation.max()
+
+
+def test_few_steps_make_the_multipliers_uncertain_and_not_wrong():
+    random = np.random.default_rng(21)
+    robot = replace(ROBOT, drive=Drive.of(with_stops(umbmark(side=1.0, runs=1))), rate=5)
+    errors, nees, widths = [], [], []
+    count = 6
+    for _ in range(count):
+        exact = robot.recording(random)
+        coarse = replace(exact, wheel_angles=stepped(exact.wheel_angles, 16, random))
+        known, found = (calibrate([one], NOMINAL) for one in (exact, coarse))
+        widths.append(deviations(found) / deviations(known))
+        errors.append((found.multipliers - known.multipliers) / deviations(found))
+        error = found.multipliers - TRUE
+        nees.append(error @ np.linalg.solve(found.covariance, error))
+    assert np.mean(widths, axis=0)[2] > 1.02
+    assert (np.abs(np.mean(errors, axis=0)) < 0.8).all()
+    assert np.mean(nees) < 3.0 + 3.5 * np.sqrt(6.0 / count)
+
+
+def test_wheels_at_4_hz_are_interpolated():
+    """The rates of a robot with finite accelerations change little between the samples."""
+    time = np.arange(0.0, 20.0, 0.25)
+    angles = np.column_stack([-np.cos(time), np.sin(0.7 * time) / 0.7])
+    dense, found = densified(time, angles)
+    assert np.diff(dense).max() <= PERIOD * (1.0 + 1e-9)
+    true = np.column_stack([-np.cos(dense), np.sin(0.7 * dense) / 0.7])
+    linear = np.column_stack([np.interp(dense, time, one) for one in angles.T])
+    assert np.std(found - true) < 0.3 * np.std(linear - true)
+
+
 # --- What a drive does not determine
 
 
@@ -442,9 +523,9 @@ def test_wheels_at_a_low_rate_and_slip_are_noted():
         wheel_time=recording.wheel_time[::50],
         wheel_angles=recording.wheel_angles[::50],
     )
-    notes = calibrate([rare], NOMINAL).notes
-    assert any('every 1 s' in note for note in notes)
-    assert any('m after 1 m: they slip' in note for note in notes)
+    assert any('every 1 s' in note for note in calibrate([rare], NOMINAL).notes)
+    slips = replace(ROBOT, noise=replace(NOISE, wheel=2e-3)).recording(np.random.default_rng(13))
+    assert any('m after 1 m: they slip' in note for note in calibrate([slips], NOMINAL).notes)
 
 
 @pytest.mark.parametrize('overlap', ['reference first', 'wheels first'])

@@ -54,8 +54,11 @@ class Group:
 
 def linearized(
     segments: Sequence[Segment], nominal: Geometry, estimate: Estimate, window: float = np.inf
-) -> tuple[Group, Group, Group]:
+) -> tuple[tuple[Group, Group, Group], Array]:
     """Return the normal equations of the motion, the positions and the headings.
+
+    And how far the reading errors of both wheels, each of one standard deviation, seem to move the body
+    at each pose: twists in its frame, shape (n, 3, 2).
 
     Args:
         segments: Continuous motions.
@@ -66,6 +69,10 @@ def linearized(
     count = len(estimate.parameters)
     geometry, sensor = estimate.geometry(nominal), estimate.sensor
     parts: tuple[list[Group], ...] = ([], [], [])
+    readings = []
+    right, left = geometry.radii
+    L = geometry.separation
+    by_reading = np.array([[right / 2.0, left / 2.0], [0.0, 0.0], [right / L, -left / L]])
     for segment, states in zip(segments, estimate.states, strict=True):
         offset = TIME_OFFSETS + segment.recording
         at = segment.time + estimate.parameters[offset]
@@ -73,8 +80,10 @@ def linearized(
         parts[0].append(_motion(moved, states, offset, count))
         for kind, part in enumerate(_observation(segment, states, sensor, count), 1):
             parts[kind].append(part)
+        errors = [np.interp(at, segment.wheel_time, one) for one in segment.wheel_errors.T]
+        readings.append(by_reading * np.column_stack(errors)[:, None])
     motion, position, heading = (_joined(part) for part in parts)
-    return motion, position, heading
+    return (motion, position, heading), np.concatenate(readings)
 
 
 def _motion(moved: Increments, states: Array, offset: int, count: int) -> Group:

@@ -60,6 +60,12 @@ def describe(result: Calibration) -> list[str]:
         f'noise: wheel travel variance {noise.wheel:.3g} m, reference {noise.position:.3g} m and '
         f'{noise.heading:.3g} rad'
     )
+    errors = np.max([one.wheel_errors.max(axis=0) for one in result.segments], axis=0) * radii
+    if errors.any():
+        lines.append(
+            f'encoders: standard deviation of a wheel at rest {errors[1]:.2g} m (left), '
+            f'{errors[0]:.2g} m (right)'
+        )
     distance = compared_distance(result)
     before, after = (
         tracks(result, geometry, distance) for geometry in (result.nominal, result.geometry)

@@ -68,6 +68,9 @@ class Segment:
     """Index of the recording."""
     wheel_time: Array
     wheel_angles: Array
+    """Most likely angles of the right and the left wheel, shape (m, 2) (rad)."""
+    wheel_errors: Array
+    """Their standard deviations by the steps of the encoders, shape (m, 2) (rad)."""
     time: Array
     """Times of the poses, not corrected by the time offset, increasing, shape (n,) (s)."""
     poses: Array

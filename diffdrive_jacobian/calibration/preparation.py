@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.calibration.encoder import densified, located
 from diffdrive_jacobian.calibration.measurements import (
     Array,
     CalibrationError,
@@ -64,11 +65,16 @@ def overlapping(recording: Recording, index: int, offset: float, radius: float) 
             continue
         here = inside & (at >= wheels[first]) & (at <= wheels[last - 1])
         if np.count_nonzero(here) >= FEWEST:
+            readings = recording.wheel_angles[first:last].T
+            both = [located(wheels[first:last], one) for one in readings]
+            time, angles = densified(wheels[first:last], np.column_stack([angles for angles, _ in both]))
+            errors = [np.interp(time, wheels[first:last], deviations) for _, deviations in both]
             found.append(
                 Segment(
                     recording=index,
-                    wheel_time=wheels[first:last],
-                    wheel_angles=recording.wheel_angles[first:last],
+                    wheel_time=time,
+                    wheel_angles=angles,
+                    wheel_errors=np.column_stack(errors),
                     time=recording.pose_time[here],
                     poses=recording.poses[here],
                     weights=np.ones(int(np.count_nonzero(here))),
