@@ -1,0 +1,255 @@
+"""Whether the multipliers are the same at all times, in each kind of motion, and in each recording.
+
+A score test: windows of time and kinds of motion have multipliers of their own, as further parameters
+of the model. Their information and gradient at the estimate show, for any set of windows or kinds, how
+much a multiplier differs there from that in the rest. Source: doc/mathematics.md, "Calibration".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffdrive_jacobian.calibration.estimate import MULTIPLIERS, TIME_OFFSETS, Estimate, prior_deviations
+from diffdrive_jacobian.calibration.fit import score
+from diffdrive_jacobian.calibration.measurements import Array, Segment
+from diffdrive_jacobian.calibration.motion import Geometry
+
+WINDOWS = 64
+"""Number of windows of equal distances into which all drives are divided."""
+MOST_POSES = 2000
+"""Number of poses that are used at most."""
+CHANCE = 1e-3
+"""Probability of a misfit by chance among all windows, among all kinds, and among all recordings."""
+SPREAD = 0.03
+"""Standard deviation that is expected of a difference [-]. Without this bound, differences that the data
+hardly determine are absurdly large."""
+EXCESS = 1.25
+"""Ratio of the squares in the median window to those of the model that may be chance."""
+STEADY = 1.0
+"""Time over which speeds are means to determine the kind of motion (s)."""
+CURVED = 0.1
+"""Ratio of the rotation to the translation of the wheels below which a motion is straight; above the
+inverse it is a turn in place."""
+DIRECTIONS = (
+    ('the left wheel travels', np.array([1.0, 0.0, 0.0])),
+    ('the right wheel travels', np.array([0.0, 1.0, 0.0])),
+    ('both wheels travel', np.array([1.0, 1.0, 0.0])),
+    ('the robot turns', np.array([0.0, 0.0, -1.0])),
+)
+"""What may be more in one part than in another, and as changes of the logarithms of the multipliers."""
+_SHAPE, _FORWARDS, _LEFT = np.unravel_index(np.arange(12), (3, 2, 2))
+KINDS = {
+    'drives straight': _SHAPE == 0,
+    'turns in place': _SHAPE == 1,
+    'drives arcs': _SHAPE == 2,
+    'turns left': (_SHAPE > 0) & (_LEFT == 1),
+    'turns right': (_SHAPE > 0) & (_LEFT == 0),
+    'drives backwards': (_SHAPE != 1) & (_FORWARDS == 0),
+}
+"""Kinds of motion, each as a set of 12 cells: straight, in place or arc; backwards or forwards; right or
+left."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Window:
+    """A part of a recording."""
+
+    recording: int
+    begin: float
+    """By the clock of the reference (s)."""
+    end: float
+    share: float
+    """Of the distance of all recordings."""
+    whole: bool
+    """Whether it is all of one of several recordings."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Misfit:
+    """A part of the drives in which a multiplier is another one than in the rest."""
+
+    window: Window | None
+    """None: it is a kind of motion."""
+    words: str
+    """What is different and where, without the name of the recording."""
+    difference: float
+    """Of the logarithm of the multiplier."""
+    deviations: float
+    """The same in standard deviations."""
+    shifts: Array
+    """What must be added to the parameters for those of the rest, and of this part, shape (2, n)."""
+
+
+def misfit(segments: Sequence[Segment], nominal: Geometry, estimate: Estimate) -> Misfit | None:
+    """Return the most certain misfit of an estimate; None: there is none that is no chance.
+
+    Args:
+        segments: The motions with the poses `estimate.states`.
+        nominal: Nominal dimensions of the robot.
+        estimate: The most likely parameters.
+    """
+    every = -(-sum(len(one.time) for one in segments) // MOST_POSES)
+    kept = [slice(None, None, min(every, len(one.time) - 1)) for one in segments]
+    segments = [one.part(here) for one, here in zip(segments, kept, strict=True)]
+    estimate = replace(
+        estimate, states=tuple(one[here] for one, here in zip(estimate.states, kept, strict=True))
+    )
+    windows, members = _windows(segments, nominal, estimate.parameters[TIME_OFFSETS:])
+    cells = len(windows) + len(_SHAPE)
+    count = len(estimate.parameters)
+    kinds = [
+        len(windows) + _kinds(one, nominal, estimate.parameters[TIME_OFFSETS + one.recording])
+        for one in segments
+    ]
+    columns = [count + 3 * np.column_stack(pair) for pair in zip(members, kinds, strict=True)]
+    information, gradient = score(segments, nominal, estimate, columns, count + 3 * cells)
+    common = np.flatnonzero(estimate.free)
+    known = information[np.ix_(common, common)] + np.diag(prior_deviations(count)[common] ** -2.0)
+    cross = information[common, count:]
+    gain = np.linalg.solve(known, np.column_stack([cross, gradient[common]]))
+    S = (information[count:, count:] - cross.T @ gain[:, :-1]).reshape(cells, 3, cells, 3)
+    g = (gradient[count:] - cross.T @ gain[:, -1]).reshape(cells, 3)
+    by_cell = np.zeros((count, cells, 3))
+    by_cell[common] = -gain[:, :-1].reshape(-1, cells, 3)
+    sets, limits = _sets(windows, _excess(S, g, len(windows)))
+    best: Misfit | None = None
+    strongest = 1.0
+    for what, direction in DIRECTIONS:
+        along = np.einsum('i,aibj,j->ab', direction, S, direction)
+        weight = np.sum((sets @ along) * sets, axis=1) + SPREAD**-2.0
+        slope = sets @ (g @ direction)
+        deviations = np.abs(slope) / np.sqrt(weight)
+        index = int(np.argmax(deviations / limits))
+        if deviations[index] > strongest * limits[index]:
+            strongest = float(deviations[index] / limits[index])
+            difference = float(-slope[index] / weight[index])
+            rest = by_cell @ direction @ sets[index] * difference
+            own = rest.copy()
+            own[MULTIPLIERS] += direction * difference
+            window = _window(sets[index], windows)
+            best = Misfit(
+                window=window,
+                words=_words(window, index, what, difference),
+                difference=difference,
+                deviations=float(deviations[index]),
+                shifts=np.stack([rest, own]),
+            )
+    return best
+
+
+def _words(window: Window | None, index: int, what: str, difference: float) -> str:
+    much = f'{what} {100.0 * abs(difference):.2g} % {"more" if difference > 0.0 else "less"} than'
+    if window is None:
+        return f'where the robot {list(KINDS)[index]}, {much} elsewhere'
+    if window.whole:
+        return f'{much} in the other recordings'
+    return f'from {window.begin:.0f} to {window.end:.0f} s {much} in the rest'
+
+
+def _windows(
+    segments: Sequence[Segment], nominal: Geometry, offsets: Array
+) -> tuple[list[Window], list[NDArray[np.int_]]]:
+    """Return all windows in their order, and the window of each step of each motion."""
+    paths = []
+    for one in segments:
+        steps = np.abs(np.diff(one.wheel_angles, axis=0)).sum(axis=1) * nominal.wheel_radius
+        path = np.concatenate([[0.0], np.cumsum(steps)])
+        paths.append(np.interp(one.time + offsets[one.recording], one.wheel_time, path))
+    total = sum(float(path[-1] - path[0]) for path in paths)
+    windows: list[Window] = []
+    members = []
+    for one, path in zip(segments, paths, strict=True):
+        share = float(path[-1] - path[0]) / total
+        count = max(1, round(WINDOWS * share))
+        bounds = np.linspace(path[0], path[-1], count + 1)
+        inside = np.searchsorted(bounds[1:-1], (path[1:] + path[:-1]) / 2.0)
+        members.append(len(windows) + inside)
+        times = np.interp(bounds, path, one.time).tolist()
+        windows += [
+            Window(recording=one.recording, begin=begin, end=end, share=share / count, whole=False)
+            for begin, end in pairwise(times)
+        ]
+    return windows, members
+
+
+def _kinds(segment: Segment, nominal: Geometry, offset: float) -> NDArray[np.int_]:
+    """Return to which cell of `KINDS` each step belongs."""
+    middle = (segment.time[1:] + segment.time[:-1]) / 2.0 + offset
+    ends = np.stack([middle - STEADY / 2.0, middle + STEADY / 2.0])
+    right, left = (
+        np.diff(np.interp(ends, segment.wheel_time, segment.wheel_angles[:, side]), axis=0)[0]
+        for side in (0, 1)
+    )
+    forwards, turning = right + left, right - left
+    shape = np.where(np.abs(turning) < CURVED * np.abs(forwards), 0, 2)
+    shape[np.abs(forwards) < CURVED * np.abs(turning)] = 1
+    return np.asarray(np.ravel_multi_index((shape, forwards > 0.0, turning > 0.0), (3, 2, 2)))
+
+
+def _excess(S: Array, g: Array, windows: int) -> float:
+    """Return how much larger the squares in the median window are than in the model."""
+    here = np.arange(windows)
+    prior = np.eye(3) / SPREAD**2
+    solved = np.linalg.solve(S[here, :, here] + prior, np.dstack([S[here, :, here], g[here, :, None]]))
+    squares = np.einsum('ni,ni->n', g[here], solved[:, :, 3])
+    freedom = np.trace(solved[:, :, :3], axis1=1, axis2=2)
+    # The median of a chi-square distribution of two to three degrees of freedom is 0.75 of its mean.
+    excess = float(np.median(squares) / np.median(freedom)) / 0.75
+    return excess if excess > EXCESS else 1.0
+
+
+def _sets(windows: Sequence[Window], excess: float) -> tuple[Array, Array]:
+    """Return all sets that are compared with the rest: kinds, recordings, consecutive windows.
+
+    Returns:
+        Which cells are in each set, shape (n, cells), and the deviations beyond which it differs not by
+        chance, shape (n,).
+    """
+    count = len(windows)
+    recordings = np.array([one.recording for one in windows])
+    first, last = np.triu_indices(count)
+    here = recordings[first] == recordings[last]
+    first, last = first[here, None], last[here, None]
+    cells = np.arange(count + len(_SHAPE))
+    parts = (cells >= first) & (cells <= last)
+    # Windows that overlap by much are nearly one test.
+    tests = np.log2(2 * count) * count / np.arange(1, count + 1)
+    limits = excess**0.5 * np.array([_limit(4.0 * number) for number in tests.tolist()])
+    kinds = np.pad(list(KINDS.values()), ((0, 0), (count, 0)))
+    several = np.unique(recordings)[:, None]
+    whole = np.pad(recordings == several, ((0, 0), (0, len(_SHAPE)))) if len(several) > 1 else kinds[:0]
+    return (
+        np.concatenate([kinds, whole, parts]).astype(np.float64),
+        np.concatenate(
+            [
+                np.full(len(kinds), _limit(len(kinds))),
+                np.full(len(whole), _limit(len(several))),
+                limits[(last - first)[:, 0]],
+            ]
+        ),
+    )
+
+
+def _window(inside: Array, windows: Sequence[Window]) -> Window | None:
+    """Return the part of a recording that consists of some windows; None: there are none."""
+    chosen = [one for one, here in zip(windows, inside.tolist(), strict=False) if here]
+    if not chosen:
+        return None
+    every = sum(one.recording == chosen[0].recording for one in windows)
+    return replace(
+        chosen[0],
+        end=chosen[-1].end,
+        share=sum(one.share for one in chosen),
+        whole=len(chosen) == every < len(windows),
+    )
+
+
+def _limit(tests: float) -> float:
+    """Return the deviations that one of a number of tests exceeds with the probability `CHANCE`."""
+    return NormalDist().inv_cdf(1.0 - CHANCE / (2.0 * len(DIRECTIONS) * tests))
