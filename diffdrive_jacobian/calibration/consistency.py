@@ -22,10 +22,13 @@ from diffdrive_jacobian.calibration.motion import Geometry
 
 WINDOWS = 64
 """Number of windows of equal distances into which all drives are divided."""
+FEWEST = 4
+"""Fewest poses for each window of a motion."""
 MOST_POSES = 2000
 """Number of poses that are used at most."""
-CHANCE = 1e-3
-"""Probability of a misfit by chance among all windows, among all kinds, and among all recordings."""
+CHANCE = 3e-3
+"""Bound of the probability of a misfit by chance, among all windows, all kinds, or all recordings. It is
+less likely, because the sets overlap."""
 SPREAD = 0.03
 """Standard deviation that is expected of a difference [-]. Without this bound, differences that the data
 hardly determine are absurdly large."""
@@ -166,7 +169,7 @@ def _windows(
     members = []
     for one, path in zip(segments, paths, strict=True):
         share = float(path[-1] - path[0]) / total
-        count = max(1, round(WINDOWS * share))
+        count = max(1, min(round(WINDOWS * share), len(one.time) // FEWEST))
         bounds = np.linspace(path[0], path[-1], count + 1)
         inside = np.searchsorted(bounds[1:-1], (path[1:] + path[:-1]) / 2.0)
         members.append(len(windows) + inside)
@@ -200,7 +203,7 @@ def _excess(S: Array, g: Array, windows: int) -> float:
     squares = np.einsum('ni,ni->n', g[here], solved[:, :, 3])
     freedom = np.trace(solved[:, :, :3], axis1=1, axis2=2)
     # The median of a chi-square distribution of two to three degrees of freedom is 0.75 of its mean.
-    excess = float(np.median(squares) / np.median(freedom)) / 0.75
+    excess = float(np.median(squares) / max(np.median(freedom), 1e-9)) / 0.75
     return excess if excess > EXCESS else 1.0
 
 
@@ -218,22 +221,12 @@ def _sets(windows: Sequence[Window], excess: float) -> tuple[Array, Array]:
     first, last = first[here, None], last[here, None]
     cells = np.arange(count + len(_SHAPE))
     parts = (cells >= first) & (cells <= last)
-    # Windows that overlap by much are nearly one test.
-    tests = np.log2(2 * count) * count / np.arange(1, count + 1)
-    limits = excess**0.5 * np.array([_limit(4.0 * number) for number in tests.tolist()])
     kinds = np.pad(list(KINDS.values()), ((0, 0), (count, 0)))
     several = np.unique(recordings)[:, None]
     whole = np.pad(recordings == several, ((0, 0), (0, len(_SHAPE)))) if len(several) > 1 else kinds[:0]
-    return (
-        np.concatenate([kinds, whole, parts]).astype(np.float64),
-        np.concatenate(
-            [
-                np.full(len(kinds), _limit(len(kinds))),
-                np.full(len(whole), _limit(len(several))),
-                limits[(last - first)[:, 0]],
-            ]
-        ),
-    )
+    families = ((kinds, 1.0), (whole, 1.0), (parts, excess**0.5))
+    limits = [np.full(len(one), factor * _limit(len(one))) for one, factor in families]
+    return np.concatenate([kinds, whole, parts]).astype(np.float64), np.concatenate(limits)
 
 
 def _window(inside: Array, windows: Sequence[Window]) -> Window | None:
@@ -250,6 +243,6 @@ def _window(inside: Array, windows: Sequence[Window]) -> Window | None:
     )
 
 
-def _limit(tests: float) -> float:
-    """Return the deviations that one of a number of tests exceeds with the probability `CHANCE`."""
-    return NormalDist().inv_cdf(1.0 - CHANCE / (2.0 * len(DIRECTIONS) * tests))
+def _limit(tests: int) -> float:
+    """Return the deviations that the largest of a number of tests exceeds with the chance `CHANCE`."""
+    return NormalDist().inv_cdf(1.0 - CHANCE / (2.0 * len(DIRECTIONS) * max(1, tests)))
