@@ -146,17 +146,22 @@ def simulate(case: str, seed: int) -> tuple[list[Recording], Geometry, np.ndarra
 
     The multipliers are those of the left radius, the right radius and the separation.
     """
+    recordings, _, multipliers = _simulated(case, seed)
+    return recordings, Geometry(wheel_radius=RADIUS, wheel_separation=SEPARATION), multipliers
+
+
+def _simulated(case: str, seed: int) -> tuple[list[Recording], list[Drive], np.ndarray]:
     random = np.random.default_rng([seed, zlib.crc32(case.encode())])
     robot = CASES[case]
     if callable(robot):
         robot = robot(random)
     multipliers = random.uniform(1 - SPREAD, 1 + SPREAD, 3)
     sensor = random.uniform([-0.1, -0.1, -0.5], [0.1, 0.1, 0.5])
-    recordings = []
+    recordings, drives = [], []
     for number, skid in enumerate(robot.skids):
-        drive = Drive(robot, multipliers, skid, random)
-        recordings.append(_recording(f'bag {number + 1}', robot, drive, sensor, random))
-    return recordings, Geometry(wheel_radius=RADIUS, wheel_separation=SEPARATION), multipliers
+        drives.append(Drive(robot, multipliers, skid, random))
+        recordings.append(_recording(f'bag {number + 1}', robot, drives[-1], sensor, random))
+    return recordings, drives, multipliers
 
 
 class Drive:
