@@ -133,7 +133,7 @@ def test_umbmark_recovers_the_true_multipliers(given):
 
 
 def test_errors_are_those_of_the_cramer_rao_bound_and_of_the_stated_covariance():
-    """A small form of `benchmark/calibration.py`: mean squares of 16 robots, within 3.5 deviations."""
+    """A small form of `benchmark/calibration_cases.py`: mean squares of 16 robots, within 3.5 deviations."""
     errors, nees, bounds = [], [], []
     count = 16
     for seed in range(count):

@@ -2,9 +2,9 @@
 
     python test/benchmark/calibration_cases.py ['CASE' ...] [--robots 200] [--jobs 2] [--results FILE]
 
-The cases are those of independent_robots.py. Prints a Markdown table, and which values are off by more
-than four of their standard deviations without a note. With `--results` what is done is stored, and not
-repeated the next time. A robot takes about half a second.
+The cases are those of independent_robots.py. Prints a Markdown table, the errors of UMBmark over the
+Cramer-Rao bound, and which values are off by more than four of their standard deviations without a note.
+With `--results` what is done is stored, and not repeated the next time. A robot takes about a second.
 """
 
 from __future__ import annotations
@@ -18,10 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from independent_robots import CASES, simulate
+from independent_robots import CASES, cramer_rao_bound, simulate
 
 from diffdrive_jacobian.calibration import CalibrationError, calibrate
 
+BOUNDED = 'UMBmark'
+"""Case of which the errors are compared with the Cramer-Rao bound."""
 FAR = 4.0
 """Errors beyond this many standard deviations need a note."""
 HEADER = (
@@ -51,13 +53,15 @@ def one_robot(task: tuple[str, int]) -> Row:
         found = calibrate(recordings, nominal)
     except CalibrationError as error:
         return {**row, 'refused': str(error), 'seconds': time.process_time() - begin}
+    seconds = time.process_time() - begin
     scale = np.outer(found.multipliers, found.multipliers)
     return {
         **row,
         'notes': list(found.notes),
         'error': np.log(found.multipliers / true).tolist(),
         'covariance': (found.covariance / scale).tolist(),
-        'seconds': time.process_time() - begin,
+        'bound': cramer_rao_bound(case, seed).tolist() if case == BOUNDED else None,
+        'seconds': seconds,
     }
 
 
@@ -86,6 +90,14 @@ def table_row(case: str, rows: list[Row]) -> list[str]:
         f'{relative.max():.1f}',
         f'{far[noted].sum()}, {far[~noted].sum()}',
     ]
+
+
+def over_the_bound(rows: list[Row]) -> str:
+    """Return the rms errors of the multipliers over the Cramer-Rao bound."""
+    found = [row for row in rows if 'error' in row]
+    squares = np.array([np.square(row['error']) / row['bound'] for row in found])
+    ratios = ', '.join(f'{one:.3f}' for one in np.sqrt(squares.mean(axis=0)))
+    return f'{BOUNDED}: rms over the Cramer-Rao bound {ratios} ± {0.5**0.5 / len(found) ** 0.5:.3f}'
 
 
 def offenders(rows: list[Row]) -> list[str]:
@@ -136,6 +148,8 @@ def main() -> None:
     print(
         f'\n{options.robots} robots of each case, {np.median(seconds):.2f} s of CPU time each (median)'
     )
+    if BOUNDED in done:
+        print(over_the_bound(done[BOUNDED]))
     print('\n'.join(offenders(everything)))
 
 

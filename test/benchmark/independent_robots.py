@@ -151,6 +151,7 @@ def simulate(case: str, seed: int) -> tuple[list[Recording], Geometry, np.ndarra
 
 
 def _simulated(case: str, seed: int) -> tuple[list[Recording], list[Drive], np.ndarray]:
+    """Return recordings, the true drives and the true multipliers."""
     random = np.random.default_rng([seed, zlib.crc32(case.encode())])
     robot = CASES[case]
     if callable(robot):
@@ -168,8 +169,12 @@ class Drive:
     """The true motion over time.
 
     Attributes:
+        robot: Its noise, and how it is recorded.
+        separation: True separation of the wheels (m).
         time: Shape (n,) (s).
         angles: Of the right and the left wheel, shape (n, 2) (rad).
+        measured: Travel of both wheels by their angles in each step, shape (n - 1, 2) (m).
+        travel: The same over the ground.
         poses: `[x, y, theta]` of the body, shape (n, 3); theta is not wrapped.
     """
 
@@ -189,14 +194,17 @@ class Drive:
         turned = rims / RADIUS * FINE
         self.angles = np.concatenate([np.zeros((1, 2)), np.cumsum(turned, axis=0)])
         left, right, separation = multipliers
-        travel = turned * RADIUS * [right, left]
+        self.robot, self.separation = robot, SEPARATION * separation
+        self.measured = turned * RADIUS * [right, left]
+        travel = self.measured.copy()
         if skid:
             begin = random.uniform(5.0, ends[-1] - 35.0)
             travel[(middle >= begin) & (middle < begin + 30.0), 0] *= 0.95
         travel[np.abs(omega) > 0.02] *= 1.0 - robot.turning_slip
         travel += np.sqrt(robot.slip * np.abs(travel)) * random.standard_normal(travel.shape)
+        self.travel = travel
         forward = travel.mean(axis=1)
-        turn = (travel[:, 0] - travel[:, 1]) / (SEPARATION * separation)
+        turn = (travel[:, 0] - travel[:, 1]) / self.separation
         start = random.uniform(-1.0, 1.0, 3) * [1.0, 1.0, np.pi]
         theta = start[2] + np.concatenate([[0.0], np.cumsum(turn)])
         halfway = theta[:-1] + turn / 2
@@ -252,3 +260,43 @@ def _recording(
         pose_time=true_time * (1.0 + robot.clock_drift) - offset,
         poses=poses,
     )
+
+
+def cramer_rao_bound(case: str, seed: int) -> np.ndarray:
+    """Return the least variances of the logarithms of the multipliers of a robot with one bag.
+
+    They are those of a Kalman filter that is linearized at the true motion with the sensor at the
+    centre, knows the noise, and estimates the pose of the body, the multipliers, the pose of the
+    sensor and the time offset.
+    """
+    (recording,), (drive,), _ = _simulated(case, seed)
+    robot, L, time, poses = drive.robot, drive.separation, drive.time, drive.poses
+    at = np.searchsorted(time, np.linspace(time[0], time[-1], len(recording.pose_time) + 1)[:-1])
+    # Effects of the travel of the right and of the left wheel, and of the turn, in world axes.
+    c, s = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
+    turn = (drive.measured[:, 0] - drive.measured[:, 1]) / L
+    covariance = np.diag([10.0] * 3 + [1.0] * 7) ** 2
+    noise = np.diag([robot.position_noise] * 2 + [robot.heading_noise]) ** 2
+    for first, last in zip([at[0], *at[:-1]], at, strict=True):
+        here = slice(first, last)
+        dx, dy = (poses[last, :2] - poses[here, :2]).T
+        one = np.ones_like(dx)
+        right = np.stack([c[here] / 2 - dy / L, s[here] / 2 + dx / L, one / L])
+        left = np.stack([c[here] / 2 + dy / L, s[here] / 2 - dx / L, -one / L])
+        step = np.eye(10)
+        step[:2, 2] = poses[first, 1] - poses[last, 1], poses[last, 0] - poses[first, 0]
+        step[:3, 3] = left @ drive.measured[here, 1]
+        step[:3, 4] = right @ drive.measured[here, 0]
+        step[:3, 5] = np.stack([dy, -dx, -one]) @ turn[here]
+        covariance = step @ covariance @ step.T
+        distance = robot.slip * np.abs(drive.travel[here])
+        covariance[:3, :3] += (right * distance[:, 0]) @ right.T + (left * distance[:, 1]) @ left.T
+        speed = drive.measured[last].mean() / FINE
+        observed = np.zeros((3, 10))
+        observed[:, :3] = observed[:, 6:9] = np.eye(3)
+        observed[:2, 6:8] = [[c[last], -s[last]], [s[last], c[last]]]
+        observed[:, 9] = speed * c[last], speed * s[last], turn[last] / FINE
+        gain = np.linalg.solve(observed @ covariance @ observed.T + noise, observed @ covariance).T
+        covariance = covariance - gain @ observed @ covariance
+        covariance = (covariance + covariance.T) / 2
+    return np.diag(covariance)[3:6]
