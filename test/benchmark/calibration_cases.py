@@ -129,7 +129,7 @@ def main() -> None:
         for line in options.results.read_text().splitlines():
             row = json.loads(line)
             rows[row['case'], row['seed']] = row
-    tasks = [(case, seed) for case in cases for seed in seeds if (case, seed) not in rows]
+    tasks = [(case, seed) for seed in seeds for case in cases if (case, seed) not in rows]
     # Of the children: several threads for small matrices are slower than one.
     os.environ['OPENBLAS_NUM_THREADS'] = '1'
     context = multiprocessing.get_context('spawn')
