@@ -39,13 +39,9 @@ STEADY = 1.0
 CURVED = 0.1
 """Ratio of the rotation to the translation of the wheels below which a motion is straight; above the
 inverse it is a turn in place."""
-DIRECTIONS = (
-    ('the left wheel travels', np.array([1.0, 0.0, 0.0])),
-    ('the right wheel travels', np.array([0.0, 1.0, 0.0])),
-    ('both wheels travel', np.array([1.0, 1.0, 0.0])),
-    ('the robot turns', np.array([0.0, 0.0, -1.0])),
-)
-"""What may be more in one part than in another, and as changes of the logarithms of the multipliers."""
+WORDS = ('the left wheel travels', 'the right wheel travels', 'both wheels travel', 'the robot turns')
+DIRECTIONS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
+"""What may be more in one part than in another, as changes of the logarithms of the multipliers."""
 _SHAPE, _FORWARDS, _LEFT = np.unravel_index(np.arange(12), (3, 2, 2))
 KINDS = {
     'drives straight': _SHAPE == 0,
@@ -90,69 +86,93 @@ class Misfit:
 
 
 def misfit(segments: Sequence[Segment], nominal: Geometry, estimate: Estimate) -> Misfit | None:
-    """Return the most certain misfit of an estimate; None: there is none that is no chance.
+    """Return the most certain misfit of an estimate; None: all differences may be chance.
 
     Args:
         segments: The motions with the poses `estimate.states`.
         nominal: Nominal dimensions of the robot.
         estimate: The most likely parameters.
     """
+    segments, estimate = _thinned(segments, estimate)
+    offsets = estimate.parameters[TIME_OFFSETS:]
+    windows, members = _windows(segments, nominal, offsets)
+    cells = [
+        np.column_stack([inside, len(windows) + _kinds(one, offsets[one.recording])])
+        for one, inside in zip(segments, members, strict=True)
+    ]
+    S, g, moves = _local(segments, nominal, estimate, cells, len(windows) + len(_SHAPE))
+    sets, limits = _sets(windows, _excess(S, g, len(windows)))
+    slopes = DIRECTIONS @ g.T @ sets.T
+    along = np.einsum('ki,aibj,kj->kab', DIRECTIONS, S, DIRECTIONS)
+    weights = np.sum((sets @ along) * sets, axis=2) + SPREAD**-2.0
+    deviations = np.abs(slopes) / np.sqrt(weights)
+    which, index = np.unravel_index(np.argmax(deviations / limits), deviations.shape)
+    if deviations[which, index] < limits[index]:
+        return None
+    difference = float(-slopes[which, index] / weights[which, index])
+    rest = moves @ DIRECTIONS[which] @ sets[index] * difference
+    part = rest.copy()
+    part[MULTIPLIERS] += DIRECTIONS[which] * difference
+    window = _window(sets[index], windows)
+    much = (
+        f'{WORDS[which]} {100.0 * abs(difference):.2g} % {"more" if difference > 0.0 else "less"} than'
+    )
+    if window is None:
+        words = f'where the robot {list(KINDS)[index]}, {much} elsewhere'
+    elif window.whole:
+        words = f'{much} in the other recordings'
+    else:
+        words = f'from {window.begin:.0f} to {window.end:.0f} s {much} in the rest'
+    return Misfit(
+        window=window,
+        words=words,
+        difference=difference,
+        deviations=float(deviations[which, index]),
+        shifts=np.stack([rest, part]),
+    )
+
+
+def _thinned(segments: Sequence[Segment], estimate: Estimate) -> tuple[list[Segment], Estimate]:
+    """Return motions and estimate with at most about `MOST_POSES` poses."""
     every = -(-sum(len(one.time) for one in segments) // MOST_POSES)
     kept = [slice(None, None, min(every, len(one.time) - 1)) for one in segments]
-    segments = [one.part(here) for one, here in zip(segments, kept, strict=True)]
-    estimate = replace(
-        estimate, states=tuple(one[here] for one, here in zip(estimate.states, kept, strict=True))
-    )
-    windows, members = _windows(segments, nominal, estimate.parameters[TIME_OFFSETS:])
-    cells = len(windows) + len(_SHAPE)
+    states = tuple(one[here] for one, here in zip(estimate.states, kept, strict=True))
+    thinned = [one.part(here) for one, here in zip(segments, kept, strict=True)]
+    return thinned, replace(estimate, states=states)
+
+
+def _local(
+    segments: Sequence[Segment],
+    nominal: Geometry,
+    estimate: Estimate,
+    cells: Sequence[NDArray[np.int_]],
+    number: int,
+) -> tuple[Array, Array, Array]:
+    """Return what is known of changes of the logarithms of the multipliers in single cells.
+
+    Args:
+        segments: The motions with the poses `estimate.states`.
+        nominal: Nominal dimensions of the robot.
+        estimate: The most likely parameters.
+        cells: Cells of each step of each motion, shape (n - 1, any).
+        number: Of all cells, n.
+
+    Returns:
+        Their information, shape (n, 3, n, 3), their gradient, shape (n, 3), and the changes of the
+        parameters with them, shape (number of parameters, n, 3).
+    """
     count = len(estimate.parameters)
-    kinds = [
-        len(windows) + _kinds(one, nominal, estimate.parameters[TIME_OFFSETS + one.recording])
-        for one in segments
-    ]
-    columns = [count + 3 * np.column_stack(pair) for pair in zip(members, kinds, strict=True)]
-    information, gradient = score(segments, nominal, estimate, columns, count + 3 * cells)
-    common = np.flatnonzero(estimate.free)
-    known = information[np.ix_(common, common)] + np.diag(prior_deviations(count)[common] ** -2.0)
-    cross = information[common, count:]
-    gain = np.linalg.solve(known, np.column_stack([cross, gradient[common]]))
-    S = (information[count:, count:] - cross.T @ gain[:, :-1]).reshape(cells, 3, cells, 3)
-    g = (gradient[count:] - cross.T @ gain[:, -1]).reshape(cells, 3)
-    by_cell = np.zeros((count, cells, 3))
-    by_cell[common] = -gain[:, :-1].reshape(-1, cells, 3)
-    sets, limits = _sets(windows, _excess(S, g, len(windows)))
-    best: Misfit | None = None
-    strongest = 1.0
-    for what, direction in DIRECTIONS:
-        along = np.einsum('i,aibj,j->ab', direction, S, direction)
-        weight = np.sum((sets @ along) * sets, axis=1) + SPREAD**-2.0
-        slope = sets @ (g @ direction)
-        deviations = np.abs(slope) / np.sqrt(weight)
-        index = int(np.argmax(deviations / limits))
-        if deviations[index] > strongest * limits[index]:
-            strongest = float(deviations[index] / limits[index])
-            difference = float(-slope[index] / weight[index])
-            rest = by_cell @ direction @ sets[index] * difference
-            own = rest.copy()
-            own[MULTIPLIERS] += direction * difference
-            window = _window(sets[index], windows)
-            best = Misfit(
-                window=window,
-                words=_words(window, index, what, difference),
-                difference=difference,
-                deviations=float(deviations[index]),
-                shifts=np.stack([rest, own]),
-            )
-    return best
-
-
-def _words(window: Window | None, index: int, what: str, difference: float) -> str:
-    much = f'{what} {100.0 * abs(difference):.2g} % {"more" if difference > 0.0 else "less"} than'
-    if window is None:
-        return f'where the robot {list(KINDS)[index]}, {much} elsewhere'
-    if window.whole:
-        return f'{much} in the other recordings'
-    return f'from {window.begin:.0f} to {window.end:.0f} s {much} in the rest'
+    columns = [count + 3 * one for one in cells]
+    information, gradient = score(segments, nominal, estimate, columns, count + 3 * number)
+    free = np.flatnonzero(estimate.free)
+    known = information[np.ix_(free, free)] + np.diag(prior_deviations(count)[free] ** -2.0)
+    cross = information[free, count:]
+    gain = np.linalg.solve(known, np.column_stack([cross, gradient[free]]))
+    moves = np.zeros((count, number, 3))
+    moves[free] = -gain[:, :-1].reshape(-1, number, 3)
+    S = information[count:, count:] - cross.T @ gain[:, :-1]
+    g = gradient[count:] - cross.T @ gain[:, -1]
+    return S.reshape(number, 3, number, 3), g.reshape(number, 3), moves
 
 
 def _windows(
@@ -181,7 +201,7 @@ def _windows(
     return windows, members
 
 
-def _kinds(segment: Segment, nominal: Geometry, offset: float) -> NDArray[np.int_]:
+def _kinds(segment: Segment, offset: float) -> NDArray[np.int_]:
     """Return to which cell of `KINDS` each step belongs."""
     middle = (segment.time[1:] + segment.time[:-1]) / 2.0 + offset
     ends = np.stack([middle - STEADY / 2.0, middle + STEADY / 2.0])
