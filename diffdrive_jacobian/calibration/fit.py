@@ -151,6 +151,32 @@ def information(segments: Sequence[Segment], nominal: Geometry, truth: Estimate)
     return _solved(groups, _weights(truth.noise), prior).information
 
 
+def score(
+    segments: Sequence[Segment],
+    nominal: Geometry,
+    estimate: Estimate,
+    columns: Sequence[NDArray[np.int_]],
+    count: int,
+) -> tuple[Array, Array]:
+    """Return the information and the gradient of all parameters and of further ones that are 0.
+
+    Args:
+        segments: Motions with the poses `estimate.states`.
+        nominal: Nominal dimensions.
+        estimate: Parameters, poses and noise.
+        columns: As of `linearized`.
+        count: Number of all parameters.
+
+    Returns:
+        Fisher information, shape (count, count), and gradient, shape (count,), without the prior.
+    """
+    groups, reading = linearized(segments, nominal, estimate, columns=columns, count=count)
+    prior = _Prior(free=np.ones(count, dtype=bool), pull=np.zeros(count), reading=reading)
+    found = _solved(groups, _weights(estimate.noise), prior)
+    damped = found.information + np.diag(prior_deviations(count) ** -2.0)
+    return found.information, -damped @ found.change
+
+
 def _moved(states: Sequence[Array], step: Array) -> tuple[Array, ...]:
     ends = np.cumsum([len(one) for one in states])[:-1]
     return tuple(composed(one, part) for one, part in zip(states, np.split(step, ends), strict=True))
@@ -181,8 +207,8 @@ def _solved(groups: tuple[Group, Group, Group], weights: Array, prior: _Prior) -
     diagonal[at] -= H @ G @ H
     right[at] -= H @ G @ b
     solved, logarithm = _block_tridiagonal.solve(diagonal, total('upper'), right)
-    eliminated = np.einsum('nip,niq->pq', right[:, :, :-1], solved)
-    eliminated += np.einsum('nip,niq->pq', b[:, :, :-1], G @ b)
+    eliminated = np.tensordot(right[:, :, :-1], solved, ((0, 1), (0, 1)))
+    eliminated += np.tensordot(b[:, :, :-1], G @ b, ((0, 1), (0, 1)))
     information = total('corner')[np.ix_(free, free)] - eliminated[:, :-1]
     information = (information + information.T) / 2.0
     damped = information + np.diag(prior_deviations(len(free))[free] ** -2.0)

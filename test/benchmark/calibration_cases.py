@@ -28,17 +28,16 @@ FAR = 4.0
 """Errors beyond this many standard deviations need a note."""
 HEADER = (
     'case',
-    'accepted',
-    'noted',
-    'refused',
+    'accepted, noted, refused',
     'NEES (3)',
-    'NEES each (1)',
+    'of each (1)',
     'within 1, 2, 3 σ (%)',
-    'rms (%)',
     'bias (%)',
+    'stated σ (%)',
     'worst (σ)',
-    'beyond 4 σ with, without a note',
+    'beyond 4 σ noted, not noted',
 )
+"""Three numbers in one cell are of the left radius, the right radius and the separation."""
 
 Row = dict[str, Any]
 
@@ -68,36 +67,39 @@ def one_robot(task: tuple[str, int]) -> Row:
 def table_row(case: str, rows: list[Row]) -> list[str]:
     """Return the cells of a case. Errors are of all robots that have a result, with or without note."""
     found = [row for row in rows if 'error' in row]
-    noted = np.array([bool(row['notes']) for row in found])
-    counts = [len(found) - noted.sum(), noted.sum(), len(rows) - len(found)]
-    cells = [case, *map(str, counts)]
+    noted = np.array([bool(row['notes']) for row in found], dtype=bool)
+    cells = [case, f'{len(found) - noted.sum()}, {noted.sum()}, {len(rows) - len(found)}']
     if not found:
         return cells + [''] * (len(HEADER) - len(cells))
     error = np.array([row['error'] for row in found])
     covariance = np.array([row['covariance'] for row in found])
     nees = np.einsum('ni,nij,nj->n', error, np.linalg.inv(covariance), error)
-    relative = np.abs(error) / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    deviation = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    relative = np.abs(error) / deviation
     far = (relative > FAR).sum(axis=1)
     chance = error.std(axis=0) / len(found) ** 0.5
     bias = zip(100 * error.mean(axis=0), 100 * chance, strict=True)
     return [
         *cells,
-        f'{nees.mean():.2f} ± {nees.std() / len(found) ** 0.5:.2f}',
-        ', '.join(f'{one:.2f}' for one in (relative**2).mean(axis=0)),
+        f'{nees.mean():.3g} ± {nees.std() / len(found) ** 0.5:.2g}',
+        ', '.join(f'{one:.3g}' for one in (relative**2).mean(axis=0)),
         ', '.join(f'{100 * (relative < limit).mean():.1f}' for limit in (1, 2, 3)),
-        ', '.join(f'{100 * one:.3f}' for one in np.sqrt((error**2).mean(axis=0))),
         ', '.join(f'{one:+.3f} ± {other:.3f}' for one, other in bias),
+        ', '.join(f'{100 * one:.3f}' for one in np.median(deviation, axis=0)),
         f'{relative.max():.1f}',
         f'{far[noted].sum()}, {far[~noted].sum()}',
     ]
 
 
 def over_the_bound(rows: list[Row]) -> str:
-    """Return the rms errors of the multipliers over the Cramer-Rao bound."""
+    """Return the rms errors of the multipliers, and the same over the Cramer-Rao bound."""
     found = [row for row in rows if 'error' in row]
-    squares = np.array([np.square(row['error']) / row['bound'] for row in found])
-    ratios = ', '.join(f'{one:.3f}' for one in np.sqrt(squares.mean(axis=0)))
-    return f'{BOUNDED}: rms over the Cramer-Rao bound {ratios} ± {0.5**0.5 / len(found) ** 0.5:.3f}'
+    squares = np.square([row['error'] for row in found])
+    bounds = np.array([row['bound'] for row in found])
+    errors = ', '.join(f'{100 * one:.3f}' for one in np.sqrt(squares.mean(axis=0)))
+    ratios = ', '.join(f'{one:.3f}' for one in np.sqrt((squares / bounds).mean(axis=0)))
+    chance = 0.5**0.5 / len(found) ** 0.5
+    return f'{BOUNDED}: rms errors {errors} %, over the Cramer-Rao bound {ratios} ± {chance:.3f}'
 
 
 def offenders(rows: list[Row]) -> list[str]:
@@ -129,7 +131,7 @@ def main() -> None:
         for line in options.results.read_text().splitlines():
             row = json.loads(line)
             rows[row['case'], row['seed']] = row
-    tasks = [(case, seed) for case in cases for seed in seeds if (case, seed) not in rows]
+    tasks = [(case, seed) for seed in seeds for case in cases if (case, seed) not in rows]
     # Of the children: several threads for small matrices are slower than one.
     os.environ['OPENBLAS_NUM_THREADS'] = '1'
     context = multiprocessing.get_context('spawn')
