@@ -42,11 +42,10 @@ def rate_warning(slope: float, rate: float) -> str:
         slope: Largest slope of the yaw rate over the heading (1/s).
         rate: Rate of the odometry (Hz).
     """
-    if slope <= rate / 2.0:
+    if slope < rate:
         return ''
-    effect = 'swings about its course' if slope < rate else 'may never arrive'
     return (
-        f'the law turns by up to {slope:.3g} rad/s per rad of heading, more than half the odometry rate '
-        f'of {rate:.3g} Hz: if commands take effect up to one sample late, the robot {effect}; choose '
-        'a smaller kp or kv, or a higher rate'
+        f'the law turns by up to {slope:.3g} rad/s per rad of heading, which is not below the odometry '
+        f'rate of {rate:.3g} Hz: if commands take effect up to one sample late, the robot may never '
+        'arrive; choose a smaller kp or kv, or a higher rate'
     )
