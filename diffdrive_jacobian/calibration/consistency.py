@@ -30,8 +30,8 @@ CHANCE = 3e-3
 """Bound of the probability of a misfit by chance, among all windows, all kinds, or all recordings. It is
 less likely, because the sets overlap."""
 SPREAD = 0.01
-"""Standard deviation that is expected of a difference [-]. A difference that the data determine less well
-does not count: where a robot hardly turns, its turns are those of the steps of the encoders."""
+"""Standard deviation that is expected of a difference [-]. A difference that the data determine less
+well does not count: where a robot hardly turns, its turns are those of the steps of the encoders."""
 EXCESS = 1.25
 """Ratio of the squares in the median window to those of the model that may be chance."""
 STEADY = 1.0
