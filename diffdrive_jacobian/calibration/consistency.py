@@ -33,9 +33,9 @@ ones much of their turns is reading error, which the score takes for motion that
 CHANCE = 3e-3
 """Bound of the probability of a misfit by chance, among all windows, all kinds, or all recordings. It is
 less likely, because the sets overlap."""
-SPREAD = 0.03
-"""Standard deviation that is expected of a difference [-]. Without this bound, differences that the data
-hardly determine are absurdly large."""
+SPREAD = 0.01
+"""Standard deviation that is expected of a difference [-]. A difference that the data determine less
+well does not count: where a robot hardly turns, its turns are those of the steps of the encoders."""
 EXCESS = 1.25
 """Ratio of the squares in the median window to those of the model that may be chance."""
 STEADY = 1.0
@@ -108,8 +108,8 @@ def misfit(segments: Sequence[Segment], nominal: Geometry, estimate: Estimate) -
     sets, limits = _sets(windows, _excess(S, g, len(windows)))
     slopes = DIRECTIONS @ g.T @ sets.T
     along = np.einsum('ki,aibj,kj->kab', DIRECTIONS, S, DIRECTIONS)
-    weights = np.sum((sets @ along) * sets, axis=2) + SPREAD**-2.0
-    deviations = np.abs(slopes) / np.sqrt(weights)
+    weights = np.sum((sets @ along) * sets, axis=2)
+    deviations = np.abs(slopes) / np.sqrt(weights + SPREAD**-2.0)
     which, index = np.unravel_index(np.argmax(deviations / limits), deviations.shape)
     if deviations[which, index] < limits[index]:
         return None
