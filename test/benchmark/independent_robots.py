@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -112,6 +112,20 @@ def good(random: np.random.Generator) -> Robot:
     )
 
 
+def coarse(random: np.random.Generator) -> Robot:
+    """Return one of many varieties with an encoder of few steps or wheels that are recorded rarely."""
+    return replace(
+        good(random),
+        encoder=int(2.0 ** random.uniform(4.0, 8.0)),
+        wheel_rate=[5.0, 10.0, 20.0, 50.0][random.integers(4)],
+    )
+
+
+def skidding(random: np.random.Generator) -> Robot:
+    """Return one of many varieties that skid."""
+    return replace(good(random), skids=(True,))
+
+
 def clock(offset: float) -> Callable[[np.random.Generator], Robot]:
     """Return a draw of robots with an offset of the clocks, on drives of about 100 s or 200 s."""
 
@@ -126,6 +140,8 @@ CASES: dict[str, Robot | Callable[[np.random.Generator], Robot]] = {
     'good': good,
     'UMBmark': STANDARD,
     **{f'encoder of {n} steps': Robot(encoder=n) for n in (16, 20, 32, 64, 128, 500, 2000)},
+    'coarse encoders, varied': coarse,
+    'skid, varied': skidding,
     'skid': Robot(skids=(True,)),
     'skid, fivefold square': Robot(drive=STANDARD.drive, pose_rate=2.0, skids=(True,)),
     'two bags, skid in one': Robot(skids=(False, True)),
