@@ -135,6 +135,7 @@ def _in_fork(call: Callable[[Path], Any], directory: Path) -> None:
         os.dup2(log, 1)
         os.dup2(log, 2)
         (directory / 'under_way').touch()
+        os.chdir(ROOT)
         os.environ['TMPDIR'] = tempfile.tempdir = str(directory)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
