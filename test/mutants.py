@@ -65,7 +65,7 @@ IMPORTED = (
 """What most tests import, apart from the package."""
 FIRST_FILES, FIRST_CPU = 3, 3.0
 """Number of test files that run first, and CPU time of their tests (s). Most mutants fail there."""
-CPU = 20.0
+CPU = 12.0
 """CPU time of the tests that follow (s)."""
 SLOWER, GRACE = 10.0, 5.0
 """A test may take this many times the CPU time that it usually takes, and so many seconds more."""
@@ -75,6 +75,8 @@ MEMORY = 4 << 30
 """Memory that a fork may use (bytes)."""
 RESULTS = ('killed', 'timeout', 'survived', 'untested', 'gone')
 """What becomes of a mutant. Untested: no test executes it."""
+AT_IMPORT = ''
+"""Stands for the tests of lines that are executed before any test."""
 
 
 # --- Forks
@@ -219,7 +221,7 @@ class Measured(NamedTuple):
     """CPU time of each test (s)."""
     not_passed: list[str]
     lines: dict[str, dict[int, list[str]]]
-    """The tests that execute each line of each file."""
+    """The tests that execute each line of each file, or AT_IMPORT."""
 
 
 @dataclass
@@ -247,8 +249,9 @@ class Coverage:
         """
         lines = self.lines[place.file]
         found = {test for line in place.lines for test in lines.get(line, ())}
-        if place.at_import or (not found and any(line in lines for line in place.lines)):
+        if place.at_import or AT_IMPORT in found:
             found = {test for tests in lines.values() for test in tests}
+        found.discard(AT_IMPORT)
         cost = {test: (self.cpu[test] * self.size[test], test) for test in found}
         cases: dict[str, list[str]] = defaultdict(list)
         for test in sorted(found, key=cost.__getitem__):
@@ -283,11 +286,7 @@ def measure(file: str, directory: Path) -> Measured:
     tracer.stop()
     data = tracer.get_data()
     lines = {
-        os.path.relpath(path, SOURCE): {
-            line: [name for name in names if name]
-            for line, names in data.contexts_by_lineno(path).items()
-        }
-        for path in data.measured_files()
+        os.path.relpath(path, SOURCE): data.contexts_by_lineno(path) for path in data.measured_files()
     }
     return Measured(plugin.cpu, plugin.not_passed, lines)
 
