@@ -69,7 +69,7 @@ CPU = 12.0
 """CPU time of the tests that follow (s)."""
 SLOWER, GRACE = 10.0, 5.0
 """A test may take this many times the CPU time that it usually takes, and so many seconds more."""
-HANGING, WALL = 60.0, 1200.0
+HANGING, WALL = 120.0, 1200.0
 """Wall time that a test may take in addition, and that a fork may take (s)."""
 MEMORY = 4 << 30
 """Memory that a fork may use (bytes)."""
@@ -102,6 +102,7 @@ def forked(calls: Iterable[tuple[Any, Callable[[Path], Any]]], workers: int) -> 
     while True:
         while len(running) < workers and (call := next(waiting, None)):
             directory = Path(tempfile.mkdtemp(prefix='mutant-'))
+            (directory / 'under_way').touch()
             sys.stdout.flush()
             with warnings.catch_warnings():
                 # A library of rclpy runs threads, which a fork does not need.
@@ -136,7 +137,6 @@ def _in_fork(call: Callable[[Path], Any], directory: Path) -> None:
         log = os.open(directory / 'log', os.O_WRONLY | os.O_CREAT)
         os.dup2(log, 1)
         os.dup2(log, 2)
-        (directory / 'under_way').touch()
         os.chdir(ROOT)
         os.environ['TMPDIR'] = tempfile.tempdir = str(directory)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -243,14 +243,14 @@ class Coverage:
                 self.size.update(passed)
 
     def tests(self, place: Place) -> list[str]:
-        """Return the tests that execute a statement, or its module if it is executed at the import.
+        """Return the tests that execute a statement, or use its module if it is executed at the import.
 
         Those that are short and specific come first, and some cases of each test before the others.
         """
         lines = self.lines[place.file]
         found = {test for line in place.lines for test in lines.get(line, ())}
         if place.at_import or AT_IMPORT in found:
-            found = {test for tests in lines.values() for test in tests}
+            found |= set(self._of_users(place.file))
         found.discard(AT_IMPORT)
         cost = {test: (self.cpu[test] * self.size[test], test) for test in found}
         cases: dict[str, list[str]] = defaultdict(list)
@@ -259,12 +259,23 @@ class Coverage:
         rank = {test: i.bit_length() for same in cases.values() for i, test in enumerate(same)}
         return sorted(found, key=lambda test: (rank[test], cost[test]))
 
-    def rounds(self, tests: list[str]) -> Iterator[dict[str, float]]:
+    def _of_users(self, file: str) -> Iterator[str]:
+        """Return the tests of a module, of those that import it, and of the test files that do."""
+        module = f'{SOURCE.name}/{file}'.removesuffix('.py').replace('/', '.')
+        for user in {file, *self.lines}:
+            if user == file or module in (SOURCE / user).read_text():
+                yield from itertools.chain.from_iterable(self.lines[user].values())
+        users = {
+            f'test/{path.name}' for path in STORED.parent.glob('*.py') if module in path.read_text()
+        }
+        yield from (test for test in self.cpu if _file(test) in users)
+
+    def rounds(self, tests: list[str], cpu: float) -> Iterator[dict[str, float]]:
         """Return which tests to run first, of few files, and which afterwards, with their CPU times."""
         files = list(dict.fromkeys(map(_file, tests)))[:FIRST_FILES]
         first = self._within(FIRST_CPU, [test for test in tests if _file(test) in files])
         yield first
-        yield self._within(CPU, [test for test in tests if test not in first])
+        yield self._within(cpu, [test for test in tests if test not in first])
 
     def _within(self, limit: float, tests: list[str]) -> dict[str, float]:
         begin = itertools.accumulate((self.cpu[test] for test in tests), initial=0.0)
@@ -360,7 +371,7 @@ def run_mutant(mutant: Mutant, place: Place, rounds: list[Mapping[str, float]], 
 
 
 def run_mutants(
-    mutants: list[Mutant], coverage: Coverage, workers: int
+    mutants: list[Mutant], coverage: Coverage, workers: int, cpu: float = CPU
 ) -> Iterator[tuple[Mutant, Outcome]]:
     """Run mutants and return what became of each, in the order in which they end."""
     without: dict[Mutant, Outcome] = {}
@@ -373,7 +384,7 @@ def run_mutants(
                 place = statements.find(mutant)
                 tests = coverage.tests(place) if place else []
                 if place and tests:
-                    rounds = [chosen for chosen in coverage.rounds(tests) if chosen]
+                    rounds = [chosen for chosen in coverage.rounds(tests, cpu) if chosen]
                     if sum(map(len, rounds)) < len(tests):
                         capped.add(mutant)
                     yield mutant, partial(run_mutant, mutant, place, rounds)
@@ -442,6 +453,7 @@ def main() -> None:
     parser.add_argument('--sample', type=int, metavar='N', help='replace the mutants by N random ones')
     parser.add_argument('--seed', type=int, default=1, help='of the random ones (default: 1)')
     parser.add_argument('--workers', type=int, default=os.cpu_count(), help='number of processes')
+    parser.add_argument('--cpu', type=float, default=CPU, help='CPU time of the tests of a mutant (s)')
     parser.add_argument('--write', action='store_true', help='store the results')
     options = parser.parse_args()
     packages = options.package or PACKAGES
@@ -465,7 +477,7 @@ def main() -> None:
     outcomes: dict[Mutant, Outcome] = {}
     begin = time.monotonic()
     try:
-        for mutant, outcome in run_mutants(mutants, coverage, options.workers):
+        for mutant, outcome in run_mutants(mutants, coverage, options.workers, options.cpu):
             outcomes[mutant] = outcome
             change = f'{mutant.function}: {mutant.statement} -> {mutant.mutant}'
             print(f'{outcome.result} ({outcome.cpu:.1f} s) {mutant.file} {change}', flush=True)

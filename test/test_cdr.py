@@ -23,7 +23,7 @@ from nav_msgs.msg import Goals, Odometry
 from rclpy.serialization import deserialize_message, serialize_message
 from rosgraph_msgs.msg import Clock
 from rosidl_parser import definition
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import JointState, LaserScan
 from std_msgs.msg import Empty, Float64MultiArray, Header, String
 
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader, Writer
@@ -189,6 +189,12 @@ def test_any_fields_are_read_as_rclpy_reads_them(message_class, data):
         assert expected is not None
         # The second time with the layout of the first.
         assert outcome(read, serialized) == outcome(read, serialized) == expected
+
+
+def test_numbers_of_four_bytes_are_read_as_rclpy_reads_them():
+    scan = LaserScan(angle_min=-0.5, angle_max=0.25, scan_time=0.1, ranges=[1.5, 2.5, 0.1])
+    serialized, fields = serialize_message(scan), readable(LaserScan)
+    assert outcome(reader(LaserScan, fields), serialized) == rclpy_outcome(LaserScan, fields, serialized)
 
 
 @by_class
