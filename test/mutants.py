@@ -243,21 +243,21 @@ class Coverage:
                 self.size.update(passed)
 
     def tests(self, place: Place) -> list[str]:
-        """Return the tests that execute a statement, or use its module if it is executed at the import.
-
-        Those that are short and specific come first, and some cases of each test before the others.
-        """
+        """Return the tests that execute a statement, then those that use what it does at the import."""
         lines = self.lines[place.file]
         found = {test for line in place.lines for test in lines.get(line, ())}
-        if place.at_import or AT_IMPORT in found:
-            found |= set(self._of_users(place.file))
-        found.discard(AT_IMPORT)
-        cost = {test: (self.cpu[test] * self.size[test], test) for test in found}
+        at_import = place.at_import or AT_IMPORT in found
+        users = set(self._of_users(place.file)) if at_import else set()
+        return [*self._ordered(found - {AT_IMPORT}), *self._ordered(users - found - {AT_IMPORT})]
+
+    def _ordered(self, tests: set[str]) -> list[str]:
+        """Return short and specific tests first, and some cases of each test before the others."""
+        cost = {test: (self.cpu[test] * self.size[test], test) for test in tests}
         cases: dict[str, list[str]] = defaultdict(list)
-        for test in sorted(found, key=cost.__getitem__):
+        for test in sorted(tests, key=cost.__getitem__):
             cases[test.partition('[')[0]].append(test)
         rank = {test: i.bit_length() for same in cases.values() for i, test in enumerate(same)}
-        return sorted(found, key=lambda test: (rank[test], cost[test]))
+        return sorted(tests, key=lambda test: (rank[test], cost[test]))
 
     def _of_users(self, file: str) -> Iterator[str]:
         """Return the tests of a module, of those that import it, and of the test files that do."""

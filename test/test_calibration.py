@@ -134,7 +134,7 @@ def test_umbmark_recovers_the_true_multipliers(given):
 
 def test_errors_are_those_of_the_cramer_rao_bound_and_of_the_stated_covariance():
     """A small form of `benchmark/calibration.py`: mean squares of 16 robots, within 3.5 deviations."""
-    errors, nees, bounds = [], [], []
+    errors, nees, bounds, places = [], [], [], []
     count = 16
     for seed in range(count):
         random = np.random.default_rng(100 + seed)
@@ -142,6 +142,8 @@ def test_errors_are_those_of_the_cramer_rao_bound_and_of_the_stated_covariance()
         error = result.multipliers - TRUE
         nees.append(error @ np.linalg.solve(result.covariance, error))
         errors.append(error)
+        # The true one is zero.
+        places.append(result.estimate.sensor / np.sqrt(np.diag(result.estimate.covariance())[3:6]))
         motion = result.motions[0]
         truth = ROBOT.truth(np.random.default_rng(100 + seed))
         states = np.column_stack([np.interp(motion.time, SHORT.time, one) for one in truth.T])
@@ -157,6 +159,7 @@ def test_errors_are_those_of_the_cramer_rao_bound_and_of_the_stated_covariance()
     # The mean of squares of 16 numbers of variance 1 has the deviation sqrt(2 / 16).
     assert (np.abs(ratio - 1.0) < 3.5 * np.sqrt(2.0 / count)).all(), ratio
     assert abs(np.mean(nees) - 3.0) < 3.5 * np.sqrt(6.0 / count)
+    assert (np.abs(np.mean(np.square(places), axis=0) - 1.0) < 3.5 * np.sqrt(2.0 / count)).all(), places
 
 
 def test_wheel_noise_that_is_not_known_makes_the_multipliers_less_certain():
@@ -231,6 +234,20 @@ def test_several_recordings_count_together():
     assert_true(all_of_them)
     assert (deviations(all_of_them) < 0.75 * deviations(one)).all()
     np.testing.assert_allclose(all_of_them.time_offsets, [0.0, 0.5, 1.0], atol=0.02)
+
+
+def test_residuals_follow_each_other_in_time_and_show_the_noise_of_the_reference():
+    random = np.random.default_rng(18)
+    result = calibrate([ROBOT.recording(random, name) for name in 'ab'], NOMINAL)
+    first, second = result.residuals()
+    assert first[0, 0] == 0.0
+    assert second[0, 0] == first[-1, 0]
+    for part, motion in zip((first, second), result.motions, strict=True):
+        np.testing.assert_allclose(np.diff(part[:, 0]), np.diff(motion.time), atol=1e-9)
+        # Poses at rest are means of several.
+        squares = motion.weights[:, np.newaxis] * np.square(part[:, 1:])
+        spread = np.sqrt(squares.mean(axis=0)) / [NOISE.position, NOISE.position, NOISE.heading]
+        assert ((spread > 0.5) & (spread < 1.2)).all(), spread
 
 
 # --- What a drive does not determine
