@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 
-from diffdrive_jacobian.bags.journal import Message
+from diffdrive_jacobian.bags.journal import Channel, Message
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError
 from diffdrive_jacobian.recording import recorder
 from diffdrive_jacobian.recording.recorder import Recorder, Selection
@@ -25,12 +25,17 @@ class Sink:
 
     def __init__(self):
         self.data = []
+        self.stamps = []
+        self.channel = None
         self.missed = {}
         self.left_out = {}
 
     def add(self, record):
         if isinstance(record, Message):
             self.data.append(record.data)
+            self.stamps.append(record.stamp)
+        if isinstance(record, Channel):
+            self.channel = record
 
     def set_missed(self, topic, messages):
         self.missed[topic] = messages
@@ -227,6 +232,32 @@ def test_a_later_publisher_with_weaker_qos_is_recorded(ros, executor_kind, first
     ros.until(lambda: len(sink.data) == 4, 'all four are recorded')
     recorder.discover()
     assert sink.missed == {}
+    assert len(sink.channel.qos) == 2
+
+
+@pytest.mark.parametrize('simulated', [False, True])
+def test_the_time_of_a_message_is_that_of_its_receipt_or_of_the_simulated_clock(
+    ros, executor_kind, simulated
+):
+    sink = Sink()
+    recorder = ros.add(
+        Recorder,
+        parameters={'use_sim_time': simulated},
+        selection=Selection(topics=('cmd_vel',)),
+        sink=sink,
+        with_info=True,
+        now=lambda: 5,
+    )
+    publisher = ros.peer.create_publisher(Twist, 'cmd_vel', 10)
+
+    def matched():
+        recorder.discover()
+        return publisher.get_subscription_count()
+
+    ros.until(matched, 'the recorder is there')
+    publisher.publish(Twist())
+    ros.until(lambda: sink.data, 'a message is recorded')
+    assert (sink.stamps == [5]) == simulated
 
 
 @pytest.fixture
