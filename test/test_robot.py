@@ -154,6 +154,12 @@ def test_a_command_is_the_same_in_every_form(form):
     assert start().commanded([0, 0], 0).expiry is None
 
 
+@pytest.mark.parametrize('command', [(np.nan, 0.0), (0.1, -np.inf), (0.1,), (0.1, 0.2, 0.3), 0.1])
+def test_a_command_is_two_finite_numbers(command):
+    with pytest.raises(ValueError, match=r'^command must '):
+        start().commanded(command, 0)
+
+
 @pytest.mark.parametrize('seconds', [0.5, 1.0, np.float64(2.0), '1', None, True])
 def test_seconds_are_not_taken_for_nanoseconds(seconds):
     robot = start()
