@@ -6,6 +6,7 @@ import pytest
 from conftest import PATIENCE
 from domains import domain_id
 from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.event_handler import UnsupportedEventTypeError
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
@@ -233,6 +234,28 @@ def test_a_later_publisher_with_weaker_qos_is_recorded(ros, executor_kind, first
     recorder.discover()
     assert sink.missed == {}
     assert len(sink.channel.qos) == 2
+
+
+def test_other_topics_are_not_recorded(ros, executor_kind):
+    other = ros.peer.create_publisher(Twist, 'another_twist', 10)
+    setting = Setting(ros)
+    assert setting.recorder.topics == ['/cmd_vel']
+    assert other.get_subscription_count() == 0
+
+
+def test_a_middleware_without_events_is_recorded_from(ros, executor_kind, monkeypatch):
+    create = Recorder.create_subscription
+
+    def without_events(*arguments, event_callbacks=None, **options):
+        if event_callbacks is not None:
+            raise UnsupportedEventTypeError('no events')
+        return create(*arguments, **options)
+
+    monkeypatch.setattr(Recorder, 'create_subscription', without_events)
+    setting = Setting(ros)
+    setting.send(3)
+    setting.until_recorded(3)
+    assert setting.sink.data == setting.sent
 
 
 @pytest.mark.parametrize('simulated', [False, True])
