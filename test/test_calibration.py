@@ -152,7 +152,7 @@ def test_umbmark_recovers_the_true_multipliers(given):
 
 def test_errors_are_those_of_the_cramer_rao_bound_and_of_the_stated_covariance():
     """A small form of `benchmark/calibration_cases.py`: mean squares of 16 robots."""
-    errors, nees, bounds = [], [], []
+    errors, nees, bounds, places = [], [], [], []
     count = 16
     for seed in range(count):
         random = np.random.default_rng(100 + seed)
@@ -161,6 +161,8 @@ def test_errors_are_those_of_the_cramer_rao_bound_and_of_the_stated_covariance()
         assert result.notes == ()
         nees.append(error @ np.linalg.solve(result.covariance, error))
         errors.append(error)
+        # The true one is zero.
+        places.append(result.estimate.sensor / np.sqrt(np.diag(result.estimate.covariance())[3:6]))
         motion = result.motions[0]
         truth = ROBOT.truth(np.random.default_rng(100 + seed))
         states = np.column_stack([np.interp(motion.time, SHORT.time, one) for one in truth.T])
@@ -176,6 +178,7 @@ def test_errors_are_those_of_the_cramer_rao_bound_and_of_the_stated_covariance()
     # The mean of squares of 16 numbers of variance 1 has the deviation sqrt(2 / 16).
     assert (np.abs(ratio - 1.0) < 3.5 * np.sqrt(2.0 / count)).all(), ratio
     assert abs(np.mean(nees) - 3.0) < 3.5 * np.sqrt(6.0 / count)
+    assert (np.abs(np.mean(np.square(places), axis=0) - 1.0) < 3.5 * np.sqrt(2.0 / count)).all(), places
 
 
 def test_wheel_noise_that_is_not_known_makes_the_multipliers_less_certain():
@@ -370,6 +373,20 @@ def test_wheels_at_4_hz_are_interpolated():
     true = np.column_stack([-np.cos(dense), np.sin(0.7 * dense) / 0.7])
     linear = np.column_stack([np.interp(dense, time, one) for one in angles.T])
     assert np.std(found - true) < 0.3 * np.std(linear - true)
+
+
+def test_residuals_follow_each_other_in_time_and_show_the_noise_of_the_reference():
+    random = np.random.default_rng(18)
+    result = calibrate([ROBOT.recording(random, name) for name in 'ab'], NOMINAL)
+    first, second = result.residuals()
+    assert first[0, 0] == 0.0
+    assert second[0, 0] == first[-1, 0]
+    for part, motion in zip((first, second), result.motions, strict=True):
+        np.testing.assert_allclose(np.diff(part[:, 0]), np.diff(motion.time), atol=1e-9)
+        # Poses at rest are means of several.
+        squares = motion.weights[:, np.newaxis] * np.square(part[:, 1:])
+        spread = np.sqrt(squares.mean(axis=0)) / [NOISE.position, NOISE.position, NOISE.heading]
+        assert ((spread > 0.5) & (spread < 1.2)).all(), spread
 
 
 # --- What a drive does not determine

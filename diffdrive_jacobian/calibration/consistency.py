@@ -28,8 +28,9 @@ FEWEST = 4
 MOST_POSES = 2000
 """Number of poses that are used at most."""
 APART = 20.0
-"""Steps of the encoders by which the wheels turn at least between the poses that are used. Between nearer
-ones much of their turns is reading error, which the score takes for motion that the reference lacks."""
+"""Steps of the encoders by which the wheels turn at least between the poses that are used. Between
+nearer ones much of their turns is reading error, which the score takes for motion that the reference
+lacks."""
 CHANCE = 3e-3
 """Bound of the probability of a misfit by chance, among all windows, all kinds, or all recordings. It is
 less likely, because the sets overlap."""
