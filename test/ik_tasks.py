@@ -8,6 +8,8 @@ from diffdrive_jacobian.kinematics.inverse_kinematics import pose_difference, so
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 
 TOLERANCE = 1e-6
+ROUNDING = 1.0 + 1e-14
+"""Lengths of the same error that are computed in two ways differ by a few units in the last place."""
 DOWNHILL = ('transpose', 'levenberg_marquardt')
 TWO, THREE, FIVE = (PlanarArm(lengths) for lengths in ([1.0, 0.7], [1.0, 0.7, 0.4], [0.5] * 5))
 LONG_FIRST = (PlanarArm([1.0, 0.7]), PlanarArm([1.0, 0.3, 0.2]))

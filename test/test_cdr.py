@@ -20,13 +20,15 @@ from geometry_msgs.msg import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nav_msgs.msg import Goals, Odometry
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.serialization import deserialize_message, serialize_message
 from rosgraph_msgs.msg import Clock
 from rosidl_parser import definition
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import JointState, LaserScan
 from std_msgs.msg import Empty, Float64MultiArray, Header, String
 
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader, Writer
+from diffdrive_jacobian.messages.errors import MessageError
 
 CLASSES = (
     *(Odometry, Twist, TwistStamped, JointState, Clock, Pose, PoseStamped, PoseWithCovarianceStamped),
@@ -189,6 +191,12 @@ def test_any_fields_are_read_as_rclpy_reads_them(message_class, data):
         assert expected is not None
         # The second time with the layout of the first.
         assert outcome(read, serialized) == outcome(read, serialized) == expected
+
+
+def test_numbers_of_four_bytes_are_read_as_rclpy_reads_them():
+    scan = LaserScan(angle_min=-0.5, angle_max=0.25, scan_time=0.1, ranges=[1.5, 2.5, 0.1])
+    serialized, fields = serialize_message(scan), readable(LaserScan)
+    assert outcome(reader(LaserScan, fields), serialized) == rclpy_outcome(LaserScan, fields, serialized)
 
 
 @by_class
@@ -402,6 +410,13 @@ def test_wrong_numbers_are_an_error_of_the_message(numbers):
         Writer(Clock(), ['clock.sec'])(1 << 31)
 
 
+def test_a_template_that_cannot_be_serialized_is_an_error():
+    with pytest.raises(MessageError, match='String cannot be serialized'):
+        Writer(String(data='\ud800'), [])
+
+
 def test_types_that_are_not_supported_are_an_error():
     with pytest.raises(TypeError, match='Empty has no fields'):
         Reader(Empty, [])
+    with pytest.raises(TypeError, match='range must not have type sequence<'):
+        Reader(ParameterDescriptor, ['name'])

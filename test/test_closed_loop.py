@@ -258,6 +258,17 @@ def test_a_law_that_diverges_has_not_arrived_and_leaves_its_company_alone(law, w
         assert_same(type(found)(*(field[~lost] for field in found)), [field[~lost] for field in tame])
 
 
+def test_who_has_driven_away_a_thousand_kilometres_is_given_up():
+    found = closed_loops(lambda pose, to: (1e3, 0.0), np.zeros(3), [-1.0, 0.0], rate=1.0, duration=1e4)
+    assert not found.arrived
+    assert found.pose[0] == pytest.approx(1e6, abs=2e3)
+
+
+def test_outcomes_that_overflow_are_an_error():
+    with pytest.raises(ValueError, match='must give finite outcomes'):
+        closed_loops(go_to_goal, np.zeros(3), [1.0, 0.0], 3.0, 0.5, r=1e-160)
+
+
 def test_turning_gains_far_beyond_the_rate_raise_nothing():
     starts, targets = random_batch(9, 100)
     Kp = 10.0 ** np.linspace(2.1, 8.0, 100)

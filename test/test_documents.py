@@ -1,5 +1,6 @@
 """The numbers and matrices that the documents A to E print; where one slipped, what is right and why.
 
+The slips are listed in doc/mathematics.md, "Slips in the documents".
 B and E order the wheels left, right: `[:, ::-1]` puts our columns, right and left, in their order.
 """
 
@@ -38,8 +39,8 @@ def test_a_script_prints_these_numbers():
 
 
 def test_a_matrices_of_its_script_and_the_rank_of_s_for_every_heading():
-    assert np.array_equal(dd.unicycle_jacobian(psi), [[np.cos(psi), 0], [np.sin(psi), 0], [0, 1]])
-    assert np.array_equal(dd.wheel_to_body_jacobian(r, l), [[r / 2, r / 2], [r / l, -r / l]])
+    close(dd.unicycle_jacobian(psi), [[np.cos(psi), 0], [np.sin(psi), 0], [0, 1]])
+    close(dd.wheel_to_body_jacobian(r, l), [[r / 2, r / 2], [r / l, -r / l]])
     S = dd.unicycle_jacobian(HEADINGS)
     assert np.all(np.linalg.matrix_rank(S) == 2)
     close(dd.no_lateral_slip_constraint(HEADINGS) @ S, 0.0)

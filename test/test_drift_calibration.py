@@ -11,11 +11,13 @@ from lockstep_nodes import make_complete
 from recorded import recorded
 from ros_messages import twist
 
-from diffdrive_jacobian.calibration import Geometry, calibrate
+from diffdrive_jacobian.calibration import PARAMETERS, Geometry, calibrate
 from diffdrive_jacobian.lockstep import Lockstep
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.reading.calibration_data import read_wheels_and_reference
+from diffdrive_jacobian.reading.reader import read_run
+from diffdrive_jacobian.reading.verification import verify
 
 LEFT, RIGHT, SEPARATION = TRUE = 0.985, 1.01, 1.03
 WRONG = {
@@ -26,14 +28,14 @@ WRONG = {
 COMMANDS = umbmark(side=1.0, runs=1, speed=0.5, turn=2.0)
 
 
-def driven(path, **multipliers):
+def driven(path, assumed=None, **multipliers):
     """Drive the squares through wheel_bridge and record them. Give where the robot truly was at the end
-    of each."""
+    of each. `assumed` are the multipliers of the robot, the others are those of the bridge."""
     with Lockstep() as world:
         drift = {'simulate_slip': True, 'slip_seed': 5, **WRONG}
         names = {'command_interface': 'wheels', 'cmd_vel_timeout': 0.0, 'publish_rate': 25.0}
         ends = []
-        robot = make_complete(VirtualRobot, **names, **drift)
+        robot = make_complete(VirtualRobot, **names, **drift, **(assumed or {}))
         with recorded(world, path) as made:
             world.add(robot)
             world.add(make_complete(WheelBridge, cmd_vel_timeout=0.0, **multipliers))
@@ -72,3 +74,24 @@ def test_the_multipliers_of_a_robot_come_out_of_its_bag(uncalibrated, tmp_path):
     before, after = (max(math.hypot(x, y) for x, y, _ in one) for one in (ends, again))
     assert before > 0.1
     assert after < before / 3.0
+
+
+def test_a_calibrated_robot_is_where_its_odometry_says(uncalibrated, tmp_path):
+    path, _ = uncalibrated
+    nominal = Geometry(wheel_radius=0.033, wheel_separation=0.16)
+    found = calibrate([read_wheels_and_reference(path).recording], nominal)
+    assumed = dict(zip(PARAMETERS, found.multipliers.tolist(), strict=True))
+    again = tmp_path / 'again'
+    driven(again, assumed, **assumed)
+    apart = []
+    for run in map(read_run, (path, again)):
+        verification = verify(run)
+        assert verification.truth is not None
+        assert verification.holds(1e-9, 1e-9)
+        off = run.odometry.values[-1, :2] - run.ground_truth.values[-1, :2]
+        apart.append(math.hypot(*off))
+    assert apart[1] < apart[0] / 3.0
+    # The multipliers refer to the nominal dimensions, so that those of the robot are found again.
+    second = calibrate([read_wheels_and_reference(again).recording], nominal)
+    sigma = np.sqrt(np.diag(second.covariance))
+    assert np.all(np.abs(second.multipliers - TRUE) < 4.0 * sigma)

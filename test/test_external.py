@@ -506,6 +506,15 @@ def test_questions_are_counted_from_the_start():
     assert due.due == 4
 
 
+def test_ticks_that_were_due_before_a_restart_are_not_awaited():
+    due = TicksDue(Every('a', 0.1), '/a')
+    due.restart(lambda _: 0)
+    due.update(SECOND // 5, lambda _: 0)
+    assert due.due == 2
+    due.restart(lambda _: 0)
+    assert due.due == 0
+
+
 @pytest.mark.parametrize('seed', range(5))
 def test_ticks_are_expected_when_rcl_has_them(lockstep, seed):
     rng = random.Random(seed)

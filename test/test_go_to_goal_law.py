@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from diffdrive_jacobian.control import go_to_goal, turn_in_place
+from diffdrive_jacobian.control import go_to_goal, go_to_pose, offset_point, turn_in_place
 from diffdrive_jacobian.kinematics.diff_drive import unicycle_jacobian
 from diffdrive_jacobian.kinematics.se2 import integrate
 
@@ -145,3 +145,12 @@ def test_turning_in_place_takes_the_smaller_angle_and_ends_at_the_heading():
     assert np.abs(np.sin((here[:, 2] - heading) / 2.0)).max() < 1e-12
     short_way = np.arccos(np.cos(heading - start[:, 2]))
     np.testing.assert_allclose(turned, short_way, rtol=0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize('law', [go_to_goal, go_to_pose, offset_point])
+@pytest.mark.parametrize('name', ['state', 'goal'])
+@pytest.mark.parametrize('size', [1, 4])
+def test_a_tuple_of_another_length_is_named(law, name, size):
+    arguments = {'state': (0.0, 0.0, 0.0), 'goal': (1.0, 1.0, 0.0)[: 3 if law is go_to_pose else 2]}
+    with pytest.raises(ValueError, match=f'^{name} must have shape'):
+        law(*(arguments | {name: (0.5,) * size}).values(), 1.0, 0.5)

@@ -77,6 +77,51 @@ def test_ground_truth_is_that_of_the_library_and_odometry_that_of_a_perfect_robo
     assert (message.header.frame_id, message.child_frame_id) == ('map', 'base_link')
 
 
+ASSUMED = {name.removeprefix('true_'): value for name, value in MULTIPLIERS.items()}
+
+
+def test_a_robot_that_assumes_its_true_dimensions_is_where_its_odometry_says(lockstep, robot_at):
+    topics, truths = Topics(lockstep), lockstep.listen(Odometry, 'ground_truth')
+    robot = robot_at(1.0, 2.0, 0.5, **MULTIPLIERS, **ASSUMED)
+    lockstep.publish('cmd_vel', twist(0.2, 0.5))
+    lockstep.run_for(0.4)
+    assert len(truths) == len(topics.odom)
+    assert robot.truth == pytest.approx(pose_of(topics.odom[-1]), abs=1e-14)
+    # Its wheels turn for its true dimensions, not for the nominal ones.
+    right, left = (0.2 + 0.5 * 0.16 * 1.05 / 2.0) / 1.02, (0.2 - 0.5 * 0.16 * 1.05 / 2.0) / 0.99
+    assert list(topics.states[-1].velocity) == pytest.approx([left / 0.033, right / 0.033])
+
+
+def test_wrongly_assumed_dimensions_are_the_inverse_of_wrong_true_ones(lockstep, robot_at):
+    robot = robot_at(**ASSUMED)
+    lockstep.publish('cmd_vel', twist(0.2, 0.5))
+    lockstep.run_for(0.4)
+    drift = Drift(
+        right_wheel_radius_multiplier=1.0 / 1.02,
+        left_wheel_radius_multiplier=1.0 / 0.99,
+        wheel_separation_multiplier=1.0 / 1.05,
+    )
+    model = RobotModel(wheel_separation=0.16 * 1.05, drift=drift)
+    start = Robot(model=model, stamp=0, pose=[0.0, 0.0, 0.0]).commanded((0.2, 0.5), 0)
+    assert robot.truth == pytest.approx(start.at(2 * SECOND // 5).true_pose, abs=1e-14)
+
+
+def test_assumed_dimensions_can_change_during_a_drive(lockstep, robot_at):
+    """From then on the truth agrees with the odometry, up to where the robot is by then."""
+    topics, truths = Topics(lockstep), lockstep.listen(Odometry, 'ground_truth')
+    robot = robot_at(**MULTIPLIERS)
+    lockstep.publish('cmd_vel', twist(0.2, 0.5))
+    lockstep.run_for(0.2)
+    assert change(robot, **ASSUMED).successful
+    lockstep.run_for(0.2)
+
+    def turned(messages):
+        poses = {stamp: pose_of(one) for stamp, one in zip(instants(messages), messages, strict=True)}
+        return [pose[2] for stamp, pose in sorted(poses.items())][-8:]
+
+    assert np.diff(turned(truths)) == pytest.approx(np.diff(turned(topics.odom)), abs=1e-12)
+
+
 def test_ground_truth_has_a_frame_of_its_own_that_can_change(lockstep, robot_at, capfd):
     truths = lockstep.listen(Odometry, 'ground_truth')
     robot = robot_at(ground_truth_frame_id='world', base_frame_id='body', **SLIPPING)
@@ -266,6 +311,14 @@ def test_without_parameters_the_odometry_alone_is_verified(run):
     assert verification.truth is None
     assert verification.holds(1e-9, 1e-9)
     assert any(note.startswith('ground_truth was not compared') for note in verification.notes)
+
+
+def test_a_run_whose_assumed_dimensions_changed_is_verified_by_its_odometry_alone(run):
+    (name,) = run.parameters
+    changed = (run.odometry.received[50], name, {'left_wheel_radius_multiplier': 1.1})
+    verification = verify(replace(run, parameter_events=(changed,)))
+    assert verification.truth is None
+    assert verification.holds(1e-9, 1e-9)
 
 
 def truths_in(drawn):

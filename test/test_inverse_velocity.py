@@ -364,6 +364,7 @@ BAD = [
     (iv.damping, {'maximum': -1.0}, r'^maximum must be zero or positive .* got -1'),
     (iv.joint_limit_cost, {'upper': Q - 1.0}, r'^upper must be above lower'),
     (iv.joint_limit_gradient, {'upper': Q - 2.0}, r'^upper must be above lower'),
+    (iv.joint_limit_cost, {'lower': Q + 2.0, 'upper': Q + 1.0}, r'^upper must be above lower'),
     (iv.joint_limit_gradient, {'q': [0.0]}, r'^(q|lower|upper)\b.* must .*got'),
     (iv.manipulability_gradient, {'jacobian': lambda q: np.eye(2)}, r'^jacobian must return'),
     (iv.manipulability_gradient, {'q': 0.0}, r'^q must have shape'),

@@ -207,6 +207,15 @@ def test_the_chain_is_that_of_document_a():
     assert numbers['measured']
 
 
+def test_the_chain_has_the_radius_of_each_wheel():
+    wheels, multipliers = (3.0, -1.0), (1.1, 0.9)
+    numbers = chain(0.0, (0.5, 0.0), wheels, (0.05, 0.3), multipliers)
+    right, left = 3.0 * 0.05 * 1.1, -1.0 * 0.05 * 0.9
+    expected = [(right + left) / 2.0, (right - left) / 0.3]
+    assert numbers['twist'] == pytest.approx(expected, rel=1e-5)
+    assert numbers['wanted'] == pytest.approx([0.5 / 0.05 / 1.1, 0.5 / 0.05 / 0.9], rel=1e-5)
+
+
 def test_the_region_contains_95_percent():
     rng = np.random.default_rng(1)
     angle, deviations = 0.6, np.array([0.3, 0.05])

@@ -350,6 +350,20 @@ def test_the_error_of_a_law_has_its_cause():
     assert isinstance(caught.value.__cause__, ZeroDivisionError)
 
 
+def test_gains_are_passed_in_the_order_of_the_controller():
+    parameters = GoToGoalParameters(kp=2.0, kv=3.0, offset=5.0)
+    for gains in ((), ('kv',), ('offset', 'kp'), ('offset', 'kp', 'kv')):
+        own = replace(MINE, gains=gains, law=lambda pose, goal, *values: (len(values), sum(values)))
+        values = tuple(getattr(parameters, name) for name in gains)
+        assert own.bind(parameters)(np.zeros(3), np.ones(3)) == (len(gains), sum(values))
+        assert own.values(parameters) == values
+
+
+def test_a_controller_without_advice_has_no_warnings():
+    parameters = GoToGoalParameters()
+    assert MINE.warnings(parameters, parameters.limits) == []
+
+
 # --- Bags
 
 

@@ -469,6 +469,17 @@ def test_a_short_line_stays_as_it_is():
     assert line(rows, np.array([], dtype=int)).tolist() == rows.tolist()
 
 
+def test_a_long_line_with_very_many_gaps_is_drawn_without_them():
+    count = 100_000
+    rows = np.column_stack([np.arange(count), np.sin(np.arange(count))])
+    kept = line(rows, np.arange(10, count, 10))
+    assert np.isfinite(kept).all()
+    assert len(kept) < count / 5
+    np.testing.assert_allclose(
+        [kept.min(axis=0), kept.max(axis=0)], [rows.min(axis=0), rows.max(axis=0)]
+    )
+
+
 # --- CSV
 
 

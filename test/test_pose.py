@@ -223,9 +223,9 @@ def test_moved_to_another_place_or_mirrored_the_law_is_the_same():
     moved = go_to_pose(se2.compose(there, states), se2.compose(there, targets), KP, KV)
     np.testing.assert_allclose(moved, here, rtol=1e-8, atol=1e-8)
     mirror = np.array([1.0, -1.0, -1.0])
-    np.testing.assert_array_equal(
-        go_to_pose(mirror * states, mirror * targets, KP, KV), [here[0], -here[1]]
-    )
+    mirrored = go_to_pose(mirror * states, mirror * targets, KP, KV)
+    # Not every library's sine is exactly odd.
+    np.testing.assert_allclose(mirrored, [here[0], -here[1]], rtol=1e-12, atol=1e-12)
 
 
 # --- Closed loops
@@ -395,24 +395,3 @@ def test_waypoints_with_headings_are_passed_in_order_and_the_last_heading_is_tak
         assert abs(se2.wrap_angle(passed[2] - heading)) < 0.5
     assert abs(se2.wrap_angle(pose_of(topics.odom[-1])[2] + 1.0)) <= 0.02
     assert topics.statuses == [ACCEPTED, EXECUTING, SUCCEEDED]
-
-
-@pytest.mark.parametrize('rate', [10.0, 50.0])
-@pytest.mark.parametrize(('Kp', 'Kv'), [(1.0, 0.5), (2.0, 0.1), (2.5, 0.5)])
-def test_the_bound_of_a_weight_that_is_given_keeps_the_sampled_loop_stable(rate, Kp, Kv):
-    """In the polar coordinates of the law, at the distance 1, which only shrinks."""
-
-    def radius(h):
-        def after_a_sample(alpha, phi):
-            pose = (-math.cos(phi), -math.sin(phi), phi - alpha)
-            pose = se2.integrate(pose, go_to_pose(pose, [0.0, 0.0, 0.0], Kp, Kv, h), 1.0 / rate)
-            phi = math.atan2(-pose[1], -pose[0])
-            return phi - pose[2], phi
-
-        small = 1e-7
-        step = np.array([after_a_sample(small, 0.0), after_a_sample(0.0, small)]).T / small
-        return np.abs(np.linalg.eigvals(step)).max()
-
-    bound = Kp * rate / Kv**2
-    assert all(radius(bound * part) < 1.0 for part in (0.01, 0.1, 0.5, 0.9, 1.0))
-    assert radius(2.1 * bound) > 1.0

@@ -6,11 +6,12 @@ import pytest
 from conftest import PATIENCE
 from domains import domain_id
 from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.event_handler import UnsupportedEventTypeError
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 
-from diffdrive_jacobian.bags.journal import Message
+from diffdrive_jacobian.bags.journal import Channel, Message
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError
 from diffdrive_jacobian.recording import recorder
 from diffdrive_jacobian.recording.recorder import Recorder, Selection
@@ -25,12 +26,17 @@ class Sink:
 
     def __init__(self):
         self.data = []
+        self.stamps = []
+        self.channel = None
         self.missed = {}
         self.left_out = {}
 
     def add(self, record):
         if isinstance(record, Message):
             self.data.append(record.data)
+            self.stamps.append(record.stamp)
+        if isinstance(record, Channel):
+            self.channel = record
 
     def set_missed(self, topic, messages):
         self.missed[topic] = messages
@@ -227,6 +233,54 @@ def test_a_later_publisher_with_weaker_qos_is_recorded(ros, executor_kind, first
     ros.until(lambda: len(sink.data) == 4, 'all four are recorded')
     recorder.discover()
     assert sink.missed == {}
+    assert len(sink.channel.qos) == 2
+
+
+def test_other_topics_are_not_recorded(ros, executor_kind):
+    other = ros.peer.create_publisher(Twist, 'another_twist', 10)
+    setting = Setting(ros)
+    assert setting.recorder.topics == ['/cmd_vel']
+    assert other.get_subscription_count() == 0
+
+
+def test_a_middleware_without_events_is_recorded_from(ros, executor_kind, monkeypatch):
+    create = Recorder.create_subscription
+
+    def without_events(*arguments, event_callbacks=None, **options):
+        if event_callbacks is not None:
+            raise UnsupportedEventTypeError('no events')
+        return create(*arguments, **options)
+
+    monkeypatch.setattr(Recorder, 'create_subscription', without_events)
+    setting = Setting(ros)
+    setting.send(3)
+    setting.until_recorded(3)
+    assert setting.sink.data == setting.sent
+
+
+@pytest.mark.parametrize('simulated', [False, True])
+def test_the_time_of_a_message_is_that_of_its_receipt_or_of_the_simulated_clock(
+    ros, executor_kind, simulated
+):
+    sink = Sink()
+    recorder = ros.add(
+        Recorder,
+        parameters={'use_sim_time': simulated},
+        selection=Selection(topics=('cmd_vel',)),
+        sink=sink,
+        with_info=True,
+        now=lambda: 5,
+    )
+    publisher = ros.peer.create_publisher(Twist, 'cmd_vel', 10)
+
+    def matched():
+        recorder.discover()
+        return publisher.get_subscription_count()
+
+    ros.until(matched, 'the recorder is there')
+    publisher.publish(Twist())
+    ros.until(lambda: sink.data, 'a message is recorded')
+    assert (sink.stamps == [5]) == simulated
 
 
 @pytest.fixture

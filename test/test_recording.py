@@ -33,7 +33,7 @@ from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.bags.storage import BagReader
 from diffdrive_jacobian.recording import recording as recordings
 from diffdrive_jacobian.recording.journal_thread import JournalThread
-from diffdrive_jacobian.recording.recording import LOST, Recording, RecordingError
+from diffdrive_jacobian.recording.recording import LOST, MAX_LEFT_OUT, Recording, RecordingError
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.recover_run import main as recover_run
 
@@ -407,6 +407,18 @@ def test_a_topic_that_is_left_out_is_reported_and_noted(tmp_path):
     assert caught.value.summary.messages == 3
     assert json.loads(custom_data(bag)[LEFT_OUT]) == {'/odom': 'it has several types'}
     assert not journal_of(bag).exists()
+
+
+def test_of_many_topics_that_are_left_out_some_are_noted(tmp_path):
+    recording = Recording(tmp_path / 'run', 'mcap')
+    add_all(recording, channel(), *messages(3))
+    for number in range(MAX_LEFT_OUT + 5):
+        recording.set_left_out(f'/topic_{number}', 'it has several types')
+    with pytest.raises(
+        RecordingError, match=f'others was not recorded: more than {MAX_LEFT_OUT} topics'
+    ):
+        recording.finish()
+    assert len(json.loads(custom_data(tmp_path / 'run')[LEFT_OUT])) == MAX_LEFT_OUT + 1
 
 
 def test_a_topic_that_is_left_out_is_reported_after_a_crash(tmp_path, capsys):

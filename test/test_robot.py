@@ -136,6 +136,13 @@ def test_a_robot_cannot_go_back():
             call()
 
 
+def test_a_time_fits_into_the_64_bits_of_ros():
+    last = 2**63 - 1
+    assert start().at(last).stamp == last
+    with pytest.raises(ValueError, match='stamp must fit into 64 bits'):
+        start().at(last + 1)
+
+
 @pytest.mark.parametrize('form', [tuple, list, np.array, lambda pair: np.array(pair, dtype=np.float32)])
 def test_a_command_is_the_same_in_every_form(form):
     for command in ((0.0, 0.0), (0.25, -1.5), (-0.0, 0.0)):
@@ -145,6 +152,12 @@ def test_a_command_is_the_same_in_every_form(form):
         assert type(robot.command) is type(robot.twist) is tuple
         assert all(type(part) is float for part in (*robot.command, *robot.twist))
     assert start().commanded([0, 0], 0).expiry is None
+
+
+@pytest.mark.parametrize('command', [(np.nan, 0.0), (0.1, -np.inf), (0.1,), (0.1, 0.2, 0.3), 0.1])
+def test_a_command_is_two_finite_numbers(command):
+    with pytest.raises(ValueError, match=r'^command must '):
+        start().commanded(command, 0)
 
 
 @pytest.mark.parametrize('seconds', [0.5, 1.0, np.float64(2.0), '1', None, True])

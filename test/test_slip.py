@@ -49,6 +49,12 @@ def irregular(seed, count, longest=30_000_000):
     return [(twists[index], stamp) for index, stamp in enumerate(stamps) for index in [index % 6]]
 
 
+def pulsed(on, off):
+    """Commands to drive for some nanoseconds and then to stop for some, again and again."""
+    stamps = range(0, SECOND // 2, on + off)
+    return [event for stamp in stamps for event in (((0.2, 0.5), stamp), ((0.0, 0.0), stamp + on))]
+
+
 # --- Random numbers
 
 
@@ -123,8 +129,11 @@ def test_odometry_is_that_of_a_perfect_robot():
     assert perfect.true_twist == perfect.twist
 
 
-def test_a_robot_at_rest_does_not_slip():
-    moved = driven(robot(seed=1), [((0.2, 0.0), 0), ((0.0, 0.0), SECOND + 3)], 2 * SECOND)
+def test_a_robot_at_rest_does_not_slip_after_the_cell_in_which_it_stopped():
+    stopped = driven(robot(seed=1), [((0.2, 0.0), 0), ((0.0, 0.0), SECOND + 3)], SECOND + 3)
+    assert stopped.true_twist != (0.0, 0.0)
+    moved = stopped.at(SECOND + CELL)
+    assert moved.true_pose_tuple != stopped.true_pose_tuple
     later = moved.at(3600 * SECOND)
     assert later.true_pose_tuple == moved.true_pose_tuple
     assert later.true_twist == (0.0, 0.0)
@@ -142,7 +151,11 @@ def test_a_wheel_at_rest_does_not_slip():
 def test_a_timeout_stops_the_truth_as_well():
     model = RobotModel(command_timeout=SECOND // 2, drift=Drift(seed=1))
     commanded = Robot(model=model, stamp=0, pose=[0, 0, 0]).commanded((0.2, 0.0), 5)
-    assert commanded.at(SECOND).true_pose_tuple == commanded.at(SECOND // 2 + 5).true_pose_tuple
+    expiry = SECOND // 2 + 5
+    stopped = driven(robot(seed=1), [((0.2, 0.0), 5), ((0.0, 0.0), expiry)], expiry)
+    for later in (expiry, expiry + 1000, SECOND):
+        assert commanded.at(later).true_pose_tuple == stopped.at(later).true_pose_tuple
+    assert commanded.at(SECOND).true_pose_tuple == commanded.at(SECOND // 2 + CELL).true_pose_tuple
 
 
 # --- What the noise is
@@ -162,10 +175,14 @@ def test_in_a_cell_the_robot_moves_along_one_arc_with_its_numbers():
         np.testing.assert_allclose(end.true_pose, expected, rtol=1e-12)
 
 
-def test_the_slip_in_a_cell_has_the_variance_of_its_distance_whatever_the_commands():
+@pytest.mark.parametrize(
+    'speeds',
+    [(0.1, 0.3, 0.3, -0.05, 0.9), (0.3, 0.0, 0.3, 0.0, 0.3), (0.0, 0.0, 0.3, 0.0, 0.0), (0.0,) * 5],
+    ids=str,
+)
+def test_the_slip_in_a_cell_has_the_variance_of_its_distance_whatever_the_commands(speeds):
     """Divided by xi, the slip of the whole cell is the square root of k |ds|."""
     k, cell, offsets = 1e-5, 50, (0, 3_000_000, 3_000_001, 11_000_000, 19_000_000)
-    speeds = 0.1, 0.3, 0.3, -0.05, 0.9
     begin, end = cell * CELL, (cell + 1) * CELL
     start = robot(begin, seed=4)
     commands = [((v, 0.0), begin + offset) for v, offset in zip(speeds, offsets, strict=True)]
@@ -177,14 +194,13 @@ def test_the_slip_in_a_cell_has_the_variance_of_its_distance_whatever_the_comman
         assert distance_slipped / xi == pytest.approx(math.sqrt(k * distance), rel=1e-4)
 
 
-def test_a_stop_within_a_cell_leaves_no_slip_for_later():
+@pytest.mark.parametrize('share', [1e-4, 0.1, 0.5, 0.9, 0.9999])
+def test_wheels_that_stopped_slip_slower_than_while_they_rolled(share):
     begin = 50 * CELL
-    start = robot(begin, seed=4)
-    stopped = driven(start, [((0.5, 0.0), begin), ((0.0, 0.0), begin + CELL // 2)], begin + CELL - 1000)
-    again = stopped.commanded((1e-6, 0.0), stopped.stamp)
-    assert abs(again.true_twist[0]) < 0.1
-    fresh = robot(stopped.stamp, seed=4).commanded((1e-6, 0.0), stopped.stamp)
-    assert again.true_twist == fresh.true_twist
+    driving = robot(begin, seed=4).commanded((0.5, 0.0), begin)
+    stopped = driving.commanded((0.0, 0.0), begin + round(share * CELL))
+    rolling, resting = (np.array(one.true_twist) - one.twist for one in (driving, stopped))
+    assert np.all(np.abs(resting) < np.abs(rolling))
 
 
 @pytest.mark.parametrize('hold', [HOLD, SECOND // 2], ids='wide cells after {} ns'.format)
@@ -214,7 +230,9 @@ def test_the_true_pose_is_the_integral_of_the_true_twist(monkeypatch):
         assert turned == pytest.approx(omega * 1e-9, abs=2e-14)
 
 
-@pytest.mark.parametrize('commands', ['straight', 'arc', 'in place', 'irregular'])
+@pytest.mark.parametrize(
+    'commands', ['straight', 'arc', 'in place', 'irregular', 'short starts', 'short stops']
+)
 def test_nees_against_the_odometry_is_three(commands):
     """Of 200 seeds. The standard error of the mean is sqrt(6 / 200)."""
     drives = {
@@ -222,6 +240,8 @@ def test_nees_against_the_odometry_is_three(commands):
         'arc': [((0.22, 0.5), 7_654_321)],
         'in place': [((0.0, 1.0), 7_654_321)],
         'irregular': irregular(5, 60),
+        'short starts': pulsed(2_000_000, 18_000_000),
+        'short stops': pulsed(14_000_000, 1_000_000),
     }
     values = []
     for seed in range(200):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,10 +20,12 @@ from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.reading import BagError, read_run
+from diffdrive_jacobian.reading.covariance_rule import EXACT_MOMENTS, NEITHER, rule, start_covariances
 from diffdrive_jacobian.reading.run import COLUMNS, Run, Series
 from diffdrive_jacobian.reading.verification import verify
 from diffdrive_jacobian.simulation.odometry_noise import propagate_covariance
 from diffdrive_jacobian.simulation.robot import Robot
+from diffdrive_jacobian.simulation.robot_model import RobotModel
 
 EXACT = 1e-9
 FOREIGN = Path(__file__).parent / 'bags' / 'turtlebot3_fake_sqlite'
@@ -459,3 +462,18 @@ def test_without_the_robot_or_its_start_the_covariances_are_not_compared(drive, 
     without = {} if missing == 'parameters' else rows(run.start_pose, slice(0, 0))
     verification = held(replace(run, **{missing: without}))
     assert verification.covariance is None
+
+
+def test_the_rule_of_covariances_is_compared_in_units_of_their_standard_deviations():
+    robot = Robot(model=RobotModel(), stamp=0, pose=np.zeros(3), covariance=np.zeros((3, 3)))
+    begin = robot.commanded((0.2, 0.1), 0)
+    now = begin.at(1_000_000_000)
+    recorded = np.array([now.moments[:6]])
+    for factor, expected in ((1.0 + 1e-11, EXACT_MOMENTS), (1.0 + 1e-8, NEITHER)):
+        assert rule([(begin, False)], [(0, now)], factor * recorded)[0] == expected
+
+
+def test_an_invalid_covariance_of_a_start_is_zero():
+    entries = np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 1.0], [1.0, 5.0, 0.0, 1.0, 0.0, 1.0]])
+    found = start_covariances(SimpleNamespace(start_covariances=entries, start_pose=[0, 1]))
+    np.testing.assert_array_equal(found, [np.eye(3).ravel(), np.zeros(9)])

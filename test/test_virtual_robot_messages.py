@@ -24,7 +24,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.kinematics import se2
-from diffdrive_jacobian.messages.conversion import from_pose
+from diffdrive_jacobian.messages.conversion import from_pose, from_pose_with_covariance
 
 # --- Commands
 
@@ -242,3 +242,14 @@ def test_what_the_plane_fixes_may_have_any_covariance(lockstep, robot_at, index)
     lockstep.publish('initialpose', spoiled(placement(7.0), f'pose.covariance.{index}', math.nan))
     assert [one.pose.pose.position.x for one in topics.starts] == [0.0, 7.0]
     assert not np.any(topics.starts[1].pose.covariance)
+
+
+def test_variances_that_rounding_made_negative_are_set_to_zero():
+    message, direction = placement(7.0).pose, np.array([0.6, 0.0, 0.8])
+    exact = np.outer(direction, direction)
+    covariance = np.zeros((6, 6))
+    covariance[np.ix_((0, 1, 5), (0, 1, 5))] = exact - 1e-12 * np.eye(3)
+    message.covariance = covariance.ravel()
+    _, found = from_pose_with_covariance(message)
+    np.testing.assert_allclose(found, exact, atol=1e-11)
+    assert np.linalg.eigvalsh(found)[0] > -1e-15

@@ -24,6 +24,13 @@ from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 
+UNEQUAL = {
+    'left_wheel_radius_multiplier': 0.9,
+    'right_wheel_radius_multiplier': 1.05,
+    'wheel_separation_multiplier': 1.2,
+}
+"""Multipliers of the assumed dimensions, as a calibration finds them."""
+
 
 @pytest.mark.parametrize(
     ('left', 'right'),
@@ -44,12 +51,37 @@ def test_wheel_speeds_give_the_exact_arc_of_their_twist(lockstep, robot_at, left
     assert topics.odom[-1].pose.pose == pose_message(se2.integrate(start, expected, 0.5))
 
 
+def test_wheel_speeds_of_unequal_wheels_give_the_arc_of_both_rims(lockstep, robot_at):
+    topics = Topics(lockstep)
+    robot_at(command_interface='wheels', **UNEQUAL)
+    lockstep.publish('joint_command', joint_command(5.0, 8.0))
+    lockstep.run_for(0.4)
+    right, left, L = 8.0 * 0.033 * 1.05, 5.0 * 0.033 * 0.9, 0.16 * 1.2
+    assert twists(topics.applied) == [pytest.approx(((right + left) / 2.0, (right - left) / L))]
+    expected = se2.integrate([0.0, 0.0, 0.0], ((right + left) / 2.0, (right - left) / L), 0.4)
+    assert pose_of(topics.odom[-1]) == pytest.approx(expected, abs=1e-12)
+    assert list(topics.states[-1].velocity) == pytest.approx([5.0, 8.0])
+    assert list(topics.states[-1].position) == pytest.approx([2.0, 3.2])
+
+
+@pytest.mark.parametrize('command', [(1.0, 0.0), (0.0, 9.0), (1.0, 5.0), (1.0, -5.0)], ids=str)
+def test_the_faster_of_unequal_wheels_has_the_limit(lockstep, robot_at, command):
+    topics = Topics(lockstep)
+    robot_at(max_wheel_velocity=9.0, **UNEQUAL)
+    lockstep.publish('cmd_vel', twist(*command))
+    lockstep.run_for(0.1)
+    assert max(map(abs, topics.states[-1].velocity)) == pytest.approx(9.0)
+    v, omega = twists(topics.applied)[-1]
+    assert v * command[1] == pytest.approx(omega * command[0], abs=1e-12)
+
+
+@pytest.mark.parametrize('multipliers', [{}, UNEQUAL], ids=['nominal', 'calibrated'])
 @pytest.mark.parametrize('seed', range(3))
-def test_wheels_and_twist_end_at_the_same_pose(lockstep, add, seed):
+def test_wheels_and_twist_end_at_the_same_pose(lockstep, add, seed, multipliers):
     stamped, limits = {'enable_stamped_cmd_vel': True}, {'max_wheel_velocity': 9.0}
-    add(VirtualRobot, 'a', **stamped, **limits)
-    add(VirtualRobot, 'b', command_interface='wheels', **limits)
-    add(WheelBridge, 'b', **stamped)
+    add(VirtualRobot, 'a', **stamped, **limits, **multipliers)
+    add(VirtualRobot, 'b', command_interface='wheels', **limits, **multipliers)
+    add(WheelBridge, 'b', **stamped, **multipliers)
     one, other = (Topics(lockstep, name, command=TwistStamped) for name in 'ab')
     random = np.random.default_rng(seed)
     lockstep.run_for(0.3)

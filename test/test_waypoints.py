@@ -41,6 +41,13 @@ def drive(waypoints, arrival, pose, rate=50.0):
     raise AssertionError(f'never arrived: {waypoints.index} at {pose}')
 
 
+@pytest.mark.parametrize('form', [tuple, list, np.array])
+@pytest.mark.parametrize('number', [int, float, np.float32])
+def test_a_pose_may_have_any_form(form, number):
+    _, command = Waypoints(POSES).follow(form([number(0)] * 3), echo, POSITIONS_ONLY, GAIN)
+    assert command == (0.0, 0.0, 0.0, 1.0, 0.0, 2.0)
+
+
 @pytest.mark.parametrize('arrival', [POSITIONS_ONLY, WITH_HEADING])
 def test_waypoints_are_reached_in_order_each_within_the_tolerance(arrival):
     history, end = drive(Waypoints(POSES), arrival, np.zeros(3))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from diffdrive_jacobian.calibration.estimate import (
     LEVER_ARM,
@@ -53,31 +54,52 @@ class Group:
 
 
 def linearized(
-    segments: Sequence[Segment], nominal: Geometry, estimate: Estimate, window: float = np.inf
-) -> tuple[Group, Group, Group]:
+    segments: Sequence[Segment],
+    nominal: Geometry,
+    estimate: Estimate,
+    window: float = np.inf,
+    columns: Sequence[NDArray[np.int_]] | None = None,
+    count: int | None = None,
+) -> tuple[tuple[Group, Group, Group], Array]:
     """Return the normal equations of the motion, the positions and the headings.
+
+    And how far the reading errors of both wheels, each of one standard deviation, seem to move the body
+    at each pose: twists in its frame, shape (n, 3, 2).
 
     Args:
         segments: Continuous motions.
         nominal: Nominal dimensions.
         estimate: Parameters and poses at which they are linearized.
         window: As of `increments`.
+        columns: Where, among all parameters, changes of the logarithms of the multipliers begin that are
+            those of single steps, shape (n - 1, any) for each motion (default: there are none).
+        count: Number of all parameters (default: those of the estimate).
     """
-    count = len(estimate.parameters)
+    count = count or len(estimate.parameters)
+    if columns is None:
+        columns = [np.empty((len(one.time) - 1, 0), dtype=int) for one in segments]
     geometry, sensor = estimate.geometry(nominal), estimate.sensor
     parts: tuple[list[Group], ...] = ([], [], [])
-    for segment, states in zip(segments, estimate.states, strict=True):
+    readings = []
+    right, left = geometry.radii
+    L = geometry.separation
+    by_reading = np.array([[right / 2.0, left / 2.0], [0.0, 0.0], [right / L, -left / L]])
+    for segment, states, further in zip(segments, estimate.states, columns, strict=True):
         offset = TIME_OFFSETS + segment.recording
         at = segment.time + estimate.parameters[offset]
         moved = increments(segment.wheel_time, segment.wheel_angles, at, geometry, window)
-        parts[0].append(_motion(moved, states, offset, count))
+        parts[0].append(_motion(moved, states, offset, count, further))
         for kind, part in enumerate(_observation(segment, states, sensor, count), 1):
             parts[kind].append(part)
+        errors = [np.interp(at, segment.wheel_time, one) for one in segment.wheel_errors.T]
+        readings.append(by_reading * np.column_stack(errors)[:, None])
     motion, position, heading = (_joined(part) for part in parts)
-    return motion, position, heading
+    return (motion, position, heading), np.concatenate(readings)
 
 
-def _motion(moved: Increments, states: Array, offset: int, count: int) -> Group:
+def _motion(
+    moved: Increments, states: Array, offset: int, count: int, columns: NDArray[np.int_]
+) -> Group:
     """Return the normal equations of the motion, for the wheel travel variance 1 m."""
     between = relative(states[:-1], states[1:])
     residual = relative(moved.steps, between)
@@ -86,6 +108,9 @@ def _motion(moved: Increments, states: Array, offset: int, count: int) -> Group:
     back = -adjoint(inverted(between))
     change = np.zeros((len(residual), 3, count))
     change[:, :, MULTIPLIERS] = -moved.jacobian
+    for begins in columns.T:
+        for which in range(3):
+            change[np.arange(len(begins)), :, begins + which] = -moved.jacobian[:, :, which]
     # The time offset moves both ends of a step.
     change[:, :, offset] = -(moved.rates[1:] + np.einsum('nij,nj->ni', back, moved.rates[:-1]))
     n = len(states)
@@ -103,7 +128,7 @@ def _motion(moved: Increments, states: Array, offset: int, count: int) -> Group:
         diagonal=diagonal,
         upper=weighted_back,
         border=border,
-        corner=np.einsum('nip,niq->pq', change, weighted_change),
+        corner=np.tensordot(change, weighted_change, ((0, 1), (0, 1))),
         gradient=gradient,
         gradient_corner=np.einsum('nip,ni->p', change, weighted),
         cost=float(np.sum(residual * weighted)),

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from diffdrive_jacobian.calibration.clock import time_offset
+from diffdrive_jacobian.calibration.consistency import misfit
 from diffdrive_jacobian.calibration.estimate import TIME_OFFSETS, YAW_OFFSET, Estimate
 from diffdrive_jacobian.calibration.fit import fit
 from diffdrive_jacobian.calibration.measurements import (
@@ -20,16 +21,17 @@ from diffdrive_jacobian.calibration.measurements import (
     wrapped,
 )
 from diffdrive_jacobian.calibration.motion import Geometry, composed
-from diffdrive_jacobian.calibration.observability import undetermined
+from diffdrive_jacobian.calibration.observability import UNDETERMINED, undetermined
 from diffdrive_jacobian.calibration.preparation import (
     overlapping,
     sampling_notes,
     thinned_poses,
     thinned_samples,
+    without,
     without_jumps,
 )
 from diffdrive_jacobian.calibration.rest import merged
-from diffdrive_jacobian.calibration.rough import rough
+from diffdrive_jacobian.calibration.rough import rough, unit
 
 PARAMETERS = (
     'left_wheel_radius_multiplier',
@@ -46,14 +48,19 @@ NOTABLE_WHEEL_NOISE = 5e-4
 """Wheel travel variance that is worth a note (m)."""
 EXACT = Noise(wheel=1e-7, position=2e-5, heading=2e-5)
 """Noise below which a reference is no observation of a real robot."""
-DISAGREEMENT = 30.0
-"""Largest squared distance of a recording's own estimate from that of all, in units of its covariance;
-a sum of three squares exceeds it once in a million."""
+DISAGREEMENT = 5.5
+"""Deviations by which a recording must differ from the others to be refused; one in a million does."""
 SAME = 0.005
 """Multipliers that differ by less agree in any case [-]."""
+MOST_PARTS, MOST_LEFT_OUT = 8, 0.4
+"""Most parts of the drives that are left out, and the largest share of the distance."""
 ROUNDS = 3
 LONG_DELAY = 0.2
 """Time offset that is worth a note (s)."""
+UNUSUAL = 1.15
+"""Factor beyond which multipliers are not explained by manufacturing."""
+BACKWARD = 0.6
+"""Angle from straight back within which a sensor looks backwards (rad)."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -141,6 +148,11 @@ def calibrate(
     for index, one in enumerate(recordings):
         found = given.time_offset if given.time_offset is not None else time_offset(one, nominal)
         offsets[index] = 0.0 if found is None else found
+        if found is None:
+            notes.append(
+                f'{one.name}: the speeds of the wheels and of the reference do not show the offset '
+                'between their clocks, which is assumed to be about 0 s'
+            )
     segments = [
         segment
         for index, one in enumerate(recordings)
@@ -167,7 +179,7 @@ def calibrate(
         free=_free(given, len(recordings)),
         information=np.zeros((0, 0)),
     )
-    estimate, motions = _estimated(segments, nominal, start, given)
+    segments, motions, estimate, misfits = _consistent(segments, nominal, start, given, names)
     result = Calibration(
         nominal=nominal,
         estimate=estimate,
@@ -176,9 +188,7 @@ def calibrate(
         motions=tuple(motions),
     )
     _check_result(result)
-    notes += _noise_notes(estimate.noise)
-    if len(recordings) > 1:
-        _check_agreement(result, given)
+    notes += [*misfits, *_noise_notes(estimate.noise), *_size_notes(result, given)]
     for one, offset in zip(recordings, result.time_offsets.tolist(), strict=True):
         if given.time_offset is None and abs(offset) > LONG_DELAY:
             notes.append(
@@ -215,6 +225,25 @@ def _noise_notes(noise: Noise) -> list[str]:
     return []
 
 
+def _size_notes(result: Calibration, given: Given) -> list[str]:
+    notes = []
+    values = result.multipliers
+    if (np.abs(np.log(values)) > np.log(UNUSUAL)).any():
+        listed = ', '.join(f'{value:.4g}' for value in values.tolist())
+        notes.append(
+            f'the multipliers {listed} (left, right, separation) are beyond what manufacturing '
+            'explains: are the nominal dimensions wrong, or is the reference in '
+            f'{unit(float(np.exp(np.log(values).mean())))} instead of metres?'
+        )
+    yaw = float(result.estimate.sensor[2])
+    if given.yaw_offset is None and np.cos(yaw) < -np.cos(BACKWARD):
+        notes.append(
+            'the sensor looks backwards. If it is not mounted so, the left and the right wheel are '
+            'swapped and both turn in the wrong sense: the multipliers of the radii are exchanged then'
+        )
+    return notes
+
+
 def _free(given: Given, count: int) -> np.typing.NDArray[np.bool_]:
     free = np.ones(TIME_OFFSETS + count, dtype=bool)
     free[3:5] = given.lever_arm is None
@@ -243,52 +272,67 @@ def _estimated(
     return estimate, motions
 
 
+def _consistent(
+    segments: Sequence[Segment],
+    nominal: Geometry,
+    start: Estimate,
+    given: Given,
+    names: Sequence[str],
+) -> tuple[list[Segment], list[Segment], Estimate, list[str]]:
+    """Return the segments, motions and estimate without parts that do not fit, and notes about these.
+
+    Where it is unknown which part is right, either may be: the estimate is the mean of both.
+
+    Raises:
+        CalibrationError: The recordings disagree, or too little fits.
+    """
+    segments, left_out = list(segments), 0.0
+    notes: list[str] = []
+    estimate, motions = _estimated(segments, nominal, start, given)
+    while (found := misfit(motions, nominal, estimate)) is not None:
+        window = found.window
+        where = found.words if window is None else f'{names[window.recording]}: {found.words}'
+        if window is None or window.whole or len(notes) == MOST_PARTS:
+            break
+        left_out += window.share * (1.0 - left_out)
+        if left_out > MOST_LEFT_OUT:
+            break
+        notes.append(f'{where}. A wheel skids or the reference is wrong: this part is left out')
+        segments = without(segments, window.recording, window.begin, window.end)
+        start = replace(start, parameters=estimate.parameters, noise=estimate.noise)
+        estimate, motions = _estimated(segments, nominal, start, given)
+    if found is None:
+        return segments, motions, estimate, notes
+    certain = found.deviations > DISAGREEMENT and abs(found.difference) > SAME
+    if window is not None and window.whole and certain:
+        raise CalibrationError(f'the recordings disagree about the multipliers: {where}')
+    middle, half = found.shifts.mean(axis=0), (found.shifts[0] - found.shifts[1]) / 2.0
+    widened = replace(estimate, parameters=estimate.parameters + middle).widened(
+        np.stack([half, middle / found.deviations])
+    )
+    if undetermined(widened.covariance()[:3, :3]) != undetermined(estimate.covariance()[:3, :3]):
+        raise CalibrationError(
+            f'{where}. Which is right is unknown, and one of the multipliers is uncertain by more than '
+            f'{100.0 * UNDETERMINED:g} %'
+        )
+    notes.append(
+        f'{where}. Which is right is unknown: the estimate lies between, and its deviations include both'
+    )
+    return segments, motions, widened, notes
+
+
 def _check_result(result: Calibration) -> None:
     values = result.multipliers
     if (values < BOUNDS[0]).any() or (values > BOUNDS[1]).any():
         found = ', '.join(f'{value:.3g}' for value in values.tolist())
         raise CalibrationError(
             f'multipliers must be from {BOUNDS[0]:g} to {BOUNDS[1]:g}, got {found} (left, right, '
-            'separation): are the nominal dimensions right, and is the reference of this robot?'
+            'separation): are the nominal dimensions wrong, or is the reference of another robot, or in '
+            f'{unit(float(np.exp(np.log(values).mean())))} instead of metres?'
         )
     noise = result.estimate.noise
     if noise.wheel > LARGE_WHEEL_NOISE:
         raise CalibrationError(
             f'the reference does not follow the wheels: after 1 m they differ by '
             f'{noise.wheel**0.5:.2g} m; is it of this robot, and do the wheels slip?'
-        )
-
-
-def _check_agreement(result: Calibration, given: Given) -> None:
-    """Raise CalibrationError if the recordings, each alone, have different multipliers."""
-    known = replace(
-        given,
-        wheel_noise=result.estimate.noise.wheel,
-        position_noise=result.estimate.noise.position,
-        heading_noise=result.estimate.noise.heading,
-    )
-    together = result.estimate.parameters[:3]
-    lines, disagree = [], False
-    for index, one in enumerate(result.recordings):
-        own = [replace(part, recording=0) for part in result.segments if part.recording == index]
-        if not own:
-            continue
-        here = np.r_[0:TIME_OFFSETS, TIME_OFFSETS + index]
-        start = replace(
-            result.estimate,
-            parameters=result.estimate.parameters[here],
-            free=result.estimate.free[here],
-        )
-        alone, _ = _estimated(own, result.nominal, start, known)
-        covariance = alone.covariance()[:3, :3]
-        off = alone.parameters[:3] - together
-        distance = float(off @ np.linalg.solve(covariance, off))
-        deviation = np.sqrt(np.diag(covariance))
-        values = zip(np.exp(alone.parameters[:3]).tolist(), deviation.tolist(), strict=True)
-        lines.append(f'{one.name}: ' + ', '.join(f'{value:.4f} ± {std:.4f}' for value, std in values))
-        disagree |= distance > DISAGREEMENT and bool((np.abs(off) > SAME).any())
-    if disagree:
-        raise CalibrationError(
-            'the recordings disagree about the multipliers (left radius, right radius, separation), '
-            f'each alone: {"; ".join(lines)}'
         )

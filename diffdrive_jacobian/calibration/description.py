@@ -11,7 +11,7 @@ from diffdrive_jacobian.calibration.errors import compared_distance, rms, tracks
 
 
 def parameter_file(result: Calibration, source: str) -> str:
-    """Return a ROS parameter file (YAML) for `wheel_bridge` and diff_drive_controller.
+    """Return a ROS parameter file (YAML) for the nodes of this package and for diff_drive_controller.
 
     Args:
         result: The calibration.
@@ -20,7 +20,8 @@ def parameter_file(result: Calibration, source: str) -> str:
     deviations = np.sqrt(np.diag(result.covariance)).tolist()
     lines = [
         f'# Estimated by calibrate_run from {source}.',
-        '# For wheel_bridge and diff_drive_controller. Behind each value: its standard deviation.',
+        '# For virtual_robot, wheel_bridge and diff_drive_controller. Behind each value: its standard '
+        'deviation.',
         '/**:',
         '  ros__parameters:',
         f'    wheel_radius: {result.nominal.wheel_radius!r}',
@@ -59,6 +60,12 @@ def describe(result: Calibration) -> list[str]:
         f'noise: wheel travel variance {noise.wheel:.3g} m, reference {noise.position:.3g} m and '
         f'{noise.heading:.3g} rad'
     )
+    errors = np.max([one.wheel_errors.max(axis=0) for one in result.segments], axis=0) * radii
+    if errors.any():
+        lines.append(
+            f'encoders: standard deviation of a wheel at rest {errors[1]:.2g} m (left), '
+            f'{errors[0]:.2g} m (right)'
+        )
     distance = compared_distance(result)
     before, after = (
         tracks(result, geometry, distance) for geometry in (result.nominal, result.geometry)

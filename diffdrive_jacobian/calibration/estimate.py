@@ -53,6 +53,13 @@ class Estimate:
         full[np.ix_(self.free, self.free)] = (inverse + inverse.T) / 2.0
         return full
 
+    def widened(self, errors: Array) -> Estimate:
+        """Return the estimate with additional errors, shape (any, number of parameters)."""
+        free = np.ix_(self.free, self.free)
+        covariance = self.covariance()[free] + (errors.T @ errors)[free]
+        scales = prior_deviations(len(self.parameters))[self.free]
+        return replace(self, information=np.linalg.inv(covariance) - np.diag(scales**-2.0))
+
 
 def prior_deviations(count: int) -> Array:
     """Return `SCALES` for a number of parameters."""

@@ -28,7 +28,7 @@ from diffdrive_jacobian.calibration.measurements import (
 from diffdrive_jacobian.calibration.motion import Geometry, composed, inverted
 
 MAX_STEPS = 40
-FULL_STEPS = 10
+FULL_STEPS = 5
 """Steps after which they are halved."""
 WINDOW = 4.0
 """Half of the time over which wheel speeds are means, in units of the last change of the time offset:
@@ -57,15 +57,24 @@ LARGEST = Noise(wheel=1.0, position=1e3, heading=1e2)
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Prior:
-    """Which parameters are free, and the gradient of the prior."""
+    """Which parameters are free, the gradient of their prior, and that of the reading errors."""
 
     free: NDArray[np.bool_]
     pull: Array
+    reading: Array
+    """What reading errors of one standard deviation do at each pose, as of `linearized`."""
+
+    @property
+    def misread(self) -> NDArray[np.intp]:
+        """Indices of the poses with reading errors."""
+        return np.flatnonzero(self.reading.any(axis=(1, 2)))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Solution:
     step: Array
+    observed: Array
+    """Step of the poses as the reference observes them, which differ by the reading errors."""
     change: Array
     information: Array
     logarithm: float
@@ -100,8 +109,9 @@ def fit(
     window = np.inf
     tolerances = np.where(np.arange(len(anchor)) < TIME_OFFSETS, CONVERGED, TIME_CONVERGED)[start.free]
     for count in range(MAX_STEPS):
-        groups = linearized(segments, nominal, estimate, window)
-        prior = _Prior(free=estimate.free, pull=(estimate.parameters - anchor) / scales**2)
+        groups, reading = linearized(segments, nominal, estimate, window)
+        pull = (estimate.parameters - anchor) / scales**2
+        prior = _Prior(free=estimate.free, pull=pull, reading=reading)
         noise, solution, settled = _with_noise(groups, estimate.noise, given, prior)
         size = np.abs(solution.change)
         window = WINDOW * float(size[np.count_nonzero(estimate.free[:TIME_OFFSETS]) :].max(initial=0.0))
@@ -136,9 +146,35 @@ def information(segments: Sequence[Segment], nominal: Geometry, truth: Estimate)
 
     Its inverse is the Cramer-Rao bound if these are the true ones.
     """
-    groups = linearized(segments, nominal, truth)
-    prior = _Prior(free=truth.free, pull=np.zeros(len(truth.parameters)))
+    groups, reading = linearized(segments, nominal, truth)
+    prior = _Prior(free=truth.free, pull=np.zeros(len(truth.parameters)), reading=reading)
     return _solved(groups, _weights(truth.noise), prior).information
+
+
+def score(
+    segments: Sequence[Segment],
+    nominal: Geometry,
+    estimate: Estimate,
+    columns: Sequence[NDArray[np.int_]],
+    count: int,
+) -> tuple[Array, Array]:
+    """Return the information and the gradient of all parameters and of further ones that are 0.
+
+    Args:
+        segments: Motions with the poses `estimate.states`.
+        nominal: Nominal dimensions.
+        estimate: Parameters, poses and noise.
+        columns: As of `linearized`.
+        count: Number of all parameters.
+
+    Returns:
+        Fisher information, shape (count, count), and gradient, shape (count,), without the prior.
+    """
+    groups, reading = linearized(segments, nominal, estimate, columns=columns, count=count)
+    prior = _Prior(free=np.ones(count, dtype=bool), pull=np.zeros(count), reading=reading)
+    found = _solved(groups, _weights(estimate.noise), prior)
+    damped = found.information + np.diag(prior_deviations(count) ** -2.0)
+    return found.information, -damped @ found.change
 
 
 def _moved(states: Sequence[Array], step: Array) -> tuple[Array, ...]:
@@ -154,13 +190,25 @@ def _solved(groups: tuple[Group, Group, Group], weights: Array, prior: _Prior) -
     """Return the Gauss-Newton step for given weights of the groups."""
     free = prior.free
 
-    def total(name: str) -> Array:
-        return np.asarray(sum(w * getattr(one, name) for w, one in zip(weights, groups, strict=True)))
+    def total(name: str, kinds: Sequence[int] = (0, 1, 2)) -> Array:
+        return np.asarray(sum(weights[kind] * getattr(groups[kind], name) for kind in kinds))
 
-    border = total('border')[:, :, free]
-    right = np.concatenate([border, total('gradient')[:, :, None]], axis=2)
-    solved, logarithm = _block_tridiagonal.solve(total('diagonal'), total('upper'), right)
-    eliminated = np.einsum('nip,niq->pq', border, solved)
+    def right_side(kinds: Sequence[int] = (0, 1, 2)) -> Array:
+        border, gradient = total('border', kinds)[:, :, free], total('gradient', kinds)
+        return np.concatenate([border, gradient[:, :, None]], axis=2)
+
+    diagonal, right = total('diagonal'), right_side()
+    # The reading errors, with a prior of unit weight, act on the reference only. They are eliminated.
+    at = prior.misread
+    B, H, b = prior.reading[at], total('diagonal', (1, 2))[at], right_side((1, 2))[at]
+    back = np.swapaxes(B, 1, 2)
+    inner = np.eye(2) + back @ H @ B
+    G = B @ np.linalg.solve(inner, back)
+    diagonal[at] -= H @ G @ H
+    right[at] -= H @ G @ b
+    solved, logarithm = _block_tridiagonal.solve(diagonal, total('upper'), right)
+    eliminated = np.tensordot(right[:, :, :-1], solved, ((0, 1), (0, 1)))
+    eliminated += np.tensordot(b[:, :, :-1], G @ b, ((0, 1), (0, 1)))
     information = total('corner')[np.ix_(free, free)] - eliminated[:, :-1]
     information = (information + information.T) / 2.0
     damped = information + np.diag(prior_deviations(len(free))[free] ** -2.0)
@@ -168,13 +216,16 @@ def _solved(groups: tuple[Group, Group, Group], weights: Array, prior: _Prior) -
         damped, total('gradient_corner')[free] + prior.pull[free] - eliminated[:, -1]
     )
     step = -solved[:, :, -1] - solved[:, :, :-1] @ change
+    observed = step.copy()
+    observed[at] -= (G @ (H @ step[at, :, None] + b @ np.append(change, 1.0)[:, None]))[:, :, 0]
     if not (np.isfinite(change).all() and np.isfinite(step).all()):
         raise CalibrationError('the estimate diverges: the poses do not fit the motion of the wheels')
     return _Solution(
         step=step,
+        observed=observed,
         change=change,
         information=information,
-        logarithm=logarithm + float(np.linalg.slogdet(damped)[1]),
+        logarithm=logarithm + float(np.linalg.slogdet(inner)[1].sum() + np.linalg.slogdet(damped)[1]),
     )
 
 
@@ -269,7 +320,8 @@ def _costs(
 ) -> list[float]:
     change = np.zeros(len(free))
     change[free] = solution.change
-    return [one.cost_after(solution.step, change) for one in groups]
+    steps = (solution.step, solution.observed, solution.observed)
+    return [one.cost_after(step, change) for one, step in zip(groups, steps, strict=True)]
 
 
 def _used(
@@ -277,10 +329,6 @@ def _used(
 ) -> Array:
     """Return the degrees of freedom that the estimate takes from each group, shape (3,)."""
     h = 1e-3
-    used = np.zeros(3)
-    for kind in (1, 2):
-        shifted = weights * np.where(np.arange(3) == kind, np.exp(h), 1.0)
-        used[kind] = (_solved(groups, shifted, prior).logarithm - solution.logarithm) / h
-    # The derivatives add up to the number of unknowns.
-    used[0] = groups[0].diagonal.shape[0] * 3 + int(prior.free.sum()) - used[1] - used[2]
-    return used
+    shifts = weights * np.exp(h * np.eye(3))
+    logarithms = np.array([_solved(groups, shifted, prior).logarithm for shifted in shifts])
+    return (logarithms - solution.logarithm) / h

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,12 +68,19 @@ class Segment:
     """Index of the recording."""
     wheel_time: Array
     wheel_angles: Array
+    """Most likely angles of the right and the left wheel, shape (m, 2) (rad)."""
+    wheel_errors: Array
+    """Their standard deviations by the steps of the encoders, shape (m, 2) (rad)."""
     time: Array
     """Times of the poses, not corrected by the time offset, increasing, shape (n,) (s)."""
     poses: Array
     """Poses of the sensor, shape (n, 3)."""
     weights: Array = field(default_factory=lambda: np.empty(0))
     """Number of samples that each pose is the mean of, shape (n,)."""
+
+    def part(self, here: slice | NDArray[np.intp]) -> Segment:
+        """Return the segment with only some of its poses."""
+        return replace(self, time=self.time[here], poses=self.poses[here], weights=self.weights[here])
 
 
 def wrapped(angle: Array) -> Array:

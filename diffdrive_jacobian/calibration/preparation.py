@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.calibration.encoder import densified, located
 from diffdrive_jacobian.calibration.measurements import (
     Array,
     CalibrationError,
@@ -64,11 +65,16 @@ def overlapping(recording: Recording, index: int, offset: float, radius: float) 
             continue
         here = inside & (at >= wheels[first]) & (at <= wheels[last - 1])
         if np.count_nonzero(here) >= FEWEST:
+            readings = recording.wheel_angles[first:last].T
+            both = [located(wheels[first:last], one) for one in readings]
+            time, angles = densified(wheels[first:last], np.column_stack([angles for angles, _ in both]))
+            errors = [np.interp(time, wheels[first:last], deviations) for _, deviations in both]
             found.append(
                 Segment(
                     recording=index,
-                    wheel_time=wheels[first:last],
-                    wheel_angles=recording.wheel_angles[first:last],
+                    wheel_time=time,
+                    wheel_angles=angles,
+                    wheel_errors=np.column_stack(errors),
                     time=recording.pose_time[here],
                     poses=recording.poses[here],
                     weights=np.ones(int(np.count_nonzero(here))),
@@ -100,9 +106,7 @@ def thinned_poses(segments: Sequence[Segment]) -> tuple[list[Segment], str]:
     for one in segments:
         # Short motions keep enough poses.
         step = max(1, min(every, len(one.time) // FEWEST))
-        kept.append(
-            replace(one, time=one.time[::step], poses=one.poses[::step], weights=one.weights[::step])
-        )
+        kept.append(one.part(slice(None, None, step)))
     used = sum(len(one.time) for one in kept)
     return kept, f'{used} of {count} poses of the reference are used, evenly spaced'
 
@@ -136,6 +140,19 @@ def sampling_notes(one: Recording) -> list[str]:
     return lines
 
 
+def without(segments: Sequence[Segment], recording: int, begin: float, end: float) -> list[Segment]:
+    """Return motions without the poses of a recording between two times, where they are split."""
+    kept = []
+    for one in segments:
+        count = len(one.time)
+        here = one.recording == recording
+        first = int(np.searchsorted(one.time, begin, 'right')) if here else count
+        last = int(np.searchsorted(one.time, end)) if here else count
+        parts = (slice(0, first), slice(max(first, last), count))
+        kept += [one.part(part) for part in parts if part.stop - part.start >= FEWEST]
+    return kept
+
+
 def without_jumps(
     segments: Sequence[Segment], found: Rough, offsets: Array, names: Sequence[str]
 ) -> tuple[list[Segment], list[str]]:
@@ -166,14 +183,7 @@ def without_jumps(
         for first, last in pairwise(bounds):
             here = np.flatnonzero(use[first:last]) + first
             if len(here) >= FEWEST:
-                kept.append(
-                    replace(
-                        segment,
-                        time=segment.time[here],
-                        poses=segment.poses[here],
-                        weights=segment.weights[here],
-                    )
-                )
+                kept.append(segment.part(here))
     if glitches + len(jumps) > MOST_JUMPS * poses:
         raise CalibrationError(
             f'the poses of the reference do not follow the wheels: {glitches + len(jumps)} of {poses} '
@@ -209,13 +219,8 @@ def _followed(
         # Does one of the next poses continue the one before?
         last = mark - 1
         for back in range(mark + 1, min(mark + 1 + GLITCH, len(use))):
-            pair = replace(
-                segment,
-                time=segment.time[[last, back]],
-                poses=segment.poses[[last, back]],
-                weights=segment.weights[[last, back]],
-            )
-            difference, travel = found.differences(pair, offset)
+            pair = np.array([last, back])
+            difference, travel = found.differences(segment.part(pair), offset)
             if (np.abs(difference) <= allowed + travel[:, None] * SHARES).all():
                 use[mark:back] = False
                 index = back

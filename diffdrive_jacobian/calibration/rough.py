@@ -31,6 +31,14 @@ LEAST_MOVE = 0.1
 """Extent of the path of a reference that moves (m)."""
 LEAST_TURN, FIXED = 1.0, 0.05
 """Turn of the robot (rad), and share of it, below which the heading of the reference is fixed."""
+UNITS = {
+    'feet': 3.2808,
+    'inches': 39.370,
+    'centimetres': 100.0,
+    'millimetres': 1000.0,
+    'kilometres': 1e-3,
+}
+"""Units of a reference, by how many of them are a metre."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -109,8 +117,8 @@ def rough(segments: Sequence[Segment], nominal: Geometry, offsets: Array) -> Rou
     scale = float(np.hypot(*found[:2]))
     if not 0.05 <= scale <= 20.0:
         raise CalibrationError(
-            f'the reference moves {scale:.2g} times as far as the wheels: its poses are not those of '
-            'this robot, or the nominal wheel radius is wrong'
+            f'the reference moves {scale:.4g} times as far as the wheels: its poses are not those of '
+            f'this robot, or in {unit(scale)} instead of metres, or the nominal wheel radius is wrong'
         )
     yaw = float(np.arctan2(found[1], found[0]))
     c, s = np.cos(yaw), np.sin(yaw)
@@ -122,6 +130,12 @@ def rough(segments: Sequence[Segment], nominal: Geometry, offsets: Array) -> Rou
         multipliers=(left, right, float(np.clip(scale, 0.05, 20.0))),
     )
     return Rough(geometry=geometry, sensor=np.array([*lever, yaw]))
+
+
+def unit(scale: float) -> str:
+    """Return the unit of a reference that explains its scale."""
+    found = [name for name, per_metre in UNITS.items() if abs(scale / per_metre - 1.0) < 0.1]
+    return found[0] if found else 'another unit'
 
 
 def _check_turning(angles: Array, turns: Array, expected: Array, moves: bool) -> None:

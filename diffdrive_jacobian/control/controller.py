@@ -24,6 +24,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffdrive_jacobian.control.sampling import rate_warning
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import boolean, function, instance, number, positive, short
 
@@ -133,6 +134,8 @@ class Controller:
     law drives the axle centre."""
     advice: Callable[[GainValues, VelocityLimits], Iterable[str]] = no_advice
     """Return warnings about gains or limits that do not suit the law."""
+    slope: Callable[[GainValues], float] | None = None
+    """Return the largest slope of the yaw rate over the heading (1/s). The sampling rate limits it."""
     boundary: Boundary | None = None
     """Line that is drawn in the picture of a sweep."""
     reference_gains: ReferenceGains | None = None
@@ -147,6 +150,8 @@ class Controller:
             )
         function('law', self.law)
         function('advice', self.advice)
+        if self.slope is not None:
+            function('slope', self.slope)
         instance('summary', self.summary, str)
         boolean('takes_heading', self.takes_heading)
         if not isinstance(self.gains, tuple) or not all(gain in GAINS for gain in self.gains):
@@ -171,6 +176,21 @@ class Controller:
             return [str(text) for text in self.advice(gains, limits)]
         except Exception as error:
             return [f'the advice of controller {self.name!r} failed: {_reason(error)}']
+
+    def rate_warnings(self, gains: GainValues, rate: float, *, turns: bool) -> list[str]:
+        """Return the warnings about gains that are too large for the rate of the odometry.
+
+        Args:
+            gains: The gains.
+            rate: Rate of the odometry, at which the law is evaluated (Hz).
+            turns: Whether the robot turns in place at the end, with the gain kp.
+        """
+        try:
+            slope = 0.0 if self.slope is None else float(self.slope(gains))
+            warning = rate_warning(max(slope, gains.kp if turns else 0.0), rate)
+        except Exception as error:
+            warning = f'the slope of controller {self.name!r} failed: {_reason(error)}'
+        return [warning] if warning else []
 
     def bind(self, gains: GainValues) -> BoundLaw:
         """Return the law with its gains, for single poses.

@@ -24,6 +24,9 @@ def go_to_goal(state: Vector, goal: Vector, Kp: Number, Kv: Number) -> tuple[Num
     distance. In continuous time `d_dot = -Kv d cos^2(e) <= 0`, so the distance never grows. With
     `Kp < Kv` the heading error does not converge to zero and the robot spirals in.
 
+    When the law is sampled, the robot arrives with `Kp < 2 rate` and `Kv < rate`, and if commands take
+    effect up to one sample late, with `Kp + Kv < rate`. Half of that is recommended.
+
     Args:
         state: Pose of the robot, shape (..., 3).
         goal: Position `[x, y]`, shape (..., 2) (m).
@@ -62,6 +65,7 @@ CONTROLLER = Controller(
     law=go_to_goal,
     summary="document A's law, to a position",
     advice=_advice,
+    slope=lambda gains: gains.kp + gains.kv,
     boundary=Boundary(ratio=1.0, beyond='with a larger kv the robot spirals in'),
     reference_gains=ReferenceGains(kp=3.0, kv=0.5, source="document A's gains"),
 )
@@ -72,6 +76,9 @@ def turn_in_place(theta: Number, heading: Number, Kp: Number) -> tuple[Number, N
     """Compute the twist that turns to a heading by the smaller angle.
 
     `v = 0`, `omega = Kp wrap(heading - theta)`.
+
+    When the law is sampled, it converges with `Kp < 2 rate`. If commands take effect up to one sample
+    late, it converges from rest with `Kp < rate`. Half of that is recommended.
 
     Args:
         theta: Heading of the robot, shape (...) (rad).

@@ -30,7 +30,9 @@ def offset_point(state: Vector, goal: Vector, k: Number, d: Number) -> tuple[Num
     `v = k a`, `omega = k b / d`, where `[a, b]` is the vector from the point to the goal in the body
     frame. The distance of the point decays as exp(-k t), whatever the heading. The point comes to rest
     on the goal, the axle centre at a distance |d| from it. When the law is sampled, this requires
-    `k distance < 2 |d| rate`. With a shorter offset the robot turns too far when the goal is far away.
+    `k distance < 2 |d| rate` and `k < rate`, and if commands take effect up to one sample late,
+    `k (1 + distance / |d|) < rate`. With a shorter offset the robot turns too far when the goal is far
+    away.
 
     Args:
         state: Pose of the robot, shape (..., 3).
@@ -69,4 +71,6 @@ CONTROLLER = Controller(
     gains=('kv', 'offset'),
     offset='offset',
     advice=_advice,
+    # At the goal. At a distance it is larger by kv distance / |offset|.
+    slope=lambda gains: gains.kv,
 )

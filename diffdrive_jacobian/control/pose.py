@@ -26,6 +26,8 @@ from diffdrive_jacobian.numerics.formula import Number, Vector, formula
 
 FASTER = 2.0
 """Ratio of the default rates at which heading and distance converge [-]."""
+STEEPEST = 2.74
+"""Largest slope of `phi cos(alpha) sin(alpha) / alpha` over alpha, with phi = pi [-]."""
 
 
 @formula('(3),(3),(),(),() -> (),()', Kp=positive, Kv=positive, h=positive)
@@ -43,16 +45,16 @@ def go_to_pose(
     2 Kv. A weight larger than necessary leads to longer paths. If the goal lies behind, the robot backs
     up while it turns to it and then drives forwards. If it may not back up, it turns first.
 
-    When the law is sampled, Kp should be below a quarter of the rate. With a given weight h also
-    `Kv^2 h < Kp rate` should hold. From about twice that value, heading and bearing oscillate with a
-    growing amplitude near the goal.
+    When the law is sampled with `Kp > 2 Kv`, the robot arrives with `K = Kp + Kv (1 + 2.74 h)` below
+    twice the rate, and if commands take effect up to one sample late, with K below the rate. Half of
+    that is recommended. With the default h, K is at most `6.5 Kp`.
 
     Args:
         state: Pose of the robot, shape (..., 3).
         goal: Desired pose `[x, y, theta]`, shape (..., 3).
         Kp: Gain on the bearing, positive, shape (...) (1/s).
         Kv: Gain on the distance, positive, shape (...) (1/s).
-        h: Weight of the heading, positive, shape (...); sampled, below `Kp rate / Kv^2`. None:
+        h: Weight of the heading, positive, shape (...). None:
             `(Kp / (2 Kv))^2`, which is critical damping, or for `Kp > 4 Kv` the smaller `2 Kp / Kv - 4`,
             with which the heading decays like exp(-2 Kv t).
 
@@ -84,6 +86,10 @@ def default_weight(Kp: Number, Kv: Number) -> Number:
     return (least / (2.0 * Kv)) ** 2 + FASTER * (Kp - least) / Kv
 
 
+def _slope(gains: GainValues) -> float:
+    return gains.kp + gains.kv * (1.0 + STEEPEST * float(default_weight(gains.kp, gains.kv)))
+
+
 def _advice(gains: GainValues, limits: VelocityLimits) -> Iterator[str]:
     if gains.kp <= 2.0 * gains.kv:
         yield (
@@ -98,5 +104,6 @@ CONTROLLER = Controller(
     summary='to a position and a heading',
     takes_heading=True,
     advice=_advice,
+    slope=_slope,
     boundary=Boundary(ratio=2.0, beyond='with a larger kv the robot turns on the spot at the goal'),
 )

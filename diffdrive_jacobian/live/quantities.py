@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.control import Arrival
 from diffdrive_jacobian.kinematics.diff_drive import (
-    body_to_wheel,
     body_to_wheel_jacobian,
     unicycle_jacobian,
-    wheel_to_body,
     wheel_to_body_jacobian,
 )
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
@@ -72,7 +70,13 @@ def errors(pose: Array, goal: Array, offset: float) -> Pair:
     return distance, float(wrap_angle(direction - theta))
 
 
-def chain(theta: float, command: Pair, measured: Pair | None, geometry: Pair) -> dict[str, Any]:
+def chain(
+    theta: float,
+    command: Pair,
+    measured: Pair | None,
+    geometry: Pair,
+    radius_multipliers: Pair = (1.0, 1.0),
+) -> dict[str, Any]:
     """Compute the chain from the commanded twist to the velocity in the world.
 
     Args:
@@ -80,23 +84,26 @@ def chain(theta: float, command: Pair, measured: Pair | None, geometry: Pair) ->
         command: `(v, omega)` as commanded (m/s, rad/s).
         measured: Wheel speeds `(omega_R, omega_L)` as measured (rad/s). None: as commanded.
         geometry: Wheel radius and separation (m).
+        radius_multipliers: Radii of the right and the left wheel, relative to that.
 
     Returns:
         Matrices and vectors. `measured` says whether the second half follows from measured wheel speeds.
     """
-    r, L = geometry
-    wanted = body_to_wheel(*command, r, L)
-    wheels = wanted if measured is None else measured
-    twist = wheel_to_body(wheels[0], wheels[1], r, L)
+    scale = np.array(radius_multipliers)
+    inverse, forward = body_to_wheel_jacobian(*geometry), wheel_to_body_jacobian(*geometry)
+    inverse, forward = inverse / scale[:, np.newaxis], forward * scale
+    wanted = inverse @ np.array(command)
+    wheels = wanted if measured is None else np.array(measured)
+    twist = forward @ wheels
     jacobian = unicycle_jacobian(theta)
     return {
         'command': rounded(command),
-        'inverse': rounded(body_to_wheel_jacobian(r, L)),
+        'inverse': rounded(inverse),
         'wanted': rounded(wanted),
         'wheels': rounded(wheels),
         'measured': measured is not None,
-        'forward': rounded(wheel_to_body_jacobian(r, L)),
+        'forward': rounded(forward),
         'twist': rounded(twist),
         'unicycle': rounded(jacobian),
-        'world': rounded(jacobian @ np.array(twist, dtype=np.float64)),
+        'world': rounded(jacobian @ twist),
     }

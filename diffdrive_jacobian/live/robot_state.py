@@ -66,13 +66,25 @@ class RobotState:
 
     @property
     def geometry(self) -> tuple[float, float]:
-        """Wheel radius and separation (m), of the virtual robot by default."""
+        """Wheel radius and separation (m), of the virtual robot by default. The separation is that which
+        the odometry assumes; the radius of each wheel has a multiplier in addition.
+        """
         values = self.robot_values
         r = _number(values, 'wheel_radius', ROBOT_DEFAULTS.wheel_radius)
         L = _number(values, 'wheel_separation', ROBOT_DEFAULTS.wheel_separation)
+        L *= _number(values, 'wheel_separation_multiplier', 1.0)
         if min(r, L) < MIN_LENGTH:
             return ROBOT_DEFAULTS.wheel_radius, ROBOT_DEFAULTS.wheel_separation
         return r, L
+
+    @property
+    def radius_multipliers(self) -> tuple[float, float]:
+        """Radii of the right and the left wheel, relative to that of `geometry`."""
+        right, left = (
+            _number(self.robot_values, f'{side}_wheel_radius_multiplier', 1.0)
+            for side in ('right', 'left')
+        )
+        return (right, left) if min(right, left) > MIN_LENGTH else (1.0, 1.0)
 
     @property
     def wheel_names(self) -> tuple[str, str]:
@@ -170,7 +182,9 @@ class RobotState:
             'law': self._law(target),
             'by_hand': by_hand,
             'commanded': self.command is not None,
-            'chain': quantities.chain(float(self.pose[2]), command, self.wheels, geometry),
+            'chain': quantities.chain(
+                float(self.pose[2]), command, self.wheels, geometry, self.radius_multipliers
+            ),
             **more,
         }
 

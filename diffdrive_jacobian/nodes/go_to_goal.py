@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 from action_msgs.msg import GoalInfo, GoalStatus
@@ -11,6 +13,7 @@ from nav_msgs.msg import Goals, Odometry
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.control import Arrival, Controller, LawError, saturate
+from diffdrive_jacobian.control.sampling import LARGEST_TURN, without_whole_turns
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
@@ -23,6 +26,11 @@ from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import nanoseconds
+
+RATE_PERIODS = 10
+"""Number of periods of the odometry from which its rate is measured."""
+SLOW_TURN = 60.0
+"""Time for half a turn above which a limit of the yaw rate is reported (s)."""
 
 
 class GoToGoal(ParameterizedNode[GoToGoalParameters]):
@@ -52,6 +60,9 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._goal: Goal | None = None
         self._identifiers = GoalIdentifiers(self.get_fully_qualified_name())
         self._odom_frame = ''
+        # Rate of the odometry (Hz), and the times of the messages from which it is measured (ns).
+        self._rate = math.inf
+        self._times: list[int] = []
         # Whether the last command makes the robot move: it outlives a goal that is replaced.
         self._driving = False
         stamped = self.parameters.enable_stamped_cmd_vel
@@ -135,6 +146,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             # While the robot moves the watchdog runs already, and a new goal is no sign of odometry.
             self._watchdog.start(nanoseconds(self.parameters.odom_timeout))
         self._goal = goal
+        self._times.clear()
         self._others.start()
         self._publish_status(goal.info, GoalStatus.STATUS_ACCEPTED)
         x, y, _ = goal.waypoints.poses[-1]
@@ -197,6 +209,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             return
         self._watchdog.feed(now)
         self._others.search(now)
+        if len(self._times) <= RATE_PERIODS:
+            self._measure_rate(now)
         if not goal.executing and not self._begin(goal):
             return
         if goal.stale:
@@ -216,7 +230,11 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._end(GoalStatus.STATUS_SUCCEEDED, 'reached')
             return
         # Without wheels in the limits the geometry of the wheels does not matter.
-        self._publish_command(*saturate(*command, self._limits))
+        v, omega = saturate(*command, self._limits)
+        if abs(omega) > LARGEST_TURN * self._rate:
+            # The other direction may be forbidden.
+            v, omega = saturate(v, without_whole_turns(omega, self._rate), self._limits)
+        self._publish_command(v, omega)
 
     def _begin(self, goal: Goal) -> bool:
         """Start executing a goal, now that the frame of the odometry is known."""
@@ -229,6 +247,19 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         goal.executing = True
         self._publish_status(goal.info, GoalStatus.STATUS_EXECUTING)
         return True
+
+    def _measure_rate(self, now: int) -> None:
+        """Measure the rate of the odometry at the beginning of each goal."""
+        self._times.append(now)
+        if len(self._times) <= RATE_PERIODS:
+            return
+        # The median is not affected by a gap or by messages that arrive together.
+        period = sorted(b - a for a, b in pairwise(self._times))[RATE_PERIODS // 2]
+        rate = 1e9 / period if period > 0 else math.inf
+        changed = not 0.8 < rate / self._rate < 1.25
+        self._rate = rate
+        if changed:
+            self._warn_of_rate()
 
     def _on_stale_odometry(self) -> None:
         """Stop the robot because odometry is missing, and keep the goal."""
@@ -318,5 +349,19 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
                 'angular.z.min_velocity or angular.z.max_velocity is 0: the robot may turn in one '
                 'direction only or not at all, some goals and headings cannot be reached',
             )
+        elif (slowest := min(-self._limits.min_omega, self._limits.max_omega)) * SLOW_TURN < math.pi:
+            self.log_event_warning(
+                'omega',
+                f'the yaw rate is limited to {slowest:g} rad/s: half a turn takes more than '
+                f'{SLOW_TURN:g} s',
+            )
+        self._warn_of_rate()
         for number, warning in enumerate(controller.warnings(parameters, self._limits)):
             self.log_event_warning(f'advice {number}', warning)
+
+    def _warn_of_rate(self) -> None:
+        """Warn of gains that are too large for the rate of the odometry."""
+        for warning in self._controller.rate_warnings(
+            self.parameters, self._rate, turns=self._arrival.use_heading
+        ):
+            self.log_event_warning('rate', warning)

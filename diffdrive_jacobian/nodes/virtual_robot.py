@@ -25,7 +25,6 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.diagnosis.lasting import Interleaving
-from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages import wire
@@ -128,7 +127,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             return None
         robot = self._robot
         if robot is None:
-            model = self.condition.model(self.parameters.model())
+            model = self.condition.model(self._model)
             robot = Robot(model=model, stamp=now, pose=self._initial_pose())
             self._publish_start(robot)
         elif now < self._latest:
@@ -189,11 +188,10 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
     def _read_joint_command(
         self, sec: int, nanosec: int, joints: Sequence[str], velocities: Sequence[float]
     ) -> Command:
-        parameters = self.parameters
-        speeds = messages.from_joint_values(joints, velocities, parameters.wheel_names)
+        speeds = messages.from_joint_values(joints, velocities, self.parameters.wheel_names)
         # Not later: the twist of such speeds is zero.
         self.warn_of_integers('a command on joint_command', *speeds)
-        v, omega = wheel_to_body(*speeds, parameters.wheel_radius, parameters.wheel_separation)
+        v, omega = self._model.twist(*speeds)
         return messages.plausible_twist(v, omega), messages.from_time_values(sec, nanosec)
 
     def _apply(self, read: Callable[..., Command], fields: tuple[Any, ...]) -> None:
@@ -295,7 +293,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
     def _remodel(self) -> None:
         """Continue with the model of the present parameters and condition."""
         advanced = self._advance()
-        model = self.condition.model(self.parameters.model())
+        model = self.condition.model(self._model)
         if model.drift is not None and self._ground_truth is None:
             self._ground_truth = self.advertise(Odometry, 'ground_truth')
         if advanced is not None and model != advanced[1].model:
@@ -310,8 +308,9 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         return np.array([parameters.x, parameters.y, wrap_angle(parameters.theta)])
 
     def _configure(self) -> None:
-        """Compute from the parameters what every message needs: the names of frames and joints."""
+        """Compute from the parameters what every message needs: the model, frames and joints."""
         parameters = self.parameters
+        self._model = parameters.model()
         self._period = 1.0 / parameters.publish_rate
         self._odometry = Odometry(child_frame_id=parameters.base_frame_id)
         truth = Odometry(child_frame_id=parameters.base_frame_id)

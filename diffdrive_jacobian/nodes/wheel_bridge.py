@@ -82,7 +82,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         """Return `(omega_R, omega_L)` of the calibrated wheels, within their limit (rad/s)."""
         parameters = self.parameters
         L = parameters.wheel_separation * parameters.wheel_separation_multiplier
-        right, left = body_to_wheel(v, omega, parameters.wheel_radius, L)
+        right, left = body_to_wheel.formula(v, omega, parameters.wheel_radius, L)
         right /= parameters.right_wheel_radius_multiplier
         left /= parameters.left_wheel_radius_multiplier
         excess = max(1.0, max(abs(right), abs(left)) / parameters.wheel_speed_limit)

@@ -22,6 +22,11 @@ def wheel_separation_field() -> Any:
     return parameter(0.16, 'Distance between the left and the right wheel [m].', bounds=(1e-3, 100.0))
 
 
+def multiplier_field(what: str) -> Any:
+    """Declare the correction factor of a dimension, as diff_drive_controller has it."""
+    return parameter(1.0, f'Correction factor for the {what} [-].', bounds=(0.1, 10.0))
+
+
 def max_wheel_velocity_field() -> Any:
     """Declare the limit of the wheel speeds."""
     return parameter(

@@ -12,6 +12,7 @@ from diffdrive_jacobian.parameters._fields import (
     STAMPED,
     differ,
     max_wheel_velocity_field,
+    multiplier_field,
     timeout_field,
     wheel_radius_field,
     wheel_separation_field,
@@ -21,6 +22,13 @@ from diffdrive_jacobian.parameters.limits import LimitParameters, number_or
 from diffdrive_jacobian.simulation.robot import RobotModel
 from diffdrive_jacobian.simulation.slip import MAX_SEED, Drift
 from diffdrive_jacobian.time_units import nanoseconds
+
+MULTIPLIERS = tuple(
+    f'{which}{what}_multiplier'
+    for which in ('', 'true_')
+    for what in ('left_wheel_radius', 'right_wheel_radius', 'wheel_separation')
+)
+"""The multipliers of the dimensions that the odometry assumes, and those of the true ones."""
 
 
 def _true_multiplier(what: str) -> Any:
@@ -43,6 +51,9 @@ class VirtualRobotParameters(LimitParameters):
     base_frame_id: str = parameter('base_link', 'Name of the frame of the robot, at the axle centre.')
     wheel_radius: float = wheel_radius_field()
     wheel_separation: float = wheel_separation_field()
+    wheel_separation_multiplier: float = multiplier_field('wheel separation')
+    left_wheel_radius_multiplier: float = multiplier_field('radius of the left wheel')
+    right_wheel_radius_multiplier: float = multiplier_field('radius of the right wheel')
     max_wheel_velocity: float = max_wheel_velocity_field()
     cmd_vel_timeout: float = timeout_field(
         0.5, 'Time without a command after which the robot stops [s]; 0: never.'
@@ -111,7 +122,9 @@ class VirtualRobotParameters(LimitParameters):
         """Return the model of the robot with these parameters."""
         return RobotModel(
             wheel_radius=self.wheel_radius,
-            wheel_separation=self.wheel_separation,
+            wheel_separation=self.wheel_separation * self.wheel_separation_multiplier,
+            right_wheel_radius_multiplier=self.right_wheel_radius_multiplier,
+            left_wheel_radius_multiplier=self.left_wheel_radius_multiplier,
             limits=self.limits(),
             command_timeout=nanoseconds(self.cmd_vel_timeout),
             wheel_travel_variance=self.wheel_travel_variance,
@@ -120,10 +133,14 @@ class VirtualRobotParameters(LimitParameters):
 
     def drift(self) -> Drift | None:
         """Return in what the true motion differs from the odometry; None: in nothing."""
-        drift = Drift(
+        if not self.simulate_slip and all(getattr(self, name) == 1.0 for name in MULTIPLIERS):
+            return None
+        return Drift(
             seed=self.slip_seed if self.simulate_slip else None,
-            right_wheel_radius_multiplier=self.true_right_wheel_radius_multiplier,
-            left_wheel_radius_multiplier=self.true_left_wheel_radius_multiplier,
-            wheel_separation_multiplier=self.true_wheel_separation_multiplier,
+            right_wheel_radius_multiplier=self.true_right_wheel_radius_multiplier
+            / self.right_wheel_radius_multiplier,
+            left_wheel_radius_multiplier=self.true_left_wheel_radius_multiplier
+            / self.left_wheel_radius_multiplier,
+            wheel_separation_multiplier=self.true_wheel_separation_multiplier
+            / self.wheel_separation_multiplier,
         )
-        return None if drift == Drift() else drift

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 from diffdrive_jacobian.parameters._fields import (
     STAMPED,
     differ,
     max_wheel_velocity_field,
+    multiplier_field,
     timeout_field,
     wheel_radius_field,
     wheel_separation_field,
@@ -18,19 +18,15 @@ from diffdrive_jacobian.parameters.declaration import NodeParameters, parameter
 from diffdrive_jacobian.parameters.limits import number_or
 
 
-def _multiplier(what: str) -> Any:
-    return parameter(1.0, f'Correction factor for the {what} [-].', bounds=(0.1, 10.0))
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class WheelBridgeParameters(NodeParameters):
     """Parameters of the node wheel_bridge."""
 
     wheel_radius: float = wheel_radius_field()
     wheel_separation: float = wheel_separation_field()
-    wheel_separation_multiplier: float = _multiplier('wheel separation')
-    left_wheel_radius_multiplier: float = _multiplier('radius of the left wheel')
-    right_wheel_radius_multiplier: float = _multiplier('radius of the right wheel')
+    wheel_separation_multiplier: float = multiplier_field('wheel separation')
+    left_wheel_radius_multiplier: float = multiplier_field('radius of the left wheel')
+    right_wheel_radius_multiplier: float = multiplier_field('radius of the right wheel')
     max_wheel_velocity: float = max_wheel_velocity_field()
     cmd_vel_timeout: float = timeout_field(
         0.5, 'Time without a command after which the wheels are stopped [s]; 0: never.'

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.parameters.virtual_robot import MULTIPLIERS
 from diffdrive_jacobian.reading.ground_truth import NODE, recorded_drift
 from diffdrive_jacobian.reading.run import Run
 from diffdrive_jacobian.simulation.odometry_noise import covariance_entries, propagate_covariance
@@ -38,7 +39,9 @@ def recorded_model(run: Run) -> RobotModel | None:
         if value != recorded.get(name)
     }
     separation, variance = (run.number_of_node(NODE, name, math.nan) for name in _PARAMETERS)
-    if changed & set(_PARAMETERS) or not (separation > 0.0 and variance >= 0.0):
+    # Earlier versions had no multipliers.
+    separation *= run.number_of_node(NODE, 'wheel_separation_multiplier', 1.0)
+    if changed & {*_PARAMETERS, *MULTIPLIERS} or not (separation > 0.0 and variance >= 0.0):
         return None
     drift = recorded_drift(run)
     return RobotModel(wheel_separation=separation, wheel_travel_variance=variance, drift=drift)

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
 from diffdrive_jacobian.messages.conversion import MessageError, plausible_twist
 from diffdrive_jacobian.numerics.elementary import wrapped
 from diffdrive_jacobian.parameters.declaration import from_ros
@@ -359,7 +358,7 @@ def _commanded(run: Run, given: Mapping[str, Any] | None) -> tuple[str, str, lis
             )
         else:
             try:
-                twist = _twist(parameters, source, event)
+                twist = _twist(robot.model, source, event)
             except MessageError:
                 # The node drops it as well.
                 continue
@@ -368,11 +367,8 @@ def _commanded(run: Run, given: Mapping[str, Any] | None) -> tuple[str, str, lis
     return source, 'odometry', [anchors]
 
 
-def _twist(
-    parameters: VirtualRobotParameters, source: str, values: NDArray[np.float64]
-) -> tuple[float, float]:
+def _twist(model: RobotModel, source: str, values: NDArray[np.float64]) -> tuple[float, float]:
     first, second = (float(value) for value in values)
     if source == 'cmd_vel':
         return first, second
-    v, omega = wheel_to_body(first, second, parameters.wheel_radius, parameters.wheel_separation)
-    return plausible_twist(float(v), float(omega))
+    return plausible_twist(*model.twist(first, second))

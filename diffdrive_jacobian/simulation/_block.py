@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from diffdrive_jacobian.control.sampling import LARGEST_TURN, without_whole_turns
 from diffdrive_jacobian.kinematics.saturation import saturate
 from diffdrive_jacobian.numerics.checks import floats
 from diffdrive_jacobian.numerics.elementary import wrap
@@ -134,6 +135,10 @@ class Block:
                 f'law must return finite (v, omega), got ({v[row]}, {omega[row]}) at pose {pose}'
             )
         if not batch.limits.unlimited:
+            v, omega = saturate(v, omega, batch.limits, batch.r, batch.L)
+        if np.abs(omega).max() > LARGEST_TURN * batch.rate:
+            omega = without_whole_turns(omega, batch.rate)
+            # The other direction may be forbidden.
             v, omega = saturate(v, omega, batch.limits, batch.r, batch.L)
         return v, omega
 

@@ -1,8 +1,9 @@
 """Closed loops in batches: thousands of unicycles under a control law, simulated together.
 
 Every robot is sampled at the control rate. At each sample it either has arrived, or its law returns a
-body twist `[v, omega]` (m/s, rad/s). The twist is saturated and applied along the exact arc until the
-next sample. This is the loop of go_to_goal and virtual_robot without delay.
+body twist `[v, omega]` (m/s, rad/s). The twist is saturated, freed of whole turns per sample
+(`control.sampling.without_whole_turns`) and applied along the exact arc until the next sample. This is
+the loop of go_to_goal and virtual_robot without delay.
 
 Starts, goals, gains, robots and limits broadcast with each other; the batch is their leading axes.
 

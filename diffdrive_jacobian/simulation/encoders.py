@@ -13,7 +13,6 @@ import math
 from dataclasses import dataclass, replace
 
 from diffdrive_jacobian.kinematics._arc import arc_end
-from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body
 from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -63,7 +62,7 @@ class Encoders:
             (new - old) * self.increment for new, old in zip(counts, self.counts, strict=True)
         )
         model, dt = robot.model, (robot.stamp - self.stamp) / NANOSECONDS
-        distance, turn = wheel_to_body(right, left, model.wheel_radius, model.wheel_separation)
+        distance, turn = model.twist(right, left)
         pose = arc_end(*self.pose, distance, turn, 1.0)
         # Time may have gone back.
         speeds = (right / dt, left / dt) if dt > 0.0 else (0.0, 0.0)
@@ -77,7 +76,7 @@ class Encoders:
         """Return the robot as these encoders report it."""
         right, left = self.counts
         model = robot.model
-        twist = wheel_to_body(*self.speeds, model.wheel_radius, model.wheel_separation)
+        twist = model.twist(*self.speeds)
         return robot.reported(self.pose, (right * self.increment, left * self.increment), twist)
 
 

@@ -30,8 +30,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics._arc import arc_end
-from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
-from diffdrive_jacobian.kinematics.saturation import saturate
 from diffdrive_jacobian.kinematics.se2 import compose
 from diffdrive_jacobian.numerics.checks import (
     MAX_NANOSECONDS,
@@ -162,7 +160,7 @@ class Robot:
     def true_twist(self) -> tuple[float, float]:
         """The true twist `(v, omega)` from this time on, the slip included (m/s, rad/s)."""
         truth, model = self._truth, self.model
-        if truth is None or self.twist == STANDSTILL:
+        if truth is None:
             return self.twist
         return truth.twist(self.stamp, self.twist, model.wheel_separation, model.wheel_travel_variance)
 
@@ -193,12 +191,7 @@ class Robot:
     @property
     def wheel_speeds(self) -> tuple[float, float]:
         """`(omega_R, omega_L)` (rad/s), by the inverse wheel Jacobian."""
-        (v, omega), r, L = self.twist, self.model.wheel_radius, self.model.wheel_separation
-        half = omega * L / 2.0
-        omega_R, omega_L = (v + half) / r, (v - half) / r
-        if not (isfinite(omega_R) and isfinite(omega_L)):
-            raise ValueError('twist must give finite wheel speeds, but they overflow')
-        return omega_R, omega_L
+        return self.model.wheel_speeds(*self.twist)
 
     def twist_covariance(self, interval: float) -> NDArray[np.float64]:
         """Compute the covariance of the twist as measured over an interval (s), shape (2, 2).
@@ -252,7 +245,7 @@ class Robot:
         """
         v, omega = pair('command', command)
         model = self.model
-        twist = saturate(v, omega, model.limits, model.wheel_radius, model.wheel_separation)
+        twist = model.limited((v, omega))
         if model.actuators is not None:
             here = self._changed_until(stamp)
             commanded_at = None if v == omega == 0.0 else here.stamp
@@ -338,8 +331,7 @@ class Robot:
         here = self.at(stamp)
         command = here.command
         if wheels_commanded:
-            speeds = body_to_wheel(*command, self.model.wheel_radius, self.model.wheel_separation)
-            command = wheel_to_body(*speeds, model.wheel_radius, model.wheel_separation)
+            command = model.twist(*self.model.wheel_speeds(*command))
         limited = model.limited(command)
         pose, angles, uncertainty, truth = here._present
         if truth is None or model.drift is None:
@@ -416,16 +408,16 @@ class Robot:
         """
         actuators = model.actuators
         assert actuators is not None
-        r, L, stamp = model.wheel_radius, model.wheel_separation, self.stamp
-        demanded: Speeds = body_to_wheel(*twist, r, L)
+        stamp = self.stamp
+        demanded = model.wheel_speeds(*twist)
         speeds, reached = self._motor_speeds, actuators.limited(demanded)
         settling = None
         if actuators.settled(speeds, reached):
             if reached != demanded:
-                twist = wheel_to_body(*reached, r, L)
+                twist = model.twist(*reached)
         else:
             settling = Settling(stamp if since is None else since, stamp, speeds, reached)
-            twist = wheel_to_body(*actuators.mean(settling), r, L)
+            twist = model.twist(*actuators.mean(settling))
         return _robot(model, stamp, state, command, twist, commanded_at, settling)
 
     @property
@@ -449,7 +441,8 @@ class Robot:
         expiry = self.expiry
         if expiry is None or expiry > stamp:
             return stamp, self._state(stamp), False
-        return stamp, self._state(expiry), True
+        stopped = _robot(self.model, expiry, self._state(expiry), STANDSTILL, STANDSTILL)
+        return stamp, stopped._state(stamp), True
 
     def _state(self, stamp: int) -> _State:
         """Compute the state at a time up to the timeout."""
@@ -458,20 +451,20 @@ class Robot:
             return ahead[1]
         dt = (stamp - self.stamp) / NANOSECONDS
         twist = v, omega = self.twist
-        truth = self._truth
-        if dt == 0.0 or twist == STANDSTILL:
-            if truth is None or dt == 0.0:
-                return self._present
-            return self.pose_tuple, self.wheel_angles, self._uncertainty, truth.at_rest()
-        model, (x, y, theta), (right, left) = self.model, self.pose_tuple, self.wheel_angles
+        truth, model = self._truth, self.model
+        if dt == 0.0 or (truth is None and twist == STANDSTILL):
+            return self._present
+        L, k = model.wheel_separation, model.wheel_travel_variance
+        if truth is not None:
+            truth = truth.after(self.stamp, stamp, twist, L, k)
+        if twist == STANDSTILL:
+            return self.pose_tuple, self.wheel_angles, self._uncertainty, truth
+        (x, y, theta), (right, left) = self.pose_tuple, self.wheel_angles
         omega_R, omega_L = self.wheel_speeds
         right, left = angles = right + omega_R * dt, left + omega_L * dt
         # A finite sum has finite terms.
         if not (isfinite(right + left) or (isfinite(right) and isfinite(left))):
             raise ValueError(f'wheel_angles must be finite, got {list(angles)}')
-        L, k = model.wheel_separation, model.wheel_travel_variance
-        if truth is not None:
-            truth = truth.after(self.stamp, stamp, twist, L, k)
         uncertainty = self._uncertainty.after((theta, twist, dt, L, k))
         state = arc_end(x, y, theta, v, omega, dt), angles, uncertainty, truth
         object.__setattr__(self, '_ahead', (stamp, state))

@@ -9,27 +9,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits, saturate
 from diffdrive_jacobian.numerics.checks import instance, nanoseconds, not_negative, number, positive
 from diffdrive_jacobian.numerics.elementary import components
-from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.simulation.actuators import Actuators, Speeds
 from diffdrive_jacobian.simulation.slip import Drift
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RobotModel:
-    """Parameters of a robot.
+    """Parameters of a robot, as its controller and its odometry assume them.
 
     Raises:
-        ValueError: A length is not positive and finite, the variance or the timeout is negative, the
-            timeout is not an integer, the limits are not those of one robot, or the drift or the
-            actuators are of another class.
+        ValueError: A length or a multiplier is not positive and finite, the variance or the timeout is
+            negative, the timeout is not an integer, the limits are not those of one robot, or the drift
+            or the actuators are of another class.
     """
 
     wheel_radius: float = 0.033
     """r (m)."""
     wheel_separation: float = 0.16
     """L (m)."""
+    right_wheel_radius_multiplier: float = 1.0
+    """Radius of the right wheel, relative to r [-]."""
+    left_wheel_radius_multiplier: float = 1.0
+    """Radius of the left wheel, relative to r [-]."""
     limits: VelocityLimits = field(default_factory=VelocityLimits)
     """Velocity limits; without limits the robot is an ideal unicycle."""
     command_timeout: int = 0
@@ -64,14 +69,55 @@ class RobotModel:
             ValueError: It has another shape or is not finite.
         """
         v, omega = saturate(
-            *pair('command', command), self.limits, self.wheel_radius, self.wheel_separation
+            *pair('command', command), self.limits, max(self.radii), self.wheel_separation
         )
+        if self.limits.max_wheel_speed < math.inf:
+            # The smaller wheel may still be too fast.
+            fastest = max(map(abs, self.wheel_speeds(v, omega)))
+            excess = max(1.0, fastest / self.limits.max_wheel_speed)
+            v, omega = v / excess, omega / excess
+        return v, omega
+
+    @property
+    def radii(self) -> tuple[float, float]:
+        """Radii of the right and the left wheel (m)."""
+        return (
+            self.wheel_radius * self.right_wheel_radius_multiplier,
+            self.wheel_radius * self.left_wheel_radius_multiplier,
+        )
+
+    def wheel_speeds(self, v: float, omega: float) -> Speeds:
+        """Return the wheel speeds `(omega_R, omega_L)` of a twist (rad/s).
+
+        Raises:
+            ValueError: They overflow.
+        """
+        right, left = body_to_wheel.formula(v, omega, self.wheel_radius, self.wheel_separation)
+        right /= self.right_wheel_radius_multiplier
+        left /= self.left_wheel_radius_multiplier
+        if not (math.isfinite(right) and math.isfinite(left)):
+            raise ValueError('twist must give finite wheel speeds, but they overflow')
+        return right, left
+
+    def twist(self, omega_R: float, omega_L: float) -> tuple[float, float]:
+        """Return the twist `(v, omega)` of wheel speeds (m/s, rad/s).
+
+        Raises:
+            ValueError: It overflows.
+        """
+        right = omega_R * self.right_wheel_radius_multiplier
+        left = omega_L * self.left_wheel_radius_multiplier
+        v, omega = wheel_to_body.formula(right, left, self.wheel_radius, self.wheel_separation)
+        if not (math.isfinite(v) and math.isfinite(omega)):
+            raise ValueError('wheel speeds must give a finite twist, but it overflows')
         return v, omega
 
 
 _CHECKS = {
     'wheel_radius': positive,
     'wheel_separation': positive,
+    'right_wheel_radius_multiplier': positive,
+    'left_wheel_radius_multiplier': positive,
     'wheel_travel_variance': not_negative,
 }
 

@@ -1,21 +1,21 @@
 """The true motion of a robot whose wheels slip, and whose wheels are not as its odometry assumes.
 
-Model: the wheels turn as commanded, and the odometry is computed from their nominal radius and
-separation. The true radii and the true separation may differ. In addition each wheel slips: the distance
+Model: the wheels turn as commanded, and the odometry is computed from the radii and the separation that
+the robot assumes. The true ones may differ. In addition each wheel slips: the distance
 that it travels over the ground has a random error whose variance is `k |ds|`, as `odometry_noise` has
 it, where `ds` is the distance that its true rim rolls.
 
 Simulated time is divided into cells of `CELL`, at its multiples. For each wheel and each cell there is
 one standard normal number xi, a pure function of seed, wheel and cell: Philox4x64-10 with the key
-`(seed, wheel)` (right 0, left 1) and the cell as counter, and Box and Muller's transform. In a cell
-under one command the wheel slips at the constant speed `xi sqrt(k |v| / CELL)`, v its rim speed, so the
-true motion in the cell is one exact arc. After a command within a cell, the speed is
+`(seed, wheel)` (right 0, left 1) and the cell as counter, and Box and Muller's transform. From a command
+to the next one, or to the end of the cell, the wheel slips at the constant speed
 
     xi (sqrt(V + k |v| t) - a) / t
 
-with t the time that is left of the cell, V the variance `k |ds|` of the distance rolled so far in it,
-and `xi a` what has been slipped so far in it. So the variance in the whole cell is `k |ds|` again. A
-wheel at rest does not slip: what was missing from V then is left out.
+with v its rim speed, t the time that is left of the cell, V the variance `k |ds|` of the distance rolled
+so far in it, and `xi a` what has been slipped so far in it. So the variance in the whole cell is
+`k |ds|`, whatever the commands. In a cell under one command the speed is `xi sqrt(k |v| / CELL)`, and
+the true motion one exact arc. A wheel that stops goes on slipping until the cell ends.
 
 The state at a time follows from the last command through the cells between. It does not depend, to the
 last bit, on when it is computed. Under a command that is held for longer than `HOLD`, the width of cells
@@ -51,7 +51,6 @@ _BLOCK = 256
 Pose: TypeAlias = tuple[float, float, float]
 _Slipped: TypeAlias = tuple[int, int, float, float, float, float]
 """Level and index of a cell; a and V of the right wheel, then of the left one (m, m^2)."""
-_NOT_SLIPPED: _Slipped = (-1, 0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -66,11 +65,11 @@ class Drift:
     seed: int | None = None
     """Seed of the random slip. None: the wheels do not slip."""
     right_wheel_radius_multiplier: float = 1.0
-    """True radius of the right wheel, relative to the nominal one [-]."""
+    """True radius of the right wheel, relative to the one that the odometry assumes [-]."""
     left_wheel_radius_multiplier: float = 1.0
-    """True radius of the left wheel, relative to the nominal one [-]."""
+    """True radius of the left wheel, relative to the one that the odometry assumes [-]."""
     wheel_separation_multiplier: float = 1.0
-    """True wheel separation, relative to the nominal one [-]."""
+    """True wheel separation, relative to the one that the odometry assumes [-]."""
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -114,7 +113,7 @@ class Truth:
         self,
         drift: Drift,
         pose: Pose,
-        slipped: _Slipped = _NOT_SLIPPED,
+        slipped: _Slipped | None = None,
         held: tuple[tuple[float, float], int] | None = None,
     ) -> None:
         """Place the robot.
@@ -122,7 +121,7 @@ class Truth:
         Args:
             drift: In what its motion differs from its odometry.
             pose: `(x, y, theta)` (m, m, rad).
-            slipped: What its wheels slipped in the present cell.
+            slipped: What its wheels slipped in the present cell; None: it begins, or they rested in it.
             held: The twist that led here, and since when it is held (ns); None: the robot rested.
         """
         self.pose = pose
@@ -168,36 +167,28 @@ class Truth:
         time, pose, slipped = start, self.pose, self._present(start, twist)
         if self._ahead is not None and self._ahead[1] <= stamp and self._ahead[0] == motion:
             _, time, pose = self._ahead
-            slipped = _NOT_SLIPPED
+            slipped = None
         growth_R, growth_L = k * abs(right), k * abs(left)
-        while True:
-            begun = slipped is not _NOT_SLIPPED
-            level = slipped[0] if begun else ((time - since) // HOLD).bit_length()
-            cell = time // (CELL << level)
+        # Wheels at rest slip only to the end of the cell in which they stopped.
+        while slipped is not None or right or left:
+            level, cell, a_R, V_R, a_L, V_L = slipped or _fresh(time, time - since)
             end = (cell + 1) * (CELL << level)
             xi_R, xi_L = normals(drift.seed, level, cell)
             rest = (end - time) / NANOSECONDS
-            if not begun:
-                # sqrt(k |v| rest) / rest
-                gain_R, gain_L = math.sqrt(growth_R / rest), math.sqrt(growth_L / rest)
-            else:
-                gain_R = _gain(slipped[2], slipped[3], growth_R, rest)
-                gain_L = _gain(slipped[4], slipped[5], growth_L, rest)
+            gain_R, gain_L = _gain(a_R, V_R, growth_R, rest), _gain(a_L, V_L, growth_L, rest)
             rim_R, rim_L = right + gain_R * xi_R, left + gain_L * xi_L
             v, omega = (rim_R + rim_L) / 2.0, (rim_R - rim_L) / separation
             if stamp < end:
+                dt = (stamp - time) / NANOSECONDS
+                pose = arc_end(*pose, v, omega, dt)
+                a_R, V_R = a_R + gain_R * dt, V_R + growth_R * dt
+                a_L, V_L = a_L + gain_L * dt, V_L + growth_L * dt
+                slipped = level, cell, a_R, V_R, a_L, V_L
                 break
             pose = arc_end(*pose, v, omega, rest)
-            time, slipped = end, _NOT_SLIPPED
-        if time > start:
+            time, slipped = end, None
             self._ahead = motion, time, pose
-        if time == stamp:
-            return Truth(drift, pose, slipped, (twist, since))
-        dt = (stamp - time) / NANOSECONDS
-        a_R, V_R = (slipped[2] + gain_R * dt, slipped[3] + growth_R * dt) if right else (0.0, 0.0)
-        a_L, V_L = (slipped[4] + gain_L * dt, slipped[5] + growth_L * dt) if left else (0.0, 0.0)
-        slipped = level, cell, a_R, V_R, a_L, V_L
-        return Truth(drift, arc_end(*pose, v, omega, dt), slipped, (twist, since))
+        return Truth(drift, pose, slipped, (twist, since))
 
     def twist(self, stamp: int, twist: tuple[float, float], L: float, k: float) -> tuple[float, float]:
         """Return the true twist from a time on, the slip included (m/s, rad/s).
@@ -211,11 +202,9 @@ class Truth:
         right, left, separation = self._wheels(twist, L)
         seed = self._drift.seed
         if seed is not None and k:
-            level, _, a_R, V_R, a_L, V_L = self._present(stamp, twist)
-            if level < 0:
-                level = ((stamp - self._since(stamp, twist)) // HOLD).bit_length()
-            cell, passed = divmod(stamp, CELL << level)
-            rest = ((CELL << level) - passed) / NANOSECONDS
+            slipped = self._present(stamp, twist) or _fresh(stamp, stamp - self._since(stamp, twist))
+            level, cell, a_R, V_R, a_L, V_L = slipped
+            rest = ((cell + 1) * (CELL << level) - stamp) / NANOSECONDS
             xi_R, xi_L = normals(seed, level, cell)
             right += xi_R * _gain(a_R, V_R, k * abs(right), rest)
             left += xi_L * _gain(a_L, V_L, k * abs(left), rest)
@@ -225,14 +214,16 @@ class Truth:
         """Return since when a twist from a time on is held (ns)."""
         return self._held[1] if self._held is not None and self._held[0] == twist else start
 
-    def _present(self, start: int, twist: tuple[float, float]) -> _Slipped:
+    def _present(self, start: int, twist: tuple[float, float]) -> _Slipped | None:
         """Return what was slipped so far in the cell of a time, from which on a twist is held.
 
         A wide cell ends with the twist that was held.
         """
-        level, cell, *_ = slipped = self._slipped
-        valid = level == 0 or (level > 0 and self._since(start, twist) < start)
-        return slipped if valid and cell == start // (CELL << level) else _NOT_SLIPPED
+        if self._slipped is None:
+            return None
+        level, cell, *_ = self._slipped
+        valid = level == 0 or self._since(start, twist) < start
+        return self._slipped if valid and cell == start // (CELL << level) else None
 
     def _wheels(self, twist: tuple[float, float], L: float) -> tuple[float, float, float]:
         """Return the true rim speeds of right and left wheel without slip, and the true separation."""
@@ -245,6 +236,12 @@ class Truth:
         )
 
 
+def _fresh(time: int, held: int) -> _Slipped:
+    """Return the cell of a time (ns), in which nothing was slipped yet, by the time of its command."""
+    level = (held // HOLD).bit_length()
+    return level, time // (CELL << level), 0.0, 0.0, 0.0, 0.0
+
+
 def _gain(a: float, variance: float, growth: float, rest: float) -> float:
     """Return the slip speed for xi = 1 in the rest of a cell (m/s).
 
@@ -254,7 +251,7 @@ def _gain(a: float, variance: float, growth: float, rest: float) -> float:
         growth: Its rate, `k |v|` (m^2/s).
         rest: Time that is left of the cell (s).
     """
-    return (math.sqrt(variance + growth * rest) - a) / rest if growth else 0.0
+    return (math.sqrt(variance + growth * rest) - a) / rest
 
 
 def normals(seed: int, level: int, cell: int) -> tuple[float, float]:

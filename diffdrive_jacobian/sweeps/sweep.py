@@ -285,7 +285,7 @@ def _drive(setup: Setup, rows: slice, progress: Callable[[int], object] | None =
         arrival=setup.arrival,
         turning_gain=values['kp'],
         limits=setup.robot.limits,
-        r=setup.robot.wheel_radius,
+        r=min(setup.robot.radii),
         L=setup.robot.wheel_separation,
         on_step=progress,
     )

@@ -84,10 +84,10 @@ def _note(text: str) -> None:
 
 
 def _print_summary(result: Calibration, read: Sequence[WheelsAndReference]) -> None:
-    for one in read:
+    for one, offset in zip(read, result.time_offsets.tolist(), strict=True):
         recording = one.recording
-        begin = max(recording.wheel_time[0], recording.pose_time[0])
-        end = min(recording.wheel_time[-1], recording.pose_time[-1])
+        begin = max(recording.wheel_time[0], recording.pose_time[0] + offset)
+        end = min(recording.wheel_time[-1], recording.pose_time[-1] + offset)
         left, right = map(printable, one.wheel_names)
         print(
             f'{recording.name}: {end - begin:.1f} s, {len(recording.pose_time)} poses on '
@@ -208,10 +208,10 @@ def _parser() -> _cli.Parser:
         prog=PROGRAM,
         description='Estimate the wheel radii and the wheel separation of a robot from recorded drives '
         'with a reference of its pose, such as motion capture or SLAM. Writes the multipliers of '
-        'wheel_bridge and diff_drive_controller as a parameter file, and a picture. Existing files are '
-        'not overwritten. Exit code 0: calibrated; 1: the drives do not determine the parameters, '
-        'contradict each other, or a file cannot be written; 2: wrong arguments, or a bag cannot be '
-        'read; 130: interrupted.',
+        'virtual_robot, wheel_bridge and diff_drive_controller as a parameter file, and a picture. '
+        'Existing files are not overwritten. Exit code 0: calibrated; 1: the drives do not determine '
+        'the parameters, contradict each other, or a file cannot be written; 2: wrong arguments, or a '
+        'bag cannot be read; 130: interrupted.',
     )
     parser.add_argument('bags', metavar='BAG', nargs='+', help='directory of a bag')
     parser.add_argument(

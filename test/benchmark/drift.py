@@ -2,7 +2,8 @@
 
 For each drive: the mean normalized error squared (NEES, 3 is right) of the true pose about the odometry,
 with the published covariance, over 4,000 seeds, and the standard deviations. Commands take effect within
-cells. Then the CPU time of a message with and without slip, interleaved, and that of long gaps.
+cells, also several in each. Then the CPU time of a message with and without slip, interleaved, and that
+of long gaps.
 `--seconds 60` drives longer: half a minute of CPU time for each ten seconds.
 """
 
@@ -27,6 +28,10 @@ from moments_reference import DRIVES
 from diffdrive_jacobian.simulation import Drift, Robot, RobotModel
 from diffdrive_jacobian.time_units import nanoseconds
 
+DRIVES = DRIVES | {
+    'short starts': lambda duration: [((0.22, 0.0), 0.002), ((0.0, 0.0), 0.018)] * round(50 * duration),
+    'short stops': lambda duration: [((0.22, 0.0), 0.014), ((0.0, 0.0), 0.001)] * round(67 * duration),
+}
 START = 7_654_321
 PERIOD = 20_000_000
 GAPS = {'1 s': 1.0, '1 min': 60.0, '1 h': 3600.0, '1 day': 86400.0, '1 year': 3.15e7}
