@@ -29,7 +29,7 @@ ODOMETRY = {'L': 0.16, 'wheel_travel_variance': 1e-5}
 
 
 def law(pose, goal):
-    return control.go_to_goal(pose, goal[..., :2], 3.0, 0.5)
+    return 0.1, 0.2
 
 
 def closed_loops(starts, goals, **options):

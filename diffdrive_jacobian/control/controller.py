@@ -212,7 +212,7 @@ class Controller:
                 if equation is None:
                     twist = self.law(np.asarray(pose), np.asarray(goal[:size]), *values)
                 else:
-                    twist = equation(pose, goal[:size], *values)
+                    twist = equation(pose, np.asarray(goal)[:size].tolist(), *values)
             except Exception as error:
                 raise LawError(
                     f'the law of controller {self.name!r} failed: {_reason(error)}'

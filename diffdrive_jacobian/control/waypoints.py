@@ -25,8 +25,8 @@ from diffdrive_jacobian.numerics.checks import (
 
 Pose: TypeAlias = NDArray[np.float64] | tuple[float, float, float]
 Law: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
-"""A control law with its gains: pose, shape (3,), and goal, shape (3,), to `(v, omega)`. Both are arrays
-or both are tuples, as the pose that is given to `follow`."""
+"""A control law with its gains: pose as given to `follow`, and goal, an array of shape (3,), to
+`(v, omega)`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +91,7 @@ class Waypoints:
         while not here.turning:
             goal = here._goal
             if not arrival.reached(x, y, theta, goal[0], goal[1]):
-                return here, law(pose, goal if isinstance(pose, tuple) else np.array(goal))
+                return here, law(pose, here.poses[here.index])
             if here.index + 1 < len(here.poses):
                 here = here._progressed(here.index + 1, turning=False)
             elif arrival.use_heading:
