@@ -205,7 +205,8 @@ def test_every_public_function_is_called_here():
             if inspect.isfunction(value) and not name.startswith('_')
         }
         tested = {call.__name__ for call in CALLS if getattr(call, '__self__', None) == instance}
-        assert methods - {'reached'} <= tested | {
+        # These are without checks, for every message.
+        assert methods - {'reached', 'wheel_speeds', 'twist'} <= tested | {
             call.__name__ for call in CALLS if isinstance(getattr(call, '__self__', None), cls)
         }
 

@@ -87,7 +87,7 @@ class RobotModel:
         )
 
     def wheel_speeds(self, v: float, omega: float) -> Speeds:
-        """Return the wheel speeds `(omega_R, omega_L)` of a twist (rad/s).
+        """Return the wheel speeds `(omega_R, omega_L)` of a twist of floats (rad/s).
 
         Raises:
             ValueError: They overflow.
@@ -100,7 +100,7 @@ class RobotModel:
         return right, left
 
     def twist(self, omega_R: float, omega_L: float) -> tuple[float, float]:
-        """Return the twist `(v, omega)` of wheel speeds (m/s, rad/s).
+        """Return the twist `(v, omega)` of wheel speeds that are floats (m/s, rad/s).
 
         Raises:
             ValueError: It overflows.
