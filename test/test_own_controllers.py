@@ -350,13 +350,6 @@ def test_the_error_of_a_law_has_its_cause():
     assert isinstance(caught.value.__cause__, ZeroDivisionError)
 
 
-@pytest.mark.parametrize('twist', [(np.array([0.1]), 0.2), (0.1, np.array([0.2])), (0.1, None), 0.1])
-def test_a_law_returns_two_numbers(twist):
-    bound = replace(MINE, law=lambda *arguments: twist).bind(GoToGoalParameters())
-    with pytest.raises(LawError, match=r'must return \(v, omega\), two numbers'):
-        bound(np.zeros(3), np.ones(3))
-
-
 def test_gains_are_passed_in_the_order_of_the_controller():
     parameters = GoToGoalParameters(kp=2.0, kv=3.0, offset=5.0)
     for gains in ((), ('kv',), ('offset', 'kp'), ('offset', 'kp', 'kv')):
