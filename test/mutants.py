@@ -475,6 +475,8 @@ def main() -> None:
         for mutant in sorted(stored)
         if mutant.package == package and stored[mutant].get('result') in results
     ]
+    # As conftest.py does before rclpy is loaded.
+    os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='OFF', ROS_PYTHON_CHECK_FIELDS='1')
     for name in IMPORTED:
         importlib.import_module(name)
     coverage = measured_coverage(options.workers)
