@@ -246,9 +246,13 @@ class Coverage:
         """Return the tests that execute a statement, then those that use what it does at the import."""
         lines = self.lines[place.file]
         found = {test for line in place.lines for test in lines.get(line, ())}
-        at_import = place.at_import or AT_IMPORT in found
-        users = set(self._of_users(place.file)) if at_import else set()
-        return [*self._ordered(found - {AT_IMPORT}), *self._ordered(users - found - {AT_IMPORT})]
+        groups = [found - {AT_IMPORT}]
+        if place.at_import:
+            # A test that is the first to import the module may have nothing else to do with it.
+            groups = [*self._of_users(place.file), *groups]
+        elif AT_IMPORT in found:
+            groups = [*groups, *self._of_users(place.file)]
+        return list(dict.fromkeys(test for group in groups for test in self._ordered(group)))
 
     def _ordered(self, tests: set[str]) -> list[str]:
         """Return short and specific tests first, and some cases of each test before the others."""
@@ -259,16 +263,16 @@ class Coverage:
         rank = {test: i.bit_length() for same in cases.values() for i, test in enumerate(same)}
         return sorted(tests, key=lambda test: (rank[test], cost[test]))
 
-    def _of_users(self, file: str) -> Iterator[str]:
-        """Return the tests of a module, of those that import it, and of the test files that do."""
+    def _of_users(self, file: str) -> tuple[set[str], set[str]]:
+        """Return the tests in files that import a module, and those that execute its importers."""
         module = f'{SOURCE.name}/{file}'.removesuffix('.py').replace('/', '.')
-        for user in {file, *self.lines}:
-            if user == file or module in (SOURCE / user).read_text():
-                yield from itertools.chain.from_iterable(self.lines[user].values())
-        users = {
-            f'test/{path.name}' for path in STORED.parent.glob('*.py') if module in path.read_text()
+        files = {
+            f'test/{path.name}' for path in (ROOT / 'test').glob('*.py') if module in path.read_text()
         }
-        yield from (test for test in self.cpu if _file(test) in users)
+        users = {file, *(user for user in self.lines if module in (SOURCE / user).read_text())}
+        lines = (tests for user in users for tests in self.lines[user].values())
+        executing = set(itertools.chain.from_iterable(lines)) - {AT_IMPORT}
+        return {test for test in self.cpu if _file(test) in files}, executing
 
     def rounds(self, tests: list[str], cpu: float) -> Iterator[dict[str, float]]:
         """Return which tests to run first, of few files, and which afterwards, with their CPU times."""
@@ -471,6 +475,8 @@ def main() -> None:
         for mutant in sorted(stored)
         if mutant.package == package and stored[mutant].get('result') in results
     ]
+    # As conftest.py does before rclpy is loaded.
+    os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='OFF', ROS_PYTHON_CHECK_FIELDS='1')
     for name in IMPORTED:
         importlib.import_module(name)
     coverage = measured_coverage(options.workers)

@@ -21,6 +21,7 @@ from diffdrive_jacobian.calibration import PARAMETERS, calibrate, fit
 from diffdrive_jacobian.parameters.nodes import WheelBridgeParameters
 from diffdrive_jacobian.plots import calibration_figure
 from diffdrive_jacobian.plots.calibration_figure import figure
+from diffdrive_jacobian.reading.calibration_choice import wheel_names
 from diffdrive_jacobian.reading.calibration_data import read_wheels_and_reference
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import calibrate_run as _calibrate_run
@@ -224,6 +225,20 @@ def test_missing_topics_are_listed(folder, capsys):
     small(folder / 'wheels', [one for one in bag_messages(RECORDING)[:500] if one[1] == '/mocap/pose'])
     assert run('wheels') == 2
     refuses(capsys, 2, 'no topic joint_states', '/mocap/pose (geometry_msgs/msg/PoseStamped)')
+
+
+def test_wheels_that_are_given_are_not_looked_for():
+    parameters = {'wheel_bridge': {'left_wheel_name': 'a', 'right_wheel_name': 'b'}}
+    joints = ('a', 'b', 'left_wheel', 'right_wheel')
+    assert wheel_names('run', '/joint_states', joints, ('b', 'left_wheel'), parameters) == (
+        'b',
+        'left_wheel',
+    )
+    assert wheel_names('run', '/joint_states', joints, None, parameters) == ('a', 'b')
+    assert wheel_names('run', '/joint_states', joints[2:], None, parameters) == (
+        'left_wheel',
+        'right_wheel',
+    )
 
 
 @pytest.mark.parametrize(

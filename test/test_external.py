@@ -24,6 +24,8 @@ from diffdrive_jacobian.faults import ClockPause, Kill, Loss, TimeJump
 from diffdrive_jacobian.lockstep import Answers, Every, Idle, Lockstep, LockstepError, PropertyViolation
 from diffdrive_jacobian.lockstep import _external_process as external_process
 from diffdrive_jacobian.lockstep._external_answers import AnswersDue, TicksDue
+from diffdrive_jacobian.lockstep._external_topic import ExternalTopic
+from diffdrive_jacobian.lockstep._report import Traffic
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.properties import NeverFasterThan
@@ -409,6 +411,14 @@ def test_a_process_and_its_children_are_ended_with_the_world():
     assert forgotten.returncode == -signal.SIGINT
 
 
+def test_a_process_that_ignores_sigint_is_killed_with_the_world(monkeypatch):
+    monkeypatch.setattr(external_process.ExternalProcess.stop, '__defaults__', (0.1,))
+    with Lockstep(external=[]) as world:
+        stubborn = world.start('sh', '-c', 'trap "" INT; echo hi; sleep 60', use_sim_time=False)
+        until_says_hi(stubborn)
+    assert stubborn.returncode == -signal.SIGKILL
+
+
 def test_a_process_receives_sigint_that_the_tests_ignore():
     """As they do if a shell has started them in the background."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -513,6 +523,21 @@ def test_ticks_that_were_due_before_a_restart_are_not_awaited():
     assert due.due == 2
     due.restart(lambda _: 0)
     assert due.due == 0
+
+
+def test_messages_before_a_restart_are_not_delivered(ros):
+    publisher = ros.peer.create_publisher(Twist, 'cmd_vel', 10)
+    infos = ros.peer.get_publishers_info_by_topic('/cmd_vel')
+    topic = ExternalTopic(ros.peer, '/cmd_vel', infos, Traffic(lambda: 0))
+    for _ in range(3):
+        publisher.publish(Twist())
+    assert topic.count() == len(topic.deliver()) == 3
+    publisher.publish(Twist())
+    topic.restart()
+    assert topic.count() == 0
+    publisher.publish(Twist())
+    assert len(topic.deliver()) == 1
+    topic.close()
 
 
 @pytest.mark.parametrize('seed', range(5))

@@ -379,6 +379,19 @@ def test_a_journal_that_goes_is_noticed_and_saved(tmp_path, capsys, change):
         assert journal_of(folder / 'run').read_text() == 'of somebody else'
 
 
+def test_a_journal_that_went_and_cannot_be_saved_is_reported(tmp_path, monkeypatch):
+    recording = Recording(tmp_path / 'run', 'mcap')
+    _remove(tmp_path)
+    until(lambda: recording.error is not None, 'it is noticed')
+
+    def full():
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(recording.journal, 'rescue', full)
+    with pytest.raises(RecordingError, match=r'content cannot be saved: .*No space left'):
+        recording.finish()
+
+
 def test_discarding_keeps_a_file_of_another_process(tmp_path):
     recording = Recording(tmp_path / 'run', 'mcap')
     _replace(tmp_path)

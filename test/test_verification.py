@@ -103,6 +103,15 @@ def test_a_run_is_driven_again_exactly(drive, parameters):
     assert np.ptp(run.odometry.values[:, 0]) > 0.2
 
 
+def test_messages_that_are_there_twice_do_not_turn_back_time(drive):
+    run = drive()
+    twice = np.repeat(np.arange(len(run.odometry)), 2)
+    run = replace(
+        run, odometry=rows(run.odometry, twice), odometry_covariances=run.odometry_covariances[twice]
+    )
+    assert len(held(run).seconds) == len(twice)
+
+
 @pytest.mark.parametrize(
     'parameters',
     [{}, {'command_interface': 'wheels'}, LIMITS],

@@ -59,6 +59,8 @@ LONG_DELAY = 0.2
 """Time offset that is worth a note (s)."""
 UNUSUAL = 1.15
 """Factor beyond which multipliers are not explained by manufacturing."""
+RARE = 0.04
+"""Period of the wheels beyond which it matters how they move between their samples (s)."""
 BACKWARD = 0.6
 """Angle from straight back within which a sensor looks backwards (rad)."""
 
@@ -143,6 +145,42 @@ def calibrate(
     for one in recordings:
         _check(one)
     recordings = tuple(map(thinned_samples, recordings))
+    period = max(float(np.median(np.diff(one.wheel_time))) for one in recordings)
+    found, errors = [], []
+    for smooth in (True, False) if period > RARE else (True,):
+        try:
+            found.append(_calibrated(recordings, nominal, given, smooth))
+        except CalibrationError as error:
+            errors.append(error)
+    if not found:
+        raise errors[0]
+    return found[0] if len(found) == 1 else _compared(found[0], found[1], period)
+
+
+def _compared(first: Calibration, second: Calibration, period: float) -> Calibration:
+    """Return the more likely one of two results, with their difference in its uncertainty."""
+    if _misfit(second.estimate.noise) < _misfit(first.estimate.noise):
+        first, second = second, first
+    difference = second.estimate.parameters - first.estimate.parameters
+    deviations = np.sqrt(np.diag(first.estimate.covariance())[:3])
+    if (np.abs(difference[:3]) < deviations).all():
+        return first
+    note = (
+        f'the wheels are recorded every {period:.2g} s, and the multipliers depend on how they move '
+        'between their samples: record them more often'
+    )
+    widened = first.estimate.widened(difference[np.newaxis])
+    return replace(first, estimate=widened, notes=(*first.notes, note))
+
+
+def _misfit(noise: Noise) -> float:
+    """Return what falls with the likelihood of the noise, of three residuals of wheels for each pose."""
+    return float(3.0 * np.log(noise.wheel) / 2.0 + 2.0 * np.log(noise.position) + np.log(noise.heading))
+
+
+def _calibrated(
+    recordings: tuple[Recording, ...], nominal: Geometry, given: Given, smooth: bool
+) -> Calibration:
     notes = [note for one in recordings for note in sampling_notes(one)]
     offsets = np.zeros(len(recordings))
     for index, one in enumerate(recordings):
@@ -156,7 +194,7 @@ def calibrate(
     segments = [
         segment
         for index, one in enumerate(recordings)
-        for segment in overlapping(one, index, offsets[index], nominal.wheel_radius)
+        for segment in overlapping(one, index, offsets[index], nominal.wheel_radius, smooth)
     ]
     if not segments:
         raise CalibrationError(

@@ -7,7 +7,6 @@ much a multiplier differs there from that in the rest. Source: doc/mathematics.m
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -16,6 +15,7 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.calibration.encoder import poses_apart
 from diffdrive_jacobian.calibration.estimate import MULTIPLIERS, TIME_OFFSETS, Estimate, prior_deviations
 from diffdrive_jacobian.calibration.fit import score
 from diffdrive_jacobian.calibration.measurements import Array, Segment
@@ -34,9 +34,9 @@ lacks."""
 CHANCE = 3e-3
 """Bound of the probability of a misfit by chance, among all windows, all kinds, or all recordings. It is
 less likely, because the sets overlap."""
-SPREAD = 0.01
+SPREAD = 0.02
 """Standard deviation that is expected of a difference [-]. A difference that the data determine less
-well does not count: where a robot hardly turns, its turns are those of the steps of the encoders."""
+well counts less: where a robot hardly turns, its turns are those of the steps of the encoders."""
 EXCESS = 1.25
 """Ratio of the squares in the median window to those of the model that may be chance."""
 STEADY = 1.0
@@ -140,18 +140,13 @@ def misfit(segments: Sequence[Segment], nominal: Geometry, estimate: Estimate) -
 def _thinned(segments: Sequence[Segment], estimate: Estimate) -> tuple[list[Segment], Estimate]:
     """Return motions and estimate with at most about `MOST_POSES` poses, `APART` steps apart."""
     every = -(-sum(len(one.time) for one in segments) // MOST_POSES)
-    kept = [slice(None, None, min(max(every, _apart(one)), len(one.time) - 1)) for one in segments]
+    kept = [
+        slice(None, None, min(max(every, poses_apart(one, APART)), len(one.time) - 1))
+        for one in segments
+    ]
     states = tuple(one[here] for one, here in zip(estimate.states, kept, strict=True))
     thinned = [one.part(here) for one, here in zip(segments, kept, strict=True)]
     return thinned, replace(estimate, states=states)
-
-
-def _apart(segment: Segment) -> int:
-    """Return after how many poses the wheels have usually turned by `APART` steps of their encoders."""
-    step = 12.0**0.5 * float(segment.wheel_errors.max(initial=0.0))
-    angles = [np.interp(segment.time, segment.wheel_time, one) for one in segment.wheel_angles.T]
-    turned = float(np.median(np.abs(np.diff(angles)).max(axis=0)))
-    return math.ceil(APART * step / turned) if turned > 0.0 else 1
 
 
 def _local(

@@ -11,9 +11,11 @@ of the readings themselves have errors that do, which would bias the estimate.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from diffdrive_jacobian.calibration.measurements import Array
+from diffdrive_jacobian.calibration.measurements import Array, Segment
 
 INTO_REST = 2.0 / 3.0
 """Time from a change of the reading to the middle of a step in which the wheel stops, relative to the
@@ -50,7 +52,7 @@ def located(time: Array, readings: Array) -> tuple[Array, Array]:
     middle = (time[first] + time[last]) / 2.0
     begin = np.clip(bounds[:-1] + inset[:-2], time[first], middle)[stops]
     end = np.clip(bounds[1:] - inset[2:], middle, time[last])[stops]
-    unknown = np.where(single, 0.0, deviation)[stops]
+    unknown = np.full(len(level), deviation)[stops]
     knots = np.concatenate([bounds[1:-1], begin, end])
     angles = np.concatenate([(level[:-1] + level[1:]) / 2.0, level[stops], level[stops]])
     deviations = np.concatenate([0.0 * jumps, unknown, unknown])
@@ -88,3 +90,11 @@ def densified(time: Array, angles: Array) -> tuple[Array, Array]:
         np.append(np.stack(times, axis=1).reshape(-1), time[-1]),
         np.concatenate([dense, angles[-1:]]),
     )
+
+
+def poses_apart(segment: Segment, steps: float) -> int:
+    """Return after how many poses, at least 1, the wheels have usually turned by some encoder steps."""
+    step = 12.0**0.5 * float(segment.wheel_errors.max(initial=0.0))
+    angles = [np.interp(segment.time, segment.wheel_time, one) for one in segment.wheel_angles.T]
+    turned = float(np.median(np.abs(np.diff(angles)).max(axis=0)))
+    return max(1, math.ceil(steps * step / turned)) if turned > 0.0 else 1

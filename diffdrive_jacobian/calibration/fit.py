@@ -29,7 +29,8 @@ from diffdrive_jacobian.calibration.motion import Geometry, composed, inverted
 
 MAX_STEPS = 40
 FULL_STEPS = 5
-"""Steps after which they are halved."""
+"""Steps after which they are shortened, more with each: the time offset may alternate about a kink of
+the wheels."""
 WINDOW = 4.0
 """Half of the time over which wheel speeds are means, in units of the last change of the time offset:
 the interpolated motion of the wheels has kinks at its samples, which long steps must overlook."""
@@ -117,7 +118,7 @@ def fit(
         window = WINDOW * float(size[np.count_nonzero(estimate.free[:TIME_OFFSETS]) :].max(initial=0.0))
         limit = scales[estimate.free]
         shorten = float(min(1.0, np.min(limit / np.maximum(size, 1e-12), initial=1.0)))
-        shorten *= 1.0 if count < FULL_STEPS else 0.5
+        shorten *= min(1.0, FULL_STEPS / (count + 1.0))
         parameters = estimate.parameters.copy()
         parameters[estimate.free] += shorten * solution.change
         estimate = replace(
@@ -128,7 +129,7 @@ def fit(
             information=solution.information,
         )
         deviation = np.sqrt(np.diag(estimate.covariance())[estimate.free])
-        if settled and (size <= np.maximum(tolerances * deviation, NEGLIGIBLE)).all():
+        if settled and (shorten * size <= np.maximum(tolerances * deviation, NEGLIGIBLE)).all():
             break
     else:
         if (size[:3] > deviation[:3] / 5.0).any():

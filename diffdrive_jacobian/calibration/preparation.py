@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.calibration.encoder import densified, located
+from diffdrive_jacobian.calibration.encoder import densified, located, poses_apart
 from diffdrive_jacobian.calibration.measurements import (
     Array,
     CalibrationError,
@@ -28,6 +28,8 @@ FEWEST_IN_ALL = 10
 MOST_SAMPLES, MOST_POSES = 400_000, 10_000
 """Most samples of a recording that are read, and most poses of all that are estimated: both bound time
 and memory. Poses at a high rate have little more to say, because their errors depend on each other."""
+STEPS = 2.0
+"""Steps of the encoders by which the wheels turn between poses that are used."""
 SLOW = 0.25
 """Period of the wheels beyond which too little of the motion is known (s)."""
 FLOORS = np.array([0.03, 0.03, 0.06])
@@ -41,8 +43,17 @@ MOST_JUMPS = 0.05
 """Share of poses at jumps beyond which the reference is refused."""
 
 
-def overlapping(recording: Recording, index: int, offset: float, radius: float) -> list[Segment]:
+def overlapping(
+    recording: Recording, index: int, offset: float, radius: float, smooth: bool = True
+) -> list[Segment]:
     """Return the continuous motions of a recording: its times in common, split at gaps of the wheels.
+
+    Args:
+        recording: The recording.
+        index: Its index among all.
+        offset: What is added to the times of its poses (s).
+        radius: Nominal wheel radius (m).
+        smooth: Whether the speeds of wheels change gradually between samples; else they are constant.
 
     Raises:
         CalibrationError: There is no time in common.
@@ -67,7 +78,9 @@ def overlapping(recording: Recording, index: int, offset: float, radius: float) 
         if np.count_nonzero(here) >= FEWEST:
             readings = recording.wheel_angles[first:last].T
             both = [located(wheels[first:last], one) for one in readings]
-            time, angles = densified(wheels[first:last], np.column_stack([angles for angles, _ in both]))
+            time, angles = wheels[first:last], np.column_stack([angles for angles, _ in both])
+            if smooth:
+                time, angles = densified(time, angles)
             errors = [np.interp(time, wheels[first:last], deviations) for _, deviations in both]
             found.append(
                 Segment(
@@ -97,18 +110,21 @@ def thinned_samples(recording: Recording) -> Recording:
 
 
 def thinned_poses(segments: Sequence[Segment]) -> tuple[list[Segment], str]:
-    """Return motions with at most about `MOST_POSES` poses, and a note; '': all are kept."""
+    """Return motions with at most about `MOST_POSES` poses, and a note; '': all are kept.
+
+    Poses between which the wheels turn by less than `STEPS` steps of their encoders are left out without
+    a note: they share a reading error.
+    """
     count = sum(len(one.time) for one in segments)
     every = -(-count // MOST_POSES)
-    if every == 1:
-        return list(segments), ''
     kept = []
     for one in segments:
         # Short motions keep enough poses.
-        step = max(1, min(every, len(one.time) // FEWEST))
+        step = max(1, min(max(every, poses_apart(one, STEPS)), len(one.time) // FEWEST))
         kept.append(one.part(slice(None, None, step)))
     used = sum(len(one.time) for one in kept)
-    return kept, f'{used} of {count} poses of the reference are used, evenly spaced'
+    note = f'{used} of {count} poses of the reference are used, evenly spaced' if every > 1 else ''
+    return kept, note
 
 
 def gaps(time: Array) -> list[tuple[float, float]]:
