@@ -342,7 +342,8 @@ def test_wheels_are_located_between_the_steps_of_their_encoders(steps):
         deviations.append(deviation)
     error, deviation = np.concatenate(errors), np.concatenate(deviations)
     rest = deviation == deviation.max()
-    assert 0.8 < (error[rest] / deviation[rest]).std() < 1.2
+    # Wheels that pass a step with each sample are located better than stated.
+    assert 0.5 < (error[rest] / deviation[rest]).std() < 1.2
     assert error[deviation == 0.0].std() < 0.5 * deviation.max()
 
 

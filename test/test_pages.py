@@ -32,7 +32,7 @@ TOOLS = sorted(
     - set(NODES)
 )
 LINK = re.compile(r'\]\(([^)\s]+)\)')
-MOST_SKIPPED = 7
+MOST_SKIPPED = 8
 """Blocks in all pages that no test runs: those that need pip, a ROS installation, a network."""
 
 

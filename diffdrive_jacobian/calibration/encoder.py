@@ -30,7 +30,8 @@ def located(time: Array, readings: Array) -> tuple[Array, Array]:
     """Return the angles of a wheel at the times of its readings, and their standard deviations.
 
     Both have shape (m,). Readings that change with each sample are returned as they are. The deviation
-    is 0 except where the wheel stops or turns back within a step.
+    is 0 where the wheel is located between two changes of its reading. Elsewhere, also where the reading
+    changes with each sample, it is that of a step, if the readings show one.
 
     Args:
         time: Increasing, shape (m,) (s).
