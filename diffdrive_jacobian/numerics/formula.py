@@ -94,19 +94,24 @@ def formula(signature: str, **checks: Check) -> _Decorator:
 
         @functools.wraps(body)
         def checked(*args: Any, **kwargs: Any) -> Any:
+            missing = optional[len(args) :]
+            if missing and not kwargs and all(missing):
+                # `bind` takes longer than most equations.
+                args += (None,) * len(missing)
             if kwargs or len(args) != len(names):
                 bound = described.bind(*args, **kwargs)
                 bound.apply_defaults()
                 args = bound.args
             batch: tuple[int, ...] = ()
-            values = None if whole else _single(args, inputs)
+            values = None if whole else _single(args, inputs, optional)
             if values is None:
                 values, batch = _several(args, inputs, names, tests, optional)
                 if not whole:
                     values = list(map(_components, values, inputs))
             else:
                 for index, name, check in restrictions:
-                    check(name, values[index])
+                    if values[index] is not None:
+                        check(name, values[index])
             try:
                 if batch or whole:
                     with np.errstate(all='ignore'):
@@ -136,17 +141,17 @@ def _shapes(side: str) -> list[Shape]:
     ]
 
 
-def _single(args: tuple[Any, ...], shapes: list[Shape]) -> list[Any] | None:
+def _single(args: tuple[Any, ...], shapes: list[Shape], optional: tuple[bool, ...]) -> list[Any] | None:
     """Return floats and vectors of one robot as floats and lists; None if anything is something else."""
     values: list[Any] = []
     total = 0.0
-    for value, shape in zip(args, shapes, strict=True):
+    for value, shape, may_miss in zip(args, shapes, optional, strict=True):
         if type(value) is float and not shape:
             total += value
         elif type(value) is np.ndarray and value.dtype is FLOAT64 and value.shape == shape and shape:
             value = value.tolist()
             total += sum(value)
-        else:
+        elif value is not None or not may_miss:
             return None
         values.append(value)
     # A finite sum has finite terms.
