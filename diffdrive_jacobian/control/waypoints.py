@@ -83,7 +83,7 @@ class Waypoints:
         x, y, theta = numbers('pose', pose, 3)
         function('law', law)
         instance('arrival', arrival, Arrival)
-        turning_gain = number('turning_gain', turning_gain, finite)
+        number('turning_gain', turning_gain, finite)
         here = self
         if here.turning and not arrival.use_heading:
             # The heading no longer counts, and the position was reached.

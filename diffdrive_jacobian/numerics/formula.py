@@ -146,7 +146,9 @@ def _single(args: tuple[Any, ...], shapes: list[Shape], optional: tuple[bool, ..
     values: list[Any] = []
     total = 0.0
     for value, shape, may_miss in zip(args, shapes, optional, strict=True):
-        if type(value) is float and not shape:
+        if isinstance(value, float) and not shape:
+            # NumPy's are floats, too.
+            value = float(value)
             total += value
         elif type(value) is np.ndarray and value.dtype is FLOAT64 and value.shape == shape and shape:
             value = value.tolist()
