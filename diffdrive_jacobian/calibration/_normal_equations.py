@@ -128,7 +128,7 @@ def _motion(
         diagonal=diagonal,
         upper=weighted_back,
         border=border,
-        corner=np.tensordot(change, weighted_change, ((0, 1), (0, 1))),
+        corner=np.asarray(np.tensordot(change, weighted_change, ((0, 1), (0, 1))), dtype=np.float64),
         gradient=gradient,
         gradient_corner=np.einsum('nip,ni->p', change, weighted),
         cost=float(np.sum(residual * weighted)),

@@ -58,7 +58,8 @@ class Estimate:
         free = np.ix_(self.free, self.free)
         covariance = self.covariance()[free] + (errors.T @ errors)[free]
         scales = prior_deviations(len(self.parameters))[self.free]
-        return replace(self, information=np.linalg.inv(covariance) - np.diag(scales**-2.0))
+        information = np.linalg.inv(covariance) - np.diag(scales**-2.0)
+        return replace(self, information=np.asarray(information, dtype=np.float64))
 
 
 def prior_deviations(count: int) -> Array:

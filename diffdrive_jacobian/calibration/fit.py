@@ -224,7 +224,7 @@ def _solved(groups: tuple[Group, Group, Group], weights: Array, prior: _Prior) -
     return _Solution(
         step=step,
         observed=observed,
-        change=change,
+        change=np.asarray(change, dtype=np.float64),
         information=information,
         logarithm=logarithm + float(np.linalg.slogdet(inner)[1].sum() + np.linalg.slogdet(damped)[1]),
     )

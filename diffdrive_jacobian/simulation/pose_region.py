@@ -207,7 +207,7 @@ def _chord(turns: Array) -> Array:
     """Return the ratios of chord and arc of turns (rad), to 5e-11."""
     ratio: Array
     if np.abs(turns).max(initial=0.0) > 0.5:
-        ratio = np.sinc(turns / (2.0 * np.pi))
+        ratio = np.asarray(np.sinc(turns / (2.0 * np.pi)), dtype=np.float64)
         return ratio
     square = turns * turns
     # The Taylor series takes a tenth of the time.
