@@ -447,6 +447,13 @@ def summary(
             yield f'no longer noticed: {mutant}'
 
 
+def positive(text: str) -> int:
+    """Return a number of the command line."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f'must be a whole number from 1 on, got {text}')
+    return int(text)
+
+
 def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(description='Change the program and see whether the tests notice.')
@@ -454,12 +461,16 @@ def main() -> None:
     parser.add_argument(
         '--result', action='append', choices=RESULTS, help='only with this stored result'
     )
-    parser.add_argument('--sample', type=int, metavar='N', help='replace the mutants by N random ones')
+    parser.add_argument(
+        '--sample', type=positive, metavar='N', help='N random mutants; with --write they replace those'
+    )
     parser.add_argument('--seed', type=int, default=1, help='of the random ones (default: 1)')
-    parser.add_argument('--workers', type=int, default=os.cpu_count(), help='number of processes')
+    parser.add_argument('--workers', type=positive, default=os.cpu_count(), help='number of processes')
     parser.add_argument('--cpu', type=float, default=CPU, help='CPU time of the tests of a mutant (s)')
     parser.add_argument('--write', action='store_true', help='store the results')
     options = parser.parse_args()
+    if not options.cpu > 0.0:
+        parser.error(f'argument --cpu: must be positive, got {options.cpu:g}')
     packages = options.package or PACKAGES
     stored = read(STORED)
     if options.sample:
@@ -467,7 +478,8 @@ def main() -> None:
         for package in packages:
             drawn = Statements(parsed(package)).sample(package, options.sample, options.seed)
             stored.update((mutant, {}) for mutant in drawn)
-        write(STORED, stored)
+        if options.write:
+            write(STORED, stored)
     results = options.result or [*RESULTS, None]
     mutants = [
         mutant

@@ -203,6 +203,14 @@ def _given(options: argparse.Namespace) -> Given:
     )
 
 
+def _noise(text: str) -> float:
+    """Parse a noise that squares and inverses of floats can represent."""
+    value = _cli.positive(text)
+    if not 1e-12 <= value <= 1e3:
+        raise argparse.ArgumentTypeError(f'must be from 1e-12 to 1000, got {text.strip()!r}')
+    return value
+
+
 def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
@@ -276,7 +284,7 @@ def _parser() -> _cli.Parser:
         parser.add_argument(
             f'--{name}-noise',
             metavar='M' if unit == 'm' else 'RAD',
-            type=_cli.positive,
+            type=_noise,
             help=f'{what} ({unit}) (default: estimated)',
         )
     return parser
