@@ -673,3 +673,20 @@ def test_recordings_that_disagree_are_refused():
     one, other = ROBOT.recording(random, 'one'), replace(ROBOT, multipliers=(1.0, 1.0, 1.0))
     with pytest.raises(CalibrationError, match=r'disagree.*: (one|other): the left wheel travels .* %'):
         calibrate([one, other.recording(random, 'other')], NOMINAL)
+
+
+def test_correlated_errors_of_the_reference_are_noted_and_enlarge_the_deviations():
+    """Errors of an autoregressive process of first order, as of SLAM, with a time constant of 1 s."""
+    random = np.random.default_rng(23)
+    recording = replace(ROBOT, rate=5).recording(random)
+    white = calibrate([recording], NOMINAL)
+    assert not any('correlated' in note for note in white.notes)
+    keep = np.exp(-np.diff(recording.pose_time))
+    errors = np.zeros((len(recording.poses), 3))
+    for index, share in enumerate(keep.tolist(), 1):
+        drawn = random.standard_normal(3) * [0.02, 0.02, 0.005]
+        errors[index] = share * errors[index - 1] + np.sqrt(1.0 - share**2) * drawn
+    wavy = calibrate([replace(recording, poses=recording.poses + errors)], NOMINAL)
+    assert any('are correlated (0.' in note for note in wavy.notes)
+    assert (deviations(wavy) > 2.0 * deviations(white)).all()
+    assert (np.abs(wavy.multipliers - TRUE) < 4.0 * deviations(wavy)).all()

@@ -59,6 +59,8 @@ LONG_DELAY = 0.2
 """Time offset that is worth a note (s)."""
 UNUSUAL = 1.15
 """Factor beyond which multipliers are not explained by manufacturing."""
+CORRELATED, LEAST_ERRORS = 0.5, 60
+"""Correlation of successive errors that is noted, and fewest errors that show it."""
 RARE = 0.04
 """Period of the wheels beyond which it matters how they move between their samples (s)."""
 BACKWARD = 0.6
@@ -227,6 +229,15 @@ def _calibrated(
     )
     _check_result(result)
     notes += [*misfits, *_noise_notes(estimate.noise), *_size_notes(result, given)]
+    correlation = _correlation(result)
+    if correlation > CORRELATED:
+        notes.append(
+            f'the errors of successive poses of the reference are correlated ({correlation:.2f}): the '
+            'stated deviations are enlarged for that'
+        )
+        # As of the mean of an autoregressive process of first order.
+        factor = (1.0 + correlation) / (1.0 - correlation)
+        result = replace(result, estimate=replace(estimate, information=estimate.information / factor))
     for one, offset in zip(recordings, result.time_offsets.tolist(), strict=True):
         if given.time_offset is None and abs(offset) > LONG_DELAY:
             notes.append(
@@ -280,6 +291,20 @@ def _size_notes(result: Calibration, given: Given) -> list[str]:
             'swapped and both turn in the wrong sense: the multipliers of the radii are exchanged then'
         )
     return notes
+
+
+def _correlation(result: Calibration) -> float:
+    """Return the correlation of the position errors of successive poses in motion; 0: there are few."""
+    first, second = [], []
+    for motion, states in zip(result.motions, result.estimate.states, strict=True):
+        errors = (motion.poses - composed(states, result.estimate.sensor))[:, :2]
+        single = (motion.weights[1:] == 1.0) & (motion.weights[:-1] == 1.0)
+        first.append(errors[:-1][single].ravel())
+        second.append(errors[1:][single].ravel())
+    a, b = np.concatenate(first), np.concatenate(second)
+    if len(a) < LEAST_ERRORS:
+        return 0.0
+    return float(np.clip(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)), 0.0, 0.99))
 
 
 def _free(given: Given, count: int) -> np.typing.NDArray[np.bool_]:
