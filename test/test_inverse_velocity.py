@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from diffdrive_jacobian.kinematics import diff_drive, secondary_tasks, task_priority
+from diffdrive_jacobian.kinematics import diff_drive, joint_limits, manipulability, task_priority
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
 
 EPS = np.finfo(float).eps
@@ -295,7 +295,7 @@ ARGUMENTS = [(function, name) for function, arguments in VALID.items() for name 
 
 
 def test_every_public_function_is_given_bad_input_here():
-    modules = (iv, secondary_tasks, task_priority)
+    modules = (iv, joint_limits, manipulability, task_priority)
     functions = {
         function
         for module in modules
