@@ -165,7 +165,8 @@ def solve(
         forward=forward,
         jacobian=jacobian,
         difference=np.subtract if difference is None else difference,
-        weights=weights,
+        rows=weights > 0.0,
+        roots=np.sqrt(weights[weights > 0.0]),
         targets=np.broadcast_to(target, (*batch, m)).reshape(-1, m),
         limits=None if limits is None else _limits(limits, n),
     )

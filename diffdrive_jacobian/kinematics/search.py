@@ -60,8 +60,9 @@ class Task:
     forward: Function
     jacobian: Function | None
     difference: Difference
-    weights: Floats
-    """The diagonal of M, shape (m,)."""
+    rows: Flags
+    roots: Floats
+    """The task's entries with a weight above zero, and the square roots of these weights."""
     targets: Floats
     limits: tuple[Floats, Floats] | None
 
@@ -72,15 +73,16 @@ class Task:
         if len(q):
             # A copy, as the function may write to its argument.
             reached = _returned('forward', self.forward(q.copy()), target.shape, q)
-            good = np.isfinite(reached).all(axis=-1)
-            if good.any():
-                e[good] = self._differences(target[good], reached[good], q[good])
+            finite = np.isfinite(reached).all(axis=-1, keepdims=True)
+            if finite.any():
+                reached = np.where(finite, reached, target)
+                e = np.where(finite, self._differences(target, reached, q), np.nan)
         e = self._weighted(e)
         return e, norm(e)
 
     def jacobians(self, q: Floats) -> Floats:
         """Return the Jacobians of joints of shape (k, n), by differences if the caller gave none."""
-        shape = (len(q), len(self.weights), q.shape[-1])
+        shape = (len(q), len(self.rows), q.shape[-1])
         if self.jacobian is None:
             return self._weighted(self._central_differences(q, shape))
         return self._weighted(_returned('jacobian', self.jacobian(q.copy()), shape, q))
@@ -99,9 +101,9 @@ class Task:
 
     def _weighted(self, values: Floats) -> Floats:
         """Return `sqrt(M) e` or `sqrt(M) J`, a copy: the caller's functions may use their memory again."""
-        counts = self.weights > 0.0
-        roots = np.sqrt(self.weights[counts])
-        return np.asarray(values[:, counts] * roots.reshape(-1, *[1] * (values.ndim - 2)))
+        if not self.rows.all():
+            values = values[:, self.rows]
+        return np.asarray(values * self.roots.reshape(-1, *[1] * (values.ndim - 2)))
 
     def _differences(self, target: Floats, reached: Floats, q: Floats) -> Floats:
         return _returned('difference', self.difference(target, reached), reached.shape, q)
@@ -193,24 +195,22 @@ def newton_step(J: Floats, e: Floats) -> Floats:
     return times(inverse(J), e)
 
 
-def transpose_step(J: Floats, e: Floats, alpha: Any) -> Floats:
-    """Return `alpha J^T M e`, shape (k, n), with alpha of shape (k,)."""
-    return np.asarray(column(alpha) * times(transposed(J), e))
+def transpose_step(gradient: Floats, alpha: Any) -> Floats:
+    """Return `alpha J^T M e`, shape (k, n), with alpha of shape (k,) or ()."""
+    return np.asarray(column(alpha) * gradient)
 
 
-def best_alpha(J: Floats, e: Floats) -> Floats:
+def best_alpha(J: Floats, gradient: Floats) -> Floats:
     """Return with which alpha the error would be least if forward were linear, shape (k,)."""
-    downhill = times(transposed(J), e)
-    return np.asarray((norm(downhill) / norm(times(J, downhill))) ** 2)
+    return np.asarray((norm(gradient) / norm(times(J, gradient))) ** 2)
 
 
-def levenberg_marquardt_step(J: Floats, e: Floats, factor: Floats) -> Floats:
+def levenberg_marquardt_step(J: Floats, gradient: Floats, factor: Floats) -> Floats:
     """Return `(J^T M J + lambda I)^-1 J^T M e`, shape (k, n), with lambda of shape (k,)."""
     H = transposed(J) @ J
     diagonal = np.einsum('kii->ki', H)  # a view
     diagonal += column(factor) + REGULAR * diagonal
-    downhill = transposed(J) @ e[..., np.newaxis]
-    return np.asarray(np.linalg.solve(H, downhill)[..., 0])
+    return np.asarray(np.linalg.solve(H, column(gradient))[..., 0])
 
 
 @dataclass
@@ -247,13 +247,13 @@ class Search:
                 still, J, gradient, again = still.keep(kept), J[kept], gradient[kept], again[kept]
             if not len(still.which):
                 break
-            tried = self._tried(still, found, J, again)
+            tried = self._tried(still, found, J, gradient, again)
             still, ended = self._judged(still, found, gradient, again, tried)
         return found
 
     def _free(self, still: _Open) -> tuple[Floats, Floats]:
         """Return J and `J^T M e`, zero for joints at a limit that would have to go beyond it."""
-        gradient = times(transposed(still.J), still.e)
+        gradient = np.einsum('kmn,km->kn', still.J, still.e)
         if self.task.limits is None:
             return still.J, gradient
         lower, upper = self.task.limits
@@ -283,29 +283,31 @@ class Search:
     def _first_factor(self) -> float:
         return {'newton': 0.0, 'transpose': RELAXED, 'levenberg_marquardt': self.damping}[self.method]
 
-    def _tried(self, still: _Open, found: Outcome, J: Floats, again: Flags) -> Floats:
+    def _tried(
+        self, still: _Open, found: Outcome, J: Floats, gradient: Floats, again: Flags
+    ) -> Floats:
         """Return joints a step further, or where the next search begins, shape (k, n)."""
-        tried = self.task.within_limits(still.q + self._step(still, found, J))
+        tried = self.task.within_limits(still.q + self._step(still, found, J, gradient))
         # A step that overflows is not taken.
         tried = np.where(np.isfinite(tried).all(axis=-1, keepdims=True), tried, still.q)
         if again.any():
             tried[again] = self._restart(still, found, again)
         return tried
 
-    def _step(self, still: _Open, found: Outcome, J: Floats) -> Floats:
+    def _step(self, still: _Open, found: Outcome, J: Floats, gradient: Floats) -> Floats:
         """Return the step of the method, shape (k, n)."""
         if self.method == 'newton':
             return newton_step(J, still.e)
         if self.method == 'transpose':
-            alpha = still.factor * best_alpha(J, still.e) if self.alpha is None else self.alpha
-            return transpose_step(J, still.e, alpha)
-        step = levenberg_marquardt_step(J, still.e, still.factor)
+            alpha = still.factor * best_alpha(J, gradient) if self.alpha is None else self.alpha
+            return transpose_step(gradient, alpha)
+        step = levenberg_marquardt_step(J, gradient, still.factor)
         late = found.iterations[still.which] - found.began[still.which] >= SECOND_ORDER_AFTER
         if late.any():
-            step[late] = self._second_order_step(still._replace(J=J).keep(late))
+            step[late] = self._second_order_step(still._replace(J=J).keep(late), gradient[late])
         return step
 
-    def _second_order_step(self, still: _Open) -> Floats:
+    def _second_order_step(self, still: _Open, gradient: Floats) -> Floats:
         """Return `(|H| + lambda I)^-1 J^T M e`, with the second derivatives of forward, shape (k, n).
 
         `H = J^T M J - sum (M e)_i d^2 forward_i / dq^2`. Its eigenvalues are made positive, so that the
@@ -324,7 +326,7 @@ class Search:
         counts &= np.isfinite(bend).all(axis=(1, 2), keepdims=True)
         H = transposed(J) @ J - np.where(counts, 0.5 * (bend + transposed(bend)), 0.0)
         values, V = np.linalg.eigh(H)
-        along = times(transposed(V) @ transposed(J), still.e)
+        along = times(transposed(V), gradient)
         return times(V, along / (np.abs(values) + column(still.factor)))
 
     # --- What became of a step
