@@ -161,6 +161,6 @@ class StraightLine:
         """
         t = number('t', t, finite)
         duration = column(self._duration)
-        moving = t < duration
-        share = np.where(moving, max(t, 0.0) / np.where(moving, duration, 1.0), 1.0)
+        elapsed = max(t, 0.0) / np.where(duration > 0.0, duration, 1.0)
+        share = np.where(t < duration, elapsed, 1.0)
         return np.asarray(self.start + share * (self.end - self.start))

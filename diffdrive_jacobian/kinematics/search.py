@@ -80,7 +80,7 @@ class Task:
         e = self._weighted(e)
         return e, norm(e)
 
-    def jacobians(self, q: Floats) -> Floats:
+    def derivatives(self, q: Floats) -> Floats:
         """Return the Jacobians of joints of shape (k, n), by differences if the caller gave none."""
         shape = (len(q), len(self.rows), q.shape[-1])
         if self.jacobian is None:
@@ -270,7 +270,7 @@ class Search:
     def _differentiate(self, still: _Open, where: Flags) -> None:
         """Write the Jacobians of these rows."""
         if where.any():
-            still.J[where] = self.task.jacobians(still.q[where])
+            still.J[where] = self.task.derivatives(still.q[where])
 
     # --- Steps
 
@@ -317,7 +317,7 @@ class Search:
         """
         J = still.J
         around, width = self.task.around(still.q, SECOND_DIFFERENCE)
-        nearby = self.task.jacobians(around.reshape(-1, self.joints))
+        nearby = self.task.derivatives(around.reshape(-1, self.joints))
         nearby = nearby.reshape(len(J), 2, self.joints, *J.shape[1:])
         bend = np.einsum('klmn,km->kln', nearby[:, 0] - nearby[:, 1], still.e)
         bend = _quotient(bend, column(width))

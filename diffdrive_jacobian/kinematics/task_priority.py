@@ -81,9 +81,9 @@ def prioritized(
         weights=W_half.shape[:-1],
     )
     q_dot, N = np.zeros((*batch, n, 1)), np.eye(n)
-    for J_k, x_dot in pairs:
+    for k, (J_k, x_dot) in enumerate(pairs):
         J = J_k / row(W_half)
-        finite('J and weights', J)
+        finite(f'J of task {k} and weights', J)
         least = cutoff * np.linalg.norm(J, ord=2, axis=(-2, -1))
         missing = x_dot[..., np.newaxis] - J @ q_dot
         q_dot = q_dot + N @ inverse(J @ N, damping, least) @ missing
