@@ -172,7 +172,9 @@ def test_joint_limits_whose_range_overflows_are_refused():
 
 @pytest.mark.parametrize('function', [iv.joint_limit_cost, iv.joint_limit_gradient])
 def test_joint_limits_raise_an_error_where_the_result_overflows(function):
-    with pytest.raises(ValueError, match=r'^joint_limit_\w+ of q, lower and upper must be finite, got inf'):
+    with pytest.raises(
+        ValueError, match=r'^joint_limit_\w+ of q, lower and upper must be finite, got inf'
+    ):
         function([HUGE], [-1e-300], [1e-300])
 
 

@@ -75,9 +75,7 @@ def resolved_rate(
     Raises:
         ValueError: The correction or a joint velocity overflows.
     """
-    q_dot = _unlimited(
-        J, x, x_desired, x_dot_desired, gain, damping, q_dot_0, max_correction, weights
-    )
+    q_dot = _unlimited(J, x, x_desired, x_dot_desired, gain, damping, q_dot_0, max_correction, weights)
     return q_dot if max_velocity is None else limit_velocity(q_dot, max_velocity)
 
 

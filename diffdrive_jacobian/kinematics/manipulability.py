@@ -1,7 +1,7 @@
 """Manipulability: how far a Jacobian is from singular, and the motion that increases it.
 
-The gradient is a secondary task for `inverse_velocity.redundant`. It is taken over the configuration q. A
-mobile manipulator's inputs are fewer than its coordinates: with its `configuration_jacobian` G the
+The gradient is a secondary task for `inverse_velocity.redundant`. It is taken over the configuration q.
+A mobile manipulator's inputs are fewer than its coordinates: with its `configuration_jacobian` G the
 gradient over the inputs is `G^T gradient`.
 
 Everything broadcasts over leading axes. Wrong shapes and values that are not finite raise ValueError.

@@ -47,7 +47,7 @@ NUDGE = 0.1
 ROUNDING = 4.0 * EPS
 """Relative decrease of `e^T M e` that may be rounding alone."""
 REGULAR = 100.0 * EPS
-"""What is added to the diagonal of `J^T M J`, relative to it, so that rounding leaves no singular one."""
+"""Added to the diagonal of `J^T M J`, relative to it, so that rounding does not make it singular."""
 FIRST_DIFFERENCE, SECOND_DIFFERENCE = EPS ** (1.0 / 3.0), EPS**0.25
 """Steps of central differences, where rounding and truncation errors are alike: of forward, and of
 Jacobians, which may be differences themselves."""
@@ -100,7 +100,7 @@ class Task:
         return q if self.limits is None else np.clip(q, *self.limits)
 
     def _weighted(self, values: Floats) -> Floats:
-        """Return `sqrt(M) e` or `sqrt(M) J`, a copy: the caller's functions may use their memory again."""
+        """Return `sqrt(M) e` or `sqrt(M) J`, a copy, as the caller may use its memory again."""
         if not self.rows.all():
             values = values[:, self.rows]
         return np.asarray(values * self.roots.reshape(-1, *[1] * (values.ndim - 2)))
@@ -283,9 +283,7 @@ class Search:
     def _first_factor(self) -> float:
         return {'newton': 0.0, 'transpose': RELAXED, 'levenberg_marquardt': self.damping}[self.method]
 
-    def _tried(
-        self, still: _Open, found: Outcome, J: Floats, gradient: Floats, again: Flags
-    ) -> Floats:
+    def _tried(self, still: _Open, found: Outcome, J: Floats, gradient: Floats, again: Flags) -> Floats:
         """Return joints a step further, or where the next search begins, shape (k, n)."""
         tried = self.task.within_limits(still.q + self._step(still, found, J, gradient))
         # A step that overflows is not taken.
