@@ -1,7 +1,7 @@
 """Inverse velocity, control and secondary tasks with numbers near the largest and smallest ones.
 
-A call has the true result or raises ValueError. It never hands an infinite matrix to LAPACK, which may not
-terminate with it, it never warns, and what is too large is not taken for zero.
+A call has the true result or raises ValueError. It never hands an infinite matrix to LAPACK, which may
+not terminate with it, it never warns, and what is too large is not taken for zero.
 """
 
 from __future__ import annotations

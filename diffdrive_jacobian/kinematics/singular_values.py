@@ -98,7 +98,7 @@ def times(matrices: Array, vectors: Array) -> Array:
 
 
 def row(vectors: Array) -> Array:
-    """Return vectors as matrices of one row, which scale columns: `J diag(v)` is `J * row(v)`."""
+    """Return vectors as matrices of one row, to scale the columns of matrices."""
     return np.asarray(vectors[..., np.newaxis, :])
 
 
