@@ -48,7 +48,7 @@ from diffdrive_jacobian.kinematics.singular_values import (
     EPS,
     FILTER,
     column,
-    inverse,
+    damped_inverse,
     projector,
     refuse_singular,
     root,
@@ -127,7 +127,8 @@ def pseudoinverse(J: Any, weights: Vector = None) -> Array:
         ValueError: `J W^-1/2` or the pseudo-inverse overflows.
     """
     W_half = root(weights)
-    return inverse(J / row(W_half)) / column(W_half)
+    inverse = damped_inverse(J / row(W_half), damping=0.0)
+    return inverse / column(W_half)  # W^-1/2 (J W^-1/2)^+
 
 
 @formula('(),(),() -> ()', manipulability=not_negative, threshold=positive, maximum=not_negative)
@@ -164,7 +165,8 @@ def damped_least_squares(J: Any, x_dot: Vector, damping: Number, weights: Vector
         ValueError: `J W^-1/2` or a joint velocity overflows.
     """
     W_half = root(weights)
-    return times(inverse(J / row(W_half), damping), x_dot) / W_half
+    inverse = damped_inverse(J / row(W_half), damping)  # J^T (J J^T + lambda^2 I)^-1 of J W^-1/2
+    return times(inverse, x_dot) / W_half
 
 
 @formula('(m,n),(),(n) -> (n,n)', damping=not_negative, weights=positive)
@@ -186,7 +188,8 @@ def null_space_projector(J: Any, damping: Number = 0.0, weights: Vector = None) 
         ValueError: `J W^-1/2` or N overflows.
     """
     W_half = root(weights)
-    return projector(J / row(W_half), damping) * row(W_half) / column(W_half)
+    N = projector(J / row(W_half), damping)  # I - J^+ J of J W^-1/2
+    return N * row(W_half) / column(W_half)
 
 
 @formula('(m,n),(m),(n),(),(n) -> (n)', damping=not_negative, weights=positive)

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics.singular_values import EPS, column, inverse, times, transposed
+from diffdrive_jacobian.kinematics.singular_values import EPS, column, damped_inverse, times, transposed
 from diffdrive_jacobian.numerics.checks import floats
 
 Floats = NDArray[np.float64]
@@ -192,7 +192,7 @@ class _Open(NamedTuple):
 
 def newton_step(J: Floats, e: Floats) -> Floats:
     """Return `J^+ e`, shape (k, n)."""
-    return times(inverse(J), e)
+    return times(damped_inverse(J), e)
 
 
 def transpose_step(gradient: Floats, alpha: Any) -> Floats:

@@ -20,7 +20,7 @@ FILTER = 0.1
 """Width of the projector's filter, relative to the damping."""
 
 
-def inverse(J: Array, damping: Any = 0.0, least: Any = None) -> Array:
+def damped_inverse(J: Array, damping: Any = 0.0, least: Any = None) -> Array:
     """Return `J^T (J J^T + lambda^2 I)^-1`, which without damping is the pseudo-inverse J^+.
 
     In singular values it is `V diag(s / (s^2 + lambda^2)) U^T`.

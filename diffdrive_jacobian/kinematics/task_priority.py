@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.kinematics.joint_limits import limit_velocity
-from diffdrive_jacobian.kinematics.singular_values import inverse, projector, root, row
+from diffdrive_jacobian.kinematics.singular_values import damped_inverse, projector, root, row
 from diffdrive_jacobian.numerics.checks import array, finite, leading, not_negative, number, positive
 from diffdrive_jacobian.numerics.formula import Array
 
@@ -86,7 +86,7 @@ def prioritized(
         finite(f'J of task {k} and weights', J)
         least = cutoff * np.linalg.norm(J, ord=2, axis=(-2, -1))
         missing = x_dot[..., np.newaxis] - J @ q_dot
-        q_dot = q_dot + N @ inverse(J @ N, damping, least) @ missing
+        q_dot = q_dot + N @ damped_inverse(J @ N, damping, least) @ missing
         N = N @ projector(J @ N, damping, least)
     q_dot = q_dot[..., 0] / W_half
     finite('result of tasks, damping and weights', q_dot)
