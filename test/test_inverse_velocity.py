@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from diffdrive_jacobian.kinematics import diff_drive, secondary_tasks, task_priority
+from diffdrive_jacobian.kinematics import diff_drive, joint_limits, manipulability, task_priority
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
 
 EPS = np.finfo(float).eps
@@ -95,21 +95,29 @@ def test_the_adjugate_never_gives_what_is_rounding_error_only():
     assert np.all(size(inverses[which] - right) <= 0.01 * size(right))
 
 
-@pytest.mark.parametrize('scale', [1e-300, 1e-161, 1e200, 1e307])
-def test_the_adjugate_inverts_whatever_the_units(scale):
+@pytest.mark.parametrize('scale', [1e-300, 1e-161, 1e-140, 1e-30, 1e150, 1e200, 1e307])
+def test_the_adjugate_inverts_whatever_the_units_or_raises_an_error(scale):
     J = np.array([[1.0, 1.0], [0.5, 2.0]])
-    np.testing.assert_allclose(iv.adjugate_inverse(J * scale) * scale, np.linalg.inv(J), rtol=1e-12)
+    if scale < 1e-145:
+        with pytest.raises(np.linalg.LinAlgError, match='must not be singular'):
+            iv.adjugate_inverse(J * scale)
+    elif scale > 1e154:
+        with pytest.raises(ValueError, match='J must give a finite result, but it overflows'):
+            iv.adjugate_inverse(J * scale)
+    else:
+        inverse = iv.adjugate_inverse(J * scale) * scale
+        np.testing.assert_allclose(inverse, np.linalg.inv(J), rtol=1e-12)
 
 
 def test_an_inverse_that_no_number_can_hold_is_refused():
-    with pytest.raises(np.linalg.LinAlgError, match='must not be singular'):
-        iv.adjugate_inverse(np.eye(2) * 1e-310)
     tiny = np.eye(2) * 1e-310
-    assert not iv.pseudoinverse(tiny).any()
-    assert np.isfinite(iv.damped_least_squares(tiny, [1e-310, 0.0], 1e-310)).all()
+    with pytest.raises(np.linalg.LinAlgError, match='must not be singular'):
+        iv.adjugate_inverse(tiny)
+    with pytest.raises(ValueError, match='must give a finite result, but it overflows'):
+        iv.pseudoinverse(tiny)
 
 
-@pytest.mark.parametrize('other', [0.0, 1e-170, 1e170])
+@pytest.mark.parametrize('other', [0.0, 1e-170, 1e150])
 def test_what_becomes_of_a_jacobian_does_not_depend_on_its_company(other):
     J = np.array([[0.1, 0.2, 0.3], [0.2, 0.4, 0.6 * (1.0 + 1e-12)]])
     company = np.stack([J, np.full((2, 3), other)])
@@ -295,7 +303,7 @@ ARGUMENTS = [(function, name) for function, arguments in VALID.items() for name 
 
 
 def test_every_public_function_is_given_bad_input_here():
-    modules = (iv, secondary_tasks, task_priority)
+    modules = (iv, joint_limits, manipulability, task_priority)
     functions = {
         function
         for module in modules

@@ -220,10 +220,10 @@ CASES = [
         )
         for links in (1, 3)
     ),
-    ('secondary_tasks.manipulability_gradient', manipulability, {'links': 2, 'heading': False}),
-    ('secondary_tasks.manipulability_gradient', manipulability, {'links': 3, 'heading': False}),
-    ('secondary_tasks.manipulability_gradient', manipulability, {'links': 4, 'heading': True}),
-    ('secondary_tasks.joint_limit_gradient', joint_limit, {}),
+    ('manipulability.manipulability_gradient', manipulability, {'links': 2, 'heading': False}),
+    ('manipulability.manipulability_gradient', manipulability, {'links': 3, 'heading': False}),
+    ('manipulability.manipulability_gradient', manipulability, {'links': 4, 'heading': True}),
+    ('joint_limits.joint_limit_gradient', joint_limit, {}),
 ]
 
 

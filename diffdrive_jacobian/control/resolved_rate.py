@@ -16,14 +16,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from diffdrive_jacobian.kinematics._task_checks import finite_result
 from diffdrive_jacobian.kinematics.inverse_velocity import (
     damped_least_squares,
     limit_velocity,
     redundant,
 )
+from diffdrive_jacobian.kinematics.singular_values import column
 from diffdrive_jacobian.numerics.checks import (
     array,
     finite,
@@ -35,14 +35,7 @@ from diffdrive_jacobian.numerics.checks import (
     positive_or_infinite,
     read_only,
 )
-from diffdrive_jacobian.numerics.elementary import (
-    agree,
-    components,
-    maximum,
-    operand,
-    sqrt,
-    vector,
-)
+from diffdrive_jacobian.numerics.formula import Array, Number, Vector, formula
 
 
 def resolved_rate(
@@ -57,7 +50,7 @@ def resolved_rate(
     max_correction: ArrayLike = np.inf,
     weights: ArrayLike | None = None,
     max_velocity: ArrayLike | None = None,
-) -> NDArray[np.float64]:
+) -> Array:
     """Return joint velocities for a moving target: `q_dot = J^+ (x_dot_d + K (x_d - x))` (A, C, D).
 
     Args:
@@ -77,76 +70,41 @@ def resolved_rate(
             are slowed down alike (see `inverse_velocity.limit_velocity`); None: no limits.
 
     Returns:
-        Joint velocities, shape (..., n). Without `max_velocity` infinite where they overflow.
+        Joint velocities, shape (..., n).
 
     Raises:
-        ValueError: The velocity of the tip overflows, or with `max_velocity` the joint velocities do.
+        ValueError: The correction or a joint velocity overflows.
     """
-    J = array('J', J, 'm', 'n')
-    m = J.shape[-2]
-    tip, wanted = components('x', x, m), components('x_desired', x_desired, m)
-    forward, K = components('x_dot_desired', x_dot_desired, m), operand('gain', gain, not_negative)
-    longest = operand('max_correction', max_correction, positive_or_infinite)
-    single = agree(
-        x=tip[0], x_desired=wanted[0], x_dot_desired=forward[0], gain=K, max_correction=longest
-    )
-    if not single or J.ndim > 2:
-        leading(
-            J=J.shape[:-2],
-            x=np.shape(tip[0]),
-            x_desired=np.shape(wanted[0]),
-            x_dot_desired=np.shape(forward[0]),
-            gain=np.shape(K),
-            max_correction=np.shape(longest),
-        )
-    with np.errstate(all='ignore'):
-        x_dot = _tip_velocity(tip, wanted, forward, K, longest)
-    finite_result('x, x_desired, x_dot_desired and gain', 'velocity', x_dot)
+    q_dot = _unlimited(J, x, x_desired, x_dot_desired, gain, damping, q_dot_0, max_correction, weights)
+    return q_dot if max_velocity is None else limit_velocity(q_dot, max_velocity)
+
+
+@formula(
+    '(m,n),(m),(m),(m),(),(),(n),(),(n) -> (n)',
+    gain=not_negative,
+    damping=not_negative,
+    max_correction=positive_or_infinite,
+    weights=positive,
+)
+def _unlimited(
+    J: Any,
+    x: Vector,
+    x_desired: Vector,
+    x_dot_desired: Vector,
+    gain: Number,
+    damping: Number,
+    q_dot_0: Vector = None,
+    max_correction: Number = np.inf,
+    weights: Vector = None,
+) -> Array:
+    """Compute `J^+ (x_dot_d + K (x_d - x))`, with the correction not longer than allowed."""
+    correction = column(gain) * (x_desired - x)
+    excess = np.linalg.norm(correction, axis=-1) / max_correction
+    finite('|K (x_d - x)|', excess)
+    x_dot = x_dot_desired + correction / column(np.maximum(excess, 1.0))
     if q_dot_0 is None:
-        q_dot = damped_least_squares(J, x_dot, damping, weights=weights)
-    else:
-        q_dot = redundant(J, x_dot, q_dot_0, damping, weights=weights)
-    if max_velocity is None:
-        return q_dot
-    finite_result('J, the velocity of the tip, damping and weights', 'joint velocity', q_dot)
-    return limit_velocity(q_dot, max_velocity)
-
-
-def _tip_velocity(
-    x: list[Any], x_desired: list[Any], x_dot_desired: list[Any], gain: Any, longest: Any
-) -> NDArray[np.float64]:
-    """Compute `x_dot_d + K (x_d - x)` from the entries, with the limited correction, shape (..., m)."""
-    correction = [gain * (there - here) for here, there in zip(x, x_desired, strict=True)]
-    squares: Any = 0.0
-    for entry in correction:
-        squares = squares + entry * entry
-    excess = sqrt(squares) / longest
-    factor = maximum(excess, 1.0)
-    correction = [entry / factor for entry in correction]
-    if not np.all(excess < np.inf):
-        overflows = ~np.asarray(excess < np.inf)
-        entries = _scaled_correction(
-            vector(*x), vector(*x_desired), np.asarray(gain), np.asarray(longest)
-        )
-        correction = [
-            np.where(overflows, entries[..., index], entry) for index, entry in enumerate(correction)
-        ]
-    return vector(*(own + added for own, added in zip(x_dot_desired, correction, strict=True)))
-
-
-def _scaled_correction(
-    x: NDArray[np.float64],
-    x_desired: NDArray[np.float64],
-    gain: NDArray[np.float64],
-    longest: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Compute `K (x_d - x)`, not longer than the limit, where its norm or its excess overflows."""
-    error = x_desired / 2.0 - x / 2.0
-    exponent = np.frexp(np.abs(error).max(axis=-1))[1]
-    error = np.ldexp(error, -exponent[..., np.newaxis])
-    length = np.linalg.norm(error, axis=-1)
-    limit = longest / np.where(length > 0.0, length, 1.0)
-    return np.asarray(error * np.minimum(np.ldexp(gain, exponent + 1), limit)[..., np.newaxis])
+        return np.asarray(damped_least_squares.formula(J, x_dot, damping, weights))
+    return np.asarray(redundant.formula(J, x_dot, q_dot_0, damping, weights))
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +122,7 @@ class StraightLine:
     """Shape (..., m) (m), read-only."""
     speed: Any
     """Speed along the line, shape (...) (m/s), read-only."""
-    _duration: NDArray[np.float64] = field(init=False, repr=False)
+    _duration: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check and copy every value."""
@@ -186,11 +144,11 @@ class StraightLine:
         object.__setattr__(self, '_duration', read_only(duration))
 
     @property
-    def duration(self) -> NDArray[np.float64]:
+    def duration(self) -> Array:
         """Time from start to end, shape (...) (s)."""
         return np.array(self._duration)
 
-    def position(self, t: float) -> NDArray[np.float64]:
+    def position(self, t: float) -> Array:
         """Return the position at a time, shape (..., m) (m).
 
         Args:
@@ -200,11 +158,7 @@ class StraightLine:
             ValueError: t is not a single finite number.
         """
         t = number('t', t, finite)
-        if self._duration.ndim == 0:
-            whole = float(self._duration)
-            share = max(t, 0.0) / whole if t < whole and whole > 0.0 else 1.0
-            return np.asarray(self.start + share * (self.end - self.start))
-        duration = self._duration[..., np.newaxis]
-        moving = t < duration
-        part = np.where(moving, max(t, 0.0) / np.where(duration > 0.0, duration, 1.0), 1.0)
-        return np.asarray(self.start + part * (self.end - self.start))
+        duration = column(self._duration)
+        elapsed = max(t, 0.0) / np.where(duration > 0.0, duration, 1.0)
+        share = np.where(t < duration, elapsed, 1.0)
+        return np.asarray(self.start + share * (self.end - self.start))

@@ -33,8 +33,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._ik_search import Search
-from diffdrive_jacobian.kinematics._ik_task import Difference, Floats, Function, Task
+from diffdrive_jacobian.kinematics.search import Difference, Floats, Function, Search, Task
 from diffdrive_jacobian.numerics.checks import array, floats, leading, not_negative, number, positive
 from diffdrive_jacobian.numerics.elementary import agree, components, vector, wrapped
 
@@ -174,6 +173,7 @@ def solve(
     search = Search(
         task=task,
         method=method,
+        joints=n,
         tolerance=number('tolerance', tolerance, positive),
         step_tolerance=number('step_tolerance', step_tolerance, not_negative),
         damping=number('damping', damping, positive),

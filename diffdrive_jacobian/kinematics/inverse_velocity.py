@@ -33,30 +33,32 @@ Control*, 2009, 3.5.1. Without damping a singular value counts as zero if it is 
 
 from __future__ import annotations
 
-from math import isfinite
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics import _singular_values
-from diffdrive_jacobian.kinematics._adjugate import EPS, adjugate, refuse_singular
-from diffdrive_jacobian.kinematics._singular_values import CUTOFF, FILTER, joint_velocities
-from diffdrive_jacobian.kinematics._task_checks import (
-    checked_damping,
-    checked_task,
-    finite_result,
-    weighted,
-)
-from diffdrive_jacobian.kinematics.secondary_tasks import (
+from diffdrive_jacobian.kinematics.joint_limits import (
     joint_limit_cost,
     joint_limit_gradient,
-    manipulability,
-    manipulability_gradient,
+    limit_velocity,
 )
-from diffdrive_jacobian.kinematics.task_priority import limit_velocity, prioritized
-from diffdrive_jacobian.numerics.checks import array, leading, not_negative, positive
-from diffdrive_jacobian.numerics.elementary import agree, matrix, operand
+from diffdrive_jacobian.kinematics.manipulability import manipulability, manipulability_gradient
+from diffdrive_jacobian.kinematics.singular_values import (
+    CUTOFF,
+    EPS,
+    FILTER,
+    column,
+    damped_inverse,
+    projector,
+    refuse_singular,
+    root,
+    row,
+    times,
+)
+from diffdrive_jacobian.kinematics.task_priority import prioritized
+from diffdrive_jacobian.numerics.checks import finite, not_negative, positive
+from diffdrive_jacobian.numerics.elementary import minimum
+from diffdrive_jacobian.numerics.formula import Array, Number, Rows, Vector, formula
 
 __all__ = [
     'CUTOFF',
@@ -75,10 +77,12 @@ __all__ = [
     'redundant',
 ]
 
-Array = NDArray[np.float64]
+TINY = 1e-290
+"""Determinants up to this have lost digits to underflow."""
 
 
-def adjugate_inverse(J: ArrayLike) -> Array:
+@formula('(2,2) -> (2,2)')
+def adjugate_inverse(J: Any) -> Rows:
     """Invert by the adjugate: `J^-1 = [[d, -b], [-c, a]] / det(J)` (A, 3.2.1).
 
     Args:
@@ -91,32 +95,22 @@ def adjugate_inverse(J: ArrayLike) -> Array:
     Raises:
         LinAlgError: A Jacobian is singular to working precision: the entries of an inverse would be
             rounding errors. The message contains its determinant.
-        ValueError: J has another shape.
+        ValueError: J has another shape, or its determinant overflows.
     """
-    J = array('J', J, 2, 2)
-    if J.ndim == 2:
-        (a, b), (c, d) = J.tolist()
-        if 1e-50 < max(abs(a), abs(b), abs(c), abs(d)) < 1e50:
-            single = a * d - b * c
-            if abs(single) > 4.0 * EPS * (a * a + b * b + c * c + d * d):
-                return matrix(2, 2, d / single, -b / single, -c / single, a / single)
-    # By powers of two, so that neither products overflow nor digits are lost.
-    _, exponent = np.frexp(np.abs(J).max(axis=(-2, -1)))
-    scaled = np.ldexp(J, -exponent[..., np.newaxis, np.newaxis])
-    determinant = scaled[..., 0, 0] * scaled[..., 1, 1] - scaled[..., 0, 1] * scaled[..., 1, 0]
+    a, b, c, d = J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]
+    determinant = a * d - b * c
     # The condition number is |J|^2 / |det| (in the norm of Frobenius).
-    singular = np.abs(determinant) <= 4.0 * EPS * np.einsum('...ij,...ij->...', scaled, scaled)
-    regular = np.where(singular, 1.0, determinant)[..., np.newaxis, np.newaxis]
-    with np.errstate(over='ignore', under='ignore'):
-        inverse: Array = np.ldexp(adjugate(scaled) / regular, -exponent[..., np.newaxis, np.newaxis])
-        # Also where the inverse would be larger than any number.
-        refuse_singular(
-            np.ldexp(determinant, 2 * exponent), singular | ~np.isfinite(inverse).all(axis=(-2, -1))
-        )
-    return inverse
+    square = a * a + b * b + c * c + d * d
+    finite('|J|^2', square)
+    refuse_singular(determinant, abs(determinant) <= 4.0 * EPS * square + TINY)
+    return [
+        [d / determinant, -b / determinant],
+        [-c / determinant, a / determinant],
+    ]
 
 
-def pseudoinverse(J: ArrayLike, *, weights: ArrayLike | None = None) -> Array:
+@formula('(m,n),(n) -> (n,m)', weights=positive)
+def pseudoinverse(J: Any, weights: Vector = None) -> Array:
     """Return the Moore-Penrose pseudo-inverse J^+ (A, C), or the weighted one.
 
     Where J is singular, `J^+ x_dot` minimises `|x_dot - J q_dot|`. Where it is redundant, `|q_dot|`, or
@@ -127,21 +121,18 @@ def pseudoinverse(J: ArrayLike, *, weights: ArrayLike | None = None) -> Array:
         weights: Weights of the joints, positive, shape (..., n). None: all 1.
 
     Returns:
-        The pseudo-inverses, shape (..., n, m). With weights infinite where they overflow.
+        The pseudo-inverses, shape (..., n, m).
 
     Raises:
-        ValueError: `J W^-1/2` overflows.
+        ValueError: `J W^-1/2` or the pseudo-inverse overflows.
     """
-    J = array('J', J, 'm', 'n')
-    if weights is None:
-        return _singular_values.pseudoinverse(J)
-    scaled, roots = weighted(J, weights)
-    with np.errstate(over='ignore'):
-        inverse: Array = _singular_values.pseudoinverse(scaled) / roots[..., np.newaxis]
-    return inverse
+    W_half = root(weights)
+    inverse = damped_inverse(J / row(W_half), damping=0.0)
+    return inverse / column(W_half)  # W^-1/2 (J W^-1/2)^+
 
 
-def damping(manipulability: ArrayLike, threshold: ArrayLike, maximum: ArrayLike) -> Array:
+@formula('(),(),() -> ()', manipulability=not_negative, threshold=positive, maximum=not_negative)
+def damping(manipulability: Number, threshold: Number, maximum: Number) -> Number:
     """Return a lambda that grows as the manipulability falls: `lambda_max (1 - w / w_0)`, or 0 (A).
 
     Args:
@@ -152,31 +143,14 @@ def damping(manipulability: ArrayLike, threshold: ArrayLike, maximum: ArrayLike)
     Returns:
         lambda, shape (...), in the units of J: not squared (Nakamura and Hanafusa 1986 square it).
     """
-    w: Any = manipulability
-    w_0: Any = threshold
-    most: Any = maximum
-    single = (
-        type(w) is type(w_0) is type(most) is float
-        and (w >= 0.0 < w_0 and most >= 0.0)
-        and isfinite(w + w_0 + most)
-    )
-    if not single:
-        w, w_0 = operand('manipulability', w, not_negative), operand('threshold', w_0, positive)
-        most = operand('maximum', most, not_negative)
-        single = agree(manipulability=w, threshold=w_0, maximum=most)
-    if single:
-        return np.asarray(most * (1.0 - (w / w_0 if w < w_0 else 1.0)))
-    w, w_0 = np.broadcast_arrays(w, w_0)
-    return np.asarray(most * (1.0 - np.divide(w, w_0, out=np.ones(w.shape), where=w < w_0)))
+    return maximum * (1.0 - minimum(manipulability / threshold, 1.0))
 
 
-def damped_least_squares(
-    J: ArrayLike, x_dot: ArrayLike, damping: ArrayLike, *, weights: ArrayLike | None = None
-) -> Array:
+@formula('(m,n),(m),(),(n) -> (n)', damping=not_negative, weights=positive)
+def damped_least_squares(J: Any, x_dot: Vector, damping: Number, weights: Vector = None) -> Array:
     """Return bounded joint velocities: `J^T (J J^T + lambda^2 I)^-1 x_dot` (A).
 
-    `|q_dot| <= |x_dot| / (2 lambda)` for every J. With lambda = 0 this is `J^+ x_dot`. It is computed
-    from singular vectors and values, so that no digits are lost to `J J^T`.
+    `|q_dot| <= |x_dot| / (2 lambda)` for every J. With lambda = 0 this is `J^+ x_dot`.
 
     Args:
         J: Jacobians, shape (..., m, n).
@@ -185,26 +159,18 @@ def damped_least_squares(
         weights: Weights of the joints, positive, shape (..., n). None: all 1.
 
     Returns:
-        Joint velocities, shape (..., n). Infinite where they overflow.
+        Joint velocities, shape (..., n).
 
     Raises:
-        ValueError: `J W^-1/2` overflows.
+        ValueError: `J W^-1/2` or a joint velocity overflows.
     """
-    J, x_dot = checked_task(J, x_dot)
-    factor = checked_damping(damping)
-    if weights is None:
-        leading(J=J.shape[:-2], x_dot=x_dot.shape[:-1], damping=factor.shape)
-        return joint_velocities(J, x_dot, factor)
-    scaled, roots = weighted(J, weights)
-    leading(J=scaled.shape[:-2], x_dot=x_dot.shape[:-1], damping=factor.shape)
-    q_dot = joint_velocities(scaled, x_dot, factor)
-    with np.errstate(over='ignore'):
-        return np.asarray(q_dot / roots)
+    W_half = root(weights)
+    inverse = damped_inverse(J / row(W_half), damping)  # J^T (J J^T + lambda^2 I)^-1 of J W^-1/2
+    return times(inverse, x_dot) / W_half
 
 
-def null_space_projector(
-    J: ArrayLike, damping: ArrayLike = 0.0, *, weights: ArrayLike | None = None
-) -> Array:
+@formula('(m,n),(),(n) -> (n,n)', damping=not_negative, weights=positive)
+def null_space_projector(J: Any, damping: Number = 0.0, weights: Vector = None) -> Array:
     """Return the projector to joint velocities that do not move the task: `N = I - J^+ J` (A, C).
 
     Without damping `J N = 0` and `N N = N`, its rank n less the rank of J. With damping N is continuous
@@ -219,28 +185,16 @@ def null_space_projector(
         N, shape (..., n, n), symmetric. With weights `W N` is symmetric.
 
     Raises:
-        ValueError: With weights, `J W^-1/2` or N overflows.
+        ValueError: `J W^-1/2` or N overflows.
     """
-    J, factor = array('J', J, 'm', 'n'), checked_damping(damping)
-    if weights is None:
-        leading(J=J.shape[:-2], damping=factor.shape)
-        return _singular_values.null_space_projector(J, factor)
-    scaled, roots = weighted(J, weights)
-    leading(J=scaled.shape[:-2], damping=factor.shape)
-    projector = _singular_values.null_space_projector(scaled, factor)
-    with np.errstate(over='ignore'):
-        oblique: Array = projector * roots[..., np.newaxis, :] / roots[..., np.newaxis]
-    finite_result('J and weights', 'projector', oblique)
-    return oblique
+    W_half = root(weights)
+    N = projector(J / row(W_half), damping)  # I - J^+ J of J W^-1/2
+    return N * row(W_half) / column(W_half)
 
 
+@formula('(m,n),(m),(n),(),(n) -> (n)', damping=not_negative, weights=positive)
 def redundant(
-    J: ArrayLike,
-    x_dot: ArrayLike,
-    q_dot_0: ArrayLike,
-    damping: ArrayLike = 0.0,
-    *,
-    weights: ArrayLike | None = None,
+    J: Any, x_dot: Vector, q_dot_0: Vector, damping: Number = 0.0, weights: Vector = None
 ) -> Array:
     """Do a task, and come near to secondary joint velocities: `J^+ x_dot + N q_dot_0` (A, C).
 
@@ -257,21 +211,11 @@ def redundant(
             gradient of a function with them, divide the gradient by the weights.
 
     Returns:
-        Joint velocities, shape (..., n): with `q_dot_0 = 0` the least ones. Infinite where they
-        overflow.
+        Joint velocities, shape (..., n): with `q_dot_0 = 0` the least ones.
 
     Raises:
-        ValueError: `J W^-1/2` or `W^1/2 q_dot_0` overflows.
+        ValueError: `J W^-1/2` or a joint velocity overflows.
     """
-    J, x_dot = checked_task(J, x_dot)
-    secondary, factor = array('q_dot_0', q_dot_0, J.shape[-1]), checked_damping(damping)
-    scaled, roots = (J, None) if weights is None else weighted(J, weights)
-    leading(
-        J=scaled.shape[:-2], x_dot=x_dot.shape[:-1], q_dot_0=secondary.shape[:-1], damping=factor.shape
-    )
-    if roots is None:
-        return joint_velocities(J, x_dot, factor, secondary)
-    with np.errstate(over='ignore'):
-        secondary = secondary * roots
-        finite_result('q_dot_0 and weights', 'product', secondary)
-        return np.asarray(joint_velocities(scaled, x_dot, factor, secondary) / roots)
+    least = damped_least_squares.formula(J, x_dot, damping, weights)
+    N = null_space_projector.formula(J, damping, weights)
+    return np.asarray(least + times(N, q_dot_0))

@@ -19,7 +19,7 @@ from math import pi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._adjugate import EPS, refuse_singular
+from diffdrive_jacobian.kinematics.singular_values import EPS, refuse_singular
 from diffdrive_jacobian.numerics.checks import array, positive
 from diffdrive_jacobian.numerics.elementary import cos, maximum, sin, wrap
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula

@@ -10,15 +10,15 @@ from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.control.resolved_rate import StraightLine, resolved_rate
-from diffdrive_jacobian.kinematics._task_checks import weighted
 from diffdrive_jacobian.kinematics.inverse_velocity import damping as damping_factor
 from diffdrive_jacobian.kinematics.inverse_velocity import manipulability
+from diffdrive_jacobian.kinematics.singular_values import root, row
 from diffdrive_jacobian.numerics.checks import array, leading, not_negative, number, positive
+from diffdrive_jacobian.numerics.formula import Array
 
-Array = NDArray[np.float64]
 MAX_STEPS = 1e8
 
 
@@ -113,9 +113,10 @@ def track_line(
     gain = number('gain', gain, not_negative)
     if gain >= rate:
         raise ValueError(f'gain must be at least 0 and below the rate {rate:g}, got {gain:g}')
-    if not rate * (float(np.max(line.duration, initial=0.0)) + settling) < MAX_STEPS:
+    samples = rate * (float(np.max(line.duration, initial=0.0)) + settling)
+    if not samples < MAX_STEPS:
         raise ValueError(f'rate must give fewer than {MAX_STEPS:g} samples of the line, got {rate:g}')
-    steps = math.ceil(rate * (float(np.max(line.duration, initial=0.0)) + settling) - 1e-9)
+    steps = math.ceil(samples - 1e-9)
     most = number('maximum_damping', maximum_damping, not_negative)
     if threshold is not None:
         threshold = number('threshold', threshold, positive)
@@ -124,39 +125,33 @@ def track_line(
         raise ValueError(f'line must have 2 coordinates, got {line.start.shape[-1]}')
     leading(q0=q.shape[:-1], line=line.duration.shape)
     inputs = robot.jacobian(q).shape[-1]
-    roots = None
     if weights is not None:
         weights = array('weights', weights, inputs)
         positive('weights', weights)
         leading(q0=q.shape[:-1], weights=weights.shape[:-1])
-        roots = np.sqrt(weights)
-    track: list[Array] = []
-    velocities: list[Array] = []
-    errors: list[Array] = []
-    for step in range(steps + 1):
-        x = robot.forward_kinematics(q)[..., :2]
-        desired = line.position(step / rate)
-        track.append(q)
-        errors.append(np.asarray(np.linalg.norm(desired - x, axis=-1)))
-        if step == steps:
-            break
+    W_half = root(weights)
+    track, velocities, errors = [q], [], []
+    for step in range(steps):
+        x, x_desired = robot.forward_kinematics(q)[..., :2], line.position(step / rate)
+        # The velocity that moves the target to its next sample, also when the line ends before it.
+        x_dot_desired = (line.position((step + 1) / rate) - x_desired) * rate
         J = robot.jacobian(q)
         factor: ArrayLike = 0.0
         if threshold is not None:
-            measured = J if weights is None else weighted(J, weights)[0]
-            factor = damping_factor(manipulability(measured), threshold, most)
-        q_dot_0 = None if secondary is None else _inputs(robot, secondary, q, inputs, roots)
-        # The velocity that moves the target to its next sample, also when the line ends before it.
-        moving = (line.position((step + 1) / rate) - desired) * rate
-        velocities.append(
-            resolved_rate(
-                *(J, x, desired, moving, gain, factor, q_dot_0),
-                max_correction=line.speed,
-                weights=weights,
-                max_velocity=max_velocity,
-            )
+            factor = damping_factor(manipulability(J / row(W_half)), threshold, most)
+        q_dot = resolved_rate(
+            *(J, x, x_desired, x_dot_desired, gain, factor),
+            None if secondary is None else _inputs(robot, secondary, q, inputs, W_half),
+            max_correction=line.speed,
+            weights=weights,
+            max_velocity=max_velocity,
         )
-        q = robot.integrate(q, velocities[-1], 1.0 / rate)
+        q = robot.integrate(q, q_dot, 1.0 / rate)
+        errors.append(np.linalg.norm(x_desired - x, axis=-1))
+        velocities.append(q_dot)
+        track.append(q)
+    x, x_desired = robot.forward_kinematics(q)[..., :2], line.position(steps / rate)
+    errors.append(np.linalg.norm(x_desired - x, axis=-1))
     shape = np.broadcast_shapes(track[0].shape, track[-1].shape)
     track[0] = np.broadcast_to(track[0], shape)
     return Tracking(
@@ -180,7 +175,7 @@ def _inputs(
     secondary: Callable[[Array], ArrayLike],
     q: Array,
     inputs: int,
-    roots: Array | None,
+    W_half: Array,
 ) -> Array:
     """Compute the secondary task's inputs, shape (..., inputs)."""
     task = array('result of secondary', secondary(q), 'n')
@@ -192,6 +187,5 @@ def _inputs(
     if to_configuration is None or task.shape[-1] != n:
         raise ValueError(f'result of secondary must have shape {allowed}, got {task.shape}')
     uphill = task[..., np.newaxis, :] @ array('configuration_jacobian', to_configuration(q), n, inputs)
-    found: Array = uphill[..., 0, :]
     # The smallest inputs in the weighted norm for this increase; also after the projection it increases.
-    return found if roots is None else found / (roots * roots)
+    return np.asarray(uphill[..., 0, :] / W_half**2)
