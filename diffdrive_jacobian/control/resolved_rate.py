@@ -23,7 +23,7 @@ from diffdrive_jacobian.kinematics.inverse_velocity import (
     limit_velocity,
     redundant,
 )
-from diffdrive_jacobian.kinematics.singular_values import column
+from diffdrive_jacobian.kinematics.singular_values import dot
 from diffdrive_jacobian.numerics.checks import (
     array,
     finite,
@@ -98,10 +98,10 @@ def _unlimited(
     weights: Vector = None,
 ) -> Array:
     """Compute `J^+ (x_dot_d + K (x_d - x))`, with the correction not longer than allowed."""
-    correction = column(gain) * (x_desired - x)
-    excess = np.linalg.norm(correction, axis=-1) / max_correction
+    correction = gain * (x_desired - x)
+    excess = np.sqrt(dot(correction, correction)) / max_correction
     finite('|K (x_d - x)|', excess)
-    x_dot = x_dot_desired + correction / column(np.maximum(excess, 1.0))
+    x_dot = x_dot_desired + correction / np.maximum(excess, 1.0)
     if q_dot_0 is None:
         return np.asarray(damped_least_squares.formula(J, x_dot, damping, weights))
     return np.asarray(redundant.formula(J, x_dot, q_dot_0, damping, weights))
@@ -158,7 +158,7 @@ class StraightLine:
             ValueError: t is not a single finite number.
         """
         t = number('t', t, finite)
-        duration = column(self._duration)
+        duration = self._duration[..., np.newaxis]
         elapsed = max(t, 0.0) / np.where(duration > 0.0, duration, 1.0)
         share = np.where(t < duration, elapsed, 1.0)
         return np.asarray(self.start + share * (self.end - self.start))

@@ -48,11 +48,9 @@ from diffdrive_jacobian.kinematics.singular_values import (
     EPS,
     FILTER,
     column,
-    damped_inverse,
-    projector,
     refuse_singular,
     root,
-    row,
+    svd,
     times,
 )
 from diffdrive_jacobian.kinematics.task_priority import prioritized
@@ -97,7 +95,7 @@ def adjugate_inverse(J: Any) -> Rows:
             rounding errors. The message contains its determinant.
         ValueError: J has another shape, or its determinant overflows.
     """
-    a, b, c, d = J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]
+    (a, b), (c, d) = J
     determinant = a * d - b * c
     # The condition number is |J|^2 / |det| (in the norm of Frobenius).
     square = a * a + b * b + c * c + d * d
@@ -127,7 +125,7 @@ def pseudoinverse(J: Any, weights: Vector = None) -> Array:
         ValueError: `J W^-1/2` or the pseudo-inverse overflows.
     """
     W_half = root(weights)
-    inverse = damped_inverse(J / row(W_half), damping=0.0)
+    inverse = svd(J / W_half).damped_inverse(damping=0.0)  # (J W^-1/2)^+
     return inverse / column(W_half)  # W^-1/2 (J W^-1/2)^+
 
 
@@ -165,7 +163,7 @@ def damped_least_squares(J: Any, x_dot: Vector, damping: Number, weights: Vector
         ValueError: `J W^-1/2` or a joint velocity overflows.
     """
     W_half = root(weights)
-    inverse = damped_inverse(J / row(W_half), damping)  # J^T (J J^T + lambda^2 I)^-1 of J W^-1/2
+    inverse = svd(J / W_half).damped_inverse(damping)  # J^T (J J^T + lambda^2 I)^-1 of J W^-1/2
     return times(inverse, x_dot) / W_half
 
 
@@ -188,8 +186,8 @@ def null_space_projector(J: Any, damping: Number = 0.0, weights: Vector = None) 
         ValueError: `J W^-1/2` or N overflows.
     """
     W_half = root(weights)
-    N = projector(J / row(W_half), damping)  # I - J^+ J of J W^-1/2
-    return N * row(W_half) / column(W_half)
+    N = svd(J / W_half).projector(damping)  # I - J^+ J of J W^-1/2
+    return N * W_half / column(W_half)
 
 
 @formula('(m,n),(m),(n),(),(n) -> (n)', damping=not_negative, weights=positive)
@@ -216,6 +214,7 @@ def redundant(
     Raises:
         ValueError: `J W^-1/2` or a joint velocity overflows.
     """
-    least = damped_least_squares.formula(J, x_dot, damping, weights)
-    N = null_space_projector.formula(J, damping, weights)
-    return np.asarray(least + times(N, q_dot_0))
+    W_half = root(weights)
+    J = svd(J / W_half)
+    q_dot = times(J.damped_inverse(damping), x_dot) + J.projected(W_half * q_dot_0, damping)
+    return q_dot / W_half

@@ -12,6 +12,7 @@ Source: document A, 3.2.3 and 3.2.5; document D, 3; doc/mathematics.md, "Manipul
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -39,9 +40,11 @@ def manipulability(J: Any) -> Array:
     Raises:
         ValueError: w overflows.
     """
-    m, n = J.shape[-2:]
-    _, s, _ = svd(J)
-    return np.asarray(s.prod(axis=-1) * (m <= n))
+    if len(J) == 2:
+        minors = [a * d - b * c for (a, c), (b, d) in combinations(zip(*J, strict=True), 2)]
+        return np.asarray(np.sqrt(sum(minor * minor for minor in minors)))
+    s = np.linalg.svd(np.moveaxis(J, (0, 1), (-2, -1)), compute_uv=False)
+    return np.asarray(s.prod(axis=-1) * (len(J) <= len(J[0])))
 
 
 def manipulability_gradient(jacobian: Callable[[Array], ArrayLike], q: ArrayLike) -> Array:

@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics.singular_values import EPS, column, damped_inverse, times, transposed
+from diffdrive_jacobian.kinematics.singular_values import EPS, svd, times
 from diffdrive_jacobian.numerics.checks import floats
+from diffdrive_jacobian.numerics.formula import entries_first
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -130,6 +131,16 @@ def norm(vectors: Floats) -> Floats:
     return np.asarray(np.sqrt(np.einsum('kn,kn->k', vectors, vectors)))
 
 
+def column(entries: Floats) -> Floats:
+    """Append an axis of length one."""
+    return np.asarray(entries)[..., np.newaxis]
+
+
+def transposed(matrices: Floats) -> Floats:
+    """Exchange rows and columns of matrices, shape (k, m, n)."""
+    return np.swapaxes(matrices, -1, -2)
+
+
 def _square(J: Floats) -> Floats:
     """Return `|J|^2` in the norm of Frobenius, shape (k,)."""
     return np.asarray(np.einsum('kmn,kmn->k', J, J))
@@ -192,7 +203,7 @@ class _Open(NamedTuple):
 
 def newton_step(J: Floats, e: Floats) -> Floats:
     """Return `J^+ e`, shape (k, n)."""
-    return times(damped_inverse(J), e)
+    return times(svd(entries_first(J, 2, 1)).damped_inverse(), e.T).T
 
 
 def transpose_step(gradient: Floats, alpha: Any) -> Floats:
@@ -202,7 +213,7 @@ def transpose_step(gradient: Floats, alpha: Any) -> Floats:
 
 def best_alpha(J: Floats, gradient: Floats) -> Floats:
     """Return with which alpha the error would be least if forward were linear, shape (k,)."""
-    return np.asarray((norm(gradient) / norm(times(J, gradient))) ** 2)
+    return np.asarray((norm(gradient) / norm(np.einsum('kmn,kn->km', J, gradient))) ** 2)
 
 
 def levenberg_marquardt_step(J: Floats, gradient: Floats, factor: Floats) -> Floats:
@@ -324,8 +335,8 @@ class Search:
         counts &= np.isfinite(bend).all(axis=(1, 2), keepdims=True)
         H = transposed(J) @ J - np.where(counts, 0.5 * (bend + transposed(bend)), 0.0)
         values, V = np.linalg.eigh(H)
-        along = times(transposed(V), gradient)
-        return times(V, along / (np.abs(values) + column(still.factor)))
+        along = np.einsum('kij,ki->kj', V, gradient) / (np.abs(values) + column(still.factor))
+        return np.asarray(np.einsum('kij,kj->ki', V, along))
 
     # --- What became of a step
 

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.kinematics.joint_limits import limit_velocity
-from diffdrive_jacobian.kinematics.singular_values import damped_inverse, projector, root, row
+from diffdrive_jacobian.kinematics.singular_values import norm, product, root, svd, times
 from diffdrive_jacobian.numerics.checks import array, finite, leading, not_negative, number, positive
-from diffdrive_jacobian.numerics.formula import Array
+from diffdrive_jacobian.numerics.formula import Array, entries_first, entries_last
 
 
 @np.errstate(all='ignore')
@@ -51,8 +51,8 @@ def prioritized(
     Args:
         tasks: `(J_k, x_k_dot)`, the most important first, shapes (..., m_k, n) and (..., m_k).
         damping: lambda for all tasks, zero or positive, in the units of the J_k, shape (...).
-        cutoff: Without damping, singular values of `J_k N` below this, relative to the norm of J_k,
-            count as zero: what a task demands there is dropped. Must be above rounding error.
+        cutoff: Without damping, singular values of `J_k N` below this, relative to the norm of J_k
+            (of Frobenius), count as zero: what a task demands there is dropped. Must be above rounding error.
         weights: Weights of the joints, positive, shape (..., n). None: all 1.
         max_velocity: Largest joint speeds, see `limit_velocity`. None: no limits.
 
@@ -73,22 +73,22 @@ def prioritized(
     if weights is not None:
         weights = array('weights', weights, n)
         positive('weights', weights)
-    W_half = root(weights)
     batch = leading(
         **{f'task {k} J': J.shape[:-2] for k, (J, _) in enumerate(pairs)},
         **{f'task {k} x_dot': x_dot.shape[:-1] for k, (_, x_dot) in enumerate(pairs)},
         damping=damping.shape,
-        weights=W_half.shape[:-1],
+        weights=() if weights is None else weights.shape[:-1],
     )
-    q_dot, N = np.zeros((*batch, n, 1)), np.eye(n)
-    for k, (J_k, x_dot) in enumerate(pairs):
-        J = J_k / row(W_half)
+    axes = len(batch)
+    damping, W_half = entries_first(damping, 0, axes), root(entries_first(weights, 1, axes))
+    q_dot, N = np.zeros((n, *batch)), np.eye(n).reshape(n, n, *[1] * axes)
+    for k, (J_k, x_k) in enumerate(pairs):
+        J, x_dot = entries_first(J_k, 2, axes) / W_half, entries_first(x_k, 1, axes)
         finite(f'J of task {k} and weights', J)
-        least = cutoff * np.linalg.norm(J, ord=2, axis=(-2, -1))
-        missing = x_dot[..., np.newaxis] - J @ q_dot
-        q_dot = q_dot + N @ damped_inverse(J @ N, damping, least) @ missing
-        N = N @ projector(J @ N, damping, least)
-    q_dot = q_dot[..., 0] / W_half
+        J_N, least = svd(product(J, N)), cutoff * norm(J)
+        q_dot += times(N, times(J_N.damped_inverse(damping, least), x_dot - times(J, q_dot)))
+        N = product(N, J_N.projector(damping, least))
+    q_dot = entries_last(q_dot / W_half, 1)
     finite('result of tasks, damping and weights', q_dot)
     return q_dot if max_velocity is None else limit_velocity(q_dot, max_velocity)
 

@@ -13,7 +13,8 @@ common. The leading axes of all arguments broadcast, and the results have them.
 The body is written for one robot, in components: a number is a float, a vector a list of floats. For a
 batch the same body is evaluated once, with an array of the shape of the batch in place of each float, so
 it uses the functions of `numerics.elementary`. Results are numbers, lists of numbers, or matrices as
-lists of rows. If an argument is a matrix, the body is given arrays with their leading axes instead.
+lists of rows. If an argument is a matrix, all arguments are arrays, with their entries first: vectors
+have the shape (n, ...), matrices (m, n, ...), and `(a, b), (c, d) = J`. Results may be such arrays, too.
 
 Bad arguments raise a ValueError that names the argument, and so does a result that overflows. The body
 without these checks is `formula` of the decorated function: it is for callers whose numbers are checked.
@@ -106,7 +107,12 @@ def formula(signature: str, **checks: Check) -> _Decorator:
             values = None if whole else _single(args, inputs, optional)
             if values is None:
                 values, batch = _several(args, inputs, names, tests, optional)
-                if not whole:
+                if whole:
+                    values = [
+                        entries_first(value, len(shape), len(batch))
+                        for value, shape in zip(values, inputs, strict=True)
+                    ]
+                else:
                     values = list(map(_components, values, inputs))
             else:
                 for index, name, check in restrictions:
@@ -191,6 +197,19 @@ def _components(value: Any, shape: Shape) -> Any:
     return list(np.moveaxis(value, -1, 0)) if shape else value
 
 
+def entries_first(value: Any, entries: int, batch: int) -> Any:
+    """Move the axes of the entries before those of the batch, which is given so many axes. None stays."""
+    if value is None:
+        return None
+    padded = value.reshape((1,) * (batch + entries - value.ndim) + value.shape)
+    return np.asarray(padded.transpose(*range(batch, padded.ndim), *range(batch)), order='C')
+
+
+def entries_last(value: Array, entries: int) -> Array:
+    """Move the axes of the entries behind those of the batch."""
+    return np.asarray(value.transpose(*range(entries, value.ndim), *range(entries)), order='C')
+
+
 def _packed(result: Any, core: Shape, batch: tuple[int, ...]) -> Any:
     """Return a float, or an array with the leading axes of the batch.
 
@@ -204,7 +223,7 @@ def _packed(result: Any, core: Shape, batch: tuple[int, ...]) -> Any:
     if not batch:
         packed = np.array(result, dtype=np.float64)
     elif isinstance(result, np.ndarray) and result.ndim == len(batch) + len(core):
-        packed = result
+        packed = entries_last(result, len(core))
     elif core:
         rows = result if len(core) == 2 else [result]
         packed = np.empty((*batch, len(rows), len(rows[0])))

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 from diffdrive_jacobian.control.resolved_rate import StraightLine, resolved_rate
 from diffdrive_jacobian.kinematics.inverse_velocity import damping as damping_factor
 from diffdrive_jacobian.kinematics.inverse_velocity import manipulability
-from diffdrive_jacobian.kinematics.singular_values import root, row
 from diffdrive_jacobian.numerics.checks import array, leading, not_negative, number, positive
 from diffdrive_jacobian.numerics.formula import Array
 
@@ -129,7 +128,7 @@ def track_line(
         weights = array('weights', weights, inputs)
         positive('weights', weights)
         leading(q0=q.shape[:-1], weights=weights.shape[:-1])
-    W_half = root(weights)
+    W_half = np.ones(inputs) if weights is None else np.sqrt(weights)
     track, velocities, errors = [q], [], []
     for step in range(steps):
         x, x_desired = robot.forward_kinematics(q)[..., :2], line.position(step / rate)
@@ -138,7 +137,7 @@ def track_line(
         J = robot.jacobian(q)
         factor: ArrayLike = 0.0
         if threshold is not None:
-            factor = damping_factor(manipulability(J / row(W_half)), threshold, most)
+            factor = damping_factor(manipulability(J / W_half[..., np.newaxis, :]), threshold, most)
         q_dot = resolved_rate(
             *(J, x, x_desired, x_dot_desired, gain, factor),
             None if secondary is None else _inputs(robot, secondary, q, inputs, W_half),
