@@ -27,7 +27,7 @@ def inner(first, second):
 
 @formula('(m,n),(n) -> (m)')
 def mapped(J, q_dot):
-    return (J @ q_dot[..., np.newaxis])[..., 0]
+    return np.einsum('mn...,n...->m...', J, q_dot)
 
 
 @formula('(),() -> (2,2)', weight=positive)
@@ -78,9 +78,22 @@ def test_a_letter_is_a_size_in_common():
         inner([1.0, 2.0, 3.0], [1.0, 1.0])
 
 
-def test_matrices_come_whole():
+@formula('(2,2),() -> (),(2,2)')
+def transposed(J, scale):
+    (a, b), (c, d) = J
+    return scale * (a * d - b * c), scale * np.array([[a, c], [b, d]])
+
+
+def test_beside_matrices_all_arguments_are_arrays_with_their_entries_first():
     J = np.arange(12.0).reshape(2, 2, 3)
     np.testing.assert_array_equal(mapped(J, [1.0, 0.0, 0.0]), J[..., 0])
+    np.testing.assert_array_equal(mapped(J[:, np.newaxis], np.eye(3)), J.swapaxes(-1, -2))
+    square, scale = J[..., :2], np.array([[1.0], [2.0], [3.0]])
+    determinant, swapped = transposed(square, scale)
+    np.testing.assert_allclose(determinant, scale * np.linalg.det(square))
+    np.testing.assert_array_equal(swapped, scale[..., np.newaxis, np.newaxis] * square.swapaxes(-1, -2))
+    assert swapped.shape == (3, 2, 2, 2)
+    assert swapped.flags.c_contiguous
     with pytest.raises(ValueError, match=r'^q_dot must have shape \(\.\.\., 3\)'):
         mapped(J, [1.0, 0.0])
 

@@ -69,7 +69,7 @@ def true_or_refused(call, expected, **close):
     return True
 
 
-SCALES = [10.0**power for power in (-305, -200, -160, -150, -100, 100, 150, 153, 155, 200, 300, 307)]
+SCALES = [10.0**power for power in (-140, -100, 100, 150, 153, 155, 200, 300, 307)]
 
 
 @pytest.mark.parametrize('scale', SCALES)
@@ -94,7 +94,17 @@ def test_jacobians_of_any_size_are_inverted_or_refused(rows, scale):
     ]
     for call, expected in calls:
         accepted = true_or_refused(call, expected, atol=1e-12)
-        assert accepted or not 1e-290 < scale < 1e153
+        assert accepted or scale > 1e152
+
+
+@pytest.mark.parametrize('scale', [1e-305, 1e-200, 1e-151])
+@pytest.mark.parametrize('rows', [1, 2, 3])
+def test_jacobians_whose_squares_underflow_count_as_zero(rows, scale):
+    J, x_dot, wish = scale * J3[:rows] / 10.0, np.ones(rows), np.array([1.0, -2.0, 0.5])
+    for damping in (0.0, 1e-3):
+        assert not iv.damped_least_squares(J, x_dot, damping).any()
+        np.testing.assert_array_equal(iv.redundant(J, x_dot, wish, damping), wish)
+    assert not iv.pseudoinverse(J).any()
 
 
 @pytest.mark.parametrize('batch', [(), (2,)])
@@ -109,15 +119,15 @@ def test_a_task_near_the_largest_number_is_refused(batch):
 
 def test_prioritized_raises_an_error_where_joint_velocities_overflow():
     with pytest.raises(ValueError, match='tasks, damping and weights must be finite'):
-        iv.prioritized([(1e-300 * J3[:1], [1e300])], max_velocity=1.0)
+        iv.prioritized([(1e-140 * J3[:1], [1e300])], max_velocity=1.0)
     with pytest.raises(ValueError, match='tasks, damping and weights must be finite'):
-        iv.prioritized([([[1e-150]], [1e200])], weights=[1e-300])
+        iv.prioritized([([[1e-290]], [1e200])], weights=[1e-300])
 
 
 def test_weights_whose_results_overflow():
     for call in (
-        lambda: iv.pseudoinverse([[1e-310]], weights=[1e-20]),
-        lambda: iv.damped_least_squares([[1e-150]], [1e200], 0.0, weights=[1e-300]),
+        lambda: iv.pseudoinverse([[1e-310]], weights=[5e-324]),
+        lambda: iv.damped_least_squares([[1e-290]], [1e200], 0.0, weights=[1e-300]),
         lambda: iv.redundant(J3[:2], [1.0, 1.0], [HUGE, 0.0, 0.0], weights=[1e10, 1.0, 1.0]),
     ):
         with pytest.raises(ValueError, match='weights must give a finite result, but it overflows'):
@@ -192,13 +202,13 @@ def test_a_correction_that_overflows_is_refused():
 
 
 def test_resolved_rate_raises_an_error_where_a_velocity_overflows():
-    for J, x, x_desired in (
-        (np.eye(2), [-HUGE, 0.0], [HUGE, 0.0]),
-        (np.eye(2) * 1e-300, [0.0, 0.0], [1e100, 0.0]),
+    for J, x, x_desired, x_dot in (
+        (np.eye(2), [-HUGE, 0.0], [HUGE, 0.0], [0.0, 0.0]),
+        (np.eye(2) * 1e-140, [0.0, 0.0], [1.0, 0.0], [1e200, 0.0]),
     ):
         for most in (None, 1.0):
             with pytest.raises(ValueError, match='must give a finite result, but it overflows'):
-                resolved_rate(J, x, x_desired, [0.0, 0.0], 1.0, max_velocity=most)
+                resolved_rate(J, x, x_desired, x_dot, 1.0, max_velocity=most)
 
 
 @pytest.mark.parametrize('line', [None, 'line', 1.0])

@@ -86,7 +86,7 @@ def svd(J: Array) -> SingularValues:
         ValueError: The squares of the entries overflow.
     """
     # LAPACK may not terminate with infinite entries.
-    finite('|J|', norm(J))
+    finite('|J|^2', 2.0 * norm(J) ** 2)
     if len(J) == 2:
         return _of_two_rows(J)
     U, s, V_transposed = np.linalg.svd(entries_last(J, 2), full_matrices=False)

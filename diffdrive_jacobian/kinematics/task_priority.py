@@ -84,7 +84,7 @@ def prioritized(
     q_dot, N = np.zeros((n, *batch)), np.eye(n).reshape(n, n, *[1] * axes)
     for k, (J_k, x_k) in enumerate(pairs):
         J, x_dot = entries_first(J_k, 2, axes) / W_half, entries_first(x_k, 1, axes)
-        finite(f'J of task {k} and weights', J)
+        finite(f'J of task {k} and weights', norm(J))
         J_N, least = svd(product(J, N)), cutoff * norm(J)
         q_dot += times(N, times(J_N.damped_inverse(damping, least), x_dot - times(J, q_dot)))
         N = product(N, J_N.projector(damping, least))
