@@ -150,3 +150,18 @@ def test_arguments_are_left_as_they_are():
     found[...] = 7.0
     assert (point == 1.0).all()
     assert hypot(3.0, 4.0) == 5.0
+
+
+@formula('(),() -> ()', scale=positive)
+def scaled(x, *, scale=None):
+    return x if scale is None else scale * x
+
+
+def test_arguments_may_be_by_name_alone():
+    assert scaled(2.0) == 2.0
+    assert scaled(2.0, scale=3.0) == scaled(scale=3.0, x=2.0) == scaled.formula(2.0, scale=3.0) == 6.0
+    np.testing.assert_array_equal(scaled([1.0, 2.0], scale=[[1.0], [2.0]]), [[1.0, 2.0], [2.0, 4.0]])
+    with pytest.raises(TypeError, match='positional'):
+        scaled(2.0, 3.0)
+    with pytest.raises(ValueError, match='scale must be positive'):
+        scaled(2.0, scale=-1.0)

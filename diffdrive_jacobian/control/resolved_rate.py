@@ -103,8 +103,8 @@ def _unlimited(
     finite('|K (x_d - x)|', excess)
     x_dot = x_dot_desired + correction / np.maximum(excess, 1.0)
     if q_dot_0 is None:
-        return np.asarray(damped_least_squares.formula(J, x_dot, damping, weights))
-    return np.asarray(redundant.formula(J, x_dot, q_dot_0, damping, weights))
+        return np.asarray(damped_least_squares.formula(J, x_dot, damping, weights=weights))
+    return np.asarray(redundant.formula(J, x_dot, q_dot_0, damping, weights=weights))
 
 
 @dataclass(frozen=True, eq=False)

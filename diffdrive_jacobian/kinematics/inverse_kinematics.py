@@ -15,8 +15,8 @@ that makes up for it in one direction shortens the step in all of them.
 A search ends unsuccessfully where to first order no joint lowers the error: at the nearest reachable
 point, in a local minimum, or at a singular start, such as a stretched arm with the target on its own
 line. It is then restarted from random joints. Thousands of targets are solved at once, each with an
-outcome of its own, which does not depend on the others. A target that is not reached is a result, not an
-exception. Units are those of forward and q. q may contain rad and m.
+outcome of its own, which but for rounding does not depend on the others. A target that is not reached is
+a result, not an exception. Units are those of forward and q. q may contain rad and m.
 
 Source: document C, "Inverse kinematics" (its update lost the minus of `r_goal - r_i`); document D, 6.
 How lambda is lowered: H. B. Nielsen, *Damping Parameter in Marquardt's Method*, IMM-REP-1999-05. Why the
@@ -35,7 +35,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics.search import Difference, Floats, Function, Search, Task
 from diffdrive_jacobian.numerics.checks import array, floats, leading, not_negative, number, positive
-from diffdrive_jacobian.numerics.elementary import agree, components, vector, wrapped
+from diffdrive_jacobian.numerics.elementary import wrap
+from diffdrive_jacobian.numerics.formula import Entries, Vector, formula
 
 METHODS = ('newton', 'transpose', 'levenberg_marquardt')
 
@@ -60,7 +61,8 @@ class IKResult(NamedTuple):
     start: NDArray[np.int64]
 
 
-def pose_difference(target: ArrayLike, pose: ArrayLike) -> Floats:
+@formula('(3),(3) -> (3)')
+def pose_difference(target: Vector, pose: Vector) -> Entries:
     """Return the error of planar poses, for `solve(..., difference=pose_difference)`.
 
     Args:
@@ -73,10 +75,9 @@ def pose_difference(target: ArrayLike, pose: ArrayLike) -> Floats:
     Raises:
         ValueError: A shape is wrong, or an entry is infinite or NaN.
     """
-    x, y, heading = components('target', target, 3)
-    x_is, y_is, heading_is = components('pose', pose, 3)
-    agree(target=heading, pose=heading_is)
-    return vector(x - x_is, y - y_is, wrapped(heading - heading_is))
+    x, y, heading = target
+    x_is, y_is, heading_is = pose
+    return [x - x_is, y - y_is, wrap(heading - heading_is)]
 
 
 def solve(
@@ -185,7 +186,7 @@ def solve(
     with np.errstate(all='ignore'):
         found = search.run(np.broadcast_to(q0, (*batch, n)).reshape(-1, n), int(max_iterations))
         converged = found.error <= search.tolerance
-    fields = (found.q, converged, found.iterations, found.error, found.restarts, found.start)
+    fields = (found.q.T, converged, found.iterations, found.error, found.restarts, found.start)
     # [()] converts the result of a single target to a scalar.
     return IKResult._make(values.reshape((*batch, *values.shape[1:]))[()] for values in fields)
 

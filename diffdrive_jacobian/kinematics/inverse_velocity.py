@@ -28,14 +28,12 @@ Maciejewski, C. A. Klein, "Numerical filtering for the operation of robotic mani
 kinematically singular configurations", 1988. Weights: D. E. Whitney, "Resolved motion rate control of
 manipulators and human prostheses", 1969; B. Siciliano et al., *Robotics: Modelling, Planning and
 Control*, 2009, 3.5.1. Without damping a singular value counts as zero if it is below
-`CUTOFF max(m, n)` times the largest one.
+`CUTOFF max(m, n)` times the largest one. One below 1e-150 always does, because its square has no digits.
 """
 
 from __future__ import annotations
 
 from typing import Any
-
-import numpy as np
 
 from diffdrive_jacobian.kinematics.joint_limits import (
     joint_limit_cost,
@@ -108,7 +106,7 @@ def adjugate_inverse(J: Any) -> Rows:
 
 
 @formula('(m,n),(n) -> (n,m)', weights=positive)
-def pseudoinverse(J: Any, weights: Vector = None) -> Array:
+def pseudoinverse(J: Any, *, weights: Vector = None) -> Array:
     """Return the Moore-Penrose pseudo-inverse J^+ (A, C), or the weighted one.
 
     Where J is singular, `J^+ x_dot` minimises `|x_dot - J q_dot|`. Where it is redundant, `|q_dot|`, or
@@ -145,7 +143,7 @@ def damping(manipulability: Number, threshold: Number, maximum: Number) -> Numbe
 
 
 @formula('(m,n),(m),(),(n) -> (n)', damping=not_negative, weights=positive)
-def damped_least_squares(J: Any, x_dot: Vector, damping: Number, weights: Vector = None) -> Array:
+def damped_least_squares(J: Any, x_dot: Vector, damping: Number, *, weights: Vector = None) -> Array:
     """Return bounded joint velocities: `J^T (J J^T + lambda^2 I)^-1 x_dot` (A).
 
     `|q_dot| <= |x_dot| / (2 lambda)` for every J. With lambda = 0 this is `J^+ x_dot`.
@@ -168,7 +166,7 @@ def damped_least_squares(J: Any, x_dot: Vector, damping: Number, weights: Vector
 
 
 @formula('(m,n),(),(n) -> (n,n)', damping=not_negative, weights=positive)
-def null_space_projector(J: Any, damping: Number = 0.0, weights: Vector = None) -> Array:
+def null_space_projector(J: Any, damping: Number = 0.0, *, weights: Vector = None) -> Array:
     """Return the projector to joint velocities that do not move the task: `N = I - J^+ J` (A, C).
 
     Without damping `J N = 0` and `N N = N`, its rank n less the rank of J. With damping N is continuous
@@ -192,7 +190,7 @@ def null_space_projector(J: Any, damping: Number = 0.0, weights: Vector = None) 
 
 @formula('(m,n),(m),(n),(),(n) -> (n)', damping=not_negative, weights=positive)
 def redundant(
-    J: Any, x_dot: Vector, q_dot_0: Vector, damping: Number = 0.0, weights: Vector = None
+    J: Any, x_dot: Vector, q_dot_0: Vector, damping: Number = 0.0, *, weights: Vector = None
 ) -> Array:
     """Do a task, and come near to secondary joint velocities: `J^+ x_dot + N q_dot_0` (A, C).
 
@@ -215,6 +213,6 @@ def redundant(
         ValueError: `J W^-1/2` or a joint velocity overflows.
     """
     W_half = root(weights)
-    J = svd(J / W_half)
-    q_dot = times(J.damped_inverse(damping), x_dot) + J.projected(W_half * q_dot_0, damping)
-    return q_dot / W_half
+    values = svd(J / W_half)
+    q_dot = times(values.damped_inverse(damping), x_dot)  # J^T (J J^T + lambda^2 I)^-1 x_dot
+    return (q_dot + values.projected(W_half * q_dot_0, damping)) / W_half  # + N q_dot_0

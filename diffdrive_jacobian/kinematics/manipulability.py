@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diffdrive_jacobian.kinematics.singular_values import svd
 from diffdrive_jacobian.numerics.checks import array
 from diffdrive_jacobian.numerics.formula import Array, formula
 

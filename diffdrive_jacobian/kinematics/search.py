@@ -4,7 +4,8 @@ Each target is a row of `Outcome`, and of `_Open` while it is searched for. All 
 each iteration forward is called once, for a step of every open row or the start of its next search. Rows
 do not influence each other: all use the same restart points. Errors and Jacobians are `sqrt(M) e` and
 `sqrt(M) J`, without the entries of weight zero, so that `J^T J` and `J^T e` are the documents' `J^T M J`
-and `J^T M e`.
+and `J^T M e`. Entries come first: with k targets q has the shape (n, k), e (m, k) and J (m, n, k). The
+caller's functions have them last.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics.singular_values import EPS, svd, times
+from diffdrive_jacobian.kinematics.singular_values import EPS, column, dot, outer, svd, times
 from diffdrive_jacobian.numerics.checks import floats
 from diffdrive_jacobian.numerics.formula import entries_first
 
@@ -68,7 +69,10 @@ class Task:
     limits: tuple[Floats, Floats] | None
 
     def errors(self, q: Floats, which: Integers) -> tuple[Floats, Floats]:
-        """Return the errors and their norms, NaN where forward is not finite."""
+        """Return the errors, shape (m, k), of joints of shape (k, n), and their norms.
+
+        NaN where forward is not finite.
+        """
         target = self.targets[which]
         e = np.full_like(target, np.nan)
         if len(q):
@@ -82,7 +86,7 @@ class Task:
         return e, norm(e)
 
     def derivatives(self, q: Floats) -> Floats:
-        """Return the Jacobians of joints of shape (k, n), by differences if the caller gave none."""
+        """Return the Jacobians, shape (m, n, k), of joints of shape (k, n)."""
         shape = (len(q), len(self.rows), q.shape[-1])
         if self.jacobian is None:
             return self._weighted(self._central_differences(q, shape))
@@ -104,7 +108,8 @@ class Task:
         """Return `sqrt(M) e` or `sqrt(M) J`, a copy, as the caller may use its memory again."""
         if not self.rows.all():
             values = values[:, self.rows]
-        return np.asarray(values * self.roots.reshape(-1, *[1] * (values.ndim - 2)))
+        roots = self.roots.reshape(-1, *[1] * (values.ndim - 1))
+        return np.asarray(entries_first(values, values.ndim - 1, 1) * roots)
 
     def _differences(self, target: Floats, reached: Floats, q: Floats) -> Floats:
         return _returned('difference', self.difference(target, reached), reached.shape, q)
@@ -121,29 +126,19 @@ class Task:
         if good.any():
             up, down = (reached[good, side].reshape(-1, m) for side in (0, 1))
             change = self._differences(up, down, around[: len(up)]).reshape(-1, n, m)
-            J[good] = transposed(_quotient(change, column(width[good])))
+            J[good] = np.swapaxes(_quotient(change, width[good][..., np.newaxis]), 1, 2)
         return J
 
 
 def norm(vectors: Floats) -> Floats:
-    """Return the lengths of vectors, shape (k, n)."""
+    """Return the lengths of vectors, shape (n, k)."""
     # Several times as fast as numpy.linalg.norm with an axis.
-    return np.asarray(np.sqrt(np.einsum('kn,kn->k', vectors, vectors)))
-
-
-def column(entries: Floats) -> Floats:
-    """Append an axis of length one."""
-    return np.asarray(entries)[..., np.newaxis]
-
-
-def transposed(matrices: Floats) -> Floats:
-    """Exchange rows and columns of matrices, shape (k, m, n)."""
-    return np.swapaxes(matrices, -1, -2)
+    return np.asarray(np.sqrt(dot(vectors, vectors)))
 
 
 def _square(J: Floats) -> Floats:
     """Return `|J|^2` in the norm of Frobenius, shape (k,)."""
-    return np.asarray(np.einsum('kmn,kmn->k', J, J))
+    return np.asarray(np.einsum('mnk,mnk->k', J, J))
 
 
 def _quotient(change: Floats, width: Floats) -> Floats:
@@ -163,7 +158,7 @@ def _returned(name: str, value: Any, shape: tuple[int, ...], q: Floats) -> Float
 
 @dataclass
 class Outcome:
-    """Best result for each target, and the state of its search. Shapes (k,), q (k, n)."""
+    """Best result for each target, and the state of its search. Shapes (k,), q (n, k)."""
 
     q: Floats
     error: Floats
@@ -183,7 +178,7 @@ class Outcome:
     @classmethod
     def of(cls, q: Floats, error: Floats) -> Outcome:
         """Return the state before the first step."""
-        return cls(q.copy(), error.copy(), error.copy(), *np.zeros((6, len(q)), dtype=np.int64))
+        return cls(q.copy(), error.copy(), error.copy(), *np.zeros((6, len(error)), dtype=np.int64))
 
 
 class _Open(NamedTuple):
@@ -198,30 +193,25 @@ class _Open(NamedTuple):
     """Lambda, or the share of the step that would be best if forward were linear."""
 
     def keep(self, rows: Flags) -> _Open:
-        return self if rows.all() else _Open._make(values[rows] for values in self)
+        return self if rows.all() else _Open._make(values[..., rows] for values in self)
 
 
 def newton_step(J: Floats, e: Floats) -> Floats:
-    """Return `J^+ e`, shape (k, n)."""
-    return times(svd(entries_first(J, 2, 1)).damped_inverse(), e.T).T
-
-
-def transpose_step(gradient: Floats, alpha: Any) -> Floats:
-    """Return `alpha J^T M e`, shape (k, n), with alpha of shape (k,) or ()."""
-    return np.asarray(column(alpha) * gradient)
+    """Return `J^+ e`, shape (n, k)."""
+    return times(svd(J).damped_inverse(), e)
 
 
 def best_alpha(J: Floats, gradient: Floats) -> Floats:
     """Return with which alpha the error would be least if forward were linear, shape (k,)."""
-    return np.asarray((norm(gradient) / norm(np.einsum('kmn,kn->km', J, gradient))) ** 2)
+    return np.asarray((norm(gradient) / norm(times(J, gradient))) ** 2)
 
 
 def levenberg_marquardt_step(J: Floats, gradient: Floats, factor: Floats) -> Floats:
-    """Return `(J^T M J + lambda I)^-1 J^T M e`, shape (k, n), with lambda of shape (k,)."""
-    H = transposed(J) @ J
-    diagonal = np.einsum('kii->ki', H)  # a view
-    diagonal += column(factor) + REGULAR * diagonal
-    return np.asarray(np.linalg.solve(H, column(gradient))[..., 0])
+    """Return `(J^T M J + lambda I)^-1 J^T M e`, shape (n, k), with lambda of shape (k,)."""
+    H = outer(J, J)
+    diagonal = np.einsum('iik->ik', H)  # a view
+    diagonal += factor + REGULAR * diagonal
+    return np.asarray(np.linalg.solve(H.transpose(2, 0, 1), gradient.T[..., np.newaxis])[..., 0].T)
 
 
 @dataclass
@@ -242,8 +232,10 @@ class Search:
         """Search from q, shape (k, n), and from restart points, in max_iterations steps per target."""
         q, which = self.task.within_limits(q), np.arange(len(q))
         e, error = self.task.errors(q, which)
+        q = entries_first(q, 1, 1)
         found = Outcome.of(q, error)
-        J, factor = np.zeros((*e.shape, self.joints)), np.full(len(q), self._first_factor)
+        J = np.zeros((len(e), self.joints, len(which)))
+        factor = np.full(len(which), self._first_factor)
         still = _Open(which, q, e, error, J, factor)
         still = still.keep(np.isfinite(error) & (error > self.tolerance))
         ended = np.zeros(len(still.which), dtype=np.bool_)
@@ -255,7 +247,8 @@ class Search:
             if ended.any():
                 again = ended & self._may_restart(still, ended, found)
                 kept = again | ~ended
-                still, J, gradient, again = still.keep(kept), J[kept], gradient[kept], again[kept]
+                still, again = still.keep(kept), again[kept]
+                J, gradient = J[..., kept], gradient[..., kept]
             if not len(still.which):
                 break
             tried = self._tried(still, found, J, gradient, again)
@@ -264,24 +257,24 @@ class Search:
 
     def _free(self, still: _Open) -> tuple[Floats, Floats]:
         """Return J and `J^T M e`, zero for joints at a limit that would have to go beyond it."""
-        gradient = np.einsum('kmn,km->kn', still.J, still.e)
+        gradient = np.einsum('mnk,mk->nk', still.J, still.e)
         if self.task.limits is None:
             return still.J, gradient
-        lower, upper = self.task.limits
+        lower, upper = map(column, self.task.limits)
         blocked = ((still.q <= lower) & (gradient < 0.0)) | ((still.q >= upper) & (gradient > 0.0))
-        return np.where(blocked[:, np.newaxis], 0.0, still.J), np.where(blocked, 0.0, gradient)
+        return np.where(blocked, 0.0, still.J), np.where(blocked, 0.0, gradient)
 
     def _movable(self, still: _Open, J: Floats, gradient: Floats) -> Flags:
         """Return which targets have a joint that lowers the error to first order."""
         # Joint by joint, so that their units do not matter.
-        most = np.sqrt(np.einsum('kmn,kmn->kn', J, J)) * column(still.error)
-        movable = (np.abs(gradient) > STATIONARY[self.method] * most).any(axis=-1)
+        most = np.sqrt(np.einsum('mnk,mnk->nk', J, J)) * still.error
+        movable = (np.abs(gradient) > STATIONARY[self.method] * most).any(axis=0)
         return np.asarray(movable & np.isfinite(_square(J)))
 
     def _differentiate(self, still: _Open, where: Flags) -> None:
         """Write the Jacobians of these rows."""
         if where.any():
-            still.J[where] = self.task.derivatives(still.q[where])
+            still.J[..., where] = self.task.derivatives(still.q[:, where].T)
 
     # --- Steps
 
@@ -295,48 +288,49 @@ class Search:
         return {'newton': 0.0, 'transpose': RELAXED, 'levenberg_marquardt': self.damping}[self.method]
 
     def _tried(self, still: _Open, found: Outcome, J: Floats, gradient: Floats, again: Flags) -> Floats:
-        """Return joints a step further, or where the next search begins, shape (k, n)."""
-        tried = self.task.within_limits(still.q + self._step(still, found, J, gradient))
+        """Return joints a step further, or where the next search begins, shape (n, k)."""
+        tried = still.q + self._step(still, found, J, gradient)
+        tried = self.task.within_limits(tried.T).T
         # A step that overflows is not taken.
-        tried = np.where(np.isfinite(tried).all(axis=-1, keepdims=True), tried, still.q)
+        tried = np.where(np.isfinite(tried).all(axis=0), tried, still.q)
         if again.any():
-            tried[again] = self._restart(still, found, again)
+            tried[:, again] = self._restart(still, found, again)
         return tried
 
     def _step(self, still: _Open, found: Outcome, J: Floats, gradient: Floats) -> Floats:
-        """Return the step of the method, shape (k, n)."""
+        """Return the step of the method, shape (n, k)."""
         if self.method == 'newton':
             return newton_step(J, still.e)
         if self.method == 'transpose':
             alpha = still.factor * best_alpha(J, gradient) if self.alpha is None else self.alpha
-            return transpose_step(gradient, alpha)
+            return alpha * gradient
         step = levenberg_marquardt_step(J, gradient, still.factor)
         late = found.iterations[still.which] - found.began[still.which] >= SECOND_ORDER_AFTER
         if late.any():
-            step[late] = self._second_order_step(still._replace(J=J).keep(late), gradient[late])
+            step[:, late] = self._second_order_step(still._replace(J=J).keep(late), gradient[:, late])
         return step
 
     def _second_order_step(self, still: _Open, gradient: Floats) -> Floats:
-        """Return `(|H| + lambda I)^-1 J^T M e`, with the second derivatives of forward, shape (k, n).
+        """Return `(|H| + lambda I)^-1 J^T M e`, with the second derivatives of forward, shape (n, k).
 
         `H = J^T M J - sum (M e)_i d^2 forward_i / dq^2`. Its eigenvalues are made positive, so that the
         step is a descent direction. The error of J^T M J alone exceeds its smallest eigenvalues where J
         is nearly singular. A lambda that compensates for it would shorten the step in all directions,
         and hundreds of steps would be needed.
         """
-        J = still.J
-        around, width = self.task.around(still.q, SECOND_DIFFERENCE)
-        nearby = self.task.derivatives(around.reshape(-1, self.joints))
-        nearby = nearby.reshape(len(J), 2, self.joints, *J.shape[1:])
-        bend = np.einsum('klmn,km->kln', nearby[:, 0] - nearby[:, 1], still.e)
-        bend = _quotient(bend, column(width))
-        free = (J != 0.0).any(axis=1)
+        J, (m, n, k) = still.J, still.J.shape
+        around, width = self.task.around(still.q.T, SECOND_DIFFERENCE)
+        nearby = self.task.derivatives(around.reshape(-1, n)).reshape(m, n, k, 2, n)
+        bend = np.einsum('mnkl,mk->kln', nearby[..., 0, :] - nearby[..., 1, :], still.e)
+        bend = _quotient(bend, width[..., np.newaxis])
+        free = (J != 0.0).any(axis=0).T
         counts = free[:, :, np.newaxis] & free[:, np.newaxis]
         counts &= np.isfinite(bend).all(axis=(1, 2), keepdims=True)
-        H = transposed(J) @ J - np.where(counts, 0.5 * (bend + transposed(bend)), 0.0)
+        H = outer(J, J).transpose(2, 0, 1)
+        H = H - np.where(counts, 0.5 * (bend + np.swapaxes(bend, 1, 2)), 0.0)
         values, V = np.linalg.eigh(H)
-        along = np.einsum('kij,ki->kj', V, gradient) / (np.abs(values) + column(still.factor))
-        return np.asarray(np.einsum('kij,kj->ki', V, along))
+        along = np.einsum('kij,ik->jk', V, gradient) / (np.abs(values.T) + still.factor)
+        return np.asarray(np.einsum('kij,jk->ik', V, along))
 
     # --- What became of a step
 
@@ -344,10 +338,10 @@ class Search:
         self, still: _Open, found: Outcome, gradient: Floats, again: Flags, tried: Floats
     ) -> tuple[_Open, Flags]:
         """Take steps or reject them. Return the open rows, and whose search ended."""
-        e, error = self.task.errors(tried, still.which)
+        e, error = self.task.errors(tried.T, still.which)
         by = tried - still.q
         change = (error - still.error) * (error + still.error)
-        slope, length = np.einsum('kn,kn->k', by, gradient), norm(by)
+        slope, length = dot(by, gradient), norm(by)
         finite, rounding = np.isfinite(error), ROUNDING * still.error**2
         taken = finite & (change < -rounding) if self._descends else finite
         ended = length <= np.maximum(EPS * norm(still.q), self.step_tolerance)
@@ -361,8 +355,8 @@ class Search:
             factor = self._stretched(still, slope, change, taken)
         taken, ended = taken | (again & finite), ended & ~again
         still = still._replace(
-            q=np.where(column(taken), tried, still.q),
-            e=np.where(column(taken), e, still.e),
+            q=np.where(taken, tried, still.q),
+            e=np.where(taken, e, still.e),
             error=np.where(taken, error, still.error),
             factor=np.where(again, self._first_factor, factor),
         )
@@ -398,7 +392,7 @@ class Search:
         bound = np.where(other & (still.error > self.tolerance), (1.0 - SAME) * bound, bound)
         best = still.error < bound
         which = still.which[best]
-        found.q[which], found.error[which] = still.q[best], still.error[best]
+        found.q[:, which], found.error[which] = still.q[:, best], still.error[best]
         found.start[which] = found.restarts[which]
         found.lowered[which] = found.iterations[which]
 
@@ -421,13 +415,13 @@ class Search:
 
     def _restart(self, still: _Open, found: Outcome, again: Flags) -> Floats:
         """Return where the next search of these rows begins."""
-        which, q = still.which[again], still.q[again]
-        starts = self._starts[found.restarts[which]]
-        moved = column(found.iterations[which] > found.began[which])
+        which, q = still.which[again], still.q[:, again]
+        starts = self._starts[found.restarts[which]].T
+        moved = found.iterations[which] > found.began[which]
         found.restarts[which] += 1
         found.began[which] = found.lowered[which] = found.iterations[which] + 1
         # A small offset from a singular start is enough, and solutions near q0 are preferred.
-        return np.where(moved, starts, q + NUDGE * (starts - q))
+        return np.asarray(np.where(moved, starts, q + NUDGE * (starts - q)))
 
     @cached_property
     def _starts(self) -> Floats:

@@ -58,7 +58,7 @@ class SingularValues(NamedTuple):
         Returns:
             `I - sum_i f_i v_i v_i^T` with `f_i = min(s_i / (FILTER lambda), 1)`, shape (n, n, ...).
         """
-        N = -outer(column(self._removed(damping, least)) * self.v, self.v)
+        N: Array = -outer(column(self._removed(damping, least)) * self.v, self.v)
         N[np.diag_indices(len(N))] += 1.0
         return N
 
@@ -70,13 +70,13 @@ class SingularValues(NamedTuple):
     def _removed(self, damping: Any, least: Any) -> Array:
         """Return the f_i, shape (k, ...)."""
         filtered = np.minimum(self.s / damping / FILTER, 1.0)
-        return np.where(np.asarray(damping) > 0.0, filtered, self._counts(damping, least))
+        return np.where(np.greater(damping, 0.0), filtered, self._counts(damping, least))
 
     def _counts(self, damping: Any, least: Any) -> Any:
         """Return which singular values do not count as zero."""
         if least is None:
             least = CUTOFF * max(len(self.u[0]), len(self.v[0])) * self.s.max(axis=0)
-        return self.s > np.where(np.asarray(damping) > 0.0, TINY, np.maximum(least, TINY))
+        return self.s > np.maximum(least * np.equal(damping, 0.0), TINY)
 
 
 def svd(J: Array) -> SingularValues:
@@ -86,7 +86,7 @@ def svd(J: Array) -> SingularValues:
         ValueError: The squares of the entries overflow.
     """
     # LAPACK may not terminate with infinite entries.
-    finite('|J|^2', 2.0 * norm(J) ** 2)
+    finite('|J|^2', 2.0 * np.einsum('ij...,ij...->...', J, J))
     if len(J) == 2:
         return _of_two_rows(J)
     U, s, V_transposed = np.linalg.svd(entries_last(J, 2), full_matrices=False)
@@ -103,18 +103,19 @@ def _of_two_rows(J: Array) -> SingularValues:
 
     Many times as fast as LAPACK.
     """
-    first = _rotation(*J)
+    first = _rotation(J)
     J = product(first, J)
     # Removes the rounding of the first one, which matters where one row is much shorter.
-    second = _rotation(*J)
+    second = _rotation(J)
     u, rows = product(second, first), product(second, J)
     s = np.sqrt(np.einsum('ij...,ij...->i...', rows, rows))
     return SingularValues(u, s, rows / column(np.maximum(s, TINY)))
 
 
-def _rotation(a: Array, b: Array) -> Array:
-    """Return the rotation of rows a and b by at most 45 deg that makes them orthogonal."""
-    difference, twice = dot(a, a) - dot(b, b), 2.0 * dot(a, b)
+def _rotation(J: Array) -> Array:
+    """Return the rotation by at most 45 deg that makes two rows orthogonal."""
+    (a, b), (_, c) = np.einsum('in...,jn...->ij...', J, J)  # J J^T
+    difference, twice = a - c, 2.0 * b
     tangent = twice / (difference + np.copysign(np.hypot(difference, twice) + TINY**2, difference))
     c = 1.0 / np.sqrt(1.0 + tangent * tangent)
     s = c * tangent

@@ -51,8 +51,9 @@ def prioritized(
     Args:
         tasks: `(J_k, x_k_dot)`, the most important first, shapes (..., m_k, n) and (..., m_k).
         damping: lambda for all tasks, zero or positive, in the units of the J_k, shape (...).
-        cutoff: Without damping, singular values of `J_k N` below this, relative to the norm of J_k
-            (of Frobenius), count as zero: what a task demands there is dropped. Must be above rounding error.
+        cutoff: Without damping, singular values of `J_k N` below this, relative to the norm of
+            J_k (of Frobenius), count as zero: what a task demands there is dropped. Must be above
+            rounding error.
         weights: Weights of the joints, positive, shape (..., n). None: all 1.
         max_velocity: Largest joint speeds, see `limit_velocity`. None: no limits.
 

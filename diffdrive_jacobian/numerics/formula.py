@@ -88,21 +88,29 @@ def formula(signature: str, **checks: Check) -> _Decorator:
         names = tuple(described.parameters)
         optional = tuple(described.parameters[name].default is None for name in names)
         tests = [checks.get(name, finite) for name in names]
+        kinds = [parameter.kind for parameter in described.parameters.values()]
+        positional = len(names) - kinds.count(inspect.Parameter.KEYWORD_ONLY)
         restrictions = [
             (index, name, checks[name]) for index, name in enumerate(names) if name in checks
         ]
         given = f'{", ".join(names[:-1])} and {names[-1]}' if names[1:] else names[0]
 
+        def evaluated(values: list[Any]) -> Any:
+            if positional == len(names):
+                return body(*values)
+            by_name = zip(names[positional:], values[positional:], strict=True)
+            return body(*values[:positional], **dict(by_name))
+
         @functools.wraps(body)
         def checked(*args: Any, **kwargs: Any) -> Any:
             missing = optional[len(args) :]
-            if missing and not kwargs and all(missing):
+            if not kwargs and all(missing) and len(args) <= positional:
                 # `bind` takes longer than most equations.
                 args += (None,) * len(missing)
-            if kwargs or len(args) != len(names):
+            else:
                 bound = described.bind(*args, **kwargs)
                 bound.apply_defaults()
-                args = bound.args
+                args = tuple(bound.arguments.values())
             batch: tuple[int, ...] = ()
             values = None if whole else _single(args, inputs, optional)
             if values is None:
@@ -121,9 +129,9 @@ def formula(signature: str, **checks: Check) -> _Decorator:
             try:
                 if batch or whole:
                     with np.errstate(all='ignore'):
-                        results = body(*values)
+                        results = evaluated(values)
                 else:
-                    results = body(*values)
+                    results = evaluated(values)
                 if several:
                     return tuple([_packed(*one, batch) for one in zip(results, outputs, strict=True)])
                 return _packed(results, outputs[0], batch)
@@ -198,7 +206,7 @@ def _components(value: Any, shape: Shape) -> Any:
 
 
 def entries_first(value: Any, entries: int, batch: int) -> Any:
-    """Move the axes of the entries before those of the batch, which is given so many axes. None stays."""
+    """Move the axes of entries before those of the batch, which is given so many axes. None stays."""
     if value is None:
         return None
     padded = value.reshape((1,) * (batch + entries - value.ndim) + value.shape)
