@@ -84,6 +84,10 @@ def finite(name: str, value: Any) -> None:
         raise ValueError(f'{name} must be finite, got {_first(value, inside)}')
 
 
+def anything(name: str, value: Any) -> None:
+    """Require nothing: the value was checked before, and may be infinite."""
+
+
 def floats(name: str, value: Any) -> NDArray[np.float64]:
     """Convert a value to a float array.
 

@@ -19,6 +19,7 @@ checked one by one, which converts them or raises an error that names the argume
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from operator import mul
@@ -230,14 +231,14 @@ def sqrt(x: Any) -> Any:
     return math.sqrt(x) if type(x) is float else np.sqrt(x)
 
 
-def maximum(x: Any, y: Any) -> Any:
-    """The larger one."""
-    return max(x, y) if type(x) is type(y) is float else np.maximum(x, y)
+def maximum(*values: Any) -> Any:
+    """The largest one."""
+    return max(values) if _are_floats(values) else functools.reduce(np.maximum, values)
 
 
-def minimum(x: Any, y: Any) -> Any:
-    """The smaller one."""
-    return min(x, y) if type(x) is type(y) is float else np.minimum(x, y)
+def minimum(*values: Any) -> Any:
+    """The smallest one."""
+    return min(values) if _are_floats(values) else functools.reduce(np.minimum, values)
 
 
 def where(condition: Any, x: Any, y: Any) -> Any:

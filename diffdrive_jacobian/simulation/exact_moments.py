@@ -27,10 +27,8 @@ from diffdrive_jacobian.simulation._noise_moments import (
     RADIUS,
     SHORT_NOISE,
     SHORT_TURN,
-    SMALL_TURN,
     NoiseMoments,
     central,
-    closed_form,
     series,
     short_arc,
 )
@@ -184,15 +182,8 @@ def _noise(alpha: float, turn: float, nu: float, beta: float, m: float) -> Noise
     """Compute the moments of the noise of one arc; None: there is no noise."""
     if not m:
         return None
-    if abs(turn) >= SMALL_TURN:
-        return closed_form(alpha, turn, nu, beta, m)
-    argument, halvings = 2.0 * abs(turn) + 4.0 * m, 0
-    if argument <= RADIUS:
-        return series(alpha, turn, nu, beta, m)
-    # A long and nearly straight arc: a short one, doubled again and again.
-    halvings = math.frexp(argument / RADIUS)[1]
-    share = 2.0**-halvings
-    alpha, turn, nu, beta, m = alpha * share, turn * share, nu * share, beta * share, m * share
+    halvings = max(0, math.frexp((2.0 * abs(turn) + 4.0 * m) / RADIUS)[1])
+    alpha, turn, nu, beta, m = (part * 2.0**-halvings for part in (alpha, turn, nu, beta, m))
     noise = series(alpha, turn, nu, beta, m)
     for _ in range(halvings):
         first = _extended(tuple(SURE), -2.0 * turn, alpha, turn, m, noise)

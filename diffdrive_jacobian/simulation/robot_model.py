@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
-from diffdrive_jacobian.kinematics.saturation import VelocityLimits, saturate
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits, scaled_to_limits
 from diffdrive_jacobian.numerics.checks import instance, nanoseconds, not_negative, number, positive
 from diffdrive_jacobian.numerics.elementary import components
 from diffdrive_jacobian.simulation.actuators import Actuators, Speeds
@@ -68,9 +68,11 @@ class RobotModel:
         Raises:
             ValueError: It has another shape or is not finite.
         """
-        v, omega = saturate(
-            *pair('command', command), self.limits, max(self.radii), self.wheel_separation
-        )
+        v, omega = pair('command', command)
+        if self.limits.unlimited:
+            return v, omega
+        radius = max(self.radii)
+        v, omega = scaled_to_limits.formula(v, omega, *self.limits.all(), radius, self.wheel_separation)
         if self.limits.max_wheel_speed < math.inf:
             # The smaller wheel may still be too fast.
             fastest = max(map(abs, self.wheel_speeds(v, omega)))
