@@ -15,7 +15,6 @@ import numpy as np
 from diffdrive_jacobian.numerics.checks import (
     anything,
     equal,
-    finite,
     floats,
     hashable,
     instance,
@@ -79,7 +78,7 @@ class VelocityLimits:
     @property
     def unlimited(self) -> bool:
         """Whether no limit is set."""
-        return self.all() == (-np.inf, np.inf, -np.inf, np.inf, np.inf)
+        return self.alike and self.all() == (-np.inf, np.inf, -np.inf, np.inf, np.inf)
 
     @property
     def alike(self) -> bool:
@@ -126,8 +125,8 @@ def saturate(
         r = L = 1.0
     elif r is None or L is None:
         raise ValueError('limits have a max_wheel_speed, so r and L must be given')
-    limited: tuple[Any, Any] = scaled_to_limits(v, omega, *limits.all(), r, L)
-    return limited
+    min_v, max_v, min_omega, max_omega, max_wheel_speed = limits.all()
+    return scaled_to_limits(v, omega, min_v, max_v, min_omega, max_omega, max_wheel_speed, r, L)
 
 
 @formula(
@@ -155,7 +154,8 @@ def scaled_to_limits(
     v_excess = v / where(v_limit == 0.0, 1.0, v_limit)
     omega_excess = omega / where(omega_limit == 0.0, 1.0, omega_limit)
     excess = maximum(1.0, v_excess, omega_excess, fastest_wheel(v, omega, r, L) / max_wheel_speed)
-    finite('excess of v and omega over the limits', excess)
+    if not np.isfinite(excess).all():
+        raise ValueError('v, omega, the limits, r and L must give finite speeds, but they overflow')
     v, omega = v / excess, omega / excess
 
     # The quotients round. A limit is never exceeded, not by the last bit either.

@@ -189,6 +189,16 @@ def vector(*entries: Any) -> NDArray[np.float64]:
     return matrix(1, len(entries), *entries)[..., 0, :]
 
 
+def from_rows(rows: Sequence[Sequence[Any]]) -> NDArray[np.float64]:
+    """Return matrices, shape (..., m, n), from rows of entries that broadcast."""
+    shape = np.broadcast_shapes(*[np.shape(entry) for row in rows for entry in row])
+    matrices = np.empty((*shape, len(rows), len(rows[0])))
+    for i, row in enumerate(rows):
+        for j, entry in enumerate(row):
+            matrices[..., i, j] = entry
+    return matrices
+
+
 def sin(x: Any) -> Any:
     """Sine (rad)."""
     return math.sin(x) if type(x) is float else np.sin(x)
