@@ -29,7 +29,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._arc import arc_end
 from diffdrive_jacobian.kinematics.se2 import compose
 from diffdrive_jacobian.numerics.checks import (
     MAX_NANOSECONDS,
@@ -42,6 +41,7 @@ from diffdrive_jacobian.numerics.checks import (
 )
 from diffdrive_jacobian.simulation._uncertainty import Uncertainty
 from diffdrive_jacobian.simulation.actuators import Settling, Speeds
+from diffdrive_jacobian.simulation.arc import arc_end
 from diffdrive_jacobian.simulation.exact_moments import Moments, gaussian
 from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose, twist_covariance
 from diffdrive_jacobian.simulation.robot_model import RobotModel as RobotModel
