@@ -70,7 +70,8 @@ class SingularValues(NamedTuple):
     def _removed(self, damping: Any, least: Any) -> Array:
         """Return the f_i, shape (k, ...)."""
         filtered = np.minimum(self.s / damping / FILTER, 1.0)
-        return np.where(np.greater(damping, 0.0), filtered, self._counts(damping, least))
+        counts = self._counts(damping, least)
+        return np.asarray(np.where(np.greater(damping, 0.0), filtered, counts))
 
     def _counts(self, damping: Any, least: Any) -> Any:
         """Return which singular values do not count as zero."""

@@ -54,7 +54,7 @@ class Call(NamedTuple):
     def check(self) -> None:
         """Refuse to compare speeds of ways to different results."""
         ours, other = self.ours(), self.by_hand()
-        tolerance = 1e-5 if self.name in (SOLVER, 'secondary_tasks.manipulability_gradient') else 1e-9
+        tolerance = 1e-5 if self.name in (SOLVER, 'manipulability.manipulability_gradient') else 1e-9
         for mine, theirs in zip(_parts(ours), _parts(other), strict=True):
             if not np.allclose(mine, theirs, rtol=tolerance, atol=tolerance):
                 raise RuntimeError(f'{self.name}: different results, {ours} and {other}')
@@ -197,7 +197,7 @@ def calls() -> list[Call]:
             lambda: np.linalg.pinv(WIDE) @ X_DOT,
         ),
         Call(
-            'secondary_tasks.manipulability_gradient',
+            'manipulability.manipulability_gradient',
             partial(iv.manipulability_gradient, ARM.jacobian, Q),
             lambda: by_hand.gradient(
                 lambda q: by_hand.manipulability(by_hand.two_links(ARM.lengths, q)), Q
