@@ -117,7 +117,7 @@ OTHERS = {
 CALLS = FUNCTIONS | OTHERS
 ELSEWHERE = {
     *('resolved_rate', 'track_line'),
-    *('Boundary', 'Controller', 'ControllerError', 'Controllers', 'LawError', 'ReferenceGains'),
+    *('Boundary', 'Controller', 'ControllerError', 'Controllers', 'Gain', 'LawError'),
     *('controller_names', 'find_controller'),
 }
 """Tested in test_resolved_rate and test_own_controllers."""

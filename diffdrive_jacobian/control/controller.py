@@ -72,6 +72,8 @@ class Gain:
     """Smallest and largest value."""
     above: float | None = None
     """Lower bound that is itself not allowed, instead of the smallest value."""
+    label: str = ''
+    """Label on the page; default: the name."""
     usual: tuple[float, float] = (math.nan, math.nan)
     """Range of the slider and of sweeps; default: from a tenth to three times the default value."""
 
@@ -82,7 +84,7 @@ class Gain:
                 'name of a gain must be a lower-case letter, then lower-case letters, digits or _, at '
                 f'most 32, got {short(repr(self.name))}'
             )
-        for name in ('unit', 'description'):
+        for name in ('unit', 'description', 'label'):
             instance(name, getattr(self, name), str)
         low, high = numbers('bounds', self.bounds, 2)
         object.__setattr__(self, 'bounds', (low, high))
@@ -113,6 +115,7 @@ KP = Gain(
     description='Gain on the heading error; should be larger than kv',
     bounds=(0.0, LARGEST_GAIN),
     above=0.0,
+    label='Kp',
     usual=(0.2, 6.0),
 )
 KV = Gain(
@@ -121,6 +124,7 @@ KV = Gain(
     description='Gain on the distance',
     bounds=(0.0, LARGEST_GAIN),
     above=0.0,
+    label='Kv',
     usual=(0.1, 3.0),
 )
 OFFSET = Gain(
@@ -128,6 +132,7 @@ OFFSET = Gain(
     default=0.1,
     unit='m',
     description='X coordinate in the body frame of the point that offset_point drives; not 0',
+    label='Offset d',
     usual=(0.02, 0.4),
 )
 

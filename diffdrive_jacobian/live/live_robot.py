@@ -14,6 +14,7 @@ from nav_msgs.msg import Goals
 from numpy.typing import NDArray
 from rclpy.node import Node
 
+from diffdrive_jacobian.control import Gain
 from diffdrive_jacobian.live import settings
 from diffdrive_jacobian.live.commands import (
     CancelGoal,
@@ -213,7 +214,7 @@ class LiveRobot:
 
     def _set(self, command: SetParameter) -> None:
         try:
-            setting = settings.find(command.parameter)
+            setting = settings.find(command.parameter, self._gains())
             value = setting.checked(command.value)
         except settings.SettingError as error:
             self._warn(str(error))
@@ -291,7 +292,13 @@ class LiveRobot:
 
     def settings(self) -> list[dict[str, Any]]:
         """Return the settings for the page."""
-        return settings.shown({role: link.values for role, link in self.links.items()})
+        values = {role: link.values for role, link in self.links.items()}
+        return settings.shown(values, self._gains())
+
+    def _gains(self) -> tuple[Gain, ...]:
+        """Return the gains of the controller that is chosen."""
+        link = self.links.get('controller')
+        return settings.gains(str(link.values.get('controller', ''))) if link else ()
 
     def destroy(self) -> None:
         """Destroy all entities."""

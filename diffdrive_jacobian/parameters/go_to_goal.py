@@ -90,7 +90,7 @@ class GoToGoalParameters(LimitParameters):
             ParameterError: The controller cannot be loaded, or a gain has the name of another parameter.
         """
         name = values.get('controller', default_of(cls, 'controller'))
-        if name in BUILT_IN or not isinstance(name, str):
+        if name not in cls.controllers or name in BUILT_IN:
             return cls
         controller = _found(cls.controllers, name)
         new = [gain for gain in controller.gains if cls.declared_gains.get(gain.name) != gain]
