@@ -525,10 +525,11 @@ def test_the_example_is_installed(site):
 
 
 def test_every_field_is_described():
-    table = PAGE.read_text().split('## Fields')[1]
-    assert re.findall(r'^\| `(\w+)`', table, re.MULTILINE) == [
-        field.name for field in fields(control.Controller)
-    ]
+    tables = PAGE.read_text().split('## Fields')[1].split('A `Gain` has')
+    for table, described in zip(tables, (control.Controller, control.Gain), strict=True):
+        assert re.findall(r'^\| `(\w+)`', table, re.MULTILINE) == [
+            field.name for field in fields(described)
+        ]
 
 
 # --- The object

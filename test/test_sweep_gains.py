@@ -543,9 +543,7 @@ def test_a_setup_checks_itself():
             Setup(**changes)
     with pytest.raises(ValueError, match='controller must be one of go_to_goal, offset_point, pose'):
         Setup(controller='other')
-    with pytest.raises(
-        ValueError, match="gains must be of kv, offset, those of 'offset_point'"
-    ):
+    with pytest.raises(ValueError, match="gains must be of kv, offset, those of 'offset_point'"):
         Setup(controller='offset_point', gains={'kp': 1.0})
 
 

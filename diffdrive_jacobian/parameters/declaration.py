@@ -231,8 +231,11 @@ def changed(parameters: P, changes: Iterable[Change]) -> P:
         ParameterError: The new values are invalid.
     """
     values = {change.name: change.value for change in changes}
+    before = ros_values(parameters)
+    return from_ros(type(parameters), before | values) if before.keys() & values.keys() else parameters
+
+
+def ros_values(parameters: NodeParameters) -> dict[str, Any]:
+    """Return the values of parameters by their ROS names."""
     known = specifications(type(parameters))
-    if not known.keys() & values.keys():
-        return parameters
-    before = {name: getattr(parameters, field) for name, (field, _) in known.items()}
-    return from_ros(type(parameters), before | values)
+    return {name: getattr(parameters, field) for name, (field, _) in known.items()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar
 
@@ -23,6 +22,7 @@ from diffdrive_jacobian.parameters.declaration import (
     changed,
     default_of,
     from_ros,
+    ros_values,
     specifications,
 )
 from diffdrive_jacobian.ros.rclpy_internals import (
@@ -83,13 +83,11 @@ def declare_new(node: Node, before: P, after: P) -> P:
     """
     new = specifications(type(after)).keys() - specifications(type(before)).keys()
     overrides = parameter_overrides(node)
-    given = {name: overrides[name].value for name in new if name in overrides}
-    known = specifications(type(after))
-    values = {known[name][0]: as_declared(type(after), name, value) for name, value in given.items()}
-    try:
-        after = dataclasses.replace(after, **values)
-    except ParameterError as error:
-        node.get_logger().warning(f'{error}; the default is used')
+    for name in sorted(new & overrides.keys()):
+        try:
+            after = from_ros(type(after), ros_values(after) | {name: overrides[name].value})
+        except ParameterError as error:
+            node.get_logger().warning(f'{error}; the default is used')
     _declare(node, after, new)
     return after
 
