@@ -357,8 +357,8 @@ def public_page() -> str:
         'What a program may import, with the first sentence of its docstring. Each name is in the',
         '`__all__` of its package, from which it is imported. Type checkers refuse others. Everything',
         'else may change without notice. Public are also the nodes, `nodes.virtual_robot.VirtualRobot`,',
-        '`nodes.go_to_goal.GoToGoal` and `nodes.wheel_bridge.WheelBridge`, and the decorator of equations,',
-        '`numerics.formula.formula` ([design](design.md)).',
+        '`nodes.go_to_goal.GoToGoal` and `nodes.wheel_bridge.WheelBridge`, and the decorator of',
+        'equations, `numerics.formula.formula` ([design](design.md)).',
         '',
         'Written by `python test/pages.py public`.',
     ]
