@@ -117,8 +117,15 @@ def _values(record: bytes) -> list[Any]:
     return values
 
 
-def read_sqlite(file: BinaryIO, note: Note) -> Iterator[Found]:
-    """Read an SQLite file of rosbag2, including rows that were not committed, in their order."""
+def read_sqlite(file: BinaryIO, note: Note, doubt: Note) -> Iterator[Found]:
+    """Read an SQLite file of rosbag2, including rows that were not committed, in their order.
+
+    Args:
+        file: The file.
+        note: Is called with a description of each loss.
+        doubt: Is called with what cannot be checked.
+    """
+    doubt('SQLite has no checksums, so altered messages cannot be noticed')
     pages = _Pages(file)
     if not pages.valid:
         note(f'its {pages.bytes} bytes are not the start of an SQLite database')
