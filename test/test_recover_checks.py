@@ -70,15 +70,13 @@ def test_written_checksums(ours):
 
 
 def test_the_mcap_library_accepts_the_checksums(ours):
-    stream_reader = pytest.importorskip('mcap.stream_reader')
+    reader = pytest.importorskip('mcap.stream_reader').StreamReader
     with open(ours / 'run.mcap', 'rb') as file:
-        names = [
-            type(one).__name__ for one in stream_reader.StreamReader(file, validate_crcs=True).records
-        ]
+        names = [type(one).__name__ for one in reader(file, validate_crcs=True).records]
     assert names.count('Message') == 60
     edit(ours / 'run.mcap', lambda data: data.__setitem__(len(data) // 2, data[len(data) // 2] ^ 1))
     with open(ours / 'run.mcap', 'rb') as file, pytest.raises(Exception, match='crc'):
-        list(stream_reader.StreamReader(file, validate_crcs=True).records)
+        list(reader(file, validate_crcs=True).records)
 
 
 # --- What is checked

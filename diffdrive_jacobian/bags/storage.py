@@ -35,7 +35,7 @@ _BLOCK = 1 << 20
 
 
 class CheckedMcapWriter(McapWriter):
-    """rosbags' writer, with checksums of each chunk, the data section and the summary (mcap.dev/spec)."""
+    """rosbags' writer, with checksums of chunks, data section and summary (mcap.dev/spec)."""
 
     def close_chunk(self) -> None:
         """Write the pending chunk."""

@@ -71,9 +71,8 @@ def report(recovery: Recovery) -> str:
     if recovery.damaged:
         lines.append(f'damaged: {recovery.damaged}')
     lost = _listed([*recovery.lost, *recovery.lost_before], 'lost: ')
-    unchecked = _listed(
-        recovery.unchecked, 'more may be lost: ' if lost else 'loss cannot be excluded: '
-    )
+    further = 'further ' if lost else ''
+    unchecked = _listed(recovery.unchecked, f'{further}loss cannot be excluded: ')
     lines += [*lost, *unchecked] or ['no loss was found']
     lines += _listed(recovery.undecodable, 'saved as recorded: ')
     return '\n'.join(lines)
