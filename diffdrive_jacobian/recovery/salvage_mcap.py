@@ -104,6 +104,7 @@ class _Check:
         self._counts: dict[int, int] | None = None
         self._topics: dict[int, Topic] = {}
         self._unchecked = False
+        self._behind = 0
         self._in_data, self._data_is_right = True, False
         self._at_end: list[tuple[str, int, int, int]] = []
 
@@ -111,6 +112,7 @@ class _Check:
         """Count what was found; `checked`: in a chunk with a checksum."""
         if isinstance(found, Message):
             self._found[found.channel] += 1
+            self._behind += not self._in_data
         elif isinstance(found, Topic) and self._topics.setdefault(found.id, found) != found:
             self._note(f'the topic {found.id} is described in different ways')
         self._unchecked |= self._in_data and not checked and not isinstance(found, str)
@@ -139,6 +141,8 @@ class _Check:
             if checksum and not right:
                 self._note(f'the checksum of its {what} is wrong')
             self._data_is_right |= right and what == 'data section'
+        if self._behind:
+            self._note(f'{self._behind} of its messages are behind its data section')
         found, counts = self._found, self._counts
         if counts is not None and any(counts.get(one, 0) != found[one] for one in {*counts, *found}):
             self._note(
