@@ -127,15 +127,20 @@ class DamagedBag:
             self.unchecked.append(
                 'there is no valid metadata.yaml, so files that are missing cannot be noticed'
             )
-        expected = [('messages', metadata.get('message_count'), self._seen.total())]
-        expected += [
-            (f'messages on {printable(topic)}', count, self._seen[topic])
-            for topic, count in _counts_by_topic(metadata).items()
-        ]
-        for what, count, found in expected:
-            if isinstance(count, int) and count != found:
-                difference = f'{source} counts {count} {what}, {found} were found'
-                (self.lost if count > found else self.unchecked).append(difference)
+        seen, counts = self._seen, _counts_by_topic(metadata)
+        count = metadata.get('message_count')
+        pairs = [(count, seen.total())] if isinstance(count, int) else []
+        pairs += [(number, seen[topic]) for topic, number in counts.items()]
+        if any(number != found for number, found in pairs):
+            topics = ', '.join(
+                f'{printable(topic)} {seen[topic]} of {number}'
+                for topic, number in counts.items()
+                if number != seen[topic]
+            )
+            difference = f'{source} counts {count} messages, {seen.total()} were found'
+            difference += f' ({topics})' if topics else ''
+            fewer = any(number > found for number, found in pairs)
+            (self.lost if fewer else self.unchecked).append(difference)
 
     def _missing_file(self, name: str) -> str:
         """Describe a file that metadata.yaml lists and that cannot be read."""
