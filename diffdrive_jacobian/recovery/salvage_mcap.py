@@ -104,17 +104,18 @@ class _Check:
         self._counts: dict[int, int] | None = None
         self._topics: dict[int, Topic] = {}
         self._unchecked = False
-        self._behind = 0
+        self._behind = self._differing = 0
         self._in_data, self._data_is_right = True, False
-        self._at_end: list[tuple[str, int, int, int]] = []
+        # Only the last of each kind counts, so that each part of the file is read once.
+        self._checksums: dict[str, tuple[int, int, int]] = {}
 
     def add(self, found: Found, checked: bool) -> None:
         """Count what was found; `checked`: in a chunk with a checksum."""
         if isinstance(found, Message):
             self._found[found.channel] += 1
             self._behind += not self._in_data
-        elif isinstance(found, Topic) and self._topics.setdefault(found.id, found) != found:
-            self._note(f'the topic {found.id} is described in different ways')
+        elif isinstance(found, Topic):
+            self._differing += self._topics.setdefault(found.id, found) != found
         self._unchecked |= self._in_data and not checked and not isinstance(found, str)
 
     def add_record(self, opcode: int, payload: bytes, end: int) -> None:
@@ -129,18 +130,20 @@ class _Check:
                 self._counts[channel] = counts.number(8)
         elif opcode == _DATA_END:
             self._in_data = False
-            self._at_end.append(('data section', 0, start, cursor.number(4)))
+            self._checksums['data section'] = 0, start, cursor.number(4)
         elif opcode == _FOOTER:
             summary, _, checksum = (cursor.number(length) for length in (8, 8, 4))
-            self._at_end.append(('summary', summary or start, end - 4, checksum))
+            self._checksums['summary'] = summary or start, end - 4, checksum
 
     def finish(self) -> None:
         """Report what differs, and what cannot be checked."""
-        for what, start, end, checksum in self._at_end:
+        for what, (start, end, checksum) in self._checksums.items():
             right = checksum != 0 and file_checksum(self._file, start, end) == checksum
             if checksum and not right:
                 self._note(f'the checksum of its {what} is wrong')
             self._data_is_right |= right and what == 'data section'
+        if self._differing:
+            self._note(f'{self._differing} descriptions of topics differ from earlier ones')
         if self._behind:
             self._note(f'{self._behind} of its messages are behind its data section')
         found, counts = self._found, self._counts
