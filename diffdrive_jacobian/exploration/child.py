@@ -17,6 +17,8 @@ import threading
 from contextlib import suppress
 from typing import IO, Any
 
+from diffdrive_jacobian.text import error_text
+
 serving = False
 """Whether this is a process that runs worlds."""
 LENGTH = struct.Struct('>Q')
@@ -217,7 +219,7 @@ def _picklable(error: Exception) -> Exception:
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:
-        return RuntimeError(f'{type(error).__name__}: {error}')
+        return RuntimeError(f'{type(error).__name__}: {error_text(error)}')
     return error
 
 

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from diffdrive_jacobian.testing.artifacts import artifact_name, name_beside_the_file
+from diffdrive_jacobian.text import error_text
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.lockstep import Lockstep
@@ -183,7 +184,8 @@ def _or_error(describe: Callable[[], str]) -> str:
     except BaseException as error:
         # Also of pytest.fail and pytest.skip, which a timeout of a plugin may raise here.
         complete = type(error).__name__ == 'RecordingError'
-        return str(error) if complete else f'not available: {error!r}'
+        text = error_text(error)
+        return text if complete else f'not available: {type(error).__name__}: {text}'
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
