@@ -71,6 +71,66 @@ def test_invalid_use_is_refused(lockstep):
         world.add(Blinker())
 
 
+class Threaded(Node):
+    """Publishes in threads of its own, also while its callback waits for one."""
+
+    def __init__(self):
+        super().__init__('threaded', start_parameter_services=False)
+        self.publisher = self.create_publisher(Vector3, 'spectrum', 10)
+        self.client = self.create_client(Empty, 'erase')
+        self.create_subscription(Twist, 'twist', lambda _: self.in_thread(self.publish), 10)
+
+    def publish(self):
+        self.publisher.publish(Vector3())
+
+    def call(self):
+        self.client.call_async(Empty.Request())
+
+    def in_thread(self, function):
+        thread = threading.Thread(target=function, name='worker')
+        thread.start()
+        thread.join()
+
+
+def test_what_a_node_sends_from_a_thread_of_its_own_is_an_error(lockstep):
+    node = Threaded()
+    # Before it is known whose thread it was.
+    node.in_thread(node.publish)
+    publishes = "node /threaded publishes /spectrum from a thread of its own ('worker')"
+    with pytest.raises(LockstepError, match=re.escape(publishes)):
+        lockstep.add(node)
+    lockstep.run_for(0.1)
+    for use in (
+        lambda: lockstep.last('spectrum'),
+        lambda: lockstep.run_for(0.1),
+        lambda: lockstep.step(0.1),
+        lambda: lockstep.finish(),
+    ):
+        node.in_thread(node.publish)
+        with pytest.raises(LockstepError, match=re.escape(publishes)):
+            use()
+    node.in_thread(node.call)
+    with pytest.raises(LockstepError, match='node /threaded calls or answers /erase from a thread of'):
+        lockstep.run_for(0.1)
+    with pytest.raises(LockstepError, match=re.escape(publishes)):
+        lockstep.publish('twist', Twist())
+    lockstep.run_for(0.1)
+    node.publish()
+    lockstep.settle()
+    assert lockstep.last('spectrum') == Vector3()
+
+
+def test_threads_of_others_do_not_matter(lockstep):
+    with Context() as context:
+        stranger = Node('stranger', context=context)
+        publisher = stranger.create_publisher(Vector3, 'spectrum', 10)
+        thread = threading.Thread(target=publisher.publish, args=(Vector3(),))
+        thread.start()
+        thread.join()
+        lockstep.run_for(0.1)
+        stranger.destroy_node()
+
+
 def test_nodes_that_cannot_be_added_are_refused(lockstep):
     blinker = lockstep.add(Blinker())
     with pytest.raises(LockstepError, match='node /blinker was already added'):

@@ -88,10 +88,11 @@ class QuiescentExecutor:
 
     def _noting(self, send: Callable[..., Any]) -> Callable[..., Any]:
         """Return a method that sends a request or a response, and takes its place among the messages."""
-        pending = self.deliveries.pending
+        pending, note_thread = self.deliveries.pending, self.deliveries.note_thread
 
-        def sent(*args: Any, **kwargs: Any) -> Any:
-            result = send(*args, **kwargs)
+        def sent(entity: Any, *args: Any, **kwargs: Any) -> Any:
+            note_thread(entity)
+            result = send(entity, *args, **kwargs)
             pending.append(None)
             return result
 

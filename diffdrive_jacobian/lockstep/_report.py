@@ -91,9 +91,11 @@ class Traffic:
         traffic, records, now, numbers = self, self._records, self._now, self._numbers
         self._deliveries = deliveries
         extend, observers_of = deliveries.pending.extend, self.observers_of
+        note_thread = deliveries.note_thread
 
         def counting(publish: Callable[..., None]) -> Callable[..., None]:
             def counted(self: Publisher, msg: Any) -> None:
+                note_thread(self)
                 if (intercept := traffic.intercept) is not None and intercept(self, msg):
                     return
                 publish(self, msg)

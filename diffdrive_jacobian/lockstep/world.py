@@ -46,9 +46,10 @@ class Lockstep(Requirements, Processes):
             controller = world.add(MyController())
             world.run_for(2.0)
 
-    An exception in a callback is raised by the method that executed it. Nodes must not publish from
-    threads of their own, because the end of their work cannot be detected. Timers on another clock than
-    that of the node run on wall time. Only for the main thread, and on systems with POSIX signals.
+    An exception in a callback is raised by the method that executed it. If a node publishes from a
+    thread of its own, the next method raises an error, because the end of that work cannot be detected.
+    Timers on another clock than that of the node run on wall time. Only for the main thread, and on
+    systems with POSIX signals.
     """
 
     _open: ClassVar[Lockstep | None] = None
@@ -216,6 +217,7 @@ class Lockstep(Requirements, Processes):
             raise LockstepError('this Lockstep is closed')
         if threading.get_ident() != self._thread:
             raise LockstepError('Lockstep must be created and used in the main thread')
+        self._check_threads()
 
     def _on_registered(self, node: Node) -> None:
         self._check_sim_time(node)
