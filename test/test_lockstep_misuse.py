@@ -9,9 +9,11 @@ import pytest
 import rclpy
 from geometry_msgs.msg import Twist, Vector3
 from rclpy.context import Context
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.task import Future
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Empty, Trigger
@@ -69,6 +71,46 @@ def test_invalid_use_is_refused(lockstep):
     assert failures == ['Lockstep must be created and used in the main thread']
     with Lockstep() as world:
         world.add(Blinker())
+
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def test_a_message_that_does_not_reach_a_latched_subscription_is_an_error(lockstep):
+    """Alone, and beside one that it reaches."""
+    planner, heard = lockstep.add(Node('planner')), []
+    planner.create_subscription(Vector3, 'map', heard.append, LATCHED)
+    words = (
+        r'/map is subscribed to by /planner with .* reliable, transient local, .*'
+        r'reliable, volatile, .* reach it: publish\(..., latched=True\)'
+    )
+    for _ in range(2):
+        with pytest.raises(LockstepError, match=words):
+            lockstep.publish('map', Vector3())
+    beside = lockstep.listen(Vector3, 'map')
+    with pytest.raises(LockstepError, match=words):
+        lockstep.publish('map', Vector3())
+    lockstep.publish('map', Vector3(x=1.0), latched=True)
+    assert heard == beside == [Vector3(x=1.0)]
+
+
+def test_a_quality_of_service_without_a_remedy_is_named(lockstep):
+    planner = lockstep.add(Node('planner'))
+    often = QoSProfile(depth=1, deadline=Duration(seconds=0.1))
+    planner.create_subscription(Vector3, 'map', print, often)
+    for latched in (False, True):
+        with pytest.raises(LockstepError, match=r'/map is subscribed to by /planner .* not reach it\n'):
+            lockstep.publish('map', Vector3(), latched=latched)
+
+
+def test_a_latched_message_waits_for_its_subscriptions(lockstep):
+    for number in range(3):
+        lockstep.publish('map', Vector3(x=float(number)), latched=True)
+    planner, heard = Node('planner'), []
+    planner.create_subscription(Vector3, 'map', heard.append, LATCHED)
+    lockstep.add(planner)
+    assert heard == [Vector3(x=2.0)]
+    assert len(lockstep.listen(Vector3, 'map', latched=True)) == 3
 
 
 class Threaded(Node):

@@ -94,9 +94,8 @@ class Deliveries:
         return reader
 
     def note_thread(self, entity: Any) -> None:
-        """Note that a publisher, client or service was used, if another thread has done so."""
-        if threading.get_ident() != self.thread:
-            self.elsewhere[entity] = threading.current_thread().name
+        """Note that this thread, another one, uses a publisher, client or service."""
+        self.elsewhere[entity] = threading.current_thread().name
 
     def replace(self, nodes: Iterable[Node]) -> None:
         """Create the readers of all present subscriptions again, by `new_reader`."""

@@ -78,6 +78,7 @@ class Requirements(Disturbed):
                 that no node has had, or a fault met nothing. A name may be misspelt.
         """
         self._check_open()
+        self._check_threads()
         if self._watches or self._expected:
             # Not otherwise: a test may have passed because a callback raises what it expects.
             self.settle()

@@ -246,7 +246,8 @@ class SimulatedTime:
         self._guard.arm()
         try:
             yield
-            self._check_threads()
+            if self._executor.deliveries.elsewhere:
+                self._check_threads()
         except ExternalShutdownException:
             raise LockstepError(SHUT_DOWN) from None
         except (Stuck, RuntimeError) as error:
@@ -268,8 +269,6 @@ class SimulatedTime:
             LockstepError: One has.
         """
         elsewhere = self._executor.deliveries.elsewhere
-        if not elsewhere:
-            return
         for entity, node in itertools.product(list(elsewhere), self._executor.nodes):
             if (sends := _sending(node, entity)) is not None:
                 raise LockstepError(

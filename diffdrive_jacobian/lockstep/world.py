@@ -217,7 +217,6 @@ class Lockstep(Requirements, Processes):
             raise LockstepError('this Lockstep is closed')
         if threading.get_ident() != self._thread:
             raise LockstepError('Lockstep must be created and used in the main thread')
-        self._check_threads()
 
     def _on_registered(self, node: Node) -> None:
         self._check_sim_time(node)

@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from diffdrive_jacobian.testing.artifacts import artifact_name, name_beside_the_file
-from diffdrive_jacobian.text import error_text
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.lockstep import Lockstep
@@ -184,6 +183,8 @@ def _or_error(describe: Callable[[], str]) -> str:
     except BaseException as error:
         # Also of pytest.fail and pytest.skip, which a timeout of a plugin may raise here.
         complete = type(error).__name__ == 'RecordingError'
+        from diffdrive_jacobian.text import error_text
+
         text = error_text(error)
         return text if complete else f'not available: {type(error).__name__}: {text}'
 
