@@ -23,7 +23,7 @@ from diffdrive_jacobian.faults import Hang, Loss
 from diffdrive_jacobian.lockstep import Lockstep, PropertyViolation
 from diffdrive_jacobian.plots import run_figure
 from diffdrive_jacobian.plots.fault_marks import VIOLATION
-from diffdrive_jacobian.properties import NeverFasterThan, Property, Watch
+from diffdrive_jacobian.properties import NeverFasterThan, Property, StaysNear, Watch
 
 
 def serial(scenario, properties=(), **arguments):
@@ -242,6 +242,16 @@ def test_an_error_without_text_of_a_process_is_reported():
     future.set_exception(LocalError())
     with pytest.raises(ExplorationError, match='could not be run: LocalError: '):
         result_of(future, None)
+
+
+def test_a_long_property_does_not_hide_what_was_found(tmp_path):
+    near = StaysNear([(0.1 * number, 5.0) for number in range(61)], 0.1)
+    found = serial(robot, [near], worlds=1, output=tmp_path)
+    (finding,) = found.findings
+    assert finding.violation.key == repr(near)
+    assert len(str(finding)) < 1000
+    title = next(finding.directory.glob('test_*.py')).read_text().partition('\n')[0]
+    assert re.fullmatch(r'"""StaysNear.{1,200}\.\.\. is violated at [\d.]+ s\.', title)
 
 
 def test_the_picture_marks_the_violation(tmp_path, monkeypatch):

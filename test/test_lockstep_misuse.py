@@ -73,6 +73,19 @@ def test_invalid_use_is_refused(lockstep):
         world.add(Blinker())
 
 
+def test_a_second_initialization_is_an_error_with_its_remedy(lockstep):
+    """Also for those who expect that of rclpy."""
+    for error in (LockstepError, RuntimeError):
+        with pytest.raises(error, match=r'leave out rclpy.init\(\)'):
+            rclpy.init()
+    lockstep.add(Blinker())
+    with Context() as other:
+        assert other.ok()
+    lockstep.close()
+    rclpy.init()
+    rclpy.shutdown()
+
+
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 

@@ -17,11 +17,11 @@ from typing import Any
 from diffdrive_jacobian.exploration.child import ChildDiedError, call_in_child
 from diffdrive_jacobian.exploration.errors import ExplorationError
 from diffdrive_jacobian.exploration.recorded_world import BAG, PICTURE, record
-from diffdrive_jacobian.exploration.result import Finding
+from diffdrive_jacobian.exploration.result import LONGEST_KEY, Finding
 from diffdrive_jacobian.exploration.scenario import ScenarioName
 from diffdrive_jacobian.exploration.source import Source
 from diffdrive_jacobian.exploration.worker import can_run_here
-from diffdrive_jacobian.text import error_text
+from diffdrive_jacobian.text import error_text, printable
 
 CASE = 'counterexample.json'
 """Name of the file with the case."""
@@ -282,9 +282,10 @@ def test_source(finding: Finding, folder: Path, name: str, seed: int) -> str:
     loads += [_load(folder, setting.scenario, *one) for one in sorted(local)]
     loads = [line for line in loads if line]
     imports += [f'from {module} import {", ".join(sorted(names[module]))}' for module in sorted(names)]
-    title, description = f'{violation.key}, at {violation.seconds:g} s.', violation.headline
+    key = printable(violation.key, LONGEST_KEY)
+    title, description = f'{key}, at {violation.seconds:g} s.', violation.headline
     if violation.index >= 0:
-        title = f'{violation.key} is violated at {violation.seconds:g} s.'
+        title = f'{key} is violated at {violation.seconds:g} s.'
         description = '\n'.join(violation.text.strip().splitlines()[:10])
     return TEST.format(
         title=_quoted(title),

@@ -92,7 +92,7 @@ class Requirements(Disturbed):
             if id(requirement) in left and self._offered.isdisjoint(names):
                 known = ', '.join(sorted(self._offered.difference(OMITTED))) or 'none'
                 raise LockstepError(
-                    f'{requirement!r} observes {" and ".join(names)}, which no node has offered; topics '
+                    f'{requirement} observes {" and ".join(names)}, which no node has offered; topics '
                     f'and services: {known}'
                 )
         for required in watches:
