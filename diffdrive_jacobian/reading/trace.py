@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
 from diffdrive_jacobian.messages.goal_status import GoalState
-from diffdrive_jacobian.numerics.elementary import wrapped
+from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.reading.reader import BagError
 from diffdrive_jacobian.reading.run import Run, Series
@@ -78,7 +78,7 @@ def trace(run: Run) -> Trace:
         breaks=breaks,
         goal=goal,
         distance=np.hypot(*to_goal.T),
-        heading_error=np.where(reached, np.nan, wrapped(np.arctan2(dy, dx) - theta)),
+        heading_error=np.where(reached, np.nan, wrap(np.arctan2(dy, dx) - theta)),
     )
 
 
