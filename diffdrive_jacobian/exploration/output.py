@@ -156,7 +156,8 @@ def _own(folder: Path) -> list[Path]:
     own = {
         name: path
         for name, path in present.items()
-        if name in written and path.is_file() and written[name] == _checksum(path)
+        if name in written and path.is_file() and not path.is_symlink()
+        if written[name] == _checksum(path)
     }
     reserved = {CASE, _test(folder).name, BAG, PICTURE, *written}
     others = {name.partition('/')[0] for name in present.keys() - own.keys()}
@@ -169,7 +170,7 @@ def _remove(folder: Path) -> None:
     cache = folder / '__pycache__'
     if own and not cache.is_symlink():
         # What pytest compiled.
-        own += cache.glob(f'{_test(folder).stem}.*')
+        own += cache.glob(f'{_test(folder).stem}.*.pyc')
     for file in own:
         file.unlink()
     for part in (folder / BAG, cache, folder) if own else ():
@@ -204,8 +205,7 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def _checksum(path: Path) -> str:
-    """Return the SHA-256 sum of a file; of a link there is none."""
-    return '' if path.is_symlink() else hashlib.sha256(path.read_bytes()).hexdigest()
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _record(finding: Finding, folder: Path, executor: Executor) -> list[str]:
