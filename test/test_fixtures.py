@@ -382,7 +382,7 @@ def test_no_hook_raises(run):
     """)
     result.assert_outcomes(failed=2, passed=1)
     text = result.stdout.str()
-    assert text.count("not available: KeyError('of a bug')") == 2
+    assert text.count("not available: KeyError: 'of a bug'") == 2
     assert 'INTERNALERROR' not in text
 
 
