@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from diffdrive_jacobian.control import find_controller
 from diffdrive_jacobian.exploration import LocalExecutor, SerialExecutor, explore, fault_schedules
 from diffdrive_jacobian.exploration.child import call_in_child
+from diffdrive_jacobian.exploration.errors import ExplorationError
 from diffdrive_jacobian.exploration.replay import replay
 from diffdrive_jacobian.exploration.trial import Outcome
 from diffdrive_jacobian.faults import Loss
@@ -84,6 +85,28 @@ def test_the_same_results_on_another_executor(expected, monkeypatch, local, kind
         cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=False, **address)
         with cluster, distributed.Client(cluster) as client, client.get_executor() as executor:
             same_results(executor, expected, monkeypatch)
+
+
+class FailsOnce(SerialExecutor):
+    """Fails with the nth of its tasks, and with no other."""
+
+    def __init__(self, number):
+        self.left = number
+
+    def submit(self, fn, /, *args, **kwargs):
+        self.left -= 1
+        return super().submit(fn, *args, **kwargs) if self.left else super().submit(lose_worker)
+
+
+def lose_worker():
+    raise ConnectionError('the worker is gone')
+
+
+@pytest.mark.parametrize('number', [2, 3], ids=['exploring', 'shrinking'])
+def test_an_executor_that_fails_once_is_reported(number):
+    """Also while Hypothesis shrinks, which would try again and call the results unreliable."""
+    with pytest.raises(ExplorationError, match=r'not be run: ConnectionError: the worker is gone$'):
+        follow_on(FailsOnce(number))
 
 
 def test_processes_of_worlds_import_little(monkeypatch):

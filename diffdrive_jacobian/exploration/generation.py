@@ -79,21 +79,30 @@ def shrink(
         block: Number of the block.
         count: Size of the block.
         fails: Returns whether a trial fails. It must return the same for equal trials. It may raise
-            StopShrinking.
+            StopShrinking. Other exceptions end the search, too, and are raised.
 
     Raises:
         ExplorationError: No trial of the block fails.
     """
     smallest: list[Trial] = []
+    errors: list[Exception] = []
 
     def check(trial: Trial) -> None:
-        if fails(trial):
+        try:
+            failed = fails(trial)
+        except Exception as error:
+            # Hypothesis would take it for a failure, run the trial again, and report what differs.
+            errors.append(error)
+            raise StopShrinking from error
+        if failed:
             smallest[:] = [trial]
             raise _FoundError
 
     try:
         _run(strategy, seed, block, count, [Phase.generate, Phase.shrink], check)
     except (_FoundError, StopShrinking):
+        if errors:
+            raise errors[0] from None
         # Hypothesis ends with the smallest one.
         if smallest:
             return smallest[0]
