@@ -39,7 +39,8 @@ class PathSqlite3Writer(Sqlite3Writer):
         self.path = path.absolute() / f'{path.name}.db3'
         self.conn = sqlite3.connect(self.path)
         try:
-            # A bag gets its name after its files were synced. Until then it need not survive a power cut.
+            # A bag gets its name after its files were synced. Until then it need not survive
+            # a power cut.
             self.conn.execute('PRAGMA synchronous = OFF')
             self.conn.execute('PRAGMA journal_mode = MEMORY')
             self.conn.executescript(self.SQLITE_SCHEMA)
