@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing.spawn
+import random
 import re
 import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -85,6 +87,18 @@ def test_the_same_results_on_another_executor(expected, monkeypatch, local, kind
         cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=False, **address)
         with cluster, distributed.Client(cluster) as client, client.get_executor() as executor:
             same_results(executor, expected, monkeypatch)
+
+
+def use_random_numbers_in_a_thread(_):
+    """As the threads of Dask do at any time."""
+    thread = Thread(target=random.random)
+    thread.start()
+    thread.join()
+
+
+def test_random_numbers_of_other_threads_do_not_end_the_generation_of_worlds():
+    cases = st.integers(0, 5).map(use_random_numbers_in_a_thread)
+    assert explore(follow, cases=cases, worlds=1, executor=SerialExecutor()).worlds == 1
 
 
 class FailsOnce(SerialExecutor):

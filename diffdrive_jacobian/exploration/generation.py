@@ -8,6 +8,7 @@ switched off here.
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -18,7 +19,7 @@ from diffdrive_jacobian.exploration.trial import Trial
 try:
     import hypothesis
     from hypothesis import HealthCheck, Phase, Verbosity, settings, strategies
-    from hypothesis.errors import HypothesisException
+    from hypothesis.errors import HypothesisDeprecationWarning, HypothesisException
 except ModuleNotFoundError as missing:
     if missing.name != 'hypothesis':
         raise
@@ -141,7 +142,9 @@ def _run(
     def test(trial: Trial) -> None:
         use(trial)
 
-    with _own_constants_only():
+    with warnings.catch_warnings(), _own_constants_only():
+        # Hypothesis takes random numbers of other threads, as of Dask's, for such of the strategy.
+        warnings.filterwarnings('ignore', 'Do not use the `random` module', HypothesisDeprecationWarning)
         try:
             test()
         except HypothesisException as error:
