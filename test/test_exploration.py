@@ -109,7 +109,7 @@ def test_what_is_written(found):
 
 def test_the_written_test_reproduces_it_until_the_controller_is_mended(found, pytester, monkeypatch):
     file = found.findings[0].directory / 'test_never_faster_than.py'
-    options = ('-p', 'no:cacheprovider', '-p', 'no:xdist', file)
+    options = ('-p', 'no:cacheprovider', '-p', 'no:xdist', '-p', 'no:launch_testing', file)
     result = pytester.runpytest_inprocess(*options)
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(

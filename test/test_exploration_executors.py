@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import multiprocessing.spawn
 import os
+import random
 import re
 import signal
 import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from hypothesis import strategies as st
 from diffdrive_jacobian.control import find_controller
 from diffdrive_jacobian.exploration import LocalExecutor, SerialExecutor, explore, fault_schedules
 from diffdrive_jacobian.exploration.child import call_in_child
+from diffdrive_jacobian.exploration.errors import ExplorationError
 from diffdrive_jacobian.exploration.replay import replay
 from diffdrive_jacobian.exploration.trial import Outcome
 from diffdrive_jacobian.faults import Loss
@@ -87,6 +90,40 @@ def test_the_same_results_on_another_executor(expected, monkeypatch, local, kind
         cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=False, **address)
         with cluster, distributed.Client(cluster) as client, client.get_executor() as executor:
             same_results(executor, expected, monkeypatch)
+
+
+def use_random_numbers_in_a_thread(_):
+    """As the threads of Dask do at any time."""
+    thread = Thread(target=random.random)
+    thread.start()
+    thread.join()
+
+
+def test_random_numbers_of_other_threads_do_not_end_the_generation_of_worlds():
+    cases = st.integers(0, 5).map(use_random_numbers_in_a_thread)
+    assert explore(follow, cases=cases, worlds=1, executor=SerialExecutor()).worlds == 1
+
+
+class FailsOnce(SerialExecutor):
+    """Fails with the nth of its tasks, and with no other."""
+
+    def __init__(self, number):
+        self.left = number
+
+    def submit(self, fn, /, *args, **kwargs):
+        self.left -= 1
+        return super().submit(fn, *args, **kwargs) if self.left else super().submit(lose_worker)
+
+
+def lose_worker():
+    raise ConnectionError('the worker is gone')
+
+
+@pytest.mark.parametrize('number', [2, 3], ids=['exploring', 'shrinking'])
+def test_an_executor_that_fails_once_is_reported(number):
+    """Also while Hypothesis shrinks, which would try again and call the results unreliable."""
+    with pytest.raises(ExplorationError, match=r'not be run: ConnectionError: the worker is gone$'):
+        follow_on(FailsOnce(number))
 
 
 def test_processes_of_worlds_import_little(monkeypatch):
