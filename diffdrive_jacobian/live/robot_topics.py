@@ -21,7 +21,7 @@ from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.ros.rclpy_internals import waiting_messages
-from diffdrive_jacobian.ros.serialization import MAX_SIZE, deserialized, ignoring_invalid
+from diffdrive_jacobian.ros.serialization import MAX_SIZE, checked_reader, ignoring_invalid
 from diffdrive_jacobian.ros.topic_errors import explaining_failure, type_name
 
 T = TypeVar('T')
@@ -67,7 +67,7 @@ class Latest:
         Raises:
             ParameterError: The topic has another type in this process.
         """
-        self._kind, self._polled = kind, polled
+        self._read, self._polled = checked_reader(kind), polled
         self._data: bytes | None = None
         group = Polled() if polled else None
         with explaining_failure(node, kind, topic):
@@ -88,7 +88,7 @@ class Latest:
         if latest is None or len(latest) > MAX_SIZE:
             return None
         try:
-            return deserialized(latest, self._kind)
+            return self._read(latest)
         except MessageError:
             return None
 
