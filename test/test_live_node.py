@@ -303,3 +303,33 @@ def test_robots_that_are_silent_and_gone(live, monkeypatch):
     live.world.remove(robot)
     monkeypatch.setattr(live_node, 'LOST', 0.0)
     live.until(lambda: live.robot() is None)
+
+
+def test_a_node_that_changes_its_name_leaves_nothing_behind(driven):
+    robot = driven.node.robots['/']
+    before = len(list(driven.node.clients))
+    for number in range(5):
+        robot.use_nodes({'robot': f'/robot_{number}', 'controller': f'/controller_{number}'})
+        refused = []
+        robot.links['robot'].set('x', 1.0, lambda *answer, to=refused: to.append(answer))
+    assert len(list(driven.node.clients)) <= before + 2 * 3
+    robot.use_nodes({'robot': '/virtual_robot'})
+    assert refused == [(False, '/robot_4 is gone')]
+    robot.destroy()
+    assert not list(driven.node.clients)
+
+
+def test_a_robot_too_many_is_named(live, monkeypatch):
+    monkeypatch.setattr(live_node, 'MAX_ROBOTS', 1)
+    first = live.world.add(make_complete(VirtualRobot, '/one'))
+    live.until(lambda: live.robot('/one'))
+    live.world.add(make_complete(VirtualRobot, '/two'))
+
+    def notes():
+        return live.session.latest()[1].fixed['notes']
+
+    live.until(notes)
+    assert notes() == ['at most 1 robots are shown; 1 more publish odometry: /two']
+    live.world.remove(first)
+    monkeypatch.setattr(live_node, 'LOST', 0.0)
+    live.until(lambda: live.robot('/two') and not notes())

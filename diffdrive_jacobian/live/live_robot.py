@@ -296,11 +296,14 @@ class LiveRobot:
     def destroy(self) -> None:
         """Destroy all entities."""
         self.topics.destroy()
-        for service in self._services.values():
-            service.destroy()
+        for one in (*self._services.values(), *self.links.values()):
+            one.destroy()
 
     def use_nodes(self, found: dict[str, str]) -> None:
         """Take the nodes that have the parameters, by role."""
         for role, name in found.items():
-            if role not in self.links or self.links[role].target != name:
+            link = self.links.get(role)
+            if link is not None and link.target != name:
+                link.destroy()
+            if link is None or link.target != name:
                 self.links[role] = ParameterLink(self._node, name)

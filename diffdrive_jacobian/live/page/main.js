@@ -75,6 +75,8 @@ function showPanels() {
   byId('tools').hidden = byId('actions').hidden = byId('goto').hidden = recorded;
   byId('chain').hidden = byId('legend').hidden = !robot;
   setText(byId('title'), model.bag || 'diffdrive_jacobian');
+  setText(byId('notes'), model.notes.join('; '));
+  byId('notes').title = model.notes.join('\n');
   setText(byId('hint'), HINTS[recorded ? 'bag' : pointer.tool]);
   byId('map').classList.toggle('grab', recorded || pointer.tool === 'move');
   if (robot) chain.show(robot);

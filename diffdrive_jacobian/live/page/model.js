@@ -11,6 +11,7 @@ export class Model {
     this.strips = null;
     this.world = { kind: 'robots' };
     this.bag = '';
+    this.notes = [];
     this.selectedName = null;
   }
 
@@ -38,6 +39,7 @@ export class Model {
     if (frame.fixed) {
       this.settings = frame.fixed.settings ?? {};
       this.bag = frame.fixed.bag ?? '';
+      this.notes = frame.fixed.notes ?? [];
       for (const [name, strips] of Object.entries(frame.fixed.strips ?? {})) {
         this.histories.set(name, History.recorded(strips));
       }
