@@ -7,7 +7,7 @@ import math
 MAX_POINTS = 6000
 """Largest number of points of a path."""
 SPACING = 0.01
-"""Distance between two points of a path (m). It doubles when the path is full, unless that is in pieces."""
+"""Distance between two points of a path (m). It doubles when the path is full, unless jumps fill it."""
 JUMP = 0.3
 """A longer step is not a motion: the path is interrupted (m)."""
 
