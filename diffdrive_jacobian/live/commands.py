@@ -177,7 +177,7 @@ def _setting(name: str, value: Any) -> float | str | bool | None:
 
 
 _position = _number(-MAX_POSITION, MAX_POSITION)
-_angle = _number(-2.0 * math.tau, 2.0 * math.tau)
+_angle = _number(-math.tau, math.tau)
 _velocity = _number(-MAX_SPEED, MAX_SPEED)
 _plausible = _number(-1e6, 1e6)
 _READERS: dict[str, Callable[[str, Any], Any]] = {
