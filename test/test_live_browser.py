@@ -220,7 +220,8 @@ def test_nothing_is_clipped_on_usual_screens(live):
         browser.evaluate('document.getElementById("goto-x").value = "x"')
         browser.evaluate('document.getElementById("goto").requestSubmit()')
         covered = """(([a, b]) => a.left < b.right && b.left < a.right
-            && a.top < b.bottom && b.top < a.bottom)(['.notice', '#legend'].map((one) => document.querySelector(one).getBoundingClientRect()))"""
+            && a.top < b.bottom && b.top < a.bottom)(['.notice', '#legend'].map(
+            (one) => document.querySelector(one).getBoundingClientRect()))"""
         assert not browser.evaluate(covered), width
         browser.evaluate('document.getElementById("goto-x").value = "1"')
         if width >= 1280:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,6 @@ from diffdrive_jacobian.live.parameter_link import ParameterLink
 from diffdrive_jacobian.live.robot_state import RobotState
 from diffdrive_jacobian.live.robot_topics import RobotTopics
 from diffdrive_jacobian.live.session import Session
-from diffdrive_jacobian.live.trail import Trail
 from diffdrive_jacobian.live.trigger_link import TriggerLink
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
@@ -48,6 +48,16 @@ SERVICES = {
     'reset_odometry': 'the odometry cannot be reset',
 }
 """Services of a robot, and what it means if they fail."""
+
+
+def _motion(message: Any) -> tuple[float, NDArray[np.float64], tuple[float, float]]:
+    """Return stamp (s), pose (m, m, rad) and twist (m/s, rad/s) of an odometry.
+
+    Raises:
+        MessageError: A value is invalid.
+    """
+    pose, twist = messages.from_pose(message.pose.pose), messages.from_twist(message.twist.twist)
+    return seconds(messages.from_time(message.header.stamp)), pose, twist
 
 
 class LiveRobot:
@@ -100,6 +110,10 @@ class LiveRobot:
         odometry = self.topics.odometry.take()
         if odometry is not None:
             self._on_odometry(odometry, now)
+        truth = self.topics.truth.take()
+        if truth is not None:
+            with suppress(MessageError):
+                self.state.truly_moved(*_motion(truth))
         joints = self.topics.joints.take()
         if joints is not None:
             try:
@@ -118,9 +132,7 @@ class LiveRobot:
 
     def _on_odometry(self, message: Any, now: float) -> None:
         try:
-            pose = messages.from_pose(message.pose.pose)
-            twist = messages.from_twist(message.twist.twist)
-            stamp = messages.from_time(message.header.stamp)
+            stamp, pose, twist = _motion(message)
         except MessageError:
             return
         try:
@@ -128,7 +140,7 @@ class LiveRobot:
         except MessageError:
             covariance = None
         self._seen, self._frame = now, message.header.frame_id
-        self.state.moved(seconds(stamp), pose, twist, covariance)
+        self.state.moved(stamp, pose, twist, covariance)
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
         self._on_poses([message], message.header.stamp)
@@ -185,7 +197,7 @@ class LiveRobot:
                 self.topics.publish_pose(pose, self._frame, self._now())
                 self.state.interrupt()
         elif isinstance(command, ClearPath):
-            self.state.trail = Trail()
+            self.state.clear_path()
         elif isinstance(command, SetParameter):
             self._set(command)
 
@@ -296,8 +308,10 @@ class LiveRobot:
     def destroy(self) -> None:
         """Destroy all entities."""
         self.topics.destroy()
-        for one in (*self._services.values(), *self.links.values()):
-            one.destroy()
+        for service in self._services.values():
+            service.destroy()
+        for link in self.links.values():
+            link.destroy()
 
     def use_nodes(self, found: dict[str, str]) -> None:
         """Take the nodes that have the parameters, by role."""

@@ -33,7 +33,10 @@ MAX_ROBOTS = 16
 """Largest number of robots that are shown."""
 LOST = 30.0
 """Time without odometry and publisher after which a robot is no longer shown (s)."""
-TOPICS = ('odom', 'joint_states', 'cmd_vel', 'goal_pose', 'goals', 'goal_status', 'initialpose')
+TOPICS = (
+    *('odom', 'ground_truth', 'joint_states', 'cmd_vel', 'goal_pose', 'goals', 'goal_status'),
+    'initialpose',
+)
 
 
 class LivePage(Node):  # type: ignore[misc]
@@ -101,6 +104,7 @@ class LivePage(Node):  # type: ignore[misc]
         return Snapshot(
             robots=[one for one in shown.values() if one is not None],
             trails={name: robot.state.trail for name, robot in self.robots.items()},
+            true_trails={name: robot.state.true_trail for name, robot in self.robots.items()},
             world={'kind': 'robots'} if self._pacing is None else self._pacing.shown(),
             fixed={
                 'settings': {name: robot.settings() for name, robot in self.robots.items()},

@@ -67,7 +67,8 @@ class Latest:
         Raises:
             ParameterError: The topic has another type in this process.
         """
-        self._read, self._polled = checked_reader(kind), polled
+        self._read: Callable[[bytes], Any] = checked_reader(kind)
+        self._polled = polled
         self._data: bytes | None = None
         group = Polled() if polled else None
         with explaining_failure(node, kind, topic):
@@ -116,6 +117,7 @@ class RobotTopics:
         self._publishers: dict[str, Publisher] = {}
         self.odometry = Latest(node, Odometry, self.full('odom'), polled=polled)
         self.joints = Latest(node, JointState, self.full('joint_states'), polled=polled)
+        self.truth = Latest(node, Odometry, self.full('ground_truth'), polled=polled)
         self.command: Latest | None = None
         """cmd_vel. None: nobody publishes or reads it yet."""
         self.twist_type: type = Twist
@@ -209,7 +211,7 @@ class RobotTopics:
 
     def destroy(self) -> None:
         """Destroy all subscriptions and publishers."""
-        for latest in (self.odometry, self.joints, self.command):
+        for latest in (self.odometry, self.joints, self.truth, self.command):
             if latest is not None:
                 latest.destroy(self._node)
         for subscription in self._subscriptions:

@@ -132,11 +132,13 @@ class LiveServer:
         # Who cannot connect is told so. Nothing of that is for the terminal.
         logger.addHandler(logging.NullHandler())
         logger.propagate = False
+        # Any factory does, as it says.
+        bounded: Any = partial(_Connection, strangers=self._strangers)
         server = await serve(
             self._handle,
             sock=self._socket,
             backlog=MAX_STRANGERS,
-            create_connection=partial(_Connection, strangers=self._strangers),
+            create_connection=bounded,
             process_request=self._answer,
             compression=None,
             max_size=MAX_SIZE,
