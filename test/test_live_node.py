@@ -333,3 +333,44 @@ def test_a_robot_too_many_is_named(live, monkeypatch):
     live.world.remove(first)
     monkeypatch.setattr(live_node, 'LOST', 0.0)
     live.until(lambda: live.robot('/two') and not notes())
+
+
+def test_a_robot_that_slips_is_shown_where_it_truly_is(live):
+    robot = live.world.add(
+        make_complete(
+            VirtualRobot, simulate_slip=True, wheel_travel_variance=2e-3, command_interface='wheels'
+        )
+    )
+    for node in (WheelBridge, GoToGoal):
+        live.world.add(make_complete(node, **(QUICK if node is GoToGoal else {})))
+    live.until(lambda: live.robot() and len(live.settings()) > 8)
+    ends = []
+    live.node.robots['/'].on_end = ends.append
+    live.send(goal(1.0, 0.5))
+    live.until(lambda: live.state() == 'executing')
+    live.pass_time(0.2)
+    shown = live.robot()
+    assert shown['true_distance'] == pytest.approx(math.dist(shown['truth'][:2], (1.0, 0.5)), abs=1e-4)
+    assert shown['true_distance'] != shown['distance']
+    live.until(lambda: live.state() == 'succeeded')
+    live.pass_time(0.2)
+    assert live.robot()['truth'] == pytest.approx(robot.truth.tolist(), abs=1e-4)
+    (end,) = ends
+    assert end.distance <= 0.021 < end.true_distance
+    trail = live.session.latest()[1].true_trails['/']
+    assert len(trail.points) > 20
+    assert trail.points[-1] == pytest.approx(robot.truth[:2].tolist(), abs=0.011)
+    live.send(ClearPath('/'))
+    live.pass_time(0.02)
+    assert len(live.session.latest()[1].true_trails['/'].points) <= 1
+
+
+def test_the_error_of_the_heading_is_shown_where_it_counts(driven):
+    driven.send(goal(0.3, 0.0, 2.0))
+    driven.until(lambda: driven.state() == 'executing')
+    assert driven.robot()['goal_heading_error'] is None
+    driven.send(SetParameter('/', 'controller/use_goal_heading', value=True))
+    driven.until(lambda: driven.robot()['use_heading'])
+    shown = driven.robot()
+    assert shown['goal_heading_error'] == pytest.approx(2.0 - shown['pose'][2], abs=1e-4)
+    assert driven.robot()['truth'] is None

@@ -500,6 +500,7 @@ def test_csv_holds_the_numbers_of_the_run(recorded, run, tmp_path):
     rounded = {'rtol': 0.0, 'atol': 5.1e-10}
     np.testing.assert_allclose(rows[:, 1:6], run.odometry.values, **rounded)
     np.testing.assert_allclose(columns['distance_m'], one.distance, **rounded)
+    assert np.isnan(columns['goal_heading_error_rad']).all()
     np.testing.assert_allclose(columns['bearing_error_rad'], one.bearing_error, **rounded)
     assert columns['omega_right_radps'].tolist() == run.wheels.values[:, 0].tolist()
     assert columns['omega_left_radps'].tolist() == run.wheels.values[:, 1].tolist()

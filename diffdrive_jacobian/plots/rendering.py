@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 ROUNDS = 4
 """Largest number of times that a figure is laid out."""
+MARGIN = 0.03
+"""Least room left of the labels (inches)."""
 POINTS = 72
 """Resolution of files without pixels (dots per inch)."""
 COMPRESSION = 1
@@ -66,8 +68,8 @@ def _lay_out(drawing: Figure, dpi: int) -> None:
         for axes in drawing.axes:
             axes.apply_aspect()
         boxes = [axes.yaxis.get_tightbbox() for axes in drawing.axes]
-        outside = max(0.0, *(-box.x0 for box in boxes if box is not None))
-        if not outside:
+        outside = max(MARGIN * dpi - box.x0 for box in boxes if box is not None)
+        if outside <= 0.0:
             break
         missing += outside / drawing.bbox.width
         layout.set(rect=(missing, 0.0, 1.0 - missing, 1.0))
