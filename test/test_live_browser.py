@@ -210,7 +210,7 @@ def test_other_widths_and_colours(live):
 
 def test_nothing_is_clipped_on_usual_screens(live):
     browser = live.browser
-    for width, height in ((1440, 900), (1400, 900), (1366, 768), (1000, 700), (420, 800)):
+    for width, height in ((1600, 900), (1440, 900), (1400, 900), (1366, 768), (1000, 700), (420, 800)):
         browser.size(width, height)
         clipped = """[...document.querySelectorAll('.strip p, #goto, #actions, #hint')].filter(
             (node) => node.scrollWidth > node.clientWidth).length"""

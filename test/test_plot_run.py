@@ -519,8 +519,8 @@ def test_csv_has_exact_times_and_no_artefacts_of_floats(tmp_path):
     bag = write_bag(tmp_path / 'bag', sent)
     assert plot(bag, '--csv', tmp_path / 'a.csv') == 0
     _, first, second = (tmp_path / 'a.csv').read_text().splitlines()
-    assert first == '0,57.304,0.3,0,0,0,,,,,,'
-    assert second == '0.123456789,-999999.123456789,0.000000001,0,0,0,,,,,,'
+    assert first == '0,57.304,0.3,0,0,0,,,,,,,'
+    assert second == '0.123456789,-999999.123456789,0.000000001,0,0,0,,,,,,,'
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ export class Chain {
     const { chain, law, goal } = robot, active = robot.distance !== null && goal.active;
     const target = active && goal.goals ? goal.goals[goal.index] : null;
     setText(this.goal, target
-      ? `(${format(target[0], 2)}, ${format(target[1], 2)}) m   →   d = ${format(robot.distance)} m,  e = ${format(robot.bearing_error)} rad${robot.goal_heading_error === null ? '' : `, heading error ${format(robot.goal_heading_error)} rad`}`
+      ? `(${format(target[0], 2)}, ${format(target[1], 2)}) m   →   d = ${format(robot.distance)} m,  e = ${format(robot.bearing_error)} rad${robot.goal_heading_error === null ? '' : `, heading at the goal: Δθ = ${format(robot.goal_heading_error)} rad`}`
       : robot.by_hand ? 'none: driven by hand' : 'none: click on the map');
     this.links.goal.node.classList.toggle('idle', !target);
     const [formula, source] = LAWS[law.name] ?? ['[v, ω] = law(pose, goal)', law.name || 'not known'];
