@@ -12,8 +12,9 @@ from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Goals, Odometry
 from std_srvs.srv import Trigger
 
-from diffdrive_jacobian.control import Arrival, Controller, LawError, saturate
+from diffdrive_jacobian.control import Arrival, Controller
 from diffdrive_jacobian.control.sampling import LARGEST_TURN, without_whole_turns
+from diffdrive_jacobian.kinematics.saturation import scaled_to_limits
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
@@ -220,7 +221,9 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             goal.waypoints, command = goal.waypoints.follow(
                 pose, self._law, self._arrival, self.parameters.kp
             )
-        except LawError as error:
+            if command is not None:
+                command = self._limited(*command)
+        except ValueError as error:
             self.log_event_warning('law', f'goal aborted: {error}')
             self._publish_command(0.0, 0.0)
             self._end(GoalStatus.STATUS_ABORTED, 'aborted')
@@ -229,12 +232,21 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._publish_command(0.0, 0.0)
             self._end(GoalStatus.STATUS_SUCCEEDED, 'reached')
             return
+        self._publish_command(*command)
+
+    def _limited(self, v: float, omega: float) -> tuple[float, float]:
+        """Return a command within the limits, without whole turns between two messages.
+
+        Raises:
+            ValueError: It overflows.
+        """
         # Without wheels in the limits the geometry of the wheels does not matter.
-        v, omega = saturate(*command, self._limits)
+        v, omega = scaled_to_limits.formula(v, omega, *self._limits.all(), 1.0, 1.0)
         if abs(omega) > LARGEST_TURN * self._rate:
             # The other direction may be forbidden.
-            v, omega = saturate(v, without_whole_turns(omega, self._rate), self._limits)
-        self._publish_command(v, omega)
+            omega = without_whole_turns(omega, self._rate)
+            v, omega = scaled_to_limits.formula(v, omega, *self._limits.all(), 1.0, 1.0)
+        return v, omega
 
     def _begin(self, goal: Goal) -> bool:
         """Start executing a goal, now that the frame of the odometry is known."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
 from diffdrive_jacobian.messages.goal_status import GoalState
-from diffdrive_jacobian.numerics.elementary import wrapped
+from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.reading.reader import BagError
 from diffdrive_jacobian.reading.run import Run, Series
@@ -84,8 +84,8 @@ def trace(run: Run) -> Trace:
         breaks=breaks,
         goal=goal,
         distance=np.hypot(*to_goal.T),
-        bearing_error=np.where(reached, np.nan, wrapped(np.arctan2(dy, dx) - theta)),
-        goal_heading_error=np.where(np.isin(goal, last), wrapped(targets[:, 2] - theta), np.nan),
+        bearing_error=np.where(reached, np.nan, wrap(np.arctan2(dy, dx) - theta)),
+        goal_heading_error=np.where(np.isin(goal, last), wrap(targets[:, 2] - theta), np.nan),
     )
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from diffdrive_jacobian.control.sampling import LARGEST_TURN, without_whole_turns
-from diffdrive_jacobian.kinematics.saturation import saturate
+from diffdrive_jacobian.kinematics.saturation import scaled_to_limits
 from diffdrive_jacobian.numerics.checks import floats
 from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.simulation._batch import Array, Batch, Mask, Outcomes, Rows
@@ -134,13 +134,22 @@ class Block:
             raise ValueError(
                 f'law must return finite (v, omega), got ({v[row]}, {omega[row]}) at pose {pose}'
             )
-        if not batch.limits.unlimited:
-            v, omega = saturate(v, omega, batch.limits, batch.r, batch.L)
+        v, omega = self._limited(v, omega)
         if np.abs(omega).max() > LARGEST_TURN * batch.rate:
-            omega = without_whole_turns(omega, batch.rate)
             # The other direction may be forbidden.
-            v, omega = saturate(v, omega, batch.limits, batch.r, batch.L)
+            v, omega = self._limited(v, without_whole_turns(omega, batch.rate))
         return v, omega
+
+    def _limited(self, v: Array, omega: Array) -> tuple[Array, Array]:
+        """Scale twists to the velocity limits."""
+        batch = self.batch
+        if batch.limits.unlimited:
+            return v, omega
+        with np.errstate(all='ignore'):
+            limited: tuple[Array, Array] = scaled_to_limits.formula(
+                v, omega, *batch.limits.all(), batch.r, batch.L
+            )
+        return limited
 
     def _advance(self, v: Array, omega: Array) -> None:
         """Apply a constant twist until the next sample.
@@ -155,7 +164,10 @@ class Block:
             self.sums[1] += v * v
             self.sums[2] += omega * omega
             half = omega * (0.5 * dt)
-            c_half, s_half = np.cos(half), np.sin(half)
+            # One sine instead of two functions: `cos 2a = 1 - 2 sin^2 a`, `sin 2a = 2 sin a cos a`.
+            s_quarter = np.sin(0.5 * half)
+            squared = s_quarter * s_quarter
+            c_half, s_half = 1.0 - 2.0 * squared, 2.0 * s_quarter * np.sqrt(1.0 - squared)
             c, s = self.c * c_half - self.s * s_half, self.s * c_half + self.c * s_half
             chord = v * dt * np.divide(s_half, half, out=np.ones_like(half), where=half != 0.0)
             self.x = self.x + chord * c

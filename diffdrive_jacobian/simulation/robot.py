@@ -23,28 +23,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import inf, isfinite
+from math import isfinite
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._arc import arc_end
 from diffdrive_jacobian.kinematics.se2 import compose
 from diffdrive_jacobian.numerics.checks import (
     MAX_NANOSECONDS,
-    array,
-    floats,
     instance,
     nanoseconds,
+    number,
+    numbers,
     positive,
     read_only,
 )
-from diffdrive_jacobian.numerics.elementary import components, operand
 from diffdrive_jacobian.simulation._uncertainty import Uncertainty
 from diffdrive_jacobian.simulation.actuators import Settling, Speeds
-from diffdrive_jacobian.simulation.exact_moments import Moments, gaussian_moments
-from diffdrive_jacobian.simulation.odometry_noise import covariance_entries, twist_covariance_entries
+from diffdrive_jacobian.simulation.arc import arc_end
+from diffdrive_jacobian.simulation.exact_moments import Moments, gaussian
+from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose, twist_covariance
 from diffdrive_jacobian.simulation.robot_model import RobotModel as RobotModel
 from diffdrive_jacobian.simulation.robot_model import pair
 from diffdrive_jacobian.simulation.slip import Truth
@@ -98,21 +97,14 @@ class Robot:
     def __post_init__(self) -> None:
         """Check every value. The methods below construct their results without these checks."""
         instance('model', self.model, RobotModel)
-        pose = array('pose', self.pose, 3)
-        if pose.ndim != 1:
-            raise ValueError(f'pose must have shape (3,), got {pose.shape}')
-        covariance = floats('covariance', self.covariance)
-        if covariance.ndim != 2:
-            raise ValueError(f'covariance must have shape (3, 3), got {covariance.shape}')
-        entries = covariance_entries('covariance', covariance)
-        pose, covariance = read_only(pose), read_only(covariance)
+        pose = _triple('pose', self.pose)
         values: dict[str, Any] = {
             'stamp': nanoseconds('stamp', self.stamp),
-            'pose': pose,
-            'covariance': covariance,
-            'pose_tuple': tuple(pose.tolist()),
-            '_uncertainty': Uncertainty(tuple(gaussian_moments(entries))),
-            '_truth': _truth(self.model, pose.tolist()),
+            'pose': read_only(pose),
+            'covariance': read_only(covariance_of_pose('covariance', self.covariance)),
+            'pose_tuple': pose,
+            '_uncertainty': Uncertainty(tuple(gaussian(self.covariance))),
+            '_truth': _truth(self.model, pose),
         }
         for name in ('wheel_angles', 'command', 'twist'):
             values[name] = pair(name, getattr(self, name))
@@ -207,14 +199,12 @@ class Robot:
         Raises:
             ValueError: As `twist_covariance`.
         """
-        model = self.model
-        if type(interval) is not float or not 0.0 < interval < inf:
-            interval = operand('interval', interval, positive)
-            if type(interval) is not float:
-                raise ValueError(f'interval must be a single number, got shape {np.shape(interval)}')
-        return twist_covariance_entries(
-            self.twist, model.wheel_separation, model.wheel_travel_variance, interval
-        )
+        L, k = self.model.wheel_separation, self.model.wheel_travel_variance
+        interval = number('interval', interval, positive)
+        (vv, vw), (wv, ww) = twist_covariance.formula(self.twist, L, k, interval)
+        if not isfinite(vv + abs(vw) + ww):
+            raise ValueError('twist and interval must give a finite result, but it overflows')
+        return vv, vw, wv, ww
 
     def at(self, stamp: int) -> Robot:
         """Advance to a time, through the timeout if it expires before.
@@ -515,9 +505,7 @@ def _triple(name: str, value: ArrayLike) -> tuple[float, float, float]:
     Raises:
         ValueError: It is something else.
     """
-    x, y, theta = components(name, value, 3)
-    if type(x) is not float:
-        raise ValueError(f'{name} must have shape (3,), got {np.shape(value)}')
+    x, y, theta = numbers(name, value, 3)
     return x, y, theta
 
 
