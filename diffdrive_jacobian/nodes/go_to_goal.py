@@ -59,6 +59,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             parameters = GoToGoalParameters.with_controller(controller)
         super().__init__('go_to_goal', parameters, **kwargs)
         self._goal: Goal | None = None
+        self._controller = self.parameters.chosen_controller()
+        self._law = self._controller.bind(self.parameters)
         self._identifiers = GoalIdentifiers(self.get_fully_qualified_name())
         self._odom_frame = ''
         # Rate of the odometry (Hz), and the times of the messages from which it is measured (ns).
@@ -147,6 +149,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             # While the robot moves the watchdog runs already, and a new goal is no sign of odometry.
             self._watchdog.start(nanoseconds(self.parameters.odom_timeout))
         self._goal = goal
+        self._law.reset()
         self._times.clear()
         self._others.start()
         self._publish_status(goal.info, GoalStatus.STATUS_ACCEPTED)
@@ -217,6 +220,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         if goal.stale:
             goal.stale = False
             self.log_event_info('odometry is back', 'odometry is received again: driving on')
+        self._law.now = now
         try:
             goal.waypoints, command = goal.waypoints.follow(
                 pose, self._law, self._arrival, self.parameters.kp
@@ -340,7 +344,9 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         """Compute from the parameters what every step needs, and warn of values that do not suit."""
         parameters = self.parameters
         self._controller = controller = parameters.chosen_controller()
-        self._law = controller.bind(parameters)
+        law = controller.bind(parameters)
+        law.continue_from(self._law)
+        self._law = law
         # Far from the goal a law may return more than what counts as a plausible command.
         self._limits = parameters.limits()
         self._arrival = Arrival(

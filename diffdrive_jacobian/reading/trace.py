@@ -246,7 +246,7 @@ def _driven_points(run: Run) -> Array:
     controller = BUILT_IN.get(name) if isinstance(name, str) else None
     if controller is None or not controller.offset:
         return poses[:, :2]
-    default = controller.driven_offset(GoToGoalParameters())
+    default = controller.driven_offset(controller.defaults)
     d = run.number_of_node('go_to_goal', controller.offset, default)
     return poses[:, :2] + d * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
 

@@ -43,6 +43,9 @@ class Block:
         self.theta: Array = wrap(theta)
         self.open: Mask = np.ones(count, dtype=np.bool_)
         self.turning: Mask = np.zeros(count, dtype=np.bool_)
+        # One array for each number that the law remembers.
+        self.state: list[Array] = [np.full(count, value) for value in batch.state]
+        self.dt = 0.0
         # Sums of |v|, v^2 and omega^2, and the largest distance beyond the goal.
         self.sums: Array = np.zeros((3, count))
         self.beyond: Array = np.zeros(count)
@@ -109,16 +112,17 @@ class Block:
     def _command(self) -> tuple[Array, Array]:
         """Evaluate the law and saturate its twists."""
         batch, shape = self.batch, (len(self.rows),)
-        pose = [self.x, self.y, self.theta]
-        if batch.equation is None:
-            twist = batch.law(np.array(pose).T, batch.goals, *batch.gains)
-        else:
-            twist = batch.equation(pose, batch.goals.T, *batch.gains)
+        twist = self._law_result()
         try:
+            if batch.state:
+                *twist, state = twist
+                state = np.broadcast_to(floats('law', state), (*shape, len(batch.state)))
+                self.state = list(state.T)
             v, omega = (np.broadcast_to(floats('law', part), shape) for part in twist)
         except (TypeError, ValueError) as error:
+            state_too = f' and the state of shape {(*shape, len(batch.state))}' if batch.state else ''
             raise ValueError(
-                f'law must return (v, omega), each of shape () or {shape}, got {twist!r:.80}'
+                f'law must return (v, omega), each of shape () or {shape}{state_too}, got {twist!r:.80}'
             ) from error
         if batch.arrival.use_heading and self.turning.any():
             v = np.where(self.turning, 0.0, v)
@@ -139,6 +143,22 @@ class Block:
             # The other direction may be forbidden.
             v, omega = self._limited(v, without_whole_turns(omega, batch.rate))
         return v, omega
+
+    def _law_result(self) -> Any:
+        """Evaluate the law: an equation of components, or a function of arrays of poses and goals."""
+        batch, pose = self.batch, [self.x, self.y, self.theta]
+        more: dict[str, Any] = {}
+        if batch.state:
+            state = np.array(self.state).T if batch.equation is None else self.state
+            more = {'state': state, 'dt': self.dt}
+            self.dt = 1.0 / batch.rate
+        if batch.equation is None:
+            return batch.law(np.array(pose).T, batch.goals, *batch.gains, **more)
+        result = batch.equation(pose, batch.goals.T, *batch.gains, **more)
+        if not batch.state:
+            return result
+        v, omega, state = result
+        return v, omega, np.array(np.broadcast_arrays(self.x, *state)[1:]).T
 
     def _limited(self, v: Array, omega: Array) -> tuple[Array, Array]:
         """Scale twists to the velocity limits."""
@@ -220,4 +240,5 @@ class Block:
         for name in ('x', 'y', 'theta', 'c', 's', 'turning', 'open', 'beyond', 'too_far'):
             setattr(self, name, getattr(self, name)[going])
         self.sums, self.along = self.sums[:, going], self.along[:, going]
+        self.state = [one[going] for one in self.state]
         return v[going], omega[going]
