@@ -134,13 +134,10 @@ def test_another_exploration_replaces_what_was_written(found):
     folder = found.findings[0].directory
     before = (folder / 'counterexample.json').read_text()
     (folder / 'notes.txt').write_text('mine')
-    # The process of a recording had ended.
-    (folder / 'run.journal').touch()
     serial(follow, [SLOW], faults=LOSSES, worlds=12, seed=1, shrink_worlds=0, output=folder.parent)
     assert (folder / 'counterexample.json').read_text() != before
     assert (folder / 'notes.txt').read_text() == 'mine'
     assert (folder / 'run' / 'run.mcap').exists()
-    assert not (folder / 'run.journal').exists()
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
 
 

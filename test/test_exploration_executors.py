@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing.spawn
+import os
 import re
+import signal
+import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
@@ -104,6 +107,29 @@ def test_a_process_that_dies_is_a_finding(local, tmp_path, monkeypatch):
     monkeypatch.setattr(sys.modules[replay.__module__], 'run_world_afresh', lambda _: [Outcome()])
     # Not in this process.
     assert not died.replay().same_verdict
+
+
+ENDLESS = """
+from diffdrive_jacobian.exploration.child import ChildProcess
+child = ChildProcess()
+print(child._process.pid, flush=True)
+child.call(exec, 'print("busy", flush=True)\\nwhile True: pass')
+"""
+
+
+def test_a_process_ends_with_a_program_that_is_killed():
+    """Also while its world does not end."""
+    pipes = {'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE, 'text': True}
+    with subprocess.Popen([PYTHON, '-c', ENDLESS], **pipes) as program:
+        pid = int(program.stdout.readline())
+        assert program.stderr.readline() == 'busy\n'
+        program.kill()
+        try:
+            # Until nobody can write any more.
+            program.communicate(timeout=60.0)
+        except subprocess.TimeoutExpired:
+            os.kill(pid, signal.SIGKILL)
+            raise
 
 
 def test_a_scenario_that_reads_its_input_gets_none(local):
