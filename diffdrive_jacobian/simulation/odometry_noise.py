@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics.se2 import integrate
 from diffdrive_jacobian.numerics.checks import array, not_negative, positive, semidefinite
-from diffdrive_jacobian.numerics.elementary import cos, from_rows, sin, sinc, sinc_defect
-from diffdrive_jacobian.numerics.formula import Array, Number, Rows, Vector, formula
+from diffdrive_jacobian.numerics.elementary import cos, product, sin, sinc, sinc_defect
+from diffdrive_jacobian.numerics.formula import Number, Rows, Vector, formula
 
 
 @formula('(2),(),(),() -> (2,2)', L=positive, wheel_travel_variance=not_negative, interval=positive)
@@ -69,7 +69,7 @@ def propagate_covariance(
     dt: Number,
     L: Number,
     wheel_travel_variance: Number,
-) -> Array:
+) -> Rows:
     """Propagate the covariance of a pose along an arc.
 
     Args:
@@ -89,15 +89,21 @@ def propagate_covariance(
         ValueError: An argument has a wrong shape or sign, is not finite, or the result overflows; the
             covariance is not symmetric and positive semidefinite.
     """
-    theta, v, omega = pose[..., 2], twist[..., 0], twist[..., 1]
+    (_, _, theta), (v, omega) = pose, twist
     dx, dy, _ = integrate.formula([0.0, 0.0, theta], [v, omega], dt)
-    Phi = from_rows([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
+    Phi = [[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]]
     # The noise is computed in the frame of the body at the end.
     end = theta + omega * dt
-    R = from_rows([[cos(end), -sin(end), 0.0], [sin(end), cos(end), 0.0], [0.0, 0.0, 1.0]])
-    Q = from_rows(_noise_at_end(v, omega, dt, L, wheel_travel_variance))
-    P: Array = Phi @ covariance @ np.swapaxes(Phi, -1, -2) + R @ Q @ np.swapaxes(R, -1, -2)
-    return (P + np.swapaxes(P, -1, -2)) / 2.0
+    R = [[cos(end), -sin(end), 0.0], [sin(end), cos(end), 0.0], [0.0, 0.0, 1.0]]
+    Q = _noise_at_end(v, omega, dt, L, wheel_travel_variance)
+    before, added = _congruent(Phi, covariance), _congruent(R, Q)  # Phi P Phi^T and R Q R^T
+    return [[p + q for p, q in zip(*rows, strict=True)] for rows in zip(before, added, strict=True)]
+
+
+def _congruent(A: Rows, P: Rows) -> Rows:
+    """Return `A P A^T`, symmetric to the last bit."""
+    M = product(product(A, P), list(zip(*A, strict=True)))
+    return [[(M[i][j] + M[j][i]) / 2.0 for j in range(3)] for i in range(3)]
 
 
 def _noise_at_end(v: Number, omega: Number, dt: Number, L: Number, k: Number) -> Rows:
