@@ -174,8 +174,8 @@ def _parser() -> _cli.Parser:
         usage=f'{PROGRAM} [TOPIC ...] [options] [--ros-args ...]',
         description='Record topics as a rosbag2 bag until Ctrl-C. Messages are on the disk within a '
         'second: after a crash recover_run writes the bag from them. Exit code 0: the bag is complete; '
-        '1: it is not complete (messages were lost, a topic cannot be recorded, or the disk failed), or '
-        'no message of a named TOPIC was received; 2: wrong arguments.',
+        '1: it is not complete (messages were or may be lost, a topic cannot be recorded, or the disk '
+        'failed), or no message of a named TOPIC was received; 2: wrong arguments.',
     )
     parser.add_argument(
         'topics',
