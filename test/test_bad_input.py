@@ -117,8 +117,8 @@ OTHERS = {
 CALLS = FUNCTIONS | OTHERS
 ELSEWHERE = {
     *('resolved_rate', 'track_line'),
-    *('Boundary', 'Controller', 'ControllerError', 'Controllers', 'LawError', 'ReferenceGains'),
-    *('controller_names', 'find_controller'),
+    *('Boundary', 'Controller', 'ControllerError', 'Controllers', 'Gain', 'LawError'),
+    *('controller_names', 'find_controller', 'KP', 'KV', 'OFFSET'),
 }
 """Tested in test_resolved_rate and test_own_controllers."""
 OPTIONAL = {'h', 'arrival', 'progress', 'commanded_at', 'seed', 'drift'}

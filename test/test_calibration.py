@@ -16,8 +16,9 @@ from diffdrive_jacobian.calibration.encoder import PERIOD, densified, located
 from diffdrive_jacobian.calibration.errors import compared_distance, rms, tracks
 from diffdrive_jacobian.calibration.estimate import Estimate
 from diffdrive_jacobian.calibration.fit import fit, information
-from diffdrive_jacobian.calibration.motion import adjoint, composed, increments, inverted, relative
+from diffdrive_jacobian.calibration.motion import composed, increments, inverted, relative
 from diffdrive_jacobian.calibration.preparation import overlapping, without
+from diffdrive_jacobian.kinematics.se2 import adjoint
 
 SHORT = Drive.of(umbmark(side=1.0, runs=1))
 ROBOT = Simulation(drive=SHORT, rate=25)

@@ -88,7 +88,7 @@ def test_goals_and_the_chain_are_as_recorded(player):
         [0.4, 0.4, 0.0],
     ]
     assert (robot['goal']['index'], robot['goal']['state']) == (0, 'executing')
-    assert robot['law']['kp'] == QUICK['kp']
+    assert robot['law']['gains']['Kp'] == QUICK['kp']
     assert robot['commanded']
     chain = robot['chain']
     assert np.array(chain['forward']) @ chain['wheels'] == pytest.approx(chain['twist'], rel=1e-4)

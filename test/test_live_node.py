@@ -105,7 +105,7 @@ def test_a_goal_is_driven_to_and_every_number_of_the_chain_is_there(driven):
     assert robot['goal']['goals'][0][:2] == [0.4, 0.3]
     assert robot['distance'] == pytest.approx(0.5, abs=0.02)
     assert robot['law']['name'] == 'go_to_goal'
-    assert robot['law']['kp'] == QUICK['kp']
+    assert robot['law']['gains']['Kp'] == QUICK['kp']
     assert robot['tolerance'] == 0.02
     chain = robot['chain']
     assert chain['measured']

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from diffdrive_jacobian.control import Arrival
+from diffdrive_jacobian.control import KP, KV, OFFSET, Arrival
 from diffdrive_jacobian.kinematics import diff_drive
 from diffdrive_jacobian.live import files, settings
 from diffdrive_jacobian.live.commands import Pause, SetSpeed, Step
@@ -305,13 +305,13 @@ def test_a_rate_with_a_burst():
 
 def test_every_setting_is_a_parameter_of_its_node():
     nodes = {'controller': GoToGoalParameters, 'robot': VirtualRobotParameters}
-    for setting in settings.SETTINGS:
+    for setting in settings.offered((KP, KV, OFFSET)):
         assert setting.name in specifications(nodes[setting.role]), setting.name
 
 
 def test_settings_that_are_shown_and_taken():
     values = {'controller': {'kp': 3.0, 'controller': 'mine', 'linear.x.max_velocity': math.nan}}
-    rows = {row['key']: row for row in settings.shown(values)}
+    rows = {row['key']: row for row in settings.shown(values, (KP, KV))}
     assert set(rows) == {
         'controller/kp',
         'controller/controller',
@@ -319,13 +319,13 @@ def test_settings_that_are_shown_and_taken():
     }
     assert rows['controller/controller']['choices'][-1] == 'mine'
     assert rows['controller/linear.x.max_velocity']['value'] is None
-    assert settings.find('controller/kp').checked(2.0) == 2.0
-    assert math.isnan(settings.find('robot/max_wheel_velocity').checked(None))
+    assert settings.find('controller/kp', (KP,)).checked(2.0) == 2.0
+    assert math.isnan(settings.find('robot/max_wheel_velocity', ()).checked(None))
     for key, value in (('controller/kp', None), ('controller/kp', 'a'), ('controller/controller', 1.0)):
         with pytest.raises(settings.SettingError):
-            settings.find(key).checked(value)
+            settings.find(key, (KP,)).checked(value)
     with pytest.raises(settings.SettingError, match='there is no setting'):
-        settings.find('controller/use_sim_time')
+        settings.find('controller/use_sim_time', (KP,))
 
 
 # --- Files of the page
@@ -374,7 +374,7 @@ def test_installed_controllers_are_looked_for_once(monkeypatch):
     monkeypatch.setattr(settings, 'controller_names', lambda: looked.append(1) or ['a'])
     settings._controllers.cache_clear()
     for _ in range(5):
-        settings.shown({'controller': {'controller': 'a'}})
+        settings.shown({'controller': {'controller': 'a'}}, ())
     settings._controllers.cache_clear()
     assert len(looked) == 1
 

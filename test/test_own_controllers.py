@@ -17,7 +17,15 @@ from lockstep_nodes import ABORTED, SUCCEEDED, Controller, Topics, arrives, chan
 from ros_messages import goal, twists
 
 from diffdrive_jacobian import control
-from diffdrive_jacobian.control import ControllerError, LawError, controller_names, find_controller
+from diffdrive_jacobian.control import (
+    KP,
+    KV,
+    OFFSET,
+    ControllerError,
+    LawError,
+    controller_names,
+    find_controller,
+)
 from diffdrive_jacobian.control.controllers import BUILT_IN, Controllers, controller_of
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
@@ -352,9 +360,9 @@ def test_the_error_of_a_law_has_its_cause():
 
 def test_gains_are_passed_in_the_order_of_the_controller():
     parameters = GoToGoalParameters(kp=2.0, kv=3.0, offset=5.0)
-    for gains in ((), ('kv',), ('offset', 'kp'), ('offset', 'kp', 'kv')):
+    for gains in ((), (KV,), (OFFSET, KP), (OFFSET, KP, KV)):
         own = replace(MINE, gains=gains, law=lambda pose, goal, *values: (len(values), sum(values)))
-        values = tuple(getattr(parameters, name) for name in gains)
+        values = tuple(getattr(parameters, gain.name) for gain in gains)
         assert own.bind(parameters)(np.zeros(3), np.ones(3)) == (len(gains), sum(values))
         assert own.values(parameters) == values
 
@@ -392,7 +400,7 @@ def test_a_bag_is_read_without_the_import_of_its_controller(site, install, monke
 
 # --- Sweeps and batches
 
-SMALL = Setup(kp=(2.0, 4.0), kv=(0.5, 1.0), grid=2, starts=2, rate=20.0, controller=MINE)
+SMALL = Setup(gains={'kp': (2.0, 4.0), 'kv': (0.5, 1.0)}, grid=2, starts=2, rate=20.0, controller=MINE)
 
 
 def test_a_given_controller_is_swept_and_drawn():
@@ -402,8 +410,9 @@ def test_a_given_controller_is_swept_and_drawn():
     np.testing.assert_array_equal(swept.outcomes.time[0, 1], alone.time)
     drawn = figure(swept)
     assert drawn.get_suptitle().startswith('mine: ')
-    # It has no boundary and no reference gains.
-    (entry,) = drawn.axes[3].get_legend().get_texts()
+    # It has no boundary, and the grid contains the defaults.
+    defaults, entry = drawn.axes[3].get_legend().get_texts()
+    assert defaults.get_text() == 'defaults: kp 3, kv 0.5'
     assert entry.get_text().startswith('fastest: ')
 
 
@@ -434,18 +443,18 @@ def test_a_driven_point_is_swept_with_its_offset():
     controller = control.Controller(
         name='point',
         law=lambda poses, goals, kp, kv, d: control.offset_point(poses, goals, kv, d),
-        gains=('kp', 'kv', 'offset'),
+        gains=(KP, KV, OFFSET),
         offset='offset',
     )
-    swept = sweep(replace(SMALL, controller=controller, offset=-0.3))
+    swept = sweep(replace(SMALL, controller=controller, gains={**SMALL.gains, 'offset': -0.3}))
     assert swept.complete.all()
     x, y = swept.outcomes.pose[..., 0], swept.outcomes.pose[..., 1]
     assert np.hypot(x, y) == pytest.approx(0.3, abs=0.021)
 
 
 def test_what_cannot_be_swept_is_refused(install, capsys):
-    with pytest.raises(ValueError, match="gains kp and kv to be swept, but 'mine' has kv"):
-        replace(SMALL, controller=replace(MINE, gains=('kv',)))
+    with pytest.raises(ValueError, match="two gains to be swept, but 'mine' has kv"):
+        replace(SMALL, controller=replace(MINE, gains=(KV,)))
     scalar = replace(MINE, law=lambda pose, to, kp, kv: (math.hypot(to[0] - pose[0], 0.0), 0.0))
     with pytest.raises(
         ValueError, match=r"'mine' must accept poses of shape \(2, 3\) to be swept, but failed: "
@@ -516,10 +525,11 @@ def test_the_example_is_installed(site):
 
 
 def test_every_field_is_described():
-    table = PAGE.read_text().split('## Fields')[1]
-    assert re.findall(r'^\| `(\w+)`', table, re.MULTILINE) == [
-        field.name for field in fields(control.Controller)
-    ]
+    tables = PAGE.read_text().split('## Fields')[1].split('A `Gain` has')
+    for table, described in zip(tables, (control.Controller, control.Gain), strict=True):
+        assert re.findall(r'^\| `(\w+)`', table, re.MULTILINE) == [
+            field.name for field in fields(described)
+        ]
 
 
 # --- The object
@@ -532,9 +542,12 @@ def test_every_field_is_described():
         ({'name': 'two words'}, "got 'two words'"),
         ({'name': 3}, 'got 3'),
         ({'law': 'law'}, 'law must be a function'),
-        ({'gains': ('kp', 'ki')}, 'gains must be a tuple of kp, kv, offset'),
-        ({'gains': ['kp', 'kv']}, 'gains must be a tuple of kp, kv, offset'),
-        ({'offset': 'kp'}, "offset must be 'offset' or '', got 'kp'"),
+        ({'gains': ('kp', 'ki')}, 'gains must be a tuple of Gain'),
+        ({'gains': [KP, KV]}, 'gains must be a tuple of Gain'),
+        ({'gains': (KP, KP)}, 'gains must have different names, got kp, kp'),
+        ({'state': (math.nan,)}, 'state must be finite'),
+        ({'state': 'x'}, 'state must be an array of real numbers'),
+        ({'offset': 'd'}, "offset must be '' or one of kp, kv, got 'd'"),
         ({'takes_heading': 1}, 'takes_heading must be True or False'),
         ({'advice': ()}, 'advice must be a function'),
         ({'boundary': (1.0, '')}, 'boundary must be of class Boundary'),
@@ -547,11 +560,24 @@ def test_an_invalid_controller_is_refused(changes, words):
         replace(MINE, **changes)
 
 
-@pytest.mark.parametrize('bad', [0.0, -1.0, math.nan, math.inf, '1', None, [1.0]], ids=str)
-def test_boundary_and_reference_gains_are_positive_numbers(bad):
-    with pytest.raises(ValueError, match='ratio must be'):
-        control.Boundary(ratio=bad, beyond='')
-    for name in ('kp', 'kv'):
-        with pytest.raises(ValueError, match=f'{name} must be'):
-            control.ReferenceGains(**{'kp': 1.0, 'kv': 1.0, name: bad}, source='')
-    assert control.Boundary(ratio=2, beyond='').equation == 'kp = 2 kv'
+@pytest.mark.parametrize(
+    ('changes', 'words'),
+    [
+        (
+            {'name': 'K'},
+            'name of a gain must be a lower-case letter, then lower-case letters, digits or _',
+        ),
+        ({'name': 'lambda'}, "got 'lambda'"),
+        ({'default': math.nan}, 'default must be finite'),
+        ({'default': 5.0}, 'ki must be in [-1, 2], got 5'),
+        ({'above': 1.0}, 'ki must be in (1, 2], got 1'),
+        ({'bounds': (1.0,)}, 'bounds must have shape (..., 2)'),
+        ({'usual': (1.0, 1.0)}, 'usual must be (first, last) with first < last'),
+        ({'usual': (0.0, 3.0)}, 'ki must be in [-1, 2], got 3'),
+        ({'unit': None}, 'unit must be of class str'),
+    ],
+    ids=str,
+)
+def test_an_invalid_gain_is_refused(changes, words):
+    with pytest.raises(ValueError, match=re.escape(words)):
+        control.Gain(**{'name': 'ki', 'default': 1.0, 'bounds': (-1.0, 2.0)} | changes)

@@ -18,7 +18,15 @@ import numpy as np
 import pytest
 from processes import open_world
 
-from diffdrive_jacobian.control import Arrival, VelocityLimits, find_controller, go_to_goal, go_to_pose
+from diffdrive_jacobian.control import (
+    KP,
+    KV,
+    Arrival,
+    VelocityLimits,
+    find_controller,
+    go_to_goal,
+    go_to_pose,
+)
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.plots import output_files
 from diffdrive_jacobian.plots import sweep_figure as _sweep_figure
@@ -26,7 +34,7 @@ from diffdrive_jacobian.plots.sweep_figure import TITLES, figure
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.simulation import RobotModel, closed_loops
 from diffdrive_jacobian.sweeps import Setup, describe, sweep, table
-from diffdrive_jacobian.sweeps.sweep import COLUMNS, MEASURES, SweptControllers
+from diffdrive_jacobian.sweeps.sweep import MEASURES, columns
 from diffdrive_jacobian.tools import sweep_gains
 from diffdrive_jacobian.tools.sweep_gains import main
 
@@ -81,7 +89,7 @@ def test_a_cell_is_what_single_loops_give(controller):
     swept = sweep(replace(SMALL, controller=controller, robot=robot, tolerance=0.05))
     law, goal = {'go_to_goal': (go_to_goal, [0.0, 0.0]), 'pose': (go_to_pose, [0.0] * 3)}[controller]
     row, column = 1, 3
-    kp, kv = swept.kp[column], swept.kv[row]
+    kp, kv = swept.x[column], swept.y[row]
     one = [
         closed_loops(
             law,
@@ -119,14 +127,14 @@ def final_heading_error(kp, kv):
 
 def test_beyond_the_boundary_it_spirals_in_as_the_theory_says():
     """The distance decays as exp(-kv cos^2(e) t), with the heading error e at which it settles."""
-    setup = Setup(kp=(0.5, 2.0), kv=(0.5, 2.0), grid=4, starts=4, duration=80.0)
+    setup = Setup(gains={'kp': (0.5, 2.0), 'kv': (0.5, 2.0)}, grid=4, starts=4, duration=80.0)
     near, nearer = (sweep(replace(setup, tolerance=tolerance)) for tolerance in (2e-3, 2e-5))
     assert near.complete.all()
     assert nearer.complete.all()
     taken = nearer.outcomes.time - near.outcomes.time
     seen = set()
-    for row, kv in enumerate(near.kv.tolist()):
-        for column, kp in enumerate(near.kp.tolist()):
+    for row, kv in enumerate(near.y.tolist()):
+        for column, kp in enumerate(near.x.tolist()):
             if 0.85 < kp / kv < 1.3:
                 # At the border itself it takes long to settle.
                 continue
@@ -137,15 +145,15 @@ def test_beyond_the_boundary_it_spirals_in_as_the_theory_says():
 
 
 def test_beyond_the_boundary_paths_and_times_are_longer():
-    swept = sweep(Setup(kp=(0.25, 4.0), kv=(0.999, 1.001), grid=16, starts=6))
-    spirals = swept.kp < 1.0
+    swept = sweep(Setup(gains={'kp': (0.25, 4.0), 'kv': (0.999, 1.001)}, grid=16, starts=6))
+    spirals = swept.x < 1.0
     assert spirals.sum() == 3
     for measure in ('time', 'path_length'):
         values = swept.mean(measure)[1]
         assert (np.diff(values) < 0.0).all()
         assert values[spirals].min() > values[~spirals].max()
     assert (swept.mean('overshoot')[1, spirals] > 0.05).all()
-    assert swept.mean('overshoot')[1, swept.kp > 1.5].max() < 0.01
+    assert swept.mean('overshoot')[1, swept.x > 1.5].max() < 0.01
 
 
 @pytest.mark.parametrize('count', [1, 2, 7, 12, 16])
@@ -162,9 +170,9 @@ def test_starts_lie_evenly_around_the_goal_and_face_all_directions(count):
 
 def test_gains_are_decimals():
     setup = Setup()
-    assert setup.gains('kp').tolist() == [round(0.2 + 0.1 * index, 1) for index in range(59)]
-    assert setup.gains('kv').tolist() == [round(0.1 + 0.05 * index, 2) for index in range(59)]
-    assert (setup.gains('kp')[28], setup.gains('kv')[8]) == (3.0, 0.5)
+    assert setup.values(KP).tolist() == [round(0.2 + 0.1 * index, 1) for index in range(59)]
+    assert setup.values(KV).tolist() == [round(0.1 + 0.05 * index, 2) for index in range(59)]
+    assert (setup.values(KP)[28], setup.values(KV)[8]) == (3.0, 0.5)
 
 
 def test_means_are_over_those_that_arrived():
@@ -271,9 +279,9 @@ def test_csv_holds_the_numbers(folder, capsys):
     assert run(*arguments) == 0
     assert left(folder) == ['a.csv']
     told, swept = read('a.csv'), small()
-    assert tuple(told) == COLUMNS
-    assert told['kp_per_s'].tolist() == np.repeat(swept.kp, 5).tolist()
-    assert told['kv_per_s'].tolist() == np.tile(swept.kv, 5).tolist()
+    assert tuple(told) == columns(swept.setup)
+    assert told['kp_per_s'].tolist() == np.repeat(swept.x, 5).tolist()
+    assert told['kv_per_s'].tolist() == np.tile(swept.y, 5).tolist()
     assert set(told['starts']) == {3.0}
     assert told['arrived'].tolist() == swept.arrived.T.ravel().tolist()
     units = {'time': 's', 'path_length': 'm', 'overshoot': 'm'}
@@ -301,7 +309,7 @@ def test_the_same_call_gives_the_same_numbers():
     ('arguments', 'changes'),
     [
         ((), {}),
-        (('--kp', '1e0', '2.5', '--kv', '.5', '0.75'), {'kp': (1.0, 2.5), 'kv': (0.5, 0.75)}),
+        (('--kp', '1e0', '2.5', '--kv', '.5', '0.75'), {'gains': {'kp': (1.0, 2.5), 'kv': (0.5, 0.75)}}),
         (('--grid', '7', '--starts', '5'), {'grid': 7, 'starts': 5}),
         (('--distance', '0.5', '--tolerance', '0.1'), {'distance': 0.5, 'tolerance': 0.1}),
         (('--controller', 'pose'), {'controller': 'pose'}),
@@ -382,8 +390,8 @@ def test_maps_show_the_means_with_units():
         assert mesh.get_cmap().name == 'viridis'
         # The cell of kp is around it.
         edges = mesh.get_coordinates()[0, :, 0]
-        assert (edges[:-1] <= swept.kp).all()
-        assert (swept.kp <= edges[1:]).all()
+        assert (edges[:-1] <= swept.x).all()
+        assert (swept.x <= edges[1:]).all()
         assert panel.patch.get_hatch()
     title = made.get_suptitle() if hasattr(made, 'get_suptitle') else made._suptitle.get_text()
     for word in ('go_to_goal', '3 starts', '2 m', '20 Hz', 'limits: none', '0.02 m'):
@@ -391,7 +399,7 @@ def test_maps_show_the_means_with_units():
     assert 'not all starts arrived within 60 s' in legend(made)
 
 
-@pytest.mark.parametrize('controller', SweptControllers())
+@pytest.mark.parametrize('controller', ['go_to_goal', 'pose'])
 def test_the_boundary_is_drawn_in_every_map(controller):
     made = figure(small()._replace(setup=replace(SMALL, controller=controller)))
     boundary = find_controller(controller).boundary
@@ -407,13 +415,13 @@ def test_the_boundary_is_drawn_in_every_map(controller):
 
 
 def test_only_what_lies_in_the_picture_is_marked():
-    setup = replace(SMALL, kp=(5.0, 6.0), kv=(0.5, 0.6), grid=2)
+    setup = replace(SMALL, gains={'kp': (5.0, 6.0), 'kv': (0.5, 0.6)}, grid=2)
     made = figure(sweep(setup))
     (only,) = legend(made)
     assert only.startswith('fastest: kp 6, kv 0.6, ')
     assert not any(panel.texts for panel in maps(made).values())
     texts = legend(figure(small()))
-    assert texts[1] == "document A's gains: kp 3, kv 0.5"
+    assert texts[1] == 'defaults: kp 3, kv 0.5'
     assert texts[2].startswith('fastest: kp 6, kv 3, ')
     assert "document A's" not in str(legend(figure(sweep(replace(setup, controller='pose')))))
 
@@ -423,7 +431,7 @@ def test_only_what_lies_in_the_picture_is_marked():
     [
         {'duration': 0.01},
         {'controller': 'pose', 'grid': 12},
-        {'kp': (2.0, 2.000001), 'kv': (0.4, 0.400001), 'starts': 1},
+        {'gains': {'kp': (2.0, 2.000001), 'kv': (0.4, 0.400001)}, 'starts': 1},
     ],
     ids=str,
 )
@@ -458,7 +466,9 @@ def test_it_says_which_gains_are_the_fastest():
         'fastest: kp 6, kv 3 (the largest kp and the largest kv of the grid): at the goal after 1.'
     )
     # Asked that seldom, it overshoots with large gains.
-    words = describe(sweep(Setup(grid=7, starts=3, kp=(0.5, 5.0), kv=(0.5, 3.0), rate=2.0)))
+    words = describe(
+        sweep(Setup(grid=7, starts=3, gains={'kp': (0.5, 5.0), 'kv': (0.5, 3.0)}, rate=2.0))
+    )
     assert 'of the grid' not in words
 
 
@@ -468,16 +478,16 @@ def test_it_says_which_gains_are_the_fastest():
 @pytest.mark.parametrize(
     ('arguments', 'words'),
     [
-        (('--kp', '-1', '2'), 'kp must be MIN MAX with 0.001 <= MIN < MAX <= 100, got -1 2'),
-        (('--kp', '-1e-3', '2'), 'got -0.001 2'),
-        (('--kv', '0', '2'), 'kv must be MIN MAX'),
-        (('--kv', '1', '101'), 'got 1 101'),
-        (('--kp', '3', '2'), 'got 3 2'),
-        (('--kp', '2', '2'), 'got 2 2'),
-        (('--kp', '2', '2.0000000001'), 'kp must have 59 different values, got'),
+        (('--kp', '-1', '2'), 'kp must be in (0, 100], got -1'),
+        (('--kp', '-1e-3', '2'), 'kp must be in (0, 100], got -0.001'),
+        (('--kv', '0', '2'), 'kv must be in (0, 100], got 0'),
+        (('--kv', '1', '101'), 'kv must be in (0, 100], got 101'),
+        (('--kp', '3', '2'), 'kp must be MIN MAX with MIN < MAX, got (3.0, 2.0)'),
+        (('--kp', '2', '2'), 'kp must be MIN MAX with MIN < MAX, got (2.0, 2.0)'),
+        (('--kp', '2', '2.0000000001'), 'kp must have 59 different values'),
         (('--kp', 'nan', '2'), "--kp: must be a finite number, got 'nan'"),
         (('--kv', '1', 'inf'), "--kv: must be a finite number, got 'inf'"),
-        (('--kp', '1'), '--kp: expected 2 arguments'),
+        (('--kp', '1'), 'two gains must be swept, got ranges of none'),
         (('--grid', '1'), 'grid must be at least 2, got 1'),
         (('--grid', '2.5'), "--grid: must be a whole number below a billion, got '2.5'"),
         (('--grid', '٣'), "--grid: must be a whole number below a billion, got '٣'"),
@@ -493,7 +503,8 @@ def test_it_says_which_gains_are_the_fastest():
         (('--distance', '0.01'), 'distance must be larger than tolerance, 0.02 m, and less than'),
         (('--distance', '1e6'), 'distance must be larger than tolerance'),
         (('--tolerance', '0'), '--tolerance: must be in [1e-06, 100], got 0.0'),
-        (('--controller', 'offset_point'), "--controller: invalid choice: 'offset_point'"),
+        (('--controller', 'other'), "controller must be one of 'go_to_goal', 'offset_point', 'pose'"),
+        (('--controller', 'offset_point', '--kp', '1', '2'), 'unrecognized arguments: --kp'),
         (('--max-velocity', '0'), "--max-velocity: must be positive, got '0'"),
         (('--max-velocity', '2000'), "'linear.x.max_velocity' must be in [0, 1000]"),
         (('--max-yaw-rate', '1e-9'), 'limits must be at least 1e-06, got 1e-09'),
@@ -530,8 +541,10 @@ def test_a_setup_checks_itself():
     for changes in ({'rate': math.nan}, {'duration': -1.0}, {'tolerance': math.inf}):
         with pytest.raises(ValueError, match=f'{next(iter(changes))} must be positive and finite'):
             Setup(**changes)
-    with pytest.raises(ValueError, match='controller must be one of go_to_goal, pose'):
-        Setup(controller='offset_point')
+    with pytest.raises(ValueError, match='controller must be one of go_to_goal, offset_point, pose'):
+        Setup(controller='other')
+    with pytest.raises(ValueError, match="gains must be of kv, offset, those of 'offset_point'"):
+        Setup(controller='offset_point', gains={'kp': 1.0})
 
 
 @pytest.mark.parametrize('option', ['-o', '--csv'])

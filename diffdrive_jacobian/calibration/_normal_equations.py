@@ -15,16 +15,17 @@ from diffdrive_jacobian.calibration.estimate import (
     YAW_OFFSET,
     Estimate,
 )
-from diffdrive_jacobian.calibration.measurements import Array, Segment, wrapped
+from diffdrive_jacobian.calibration.measurements import Array, Segment
 from diffdrive_jacobian.calibration.motion import (
     Geometry,
     Increments,
-    adjoint,
     composed,
     increments,
     inverted,
     relative,
 )
+from diffdrive_jacobian.kinematics.se2 import adjoint
+from diffdrive_jacobian.numerics.elementary import wrap
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -103,7 +104,7 @@ def _motion(
     """Return the normal equations of the motion, for the wheel travel variance 1 m."""
     between = relative(states[:-1], states[1:])
     residual = relative(moved.steps, between)
-    residual[:, 2] = wrapped(residual[:, 2])
+    residual[:, 2] = wrap(residual[:, 2])
     weight = np.linalg.inv(moved.covariance)
     back = -adjoint(inverted(between))
     change = np.zeros((len(residual), 3, count))
@@ -142,7 +143,7 @@ def _observation(segment: Segment, states: Array, sensor: Array, count: int) -> 
     c, s = np.cos(sensor[2]), np.sin(sensor[2])
     x, y = residual[:, 0].copy(), residual[:, 1].copy()
     residual[:, 0], residual[:, 1] = c * x - s * y, s * x + c * y
-    residual[:, 2] = wrapped(residual[:, 2])
+    residual[:, 2] = wrap(residual[:, 2])
     by_pose = -np.array([[1.0, 0.0, -sensor[1]], [0.0, 1.0, sensor[0]], [0.0, 0.0, 1.0]])
     by_parameters = np.zeros((3, count))
     by_parameters[:2, LEVER_ARM] = -np.eye(2)

@@ -18,7 +18,6 @@ from diffdrive_jacobian.calibration.measurements import (
     Noise,
     Recording,
     Segment,
-    wrapped,
 )
 from diffdrive_jacobian.calibration.motion import Geometry, composed
 from diffdrive_jacobian.calibration.observability import UNDETERMINED, undetermined
@@ -32,6 +31,7 @@ from diffdrive_jacobian.calibration.preparation import (
 )
 from diffdrive_jacobian.calibration.rest import merged
 from diffdrive_jacobian.calibration.rough import rough, unit
+from diffdrive_jacobian.numerics.elementary import wrap
 
 PARAMETERS = (
     'left_wheel_radius_multiplier',
@@ -119,7 +119,7 @@ class Calibration:
                 begin = before - float(motion.time[0])
             recording = motion.recording
             difference = motion.poses - composed(states, self.estimate.sensor)
-            difference[:, 2] = wrapped(difference[:, 2])
+            difference[:, 2] = wrap(difference[:, 2])
             parts.append(np.column_stack([begin + motion.time, difference]))
             before = float(parts[-1][-1, 0])
         return parts

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diffdrive_jacobian.calibration.calibrate import Calibration
-from diffdrive_jacobian.calibration.measurements import Array, wrapped
+from diffdrive_jacobian.calibration.measurements import Array
 from diffdrive_jacobian.calibration.motion import (
     Geometry,
     composed,
@@ -15,6 +15,7 @@ from diffdrive_jacobian.calibration.motion import (
     inverted,
     relative,
 )
+from diffdrive_jacobian.numerics.elementary import wrap
 
 DISTANCE = 5.0
 """Distance over which odometry and reference are compared, where the drive is long enough (m)."""
@@ -74,7 +75,7 @@ def tracks(result: Calibration, geometry: Geometry, distance: float) -> list[Tra
                 reference=reference,
                 odometry=composed(reference[0], moved.poses),
                 position_error=np.where(known, np.hypot(difference[:, 0], difference[:, 1]), np.nan),
-                heading_error=np.where(known, wrapped(difference[:, 2]), np.nan),
+                heading_error=np.where(known, wrap(difference[:, 2]), np.nan),
             )
         )
     return found

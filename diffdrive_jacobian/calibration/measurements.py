@@ -81,8 +81,3 @@ class Segment:
     def part(self, here: slice | NDArray[np.intp]) -> Segment:
         """Return the segment with only some of its poses."""
         return replace(self, time=self.time[here], poses=self.poses[here], weights=self.weights[here])
-
-
-def wrapped(angle: Array) -> Array:
-    """Wrap angles to [-pi, pi), also those of 1-D arrays of any size."""
-    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.kinematics.se2 import sinc
+from diffdrive_jacobian.kinematics.se2 import compose, inverse
+from diffdrive_jacobian.numerics.elementary import sinc
 
 Array = NDArray[np.float64]
 
@@ -96,7 +97,7 @@ def increments(
     s, a = (right + left) / 2.0, (right - left) / L
     theta = np.concatenate([[0.0], np.cumsum(a)])
     middle = theta[:-1] + a / 2.0
-    shrink = np.asarray(sinc(a / 2.0))
+    shrink = sinc(a / 2.0)
     chords = (s * shrink)[:, None] * np.column_stack([np.cos(middle), np.sin(middle)])
     places = np.concatenate([np.zeros((1, 2)), np.cumsum(chords, axis=0)])
     poses = np.column_stack([places, theta])[marks]
@@ -144,7 +145,7 @@ def _sinc_slope(h: Array) -> Array:
     """Return the derivative of sinc, `(cos h - sinc h) / h`."""
     small = np.abs(h) < 1e-2
     safe = np.where(small, 1.0, h)
-    return np.where(small, -h / 3.0 + h**3 / 30.0, (np.cos(h) - np.asarray(sinc(h))) / safe)
+    return np.where(small, -h / 3.0 + h**3 / 30.0, (np.cos(h) - sinc(h)) / safe)
 
 
 def _rates(time: Array, rims: Array, at: Array, L: float, window: float) -> Array:
@@ -156,35 +157,23 @@ def _rates(time: Array, rims: Array, at: Array, L: float, window: float) -> Arra
     return np.column_stack([(right + left) / 2.0, np.zeros_like(right), (right - left) / L])
 
 
+# Poses whose theta is not wrapped: it counts the turns of the drive.
+
+
 def relative(first: Array, second: Array) -> Array:
     """Return the second pose in the frame of the first, shape (..., 3); theta is not wrapped."""
     dx, dy, turn = np.moveaxis(second - first, -1, 0)
-    c, s = np.cos(first[..., 2]), np.sin(first[..., 2])
-    return np.stack([c * dx + s * dy, c * dy - s * dx, turn], axis=-1)
+    x, y, _ = compose.formula([0.0, 0.0, -first[..., 2]], [dx, dy, 0.0])
+    return np.stack([x, y, turn], axis=-1)
 
 
 def composed(first: Array, second: Array) -> Array:
     """Return a pose that is given in the frame of the first, shape (..., 3); theta is not wrapped."""
-    first, second = np.broadcast_arrays(first, second)
-    x, y, turn = np.moveaxis(second, -1, 0)
-    c, s = np.cos(first[..., 2]), np.sin(first[..., 2])
-    moved: Array = first + np.stack([c * x - s * y, s * x + c * y, turn], axis=-1)
-    return moved
-
-
-def adjoint(pose: Array) -> Array:
-    """Return the adjoint of poses, which maps a twist from the body to the frame, shape (..., 3, 3)."""
-    x, y, theta = np.moveaxis(pose, -1, 0)
-    c, s = np.cos(theta), np.sin(theta)
-    matrix = np.zeros((*theta.shape, 3, 3))
-    matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2] = c, -s, y
-    matrix[..., 1, 0], matrix[..., 1, 1], matrix[..., 1, 2] = s, c, -x
-    matrix[..., 2, 2] = 1.0
-    return matrix
+    x, y, _ = compose.formula(np.moveaxis(first, -1, 0), np.moveaxis(second, -1, 0))
+    return np.stack([x, y, first[..., 2] + second[..., 2]], axis=-1)
 
 
 def inverted(pose: Array) -> Array:
     """Return the inverse of poses, shape (..., 3); theta is not wrapped."""
-    x, y, theta = np.moveaxis(pose, -1, 0)
-    c, s = np.cos(theta), np.sin(theta)
-    return np.stack([-c * x - s * y, s * x - c * y, -theta], axis=-1)
+    x, y, _ = inverse.formula(np.moveaxis(pose, -1, 0))
+    return np.stack([x, y, -pose[..., 2]], axis=-1)

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from diffdrive_jacobian.calibration.measurements import Segment, wrapped
+from diffdrive_jacobian.calibration.measurements import Segment
 from diffdrive_jacobian.calibration.motion import Geometry
+from diffdrive_jacobian.numerics.elementary import wrap
 
 STILL = 1e-5
 """Distance that both wheels together travel while the robot counts as at rest (m)."""
@@ -25,7 +26,7 @@ def merged(segment: Segment, nominal: Geometry, time_offset: float) -> Segment:
     counts = np.diff([*starts, len(at)])
     headings = segment.poses[np.repeat(starts, counts), 2]
     poses = segment.poses.copy()
-    poses[:, 2] = wrapped(poses[:, 2] - headings)
+    poses[:, 2] = wrap(poses[:, 2] - headings)
     means = np.add.reduceat(poses, starts) / counts[:, None]
     means[:, 2] += segment.poses[starts, 2]
     return replace(

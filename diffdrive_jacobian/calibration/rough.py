@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.calibration.measurements import Array, CalibrationError, Segment, wrapped
+from diffdrive_jacobian.calibration.measurements import Array, CalibrationError, Segment
 from diffdrive_jacobian.calibration.motion import (
     Geometry,
     Increments,
@@ -21,6 +21,7 @@ from diffdrive_jacobian.calibration.motion import (
     inverted,
     relative,
 )
+from diffdrive_jacobian.numerics.elementary import wrap
 
 PARTS = 400
 """Largest number of parts into which the drives are divided."""
@@ -60,7 +61,7 @@ class Rough:
         expected = composed(composed(inverted(self.sensor), moved.steps), self.sensor)
         found = relative(segment.poses[:-1], segment.poses[1:])
         difference = relative(expected, found)
-        difference[:, 2] = wrapped(difference[:, 2])
+        difference[:, 2] = wrap(difference[:, 2])
         return difference, moved.travel
 
 

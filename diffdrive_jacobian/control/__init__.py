@@ -1,7 +1,7 @@
 """Control laws that compute velocities from a goal, and controllers by name. No ROS."""
 
 from diffdrive_jacobian.control.arrival import Arrival
-from diffdrive_jacobian.control.controller import Boundary, Controller, LawError, ReferenceGains
+from diffdrive_jacobian.control.controller import KP, KV, OFFSET, Boundary, Controller, Gain, LawError
 from diffdrive_jacobian.control.controllers import (
     ControllerError,
     Controllers,
@@ -16,13 +16,16 @@ from diffdrive_jacobian.control.waypoints import Waypoints
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits, saturate
 
 __all__ = [
+    'KP',
+    'KV',
+    'OFFSET',
     'Arrival',
     'Boundary',
     'Controller',
     'ControllerError',
     'Controllers',
+    'Gain',
     'LawError',
-    'ReferenceGains',
     'StraightLine',
     'VelocityLimits',
     'Waypoints',

@@ -11,6 +11,7 @@ from typing import Any
 
 from diffdrive_jacobian.kinematics.diff_drive import offset_point
 from diffdrive_jacobian.numerics.checks import (
+    array,
     boolean,
     equal,
     hashable,
@@ -18,7 +19,7 @@ from diffdrive_jacobian.numerics.checks import (
     number,
     read_only,
 )
-from diffdrive_jacobian.numerics.elementary import hypot, operand, wrap
+from diffdrive_jacobian.numerics.elementary import hypot, wrap
 from diffdrive_jacobian.numerics.formula import Number, formula
 
 
@@ -60,8 +61,8 @@ class Arrival:
         for name in ('xy_tolerance', 'yaw_tolerance'):
             object.__setattr__(self, name, number(name, getattr(self, name), not_negative))
         object.__setattr__(self, 'use_heading', boolean('use_heading', self.use_heading))
-        offset = operand('offset', self.offset)
-        object.__setattr__(self, 'offset', offset if type(offset) is float else read_only(offset))
+        offset = array('offset', self.offset)
+        object.__setattr__(self, 'offset', read_only(offset) if offset.ndim else float(offset))
 
     def __eq__(self, other: object) -> bool:
         """Compare every field, arrays by shape and entries."""

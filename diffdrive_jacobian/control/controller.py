@@ -13,44 +13,40 @@ The node go_to_goal calls it with one pose at a time. Batches and sweeps call it
 
 from __future__ import annotations
 
+import math
 import re
 import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from keyword import iskeyword
 from math import isfinite
 from pathlib import Path
-from typing import Any, Protocol
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.control.sampling import rate_warning
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
-from diffdrive_jacobian.numerics.checks import boolean, function, instance, number, positive, short
+from diffdrive_jacobian.numerics.checks import (
+    array,
+    boolean,
+    finite,
+    function,
+    instance,
+    number,
+    numbers,
+    short,
+)
+from diffdrive_jacobian.time_units import NANOSECONDS
 
-Law = Callable[..., tuple[Any, Any]]
+Law = Callable[..., tuple[Any, ...]]
 """`law(poses, goals, *gains) -> (v, omega)`, as described above."""
-BoundLaw = Callable[[ArrayLike, ArrayLike], tuple[float, float]]
-"""A law with its gains: one pose, shape (3,), and one goal, shape (3,), to `(v, omega)`."""
-GAINS = ('kp', 'kv', 'offset')
-"""Parameters that a law can take."""
+GainValues = Any
+"""An object with an attribute for each gain, such as the parameters of the node go_to_goal."""
 _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_.-]{0,63}')
-
-
-class GainValues(Protocol):
-    """Values of the gains, such as the parameters of the node go_to_goal."""
-
-    @property
-    def kp(self) -> float:
-        """Gain on the heading error (1/s)."""
-
-    @property
-    def kv(self) -> float:
-        """Gain on the distance (1/s)."""
-
-    @property
-    def offset(self) -> float:
-        """X coordinate of the driven point in the body frame (m)."""
+_GAIN = re.compile(r'[a-z][a-z0-9_]{0,31}')
+LARGEST_GAIN = 100.0
 
 
 class LawError(ValueError):
@@ -58,49 +54,101 @@ class LawError(ValueError):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Boundary:
-    """A straight line `kp = ratio * kv` in the plane of gains.
+class Gain:
+    """A gain of a law: a parameter of the node go_to_goal, a slider of the page, an axis of sweeps.
 
     Raises:
-        ValueError: The ratio is not positive and finite, or `beyond` is not a string.
+        ValueError: A field is invalid, or the default is out of range.
     """
 
-    ratio: float
-    """Positive, kp on the line divided by kv [-]."""
-    beyond: str
-    """What happens where kv is larger than on the line."""
+    name: str
+    """Name of the parameter: a lower-case letter, then letters, digits or `_`, at most 32. Laws with a
+    gain of the same name share the parameter."""
+    default: float
+    unit: str = '1/s'
+    description: str = 'Gain'
+    """What it acts on, for help texts."""
+    bounds: tuple[float, float] = (-LARGEST_GAIN, LARGEST_GAIN)
+    """Smallest and largest value."""
+    above: float | None = None
+    """Lower bound that is itself not allowed, instead of the smallest value."""
+    label: str = ''
+    """Label on the page; default: the name."""
+    usual: tuple[float, float] = (math.nan, math.nan)
+    """Range of the slider and of sweeps; default: from a tenth to three times the default value."""
 
     def __post_init__(self) -> None:
-        """Check every value."""
-        object.__setattr__(self, 'ratio', number('ratio', self.ratio, positive))
-        instance('beyond', self.beyond, str)
+        """Check every field."""
+        if not isinstance(self.name, str) or not _GAIN.fullmatch(self.name) or iskeyword(self.name):
+            raise ValueError(
+                'name of a gain must be a lower-case letter, then lower-case letters, digits or _, at '
+                f'most 32, got {short(repr(self.name))}'
+            )
+        for name in ('unit', 'description', 'label'):
+            instance(name, getattr(self, name), str)
+        low, high = numbers('bounds', self.bounds, 2)
+        object.__setattr__(self, 'bounds', (low, high))
+        if self.above is not None:
+            object.__setattr__(self, 'above', number('above', self.above, finite))
+        object.__setattr__(self, 'default', number('default', self.default, finite))
+        self.check(self.default)
+        if np.isnan(self.usual).all():
+            about = sorted((self.default / 10.0, 3.0 * self.default)) if self.default else [low, high]
+            object.__setattr__(self, 'usual', (max(low, about[0]), min(high, about[1])))
+        first, last = numbers('usual', self.usual, 2)
+        if not first < last:
+            raise ValueError(f'usual must be (first, last) with first < last, got {self.usual}')
+        self.check(first)
+        self.check(last)
+
+    def check(self, value: float) -> None:
+        """Raise ValueError if a value is not allowed."""
+        low, high = self.bounds
+        if not low <= value <= high or (self.above is not None and not value > self.above):
+            allowed = f'[{low:g}, ' if self.above is None else f'({self.above:g}, '
+            raise ValueError(f'{self.name} must be in {allowed}{high:g}], got {value:g}')
+
+
+KP = Gain(
+    name='kp',
+    default=3.0,
+    description='Gain on the heading error; should be larger than kv',
+    bounds=(0.0, LARGEST_GAIN),
+    above=0.0,
+    label='Kp',
+    usual=(0.2, 6.0),
+)
+KV = Gain(
+    name='kv',
+    default=0.5,
+    description='Gain on the distance',
+    bounds=(0.0, LARGEST_GAIN),
+    above=0.0,
+    label='Kv',
+    usual=(0.1, 3.0),
+)
+OFFSET = Gain(
+    name='offset',
+    default=0.1,
+    unit='m',
+    description='X coordinate in the body frame of the point that offset_point drives; not 0',
+    label='Offset d',
+    usual=(0.02, 0.4),
+)
+
+
+class Boundary(NamedTuple):
+    """A line `kp = ratio kv` in the picture of a sweep of these gains."""
+
+    ratio: float
+    """kp on the line divided by kv [-]."""
+    beyond: str
+    """What happens where kv is larger than on the line."""
 
     @property
     def equation(self) -> str:
         """The equation of the line, such as `kp = 2 kv`."""
         return 'kp = kv' if self.ratio == 1.0 else f'kp = {self.ratio:g} kv'
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ReferenceGains:
-    """A pair of gains that is marked in the picture of a sweep.
-
-    Raises:
-        ValueError: A gain is not positive and finite, or `source` is not a string.
-    """
-
-    kp: float
-    """Gain on the heading error (1/s)."""
-    kv: float
-    """Gain on the distance (1/s)."""
-    source: str
-    """Where they come from."""
-
-    def __post_init__(self) -> None:
-        """Check every value."""
-        for name in ('kp', 'kv'):
-            object.__setattr__(self, name, number(name, getattr(self, name), positive))
-        instance('source', self.source, str)
 
 
 def no_advice(gains: GainValues, limits: VelocityLimits) -> Iterable[str]:
@@ -125,21 +173,23 @@ class Controller:
     """The law, `law(poses, goals, *gains) -> (v, omega)`."""
     summary: str = ''
     """One sentence for help texts."""
-    gains: tuple[str, ...] = ('kp', 'kv')
-    """Parameters that are passed to the law, in this order; of `kp`, `kv` and `offset`."""
+    gains: tuple[Gain, ...] = (KP, KV)
+    """Gains that are passed to the law, in this order."""
+    state: tuple[float, ...] = ()
+    """What the law remembers when a goal begins, such as `(0.0,)` for an integral. Such a law is called
+    with `state`, shape (..., n), and with the time dt since the call before (s), at first 0, by keyword.
+    It returns `(v, omega, state)`."""
     takes_heading: bool = False
     """Whether the law takes the heading of the goal. The robot then always turns to it at the end."""
     offset: str = ''
-    """Parameter that holds the x coordinate of the driven point in the body frame, `offset`; empty: the
-    law drives the axle centre."""
+    """Name of the gain that is the x coordinate of the driven point in the body frame; empty: the law
+    drives the axle centre."""
     advice: Callable[[GainValues, VelocityLimits], Iterable[str]] = no_advice
     """Return warnings about gains or limits that do not suit the law."""
     slope: Callable[[GainValues], float] | None = None
     """Return the largest slope of the yaw rate over the heading (1/s). The sampling rate limits it."""
     boundary: Boundary | None = None
     """Line that is drawn in the picture of a sweep."""
-    reference_gains: ReferenceGains | None = None
-    """Gains that are marked in the picture of a sweep."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -154,17 +204,33 @@ class Controller:
             function('slope', self.slope)
         instance('summary', self.summary, str)
         boolean('takes_heading', self.takes_heading)
-        if not isinstance(self.gains, tuple) or not all(gain in GAINS for gain in self.gains):
-            raise ValueError(f'gains must be a tuple of {", ".join(GAINS)}, got {short(self.gains)}')
-        if self.offset not in ('', 'offset'):
-            raise ValueError(f"offset must be 'offset' or '', got {short(repr(self.offset))}")
-        for name, kind in (('boundary', Boundary), ('reference_gains', ReferenceGains)):
-            if getattr(self, name) is not None:
-                instance(name, getattr(self, name), kind)
+        if not isinstance(self.gains, tuple) or not all(isinstance(one, Gain) for one in self.gains):
+            raise ValueError(f'gains must be a tuple of Gain, got {short(self.gains)}')
+        names = self.gain_names
+        if len(set(names)) < len(names):
+            raise ValueError(f'gains must have different names, got {", ".join(names)}')
+        if self.offset not in ('', *names):
+            raise ValueError(
+                f"offset must be '' or one of {', '.join(names)}, got {short(repr(self.offset))}"
+            )
+        state = array('state', self.state, 'n') if self.state else np.zeros(0)
+        object.__setattr__(self, 'state', tuple(state.tolist()))
+        if self.boundary is not None:
+            instance('boundary', self.boundary, Boundary)
+
+    @property
+    def gain_names(self) -> tuple[str, ...]:
+        """Names of the gains, in the order of the law."""
+        return tuple(gain.name for gain in self.gains)
+
+    @property
+    def defaults(self) -> SimpleNamespace:
+        """The default value of each gain."""
+        return SimpleNamespace(**{gain.name: gain.default for gain in self.gains})
 
     def values(self, gains: GainValues) -> tuple[float, ...]:
         """Return the values that are passed to the law, in its order."""
-        return tuple(getattr(gains, name) for name in self.gains)
+        return tuple(getattr(gains, name) for name in self.gain_names)
 
     def driven_offset(self, gains: GainValues) -> float:
         """Return the x coordinate of the driven point in the body frame (m)."""
@@ -193,45 +259,79 @@ class Controller:
         return [warning] if warning else []
 
     def bind(self, gains: GainValues) -> BoundLaw:
-        """Return the law with its gains, for single poses.
+        """Return the law with its gains, for single poses."""
+        return BoundLaw(self, self.values(gains))
 
-        Args:
-            gains: The gains, such as the parameters of go_to_goal.
 
-        Returns:
-            A function of a pose, shape (3,), and a goal, shape (3,), that returns `(v, omega)`. They
-            are arrays or tuples of floats. It raises LawError if the law raises an exception or does
-            not return two finite numbers.
-        """
+class BoundLaw:
+    """A law with its gains, for single poses, and what it remembers.
+
+    It is called with a pose, shape (3,), and a goal, shape (3,), arrays or tuples of floats, and returns
+    `(v, omega)`. It raises LawError if the law raises an exception or returns something else.
+    """
+
+    def __init__(self, controller: Controller, values: tuple[float, ...]) -> None:
+        """Take the gains in the order of the law."""
+        self.controller = controller
+        self._values = values
+        self._size = 3 if controller.takes_heading else 2
         # An equation is given floats that are checked already; another law may index arrays.
-        equation = getattr(self.law, 'formula', None)
-        values, size = self.values(gains), 3 if self.takes_heading else 2
+        self._equation = getattr(controller.law, 'formula', None)
+        self.now = 0
+        """Time of the next pose (ns). Needed by laws with a state."""
+        self._before: int | None = None
+        self._state = controller.state
 
-        def bound(pose: Any, goal: Any) -> tuple[float, float]:
-            try:
-                if equation is None:
-                    twist = self.law(np.asarray(pose), np.asarray(goal[:size]), *values)
-                else:
-                    twist = equation(pose, np.asarray(goal)[:size].tolist(), *values)
-            except Exception as error:
-                raise LawError(
-                    f'the law of controller {self.name!r} failed: {_reason(error)}'
-                ) from error
-            try:
-                v, omega = map(_number, twist)
-            except (TypeError, ValueError) as error:
-                raise LawError(
-                    f'the law of controller {self.name!r} must return (v, omega), two numbers, '
-                    f'got {short(twist)}'
-                ) from error
-            if not (isfinite(v) and isfinite(omega)):
-                raise LawError(
-                    f'the law of controller {self.name!r} must return finite (v, omega), '
-                    f'got ({v:g}, {omega:g})'
-                )
-            return v, omega
+    def reset(self) -> None:
+        """Begin a new goal."""
+        self._before, self._state = None, self.controller.state
 
-        return bound
+    def continue_from(self, other: BoundLaw) -> None:
+        """Remember what the same law with other gains does."""
+        if other.controller == self.controller:
+            self.now, self._before, self._state = other.now, other._before, other._state
+
+    def __call__(self, pose: Any, goal: Any) -> tuple[float, float]:
+        """Return the twist."""
+        name, state = self.controller.name, self._state
+        try:
+            twist = self._evaluated(pose, goal)
+        except Exception as error:
+            raise LawError(f'the law of controller {name!r} failed: {_reason(error)}') from error
+        try:
+            if state:
+                v, omega, state = twist
+                state = tuple(map(float, np.ravel(state)))
+                if len(state) != len(self._state):
+                    raise ValueError(f'{len(state)} numbers')
+            else:
+                v, omega = twist
+            v, omega = _number(v), _number(omega)
+        except (TypeError, ValueError) as error:
+            raise LawError(
+                f'the law of controller {name!r} must return (v, omega), two numbers'
+                + (f', and the state, {len(self._state)} numbers' if self._state else '')
+                + f', got {short(twist)}'
+            ) from error
+        if not (isfinite(v) and isfinite(omega) and all(map(isfinite, state))):
+            raise LawError(
+                f'the law of controller {name!r} must return finite (v, omega), got ({v:g}, {omega:g})'
+                + (f' and the state {short(list(state))}' if state else '')
+            )
+        self._before, self._state = self.now, state
+        return v, omega
+
+    def _evaluated(self, pose: Any, goal: Any) -> Any:
+        state: Any = list(self._state)
+        if self._equation is None:
+            law, at, to = self.controller.law, np.asarray(pose), np.asarray(goal[: self._size])
+            state = np.array(state)
+        else:
+            law, at, to = self._equation, pose, np.asarray(goal)[: self._size].tolist()
+        if not self._state:
+            return law(at, to, *self._values)
+        dt = 0.0 if self._before is None else (self.now - self._before) / NANOSECONDS
+        return law(at, to, *self._values, state=state, dt=dt)
 
 
 def _number(value: Any) -> float:

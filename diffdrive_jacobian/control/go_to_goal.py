@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from diffdrive_jacobian.control.controller import Boundary, Controller, GainValues, ReferenceGains
+from diffdrive_jacobian.control.controller import Boundary, Controller, GainValues
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.elementary import atan2, cos, hypot, where, wrap
 from diffdrive_jacobian.numerics.formula import Number, Vector, formula
@@ -67,7 +67,6 @@ CONTROLLER = Controller(
     advice=_advice,
     slope=lambda gains: gains.kp + gains.kv,
     boundary=Boundary(ratio=1.0, beyond='with a larger kv the robot spirals in'),
-    reference_gains=ReferenceGains(kp=3.0, kv=0.5, source="document A's gains"),
 )
 
 

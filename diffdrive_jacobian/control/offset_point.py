@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from diffdrive_jacobian.control.controller import Controller, GainValues
+from diffdrive_jacobian.control.controller import KV, OFFSET, Controller, GainValues
 from diffdrive_jacobian.kinematics import diff_drive
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import offset
@@ -68,7 +68,7 @@ CONTROLLER = Controller(
     name='offset_point',
     law=offset_point,
     summary='input-output linearization at an offset point, document B',
-    gains=('kv', 'offset'),
+    gains=(KV, OFFSET),
     offset='offset',
     advice=_advice,
     # At the goal. At a distance it is larger by kv distance / |offset|.

@@ -87,7 +87,7 @@ def default_weight(Kp: Number, Kv: Number) -> Number:
 
 
 def _slope(gains: GainValues) -> float:
-    return gains.kp + gains.kv * (1.0 + STEEPEST * float(default_weight(gains.kp, gains.kv)))
+    return float(gains.kp + gains.kv * (1.0 + STEEPEST * default_weight(gains.kp, gains.kv)))
 
 
 def _advice(gains: GainValues, limits: VelocityLimits) -> Iterator[str]:

@@ -7,15 +7,13 @@ Source: doc/mathematics.md, "Control laws".
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from math import inf, isfinite
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from diffdrive_jacobian.numerics.checks import (
+    anything,
     equal,
     floats,
     hashable,
@@ -24,12 +22,11 @@ from diffdrive_jacobian.numerics.checks import (
     positive,
     read_only,
 )
-from diffdrive_jacobian.numerics.elementary import agree, alike, operand, where
+from diffdrive_jacobian.numerics.elementary import maximum, minimum, where
+from diffdrive_jacobian.numerics.formula import Number, formula
 
-Select = Callable[..., Any]
-"""`max` or `min` of floats, or of arrays element by element."""
-SMALLEST = 5e-324
-"""Smallest positive float."""
+ROUNDING = 2.0**-49
+"""By how much a computed wheel speed may be beyond its limit, relative to it."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -52,55 +49,41 @@ class VelocityLimits:
     """Fastest counter-clockwise yaw rate (rad/s)."""
     max_wheel_speed: Any = np.inf
     """Largest absolute speed of either wheel (rad/s)."""
-    unlimited: bool = field(init=False, repr=False, compare=False)
-    """Whether no limit is set."""
-    alike: bool = field(init=False, repr=False, compare=False)
-    """Whether every limit is a number, equal for all robots."""
-    _bounds: tuple[Any, ...] = field(init=False, repr=False, compare=False)
-    """Bounds that scale: lower and upper for v, then for omega."""
-    _clips: tuple[Any, ...] | None = field(init=False, repr=False, compare=False)
-    """Bounds that clip, likewise: those that are zero. None if no limit is zero."""
-    _wheels: bool = field(init=False, repr=False, compare=False)
-    """Whether the wheel speeds have a limit."""
 
     def __post_init__(self) -> None:
         """Check every limit."""
         for name, limit in zip(self.names(), self.all(), strict=True):
-            value = limit if type(limit) is float else read_only(floats(name, limit))
+            value = floats(name, limit)
             if name == 'max_wheel_speed':
                 inside, allowed = value > 0.0, 'positive'
             elif name.startswith('min'):
                 inside, allowed = value <= 0.0, 'zero or negative'
             else:
                 inside, allowed = value >= 0.0, 'zero or positive'
-            if not np.all(inside):
+            if not inside.all():
                 raise ValueError(f'{name} must be {allowed}, got {limit}')
-            object.__setattr__(self, name, float(value) if np.ndim(value) == 0 else value)
+            object.__setattr__(self, name, read_only(value) if value.ndim else float(value))
         leading(**{name: np.shape(limit) for name, limit in zip(self.names(), self.all(), strict=True)})
-        unlimited = all(type(limit) is float and abs(limit) == np.inf for limit in self.all())
-        object.__setattr__(self, 'unlimited', unlimited)
-        object.__setattr__(self, 'alike', all(type(limit) is float for limit in self.all()))
-        # Computed once, because every message needs it.
-        signed = ((self.min_v, -1.0), (self.max_v, 1.0), (self.min_omega, -1.0), (self.max_omega, 1.0))
-        bounds = tuple(where(limit == 0.0, sign * np.inf, limit) for limit, sign in signed)
-        object.__setattr__(self, '_bounds', bounds)
-        clips = tuple(where(limit == 0.0, 0.0, sign * np.inf) for limit, sign in signed)
-        zero = any(bool(np.any(limit == 0.0)) for limit, _ in signed)
-        object.__setattr__(self, '_clips', clips if zero else None)
-        wheels = type(self.max_wheel_speed) is not float or self.max_wheel_speed < np.inf
-        object.__setattr__(self, '_wheels', wheels)
 
     def __eq__(self, other: object) -> bool:
         """Compare every limit, arrays by shape and entries."""
         if not isinstance(other, VelocityLimits):
             return NotImplemented
-        if self.alike and other.alike:
-            return self.all() == other.all()
         return all(map(equal, self.all(), other.all()))
 
     def __hash__(self) -> int:
         """Return a hash that equal limits share."""
         return hash(tuple(map(hashable, self.all())))
+
+    @property
+    def unlimited(self) -> bool:
+        """Whether no limit is set."""
+        return self.alike and self.all() == (-np.inf, np.inf, -np.inf, np.inf, np.inf)
+
+    @property
+    def alike(self) -> bool:
+        """Whether every limit is a number, equal for all robots."""
+        return all(isinstance(limit, float) for limit in self.all())
 
     def all(self) -> tuple[Any, ...]:
         """Return the limits, in the order of `names`."""
@@ -121,7 +104,7 @@ def saturate(
     factor than 0 would meet the limit. So a robot that may not reverse still turns on the spot.
 
     The result meets every limit exactly, including that of the wheel speeds that `body_to_wheel`
-    returns for it. Twists whose wheel speeds would overflow are scaled too.
+    returns for it.
 
     Args:
         v: Forward speed, shape (...) (m/s).
@@ -135,112 +118,52 @@ def saturate(
 
     Raises:
         ValueError: v or omega is not finite; limits are of another class; shapes do not broadcast; the
-            wheels have a limit, and r or L is not positive and finite.
+            wheels have a limit, and r or L is not positive and finite; the wheel speeds overflow.
     """
-    if (
-        type(v) is type(omega) is float
-        and isfinite(v + omega)
-        and type(limits) is VelocityLimits
-        and limits.alike
-    ):
-        if limits.unlimited:
-            return v, omega
-        if not limits._wheels:
-            return _saturated(v, omega, limits, 1.0, 1.0, max, min)
-        if type(r) is type(L) is float and r > 0.0 < L and isfinite(r + L):
-            return _saturated(v, omega, limits, r, L, max, min)
-    v, omega = operand('v', v), operand('omega', omega)
     instance('limits', limits, VelocityLimits)
-    single = type(v) is type(omega) is float
-    if limits.unlimited:
-        if single:
-            return v, omega
-        agree(v=v, omega=omega)
-        v, omega = alike(v, omega)
-        return np.array(v), np.array(omega)
-    if limits._wheels:
-        if r is None or L is None:
-            raise ValueError('limits have a max_wheel_speed, so r and L must be given')
-        r, L = operand('r', r, positive), operand('L', L, positive)
-        single = single and type(r) is type(L) is float
-    else:
+    if np.all(limits.max_wheel_speed == np.inf):
         r = L = 1.0
-    if single and limits.alike:
-        return _saturated(v, omega, limits, r, L, max, min)
-    agree(v=v, omega=omega, r=r, L=L, **dict(zip(limits.names(), limits.all(), strict=True)))
-    with np.errstate(all='ignore'):
-        limited = _saturated(v, omega, limits, r, L, _maximum, np.minimum)
-        limited_v, limited_omega = alike(*limited)
-    return limited_v, limited_omega
+    elif r is None or L is None:
+        raise ValueError('limits have a max_wheel_speed, so r and L must be given')
+    min_v, max_v, min_omega, max_omega, max_wheel_speed = limits.all()
+    return scaled_to_limits(v, omega, min_v, max_v, min_omega, max_omega, max_wheel_speed, r, L)
 
 
-def _saturated(
-    v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, maximum: Select, minimum: Select
-) -> tuple[Any, Any]:
-    if limits._clips is not None:
-        v_floor, v_ceiling, omega_floor, omega_ceiling = limits._clips
-        v = minimum(maximum(v, v_floor), v_ceiling)
-        omega = minimum(maximum(omega, omega_floor), omega_ceiling)
-    divisor = _excess(v, omega, limits, r, L, 1.0, maximum)
-    if type(divisor) is float and divisor == 1.0:
-        return v, omega
-    infinite = divisor == inf
-    if infinite is not False and _any(infinite):
-        v, omega, divisor = _scaled_down(v, omega, limits, r, L, divisor, maximum)
-    # The quotient may round to one unit in the last place beyond the limit.
-    v_low, v_high, omega_low, omega_high = limits._bounds
-    v, omega = v / divisor, omega / divisor
-    if type(v) is not float or not (v_low <= v <= v_high and omega_low <= omega <= omega_high):
-        v = minimum(maximum(v, v_low), v_high)
-        omega = minimum(maximum(omega, omega_low), omega_high)
-    if limits._wheels:
-        # So may the wheel speeds. Shrink by one unit in the last place, then by two, four, and so on.
-        step = 2.0**-53
-        most = limits.max_wheel_speed
-        above = _fastest(v, omega, r, L) > most
-        while above is not False and _any(above):
-            v, omega = where(above, v - step * v, v), where(above, omega - step * omega, omega)
-            above = _fastest(v, omega, r, L) > most
-            step *= 2.0
-    return v, omega
+@formula(
+    '(),(),(),(),(),(),(),(),() -> (),()',
+    **dict.fromkeys(VelocityLimits.names(), anything),
+    r=positive,
+    L=positive,
+)
+def scaled_to_limits(
+    v: Number,
+    omega: Number,
+    min_v: Number,
+    max_v: Number,
+    min_omega: Number,
+    max_omega: Number,
+    max_wheel_speed: Number,
+    r: Number,
+    L: Number,
+) -> tuple[Number, Number]:
+    """Return what `saturate` does, for limits that are given one by one."""
+    v_limit, omega_limit = where(v > 0.0, max_v, min_v), where(omega > 0.0, max_omega, min_omega)
+    v, omega = where(v_limit == 0.0, 0.0, v), where(omega_limit == 0.0, 0.0, omega)
+
+    # By what factor the twist exceeds its limits.
+    v_excess = v / where(v_limit == 0.0, 1.0, v_limit)
+    omega_excess = omega / where(omega_limit == 0.0, 1.0, omega_limit)
+    excess = maximum(1.0, v_excess, omega_excess, fastest_wheel(v, omega, r, L) / max_wheel_speed)
+    if not np.isfinite(excess).all():
+        raise ValueError('v, omega, the limits, r and L must give finite speeds, but they overflow')
+    v, omega = v / excess, omega / excess
+
+    # The quotients round. A limit is never exceeded, not by the last bit either.
+    v, omega = maximum(min_v, minimum(v, max_v)), maximum(min_omega, minimum(omega, max_omega))
+    exact = where(fastest_wheel(v, omega, r, L) <= max_wheel_speed, 1.0, 1.0 - ROUNDING)
+    return v * exact, omega * exact
 
 
-def _excess(
-    v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, least: Any, maximum: Select
-) -> Any:
-    """Compute the factor by which a twist exceeds the limits; at least `least`."""
-    v_low, v_high, omega_low, omega_high = limits._bounds
-    of_wheels: Any = 0.0
-    if limits._wheels:
-        limit = limits.max_wheel_speed
-        of_wheels = _fastest(v, omega, r, L) / limit
-        if type(limit) is not float:
-            # Infinity divided by infinity would be NaN.
-            of_wheels = np.where(limit < np.inf, of_wheels, 0.0)
-    return maximum(v / v_low, v / v_high, omega / omega_low, omega / omega_high, of_wheels, least)
-
-
-def _scaled_down(
-    v: Any, omega: Any, limits: VelocityLimits, r: Any, L: Any, divisor: Any, maximum: Select
-) -> tuple[Any, Any, Any]:
-    """Scale twists whose excess is infinite until it can be computed."""
-    least: Any = 1.0
-    while _any(infinite := divisor == np.inf):
-        factor = where(infinite, 2.0**-600, 1.0)
-        v, omega, least = v * factor, omega * factor, maximum(least * factor, SMALLEST)
-        divisor = _excess(v, omega, limits, r, L, least, maximum)
-    return v, omega, divisor
-
-
-def _fastest(v: Any, omega: Any, r: Any, L: Any) -> Any:
-    """Compute the speed of the faster wheel, bit-identical to `body_to_wheel`."""
+def fastest_wheel(v: Number, omega: Number, r: Number, L: Number) -> Number:
+    """Return the speed of the faster wheel, shape (...) (rad/s)."""
     return (abs(v) + abs(omega * L / 2.0)) / r
-
-
-def _maximum(*values: Any) -> Any:
-    """Return the largest of arrays that broadcast, element by element."""
-    return functools.reduce(np.maximum, values)
-
-
-def _any(condition: Any) -> bool:
-    return condition if type(condition) is bool else bool(np.any(condition))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.live import settings
 from diffdrive_jacobian.live.commands import Command, Pause, Seek, SetSpeed, Step
 from diffdrive_jacobian.live.quantities import rounded
@@ -164,7 +165,12 @@ class _Film:
     def settings(self) -> list[dict[str, Any]]:
         """Return the recorded parameters that the page shows."""
         state = self._state
-        return settings.shown({'controller': state.controller_values, 'robot': state.robot_values})
+        # Of another package it may be missing here, or a later one.
+        controller = BUILT_IN.get(str(state.controller_values.get('controller', '')))
+        return settings.shown(
+            {'controller': state.controller_values, 'robot': state.robot_values},
+            controller.gains if controller else (),
+        )
 
     def strips(self) -> Mapping[str, Any]:
         """Return the curves over the whole bag."""

@@ -14,6 +14,7 @@ from nav_msgs.msg import Goals
 from numpy.typing import NDArray
 from rclpy.node import Node
 
+from diffdrive_jacobian.control import Gain
 from diffdrive_jacobian.live import settings
 from diffdrive_jacobian.live.commands import (
     CancelGoal,
@@ -37,6 +38,7 @@ from diffdrive_jacobian.live.trigger_link import TriggerLink
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
 from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS, seconds
 
 COMMAND_LIFE = 0.5
@@ -212,15 +214,16 @@ class LiveRobot:
             self.send(goals, together=together)
 
     def _set(self, command: SetParameter) -> None:
+        role, _, name = command.parameter.partition('/')
+        link = self.links.get(role)
+        if link is None:
+            self._warn(f'there is no {printable(role, 40)} to set {printable(name, 40)} of')
+            return
         try:
-            setting = settings.find(command.parameter)
+            setting = settings.find(command.parameter, self._gains())
             value = setting.checked(command.value)
         except settings.SettingError as error:
             self._warn(str(error))
-            return
-        link = self.links.get(setting.role)
-        if link is None:
-            self._warn(f'there is no {setting.role} to set {setting.name} of')
             return
 
         def answer(successful: bool, reason: str) -> None:
@@ -291,7 +294,13 @@ class LiveRobot:
 
     def settings(self) -> list[dict[str, Any]]:
         """Return the settings for the page."""
-        return settings.shown({role: link.values for role, link in self.links.items()})
+        values = {role: link.values for role, link in self.links.items()}
+        return settings.shown(values, self._gains())
+
+    def _gains(self) -> tuple[Gain, ...]:
+        """Return the gains of the controller that is chosen."""
+        link = self.links.get('controller')
+        return settings.gains(str(link.values.get('controller', ''))) if link else ()
 
     def destroy(self) -> None:
         """Destroy all entities."""

@@ -192,14 +192,14 @@ class RobotState:
         """Return the name of the law, its gains, and what it computes here without limits."""
         values = self.controller_values
         name = str(values.get('controller', ''))[:64]
-        gains = SimpleNamespace(
-            kp=_number(values, 'kp', math.nan),
-            kv=_number(values, 'kv', math.nan),
-            offset=_number(values, 'offset', math.nan),
-        )
-        twist = None
         # Only built-in ones: another one may be slow, and runs in the controller.
-        if name in BUILT_IN and target is not None and self.pose is not None:
+        controller = BUILT_IN.get(name)
+        if controller is None:
+            return {'name': name, 'gains': {}, 'twist': None}
+        gains = {gain.name: _number(values, gain.name, math.nan) for gain in controller.gains}
+        twist = None
+        if target is not None and self.pose is not None:
             with suppress(LawError):
-                twist = BUILT_IN[name].bind(gains)(self.pose, target)
-        return {'name': name, 'kp': rounded(gains.kp), 'kv': rounded(gains.kv), 'twist': rounded(twist)}
+                twist = controller.bind(SimpleNamespace(**gains))(self.pose, target)
+        labels = {gain.label or gain.name: rounded(gains[gain.name]) for gain in controller.gains}
+        return {'name': name, 'gains': labels, 'twist': rounded(twist)}

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
 
-from diffdrive_jacobian.control import controller_names
+from diffdrive_jacobian.control import ControllerError, Gain, controller_names, find_controller
 from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.text import printable
 
@@ -61,18 +61,12 @@ class Setting:
 
 
 SETTINGS = (
-    Setting(role='controller', name='kp', label='Kp', unit='1/s', low=0.1, high=10.0,
-            hint='Gain on the heading error: how hard the robot turns towards the goal'),
-    Setting(role='controller', name='kv', label='Kv', unit='1/s', low=0.05, high=4.0,
-            hint='Gain on the distance: how fast it drives. Above Kp the robot spirals in'),
     Setting(role='controller', name='controller', label='Control law', kind='choice',
             hint='How goal and pose become v and ω'),
     Setting(role='controller', name='use_goal_heading', label='Goal heading', kind='flag',
             hint='Turn in place to the heading of the last goal'),
     Setting(role='controller', name='xy_goal_tolerance', label='Tolerance', unit='m', low=0.005,
             high=0.5, hint='Distance that counts as arrived: the circle around the goal'),
-    Setting(role='controller', name='offset', label='Offset d', unit='m', low=0.02, high=0.4,
-            hint='The point ahead of the axle that offset_point drives'),
     Setting(role='controller', name='linear.x.max_velocity', label='Limit of v', unit='m/s', low=0.02,
             high=2.0, kind='limit', hint='Both speeds are scaled alike, so the path stays the same'),
     Setting(role='controller', name='angular.z.max_velocity', label='Limit of ω', unit='rad/s', low=0.1,
@@ -82,29 +76,56 @@ SETTINGS = (
     Setting(role='robot', name='wheel_travel_variance', label='Wheel noise', unit='m', low=0.0,
             high=0.002, hint='Variance per distance: how fast the uncertainty region grows'),
 )  # fmt: skip
-"""What the page offers. A node is asked for those that it has."""
-_BY_KEY = {setting.key: setting for setting in SETTINGS}
+"""What the page offers besides the gains. A node is asked for those that it has."""
 
 
-def find(key: str) -> Setting:
+@lru_cache(maxsize=16)
+def gains(controller: str) -> tuple[Gain, ...]:
+    """Return the gains of a controller; of one that is not installed here they are unknown."""
+    try:
+        return find_controller(controller).gains
+    except ControllerError:
+        return ()
+
+
+def offered(gains: Iterable[Gain]) -> list[Setting]:
+    """Return what the page offers for a controller with some gains."""
+    sliders = [
+        Setting(
+            role='controller',
+            name=gain.name,
+            label=gain.label or gain.name,
+            hint=gain.description,
+            unit=gain.unit,
+            low=gain.usual[0],
+            high=gain.usual[1],
+        )
+        for gain in gains
+    ]
+    return [*sliders, *SETTINGS]
+
+
+def find(key: str, gains: Iterable[Gain]) -> Setting:
     """Return a setting by its name on the page.
 
     Raises:
         SettingError: There is none.
     """
-    if key not in _BY_KEY:
-        raise SettingError(f'there is no setting {printable(key, 40)}')
-    return _BY_KEY[key]
+    for setting in offered(gains):
+        if setting.key == key:
+            return setting
+    raise SettingError(f'there is no setting {printable(key, 40)}')
 
 
-def shown(values: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+def shown(values: Mapping[str, Mapping[str, Any]], gains: Iterable[Gain]) -> list[dict[str, Any]]:
     """Return the settings that nodes have, with their values, for the page.
 
     Args:
         values: Parameters by role.
+        gains: Gains of the controller.
     """
     found = []
-    for setting in SETTINGS:
+    for setting in offered(gains):
         value = values.get(setting.role, {}).get(setting.name)
         expected = {'choice': str, 'flag': bool}.get(setting.kind, float)
         if not isinstance(value, expected):

@@ -12,8 +12,9 @@ from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Goals, Odometry
 from std_srvs.srv import Trigger
 
-from diffdrive_jacobian.control import Arrival, Controller, LawError, saturate
+from diffdrive_jacobian.control import Arrival, Controller
 from diffdrive_jacobian.control.sampling import LARGEST_TURN, without_whole_turns
+from diffdrive_jacobian.kinematics.saturation import scaled_to_limits
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
@@ -58,6 +59,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             parameters = GoToGoalParameters.with_controller(controller)
         super().__init__('go_to_goal', parameters, **kwargs)
         self._goal: Goal | None = None
+        self._controller = self.parameters.chosen_controller()
+        self._law = self._controller.bind(self.parameters)
         self._identifiers = GoalIdentifiers(self.get_fully_qualified_name())
         self._odom_frame = ''
         # Rate of the odometry (Hz), and the times of the messages from which it is measured (ns).
@@ -146,6 +149,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             # While the robot moves the watchdog runs already, and a new goal is no sign of odometry.
             self._watchdog.start(nanoseconds(self.parameters.odom_timeout))
         self._goal = goal
+        self._law.reset()
         self._times.clear()
         self._others.start()
         self._publish_status(goal.info, GoalStatus.STATUS_ACCEPTED)
@@ -216,11 +220,14 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         if goal.stale:
             goal.stale = False
             self.log_event_info('odometry is back', 'odometry is received again: driving on')
+        self._law.now = now
         try:
             goal.waypoints, command = goal.waypoints.follow(
                 pose, self._law, self._arrival, self.parameters.kp
             )
-        except LawError as error:
+            if command is not None:
+                command = self._limited(*command)
+        except ValueError as error:
             self.log_event_warning('law', f'goal aborted: {error}')
             self._publish_command(0.0, 0.0)
             self._end(GoalStatus.STATUS_ABORTED, 'aborted')
@@ -229,12 +236,21 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._publish_command(0.0, 0.0)
             self._end(GoalStatus.STATUS_SUCCEEDED, 'reached')
             return
+        self._publish_command(*command)
+
+    def _limited(self, v: float, omega: float) -> tuple[float, float]:
+        """Return a command within the limits, without whole turns between two messages.
+
+        Raises:
+            ValueError: It overflows.
+        """
         # Without wheels in the limits the geometry of the wheels does not matter.
-        v, omega = saturate(*command, self._limits)
+        v, omega = scaled_to_limits.formula(v, omega, *self._limits.all(), 1.0, 1.0)
         if abs(omega) > LARGEST_TURN * self._rate:
             # The other direction may be forbidden.
-            v, omega = saturate(v, without_whole_turns(omega, self._rate), self._limits)
-        self._publish_command(v, omega)
+            omega = without_whole_turns(omega, self._rate)
+            v, omega = scaled_to_limits.formula(v, omega, *self._limits.all(), 1.0, 1.0)
+        return v, omega
 
     def _begin(self, goal: Goal) -> bool:
         """Start executing a goal, now that the frame of the odometry is known."""
@@ -328,7 +344,9 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         """Compute from the parameters what every step needs, and warn of values that do not suit."""
         parameters = self.parameters
         self._controller = controller = parameters.chosen_controller()
-        self._law = controller.bind(parameters)
+        law = controller.bind(parameters)
+        law.continue_from(self._law)
+        self._law = law
         # Far from the goal a law may return more than what counts as a plausible command.
         self._limits = parameters.limits()
         self._arrival = Arrival(

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 MAX_NANOSECONDS = 2**63 - 1
 """Largest time of ROS clocks (ns)."""
 FLOAT64 = np.dtype(np.float64)
+ROUNDING = 1e-8
+"""Tolerance on symmetry and semidefiniteness of a covariance, relative to its largest entry."""
 FEW = 64
 """Size up to which an array is checked as floats, because that is faster."""
 
@@ -82,6 +84,32 @@ def finite(name: str, value: Any) -> None:
     inside = np.isfinite(value)
     if not inside.all():
         raise ValueError(f'{name} must be finite, got {_first(value, inside)}')
+
+
+def semidefinite(name: str, value: NDArray[np.float64]) -> None:
+    """Require covariance matrices, shape (..., n, n).
+
+    Raises:
+        ValueError: An entry is not finite, or a matrix is not symmetric and positive semidefinite up to
+            rounding.
+    """
+    finite(name, value)
+    transposed = np.swapaxes(value, -1, -2)
+    largest = np.abs(value).max(axis=(-2, -1), initial=0.0)
+    with np.errstate(over='ignore'):
+        skew = np.abs(value - transposed).max(axis=(-2, -1), initial=0.0)
+    scaled = value / np.where(largest > 0.0, largest, 1.0)[..., np.newaxis, np.newaxis]
+    least = np.linalg.eigvalsh(scaled).min(axis=-1, initial=0.0)
+    inside = (skew <= ROUNDING * largest) & (least >= -ROUNDING)
+    if not inside.all():
+        index = tuple(np.argwhere(~inside)[0])
+        raise ValueError(
+            f'{name} must be symmetric and positive semidefinite, got {value[index].tolist()}'
+        )
+
+
+def anything(name: str, value: Any) -> None:
+    """Require nothing: the value was checked before, and may be infinite."""
 
 
 def floats(name: str, value: Any) -> NDArray[np.float64]:

@@ -19,6 +19,7 @@ checked one by one, which converts them or raises an error that names the argume
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from operator import mul
@@ -188,6 +189,16 @@ def vector(*entries: Any) -> NDArray[np.float64]:
     return matrix(1, len(entries), *entries)[..., 0, :]
 
 
+def from_rows(rows: Sequence[Sequence[Any]]) -> NDArray[np.float64]:
+    """Return matrices, shape (..., m, n), from rows of entries that broadcast."""
+    shape = np.broadcast_shapes(*[np.shape(entry) for row in rows for entry in row])
+    matrices = np.empty((*shape, len(rows), len(rows[0])))
+    for i, row in enumerate(rows):
+        for j, entry in enumerate(row):
+            matrices[..., i, j] = entry
+    return matrices
+
+
 def sin(x: Any) -> Any:
     """Sine (rad)."""
     return math.sin(x) if type(x) is float else np.sin(x)
@@ -230,14 +241,14 @@ def sqrt(x: Any) -> Any:
     return math.sqrt(x) if type(x) is float else np.sqrt(x)
 
 
-def maximum(x: Any, y: Any) -> Any:
-    """The larger one."""
-    return max(x, y) if type(x) is type(y) is float else np.maximum(x, y)
+def maximum(*values: Any) -> Any:
+    """The largest one."""
+    return max(values) if _are_floats(values) else functools.reduce(np.maximum, values)
 
 
-def minimum(x: Any, y: Any) -> Any:
-    """The smaller one."""
-    return min(x, y) if type(x) is type(y) is float else np.minimum(x, y)
+def minimum(*values: Any) -> Any:
+    """The smallest one."""
+    return min(values) if _are_floats(values) else functools.reduce(np.minimum, values)
 
 
 def where(condition: Any, x: Any, y: Any) -> Any:

@@ -116,6 +116,9 @@ def parameter(
     return dataclasses.field(default=default, metadata={'parameter': specification})
 
 
+P = TypeVar('P', bound='NodeParameters')
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class NodeParameters:
     """Base class of the parameters of a node. Every instance is valid.
@@ -142,8 +145,13 @@ class NodeParameters:
     def check(self) -> None:
         """Raise ParameterError if values contradict each other. For subclasses."""
 
+    @classmethod
+    def extended(cls: type[P], values: Mapping[str, Any]) -> type[P]:
+        """Return the class of parameters that is needed for some values, by their ROS names.
 
-P = TypeVar('P', bound=NodeParameters)
+        For subclasses: other parameters may be needed where one has another value.
+        """
+        return cls
 
 
 def _got(value: object) -> str:
@@ -190,6 +198,7 @@ def from_ros(parameters: type[P], values: Mapping[str, Any]) -> P:
     Raises:
         ParameterError: The values are invalid.
     """
+    parameters = parameters.extended(values)
     known = specifications(parameters)
     return parameters(
         **{
@@ -221,6 +230,12 @@ def changed(parameters: P, changes: Iterable[Change]) -> P:
     Raises:
         ParameterError: The new values are invalid.
     """
+    values = {change.name: change.value for change in changes}
+    before = ros_values(parameters)
+    return from_ros(type(parameters), before | values) if before.keys() & values.keys() else parameters
+
+
+def ros_values(parameters: NodeParameters) -> dict[str, Any]:
+    """Return the values of parameters by their ROS names."""
     known = specifications(type(parameters))
-    values = {known[change.name][0]: change.value for change in changes if change.name in known}
-    return dataclasses.replace(parameters, **values) if values else parameters
+    return {name: getattr(parameters, field) for name, (field, _) in known.items()}

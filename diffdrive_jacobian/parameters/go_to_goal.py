@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
-from diffdrive_jacobian.control.controller import Controller
+from diffdrive_jacobian.control.controller import KP, KV, OFFSET, Controller, Gain
 from diffdrive_jacobian.control.controllers import BUILT_IN, ControllerError, Controllers
 from diffdrive_jacobian.control.controllers import CONTROLLERS as CONTROLLERS
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.plausibility import MAX_SPEED
 from diffdrive_jacobian.parameters._fields import STAMPED, timeout_field
-from diffdrive_jacobian.parameters.declaration import ParameterError, parameter
+from diffdrive_jacobian.parameters.declaration import (
+    ParameterError,
+    default_of,
+    parameter,
+    specifications,
+)
 from diffdrive_jacobian.parameters.limits import LimitParameters
 
 MIN_OFFSET = 1e-3
@@ -30,6 +37,11 @@ def _controller(default: str, choices: Controllers) -> Any:
     )
 
 
+def _gain(gain: Gain) -> Any:
+    unit = f' [{gain.unit}]' if gain.unit else ''
+    return parameter(gain.default, f'{gain.description}{unit}.', bounds=gain.bounds, above=gain.above)
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class GoToGoalParameters(LimitParameters):
     """Parameters of the node go_to_goal."""
@@ -37,16 +49,13 @@ class GoToGoalParameters(LimitParameters):
     controllers: ClassVar[Controllers] = CONTROLLERS
     """The controllers that can be chosen."""
 
-    kp: float = parameter(
-        3.0, 'Gain on the heading error [1/s]; should be larger than kv.', bounds=(0.0, 100.0), above=0.0
-    )
-    kv: float = parameter(0.5, 'Gain on the distance [1/s].', bounds=(0.0, 100.0), above=0.0)
+    declared_gains: ClassVar[Mapping[str, Gain]] = {gain.name: gain for gain in (KP, KV, OFFSET)}
+    """The gains among the parameters."""
+
+    kp: float = _gain(KP)
+    kv: float = _gain(KV)
     controller: str = _controller('go_to_goal', CONTROLLERS)
-    offset: float = parameter(
-        0.1,
-        'X coordinate in the body frame of the point that offset_point drives; not 0 [m].',
-        bounds=(-100.0, 100.0),
-    )
+    offset: float = _gain(OFFSET)
     xy_goal_tolerance: float = parameter(
         0.02, 'Tolerance on the distance to the goal [m].', bounds=(1e-6, 100.0)
     )
@@ -70,14 +79,40 @@ class GoToGoalParameters(LimitParameters):
             ValueError: It is not a Controller, or has the name of a built-in one.
         """
         known = Controllers(controller)
-        choice = _controller(controller.name, known)
+        choice = ('controller', str, _controller(controller.name, known))
+        return cls._subclass([choice], {'controllers': known})
 
-        @dataclass(frozen=True, kw_only=True, slots=True)
-        class Parameters(cls):  # type: ignore[valid-type, misc]
-            controllers: ClassVar[Controllers] = known
-            controller: str = choice
+    @classmethod
+    def extended(cls, values: Mapping[str, Any]) -> type[GoToGoalParameters]:
+        """Return the class that has the gains of the controller, too, with the defaults it declares.
 
-        return Parameters
+        Raises:
+            ParameterError: The controller cannot be loaded, or a gain has the name of another parameter.
+        """
+        name = values.get('controller', default_of(cls, 'controller'))
+        if name not in cls.controllers or name in BUILT_IN:
+            return cls
+        controller = _found(cls.controllers, name)
+        new = [gain for gain in controller.gains if cls.declared_gains.get(gain.name) != gain]
+        for gain in new:
+            if gain.name in specifications(cls).keys() - cls.declared_gains.keys():
+                raise ParameterError(
+                    f"parameter 'controller': {name!r} has a gain {gain.name!r}, which is another "
+                    'parameter of go_to_goal'
+                )
+        gains = {**cls.declared_gains, **{gain.name: gain for gain in new}}
+        fields = [(gain.name, float, _gain(gain)) for gain in new]
+        return cls._subclass(fields, {'declared_gains': gains}) if new else cls
+
+    @classmethod
+    def _subclass(
+        cls, fields: Iterable[tuple[str, type, Any]], namespace: dict[str, Any]
+    ) -> type[GoToGoalParameters]:
+        options: Any = {'frozen': True, 'kw_only': True, 'slots': True}
+        made = dataclasses.make_dataclass(
+            cls.__name__, fields, bases=(cls,), namespace=namespace, **options
+        )
+        return cast('type[GoToGoalParameters]', made)
 
     def limits(self) -> VelocityLimits:
         """Return the limits of the commands, at most the largest plausible twist."""
@@ -98,7 +133,11 @@ class GoToGoalParameters(LimitParameters):
         Raises:
             ParameterError: It cannot be loaded.
         """
-        try:
-            return self.controllers.find(self.controller)
-        except ControllerError as error:
-            raise ParameterError(f"parameter 'controller': {error}") from error
+        return _found(self.controllers, self.controller)
+
+
+def _found(controllers: Controllers, name: str) -> Controller:
+    try:
+        return controllers.find(name)
+    except ControllerError as error:
+        raise ParameterError(f"parameter 'controller': {error}") from error

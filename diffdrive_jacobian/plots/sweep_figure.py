@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from diffdrive_jacobian.control.controller import KP, KV, Gain
 from diffdrive_jacobian.plots.rendering import render
 from diffdrive_jacobian.plots.style import styled
 
@@ -72,8 +73,8 @@ def figure(swept: Sweep) -> Figure:
             _draw_boundary(panel, swept.setup)
             _draw_marks(panel, swept)
             panel.set_title(title, pad=10.0)
-            panel.set_xlabel('kp [1/s]')
-        panels[0].set_ylabel('kv [1/s]')
+            panel.set_xlabel(_label(swept.setup.axes[0]))
+        panels[0].set_ylabel(_label(swept.setup.axes[1]))
         below.axis('off')
         below.legend(handles=_legend(swept), loc='center', ncol=4, borderaxespad=0.0)
         drawn.suptitle(describe(swept.setup))
@@ -102,6 +103,10 @@ def describe(setup: Setup) -> str:
     )
 
 
+def _label(gain: Gain) -> str:
+    return f'{gain.name} [{gain.unit}]' if gain.unit else gain.name
+
+
 def _within(low: float, high: float) -> str:
     return f'±{high:g}' if -low == high else f'{low:g} to {high:g}'
 
@@ -118,14 +123,14 @@ def _draw_map(drawn: Figure, panel: Axes, swept: Sweep, measure: str) -> None:
     logarithmic = low > 0.0 and high / low > LOGARITHMIC_RATIO
     norm: Any = LogNorm(low, high) if logarithmic else Normalize(low, high)
     mesh = panel.pcolormesh(
-        _edges(swept.kp),
-        _edges(swept.kv),
+        _edges(swept.x),
+        _edges(swept.y),
         values,
         norm=norm,
         cmap=COLORS,
         rasterized=True,
     )
-    panel.set(xlim=swept.kp[[0, -1]], ylim=swept.kv[[0, -1]], facecolor=EMPTY)
+    panel.set(xlim=swept.x[[0, -1]], ylim=swept.y[[0, -1]], facecolor=EMPTY)
     panel.patch.set(hatch='////', edgecolor='white', lw=0.0)
     panel.grid(False)
     panel.spines[:].set_visible(True)
@@ -140,7 +145,7 @@ def _draw_map(drawn: Figure, panel: Axes, swept: Sweep, measure: str) -> None:
     levels = [level for level in scale.get_ticks() if (found < level).any() and (found > level).any()]
     if levels and swept.setup.grid >= CONTOUR_GRID:
         style: Any = {'colors': LIT, 'linewidths': 0.7, 'alpha': 0.6}
-        scale.add_lines(panel.contour(swept.kp, swept.kv, values, levels, **style))
+        scale.add_lines(panel.contour(swept.x, swept.y, values, levels, **style))
 
 
 def _range(values: NDArray[np.float64], *, from_zero: bool) -> tuple[float, float]:
@@ -169,7 +174,7 @@ def _draw_boundary(panel: Axes, setup: Setup) -> None:
     if np.hypot(*ends) > 0.6:
         at = low + 0.62 * (high - low)
         panel.text(
-            ratio * at + 0.02 * (setup.kp[1] - setup.kp[0]),
+            ratio * at + 0.02 * np.ptp(setup.ends(KP)),
             at,
             boundary.equation,
             rotation=math.degrees(math.atan2(1.0, ratio)),
@@ -184,10 +189,10 @@ def _draw_boundary(panel: Axes, setup: Setup) -> None:
 def _visible_boundary(setup: Setup) -> tuple[float, float]:
     """Return the first and the last kv of the boundary in the picture; not ascending: there is none."""
     boundary = setup.resolved_controller.boundary
-    if boundary is None:
+    if boundary is None or setup.axes != (KP, KV):
         return 0.0, 0.0
-    ratio = boundary.ratio
-    return max(setup.kp[0] / ratio, setup.kv[0]), min(setup.kp[1] / ratio, setup.kv[1])
+    kp, kv = setup.ends(KP), setup.ends(KV)
+    return max(kp[0] / boundary.ratio, kv[0]), min(kp[1] / boundary.ratio, kv[1])
 
 
 def _draw_marks(panel: Axes, swept: Sweep) -> None:
@@ -202,17 +207,17 @@ def _marks(swept: Sweep) -> list[Line2D]:
 
     marks = []
     style: Any = {'ls': '', 'mec': LINE, 'mfc': LIT, 'mew': 1.2, 'zorder': 5}
-    setup, reference = swept.setup, swept.setup.resolved_controller.reference_gains
-    if reference is not None:
-        kp, kv = reference.kp, reference.kv
-        if setup.kp[0] <= kp <= setup.kp[1] and setup.kv[0] <= kv <= setup.kv[1]:
-            label = f'{reference.source}: kp {kp:g}, kv {kv:g}'
-            marks.append(Line2D([kp], [kv], marker='o', ms=8, label=label, **style))
+    x, y = swept.setup.axes
+    inside = [low <= gain.default <= high for gain in (x, y) for low, high in [swept.setup.ends(gain)]]
+    if all(inside):
+        label = f'defaults: {x.name} {x.default:g}, {y.name} {y.default:g}'
+        marks.append(Line2D([x.default], [y.default], marker='o', ms=8, label=label, **style))
     found = swept.fastest()
     if found is not None:
-        kp, kv = float(swept.kp[found[1]]), float(swept.kv[found[0]])
-        label = f'fastest: kp {kp:.4g}, kv {kv:.4g}, {swept.mean("time")[found]:.2f} s'
-        marks.append(Line2D([kp], [kv], marker='*', ms=14, label=label, **style))
+        at = float(swept.x[found[1]]), float(swept.y[found[0]])
+        label = f'fastest: {x.name} {at[0]:.4g}, {y.name} {at[1]:.4g}'
+        label += f', {swept.mean("time")[found]:.2f} s'
+        marks.append(Line2D([at[0]], [at[1]], marker='*', ms=14, label=label, **style))
     return marks
 
 

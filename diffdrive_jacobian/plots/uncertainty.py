@@ -13,7 +13,7 @@ import numpy as np
 
 from diffdrive_jacobian.reading.run import COVARIANCES
 from diffdrive_jacobian.reading.trace import Array, Indices, Trace
-from diffdrive_jacobian.simulation.odometry_noise import covariance_entries
+from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose
 from diffdrive_jacobian.simulation.pose_region import (
     ELLIPSE_LEVEL,
     Region,
@@ -119,7 +119,7 @@ def _of_wheels(covariances: Array, breaks: Indices) -> bool:
         return False
     try:
         for row in covariances[[0, -1]]:
-            covariance_entries('covariance', _matrix(row))
+            covariance_of_pose('covariance', _matrix(row))
     except ValueError:
         return False
     return bool(np.all(covariances[:, 6] * covariances[:, 8] >= 0.99999 * covariances[:, 7] ** 2))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from diffdrive_jacobian.parameters.virtual_robot import MULTIPLIERS
 from diffdrive_jacobian.reading.ground_truth import NODE, recorded_drift
 from diffdrive_jacobian.reading.run import Run
-from diffdrive_jacobian.simulation.odometry_noise import covariance_entries, propagate_covariance
+from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose, propagate_covariance
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -92,7 +92,7 @@ def start_covariances(run: Run) -> NDArray[np.float64]:
     matrices: NDArray[np.float64] = entries[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].copy()
     for row in matrices:
         try:
-            covariance_entries('covariance', row.reshape(3, 3))
+            covariance_of_pose('covariance', row.reshape(3, 3))
         except ValueError:
             row[:] = 0.0
     return matrices

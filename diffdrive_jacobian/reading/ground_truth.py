@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.numerics.elementary import wrapped
+from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.reading.run import Run
@@ -55,9 +55,7 @@ def truth_differences(run: Run, robots: Iterable[Robot]) -> TruthDifferences | N
         return None
     simulated = np.array([at[stamp].true_pose_tuple for stamp in truth.stamps[rows].tolist()])
     difference: NDArray[np.float64] = truth.values[rows, :3] - simulated
-    return TruthDifferences(
-        np.hypot(difference[:, 0], difference[:, 1]), np.abs(wrapped(difference[:, 2]))
-    )
+    return TruthDifferences(np.hypot(difference[:, 0], difference[:, 1]), np.abs(wrap(difference[:, 2])))
 
 
 def placed_as_recorded(run: Run, placed: tuple[Robot, Robot]) -> Robot:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
 from diffdrive_jacobian.messages.goal_status import GoalState
-from diffdrive_jacobian.numerics.elementary import wrapped
+from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.reading.reader import BagError
 from diffdrive_jacobian.reading.run import Run, Series
@@ -78,7 +78,7 @@ def trace(run: Run) -> Trace:
         breaks=breaks,
         goal=goal,
         distance=np.hypot(*to_goal.T),
-        heading_error=np.where(reached, np.nan, wrapped(np.arctan2(dy, dx) - theta)),
+        heading_error=np.where(reached, np.nan, wrap(np.arctan2(dy, dx) - theta)),
     )
 
 
@@ -239,7 +239,7 @@ def _driven_points(run: Run) -> Array:
     controller = BUILT_IN.get(name) if isinstance(name, str) else None
     if controller is None or not controller.offset:
         return poses[:, :2]
-    default = controller.driven_offset(GoToGoalParameters())
+    default = controller.driven_offset(controller.defaults)
     d = run.number_of_node('go_to_goal', controller.offset, default)
     return poses[:, :2] + d * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
 

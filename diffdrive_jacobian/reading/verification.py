@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.messages.conversion import MessageError, plausible_twist
-from diffdrive_jacobian.numerics.elementary import wrapped
+from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.parameters.declaration import from_ros
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.reading.covariance_rule import NEITHER, recorded_model, rule, start_covariances
@@ -185,7 +185,7 @@ def verify(
         start=start,
         seconds=np.array(seconds),
         distances=np.hypot(difference[:, 0], difference[:, 1]),
-        headings=np.abs(wrapped(difference[:, 2])),
+        headings=np.abs(wrap(difference[:, 2])),
         notes=notes,
         covariance=covariance[0],
         covariance_difference=covariance[1],
@@ -221,7 +221,7 @@ def _nearest(anchors: list[_Anchor], odometry: Series, index: int) -> tuple[int,
 
     def apart(candidate: tuple[int, Robot]) -> float:
         dx, dy, turn = (odometry.values[index, :3] - candidate[1].pose).tolist()
-        return math.hypot(dx, dy) + abs(float(wrapped(turn)))
+        return math.hypot(dx, dy) + abs(float(wrap(turn)))
 
     return min(candidates, key=apart)
 

@@ -244,8 +244,11 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
     def _apply_parameters(self, changes: list[Parameter]) -> None:
         previous = self.parameters
         self.parameters = changed(previous, changes)
-        if self.parameters is not previous:
-            self.parameters_changed(previous)
+        if self.parameters is previous:
+            return
+        if type(self.parameters) is not type(previous):
+            self.parameters = ros_parameters.declare_new(self, previous, self.parameters)
+        self.parameters_changed(previous)
 
     def _check_graph(self, max_age: float = 0.0) -> None:
         self._check_clock()

@@ -22,6 +22,7 @@ from diffdrive_jacobian.parameters.declaration import (
     changed,
     default_of,
     from_ros,
+    ros_values,
     specifications,
 )
 from diffdrive_jacobian.ros.rclpy_internals import (
@@ -70,18 +71,41 @@ def declare(node: Node, parameters: type[P]) -> P:
     """
     overrides = parameter_overrides(node)
     initial = from_ros(parameters, {name: given.value for name, given in overrides.items()})
+    _declare(node, initial, specifications(type(initial)))
+    return initial
+
+
+def declare_new(node: Node, before: P, after: P) -> P:
+    """Declare the parameters that a change of others has added, with the values that the user gave.
+
+    Returns:
+        The parameters after the change. A value that is invalid is ignored, with a warning.
+    """
+    new = specifications(type(after)).keys() - specifications(type(before)).keys()
+    overrides = parameter_overrides(node)
+    for name in sorted(new & overrides.keys()):
+        try:
+            after = from_ros(type(after), ros_values(after) | {name: overrides[name].value})
+        except ParameterError as error:
+            node.get_logger().warning(f'{error}; the default is used')
+    _declare(node, after, new)
+    return after
+
+
+def _declare(node: Node, parameters: NodeParameters, names: Iterable[str]) -> None:
+    kind = type(parameters)
+    known = specifications(kind)
     declare_together(
         node,
         [
             (
                 name,
-                getattr(initial, field),
-                descriptor(specification, default_of(parameters, field)),
+                getattr(parameters, known[name][0]),
+                descriptor(known[name][1], default_of(kind, known[name][0])),
             )
-            for name, (field, specification) in specifications(parameters).items()
+            for name in names
         ],
     )
-    return initial
 
 
 def accept_integers(parameters: type[NodeParameters], changes: list[Parameter]) -> list[Parameter]:

@@ -56,6 +56,8 @@ class Batch:
     law: Law
     equation: Law | None
     """The law of components without checks, where it is a `formula`."""
+    state: tuple[float, ...]
+    """What the law remembers at the start, as of `Controller`."""
     starts: Array
     goals: Array
     gains: tuple[Any, ...]
@@ -86,8 +88,9 @@ class Batch:
     ) -> Batch:
         """Check the arguments and flatten the batch."""
         arrival = Arrival() if arrival is None else arrival
+        state: tuple[float, ...] = ()
         if isinstance(law, Controller):
-            law = law.law
+            state, law = law.state, law.law
         else:
             function('law', law)
         instance('arrival', arrival, Arrival)
@@ -123,6 +126,7 @@ class Batch:
         return cls(
             law=law,
             equation=getattr(law, 'formula', None),
+            state=state,
             starts=np.broadcast_to(starts, (*shape, 3)).reshape(-1, 3),
             goals=np.broadcast_to(goals, (*shape, goals.shape[-1])).reshape(-1, goals.shape[-1]),
             gains=tuple(flat[f'gain {index}'] for index in range(len(gains))),
@@ -140,6 +144,11 @@ class Batch:
     def size(self) -> int:
         """Number of robots."""
         return len(self.starts)
+
+    @property
+    def remembered(self) -> dict[str, Any]:
+        """Arguments of a law with a state, at the start."""
+        return {'state': np.array(self.state), 'dt': 0.0} if self.state else {}
 
     def some(self, rows: Any) -> Batch:
         """Return the batch of some of the robots, each coordinate contiguous in memory."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from diffdrive_jacobian.control.sampling import LARGEST_TURN, without_whole_turns
-from diffdrive_jacobian.kinematics.saturation import saturate
+from diffdrive_jacobian.kinematics.saturation import scaled_to_limits
 from diffdrive_jacobian.numerics.checks import floats
 from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.simulation._batch import Array, Batch, Mask, Outcomes, Rows
@@ -43,6 +43,9 @@ class Block:
         self.theta: Array = wrap(theta)
         self.open: Mask = np.ones(count, dtype=np.bool_)
         self.turning: Mask = np.zeros(count, dtype=np.bool_)
+        # One array for each number that the law remembers.
+        self.state: list[Array] = [np.full(count, value) for value in batch.state]
+        self.dt = 0.0
         # Sums of |v|, v^2 and omega^2, and the largest distance beyond the goal.
         self.sums: Array = np.zeros((3, count))
         self.beyond: Array = np.zeros(count)
@@ -109,16 +112,17 @@ class Block:
     def _command(self) -> tuple[Array, Array]:
         """Evaluate the law and saturate its twists."""
         batch, shape = self.batch, (len(self.rows),)
-        pose = [self.x, self.y, self.theta]
-        if batch.equation is None:
-            twist = batch.law(np.array(pose).T, batch.goals, *batch.gains)
-        else:
-            twist = batch.equation(pose, batch.goals.T, *batch.gains)
+        twist = self._law_result()
         try:
+            if batch.state:
+                *twist, state = twist
+                state = np.broadcast_to(floats('law', state), (*shape, len(batch.state)))
+                self.state = list(state.T)
             v, omega = (np.broadcast_to(floats('law', part), shape) for part in twist)
         except (TypeError, ValueError) as error:
+            state_too = f' and the state of shape {(*shape, len(batch.state))}' if batch.state else ''
             raise ValueError(
-                f'law must return (v, omega), each of shape () or {shape}, got {twist!r:.80}'
+                f'law must return (v, omega), each of shape () or {shape}{state_too}, got {twist!r:.80}'
             ) from error
         if batch.arrival.use_heading and self.turning.any():
             v = np.where(self.turning, 0.0, v)
@@ -134,13 +138,38 @@ class Block:
             raise ValueError(
                 f'law must return finite (v, omega), got ({v[row]}, {omega[row]}) at pose {pose}'
             )
-        if not batch.limits.unlimited:
-            v, omega = saturate(v, omega, batch.limits, batch.r, batch.L)
+        v, omega = self._limited(v, omega)
         if np.abs(omega).max() > LARGEST_TURN * batch.rate:
-            omega = without_whole_turns(omega, batch.rate)
             # The other direction may be forbidden.
-            v, omega = saturate(v, omega, batch.limits, batch.r, batch.L)
+            v, omega = self._limited(v, without_whole_turns(omega, batch.rate))
         return v, omega
+
+    def _law_result(self) -> Any:
+        """Evaluate the law: an equation of components, or a function of arrays of poses and goals."""
+        batch, pose = self.batch, [self.x, self.y, self.theta]
+        more: dict[str, Any] = {}
+        if batch.state:
+            state = np.array(self.state).T if batch.equation is None else self.state
+            more = {'state': state, 'dt': self.dt}
+            self.dt = 1.0 / batch.rate
+        if batch.equation is None:
+            return batch.law(np.array(pose).T, batch.goals, *batch.gains, **more)
+        result = batch.equation(pose, batch.goals.T, *batch.gains, **more)
+        if not batch.state:
+            return result
+        v, omega, state = result
+        return v, omega, np.array(np.broadcast_arrays(self.x, *state)[1:]).T
+
+    def _limited(self, v: Array, omega: Array) -> tuple[Array, Array]:
+        """Scale twists to the velocity limits."""
+        batch = self.batch
+        if batch.limits.unlimited:
+            return v, omega
+        with np.errstate(all='ignore'):
+            limited: tuple[Array, Array] = scaled_to_limits.formula(
+                v, omega, *batch.limits.all(), batch.r, batch.L
+            )
+        return limited
 
     def _advance(self, v: Array, omega: Array) -> None:
         """Apply a constant twist until the next sample.
@@ -155,7 +184,10 @@ class Block:
             self.sums[1] += v * v
             self.sums[2] += omega * omega
             half = omega * (0.5 * dt)
-            c_half, s_half = np.cos(half), np.sin(half)
+            # One sine instead of two functions: `cos 2a = 1 - 2 sin^2 a`, `sin 2a = 2 sin a cos a`.
+            s_quarter = np.sin(0.5 * half)
+            squared = s_quarter * s_quarter
+            c_half, s_half = 1.0 - 2.0 * squared, 2.0 * s_quarter * np.sqrt(1.0 - squared)
             c, s = self.c * c_half - self.s * s_half, self.s * c_half + self.c * s_half
             chord = v * dt * np.divide(s_half, half, out=np.ones_like(half), where=half != 0.0)
             self.x = self.x + chord * c
@@ -208,4 +240,5 @@ class Block:
         for name in ('x', 'y', 'theta', 'c', 's', 'turning', 'open', 'beyond', 'too_far'):
             setattr(self, name, getattr(self, name)[going])
         self.sums, self.along = self.sums[:, going], self.along[:, going]
+        self.state = [one[going] for one in self.state]
         return v[going], omega[going]

@@ -152,7 +152,7 @@ def _drive(
     if batch.equation is not None:
         # The law checks its arguments, the equation does not.
         try:
-            batch.law(batch.starts, batch.goals, *batch.gains)
+            batch.law(batch.starts, batch.goals, *batch.gains, **batch.remembered)
         except ValueError as error:
             raise ValueError(f'law rejects the starts, goals and gains: {error}') from error
     count = batch.size

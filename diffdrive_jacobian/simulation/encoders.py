@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from diffdrive_jacobian.kinematics._arc import arc_end
+from diffdrive_jacobian.simulation.arc import arc_end
 from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.time_units import NANOSECONDS
 

@@ -21,20 +21,17 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.numerics.checks import not_negative, number, positive
-from diffdrive_jacobian.numerics.elementary import components
+from diffdrive_jacobian.numerics.checks import not_negative, number, numbers, positive
 from diffdrive_jacobian.simulation._noise_moments import (
     RADIUS,
     SHORT_NOISE,
     SHORT_TURN,
-    SMALL_TURN,
     NoiseMoments,
     central,
-    closed_form,
     series,
     short_arc,
 )
-from diffdrive_jacobian.simulation.odometry_noise import covariance_entries
+from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose, spectral_densities
 
 
 class Moments(NamedTuple):
@@ -88,15 +85,8 @@ def gaussian(covariance: ArrayLike) -> Moments:
     Raises:
         ValueError: It has another shape, is not finite, or is not symmetric and positive semidefinite.
     """
-    entries = covariance_entries('covariance', covariance)
-    if type(entries[0]) is not float:
-        raise ValueError(f'covariance must have shape (3, 3), got {np.shape(covariance)}')
-    return gaussian_moments(entries)
-
-
-def gaussian_moments(entries: tuple[float, ...]) -> Moments:
-    """Compute what `gaussian` returns from the entries xx, xy, xt, yy, yt, tt, which were checked."""
-    xx, xy, xt, yy, yt, tt = entries
+    P = covariance_of_pose('covariance', covariance)
+    xx, xy, xt, yy, yt, tt = P[np.triu_indices(3)].tolist()
     # Stein's lemma: E[e f(delta)] = E[e delta] E[f'(delta)].
     decay = exp(-tt / 2.0)
     return Moments(xx, xy, xt, yy, yt, tt, 0.0, 0.0, 0.0, xt * decay, 0.0, yt * decay)
@@ -127,16 +117,12 @@ def propagate_moments(
     Raises:
         ValueError: An argument has a wrong shape or sign, is not finite, or the result overflows.
     """
-    _, _, theta = components('pose', pose, 3)
-    v, omega = components('twist', twist, 2)
-    if not type(theta) is type(v) is float:
-        raise ValueError(
-            f'pose and twist must have shapes (3,) and (2,), got {np.shape(pose)} and {np.shape(twist)}'
-        )
+    _, _, theta = numbers('pose', pose, 3)
+    v, omega = numbers('twist', twist, 2)
     dt, L = number('dt', dt, not_negative), number('L', L, positive)
     k = number('wheel_travel_variance', wheel_travel_variance, not_negative)
-    values = tuple(components('moments', moments, 12))
-    propagated = propagated_moments(values, theta, (v, omega), dt, L, k)
+    entries = tuple(numbers('moments', moments, 12))
+    propagated = propagated_moments(entries, theta, (v, omega), dt, L, k)
     if propagated is None:
         raise ValueError(
             'moments, pose, twist, dt, L and wheel_travel_variance must give a finite result, '
@@ -159,12 +145,9 @@ def propagated_moments(
         The moments. None: they overflow.
     """
     v, omega = twist
-    half = omega * L / 2.0
     try:
-        right = wheel_travel_variance * abs(v + half) * dt
-        left = wheel_travel_variance * abs(v - half) * dt
-        alpha, turn, both = v * dt, omega * dt, right + left
-        nu, beta, m = both / 4.0, (right - left) / (2.0 * L), both / (2.0 * L * L)
+        vv, vw, ww = spectral_densities(v, omega, L, wheel_travel_variance)
+        alpha, turn, nu, beta, m = v * dt, omega * dt, vv * dt, vw * dt, ww * dt / 2.0
         if m <= SHORT_NOISE and -SHORT_TURN <= turn <= SHORT_TURN:
             # Nearly every arc of a robot: all in the frame of the chord.
             half = turn / 2.0
@@ -184,15 +167,8 @@ def _noise(alpha: float, turn: float, nu: float, beta: float, m: float) -> Noise
     """Compute the moments of the noise of one arc; None: there is no noise."""
     if not m:
         return None
-    if abs(turn) >= SMALL_TURN:
-        return closed_form(alpha, turn, nu, beta, m)
-    argument, halvings = 2.0 * abs(turn) + 4.0 * m, 0
-    if argument <= RADIUS:
-        return series(alpha, turn, nu, beta, m)
-    # A long and nearly straight arc: a short one, doubled again and again.
-    halvings = math.frexp(argument / RADIUS)[1]
-    share = 2.0**-halvings
-    alpha, turn, nu, beta, m = alpha * share, turn * share, nu * share, beta * share, m * share
+    halvings = max(0, math.frexp((2.0 * abs(turn) + 4.0 * m) / RADIUS)[1])
+    alpha, turn, nu, beta, m = (part * 2.0**-halvings for part in (alpha, turn, nu, beta, m))
     noise = series(alpha, turn, nu, beta, m)
     for _ in range(halvings):
         first = _extended(tuple(SURE), -2.0 * turn, alpha, turn, m, noise)

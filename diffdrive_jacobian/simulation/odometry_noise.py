@@ -15,32 +15,17 @@ Scaramuzza, *Introduction to Autonomous Mobile Robots*, 5.2.4.
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.numerics.checks import floats, not_negative, positive
-from diffdrive_jacobian.numerics.elementary import (
-    agree,
-    components,
-    cos,
-    evaluated,
-    operand,
-    sin,
-    sinc,
-    sinc_defect,
-    stack,
-)
-
-ROUNDING = 1e-8
-"""Tolerance on symmetry and semidefiniteness of a covariance, relative to its largest entry."""
+from diffdrive_jacobian.kinematics.se2 import integrate
+from diffdrive_jacobian.numerics.checks import array, not_negative, positive, semidefinite
+from diffdrive_jacobian.numerics.elementary import cos, from_rows, sin, sinc, sinc_defect
+from diffdrive_jacobian.numerics.formula import Array, Number, Rows, Vector, formula
 
 
-def twist_covariance(
-    twist: ArrayLike, L: Any, wheel_travel_variance: Any, interval: Any
-) -> NDArray[np.float64]:
+@formula('(2),(),(),() -> (2,2)', L=positive, wheel_travel_variance=not_negative, interval=positive)
+def twist_covariance(twist: Vector, L: Number, wheel_travel_variance: Number, interval: Number) -> Rows:
     """Compute the covariance of a twist measured from wheel travel over an interval, `W / interval`.
 
     Args:
@@ -56,52 +41,35 @@ def twist_covariance(
     Raises:
         ValueError: An argument has a wrong shape or sign, is not finite, or the result overflows.
     """
-    v, omega = components('twist', twist, 2)
-    L, k = (
-        operand('L', L, positive),
-        operand('wheel_travel_variance', wheel_travel_variance, not_negative),
-    )
-    interval = operand('interval', interval, positive)
-    single = agree(twist=v, L=L, wheel_travel_variance=k, interval=interval)
-    names = 'twist, L, wheel_travel_variance and interval'
-    return _matrix(*evaluated(single, names, _twist_covariance, v, omega, L, k, interval))
-
-
-def _twist_covariance(v: Any, omega: Any, L: Any, k: Any, interval: Any) -> tuple[Any, ...]:
-    right, left = _wheel_variances(v, omega, L, k)
-    cross = (right - left) / (2.0 * L * interval)
-    return (right + left) / (4.0 * interval), cross, cross, (right + left) / (L * L * interval)
-
-
-def twist_covariance_entries(
-    twist: tuple[float, float], L: float, wheel_travel_variance: float, interval: float
-) -> tuple[float, float, float, float]:
-    """Compute what `twist_covariance` returns for one robot whose values were checked before, by rows.
-
-    Raises:
-        ValueError: The result overflows.
-    """
     v, omega = twist
-    half = omega * L / 2.0
-    right, left = wheel_travel_variance * abs(v + half), wheel_travel_variance * abs(v - half)
-    try:
-        both, cross = right + left, (right - left) / (2.0 * L * interval)
-        vv, ww = both / (4.0 * interval), both / (L * L * interval)
-    except ZeroDivisionError:
-        vv = math.inf
-    if not (math.isfinite(vv) and math.isfinite(cross) and math.isfinite(ww)):
-        raise ValueError('twist and interval must give a finite result, but it overflows')
-    return vv, cross, cross, ww
+    vv, vw, ww = spectral_densities(v, omega, L, wheel_travel_variance)
+    return [
+        [vv / interval, vw / interval],
+        [vw / interval, ww / interval],
+    ]
 
 
+def spectral_densities(v: Number, omega: Number, L: Number, k: Number) -> tuple[Number, Number, Number]:
+    """Return the entries vv, vw, ww of W, the spectral density of the noise of `[v, omega]`."""
+    right, left = k * abs(v + omega * L / 2.0), k * abs(v - omega * L / 2.0)
+    return (right + left) / 4.0, (right - left) / (2.0 * L), (right + left) / L / L
+
+
+@formula(
+    '(3,3),(3),(2),(),(),() -> (3,3)',
+    covariance=semidefinite,
+    dt=not_negative,
+    L=positive,
+    wheel_travel_variance=not_negative,
+)
 def propagate_covariance(
-    covariance: ArrayLike,
-    pose: ArrayLike,
-    twist: ArrayLike,
-    dt: Any,
-    L: Any,
-    wheel_travel_variance: Any,
-) -> NDArray[np.float64]:
+    covariance: Vector,
+    pose: Vector,
+    twist: Vector,
+    dt: Number,
+    L: Number,
+    wheel_travel_variance: Number,
+) -> Array:
     """Propagate the covariance of a pose along an arc.
 
     Args:
@@ -121,140 +89,53 @@ def propagate_covariance(
         ValueError: An argument has a wrong shape or sign, is not finite, or the result overflows; the
             covariance is not symmetric and positive semidefinite.
     """
-    entries = covariance_entries('covariance', covariance)
-    _, _, theta = components('pose', pose, 3)
-    v, omega = components('twist', twist, 2)
-    dt = operand('dt', dt, not_negative)
-    L, k = (
-        operand('L', L, positive),
-        operand('wheel_travel_variance', wheel_travel_variance, not_negative),
-    )
-    single = agree(covariance=entries[0], pose=theta, twist=v, dt=dt, L=L, wheel_travel_variance=k)
-    names = 'covariance, pose, twist, dt, L and wheel_travel_variance'
-    return _matrix(*evaluated(single, names, _propagated, *entries, theta, v, omega, dt, L, k))
+    theta, v, omega = pose[..., 2], twist[..., 0], twist[..., 1]
+    dx, dy, _ = integrate.formula([0.0, 0.0, theta], [v, omega], dt)
+    Phi = from_rows([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
+    # The noise is computed in the frame of the body at the end.
+    end = theta + omega * dt
+    R = from_rows([[cos(end), -sin(end), 0.0], [sin(end), cos(end), 0.0], [0.0, 0.0, 1.0]])
+    Q = from_rows(_noise_at_end(v, omega, dt, L, wheel_travel_variance))
+    P: Array = Phi @ covariance @ np.swapaxes(Phi, -1, -2) + R @ Q @ np.swapaxes(R, -1, -2)
+    return (P + np.swapaxes(P, -1, -2)) / 2.0
 
 
-def covariance_entries(name: str, covariance: ArrayLike) -> tuple[Any, ...]:
-    """Return the entries xx, xy, xt, yy, yt, tt of covariances of a pose, shape (..., 3, 3).
-
-    Raises:
-        ValueError: The shape is another one, an entry is not finite, or the matrix is not symmetric and
-            positive semidefinite up to rounding.
-    """
-    made = floats(name, covariance)
-    if made.shape[-2:] != (3, 3):
-        raise ValueError(f'{name} must have shape (..., 3, 3), got {made.shape}')
-    rows = components(name, made.reshape(*made.shape[:-2], 9), 9)
-    if made.ndim == 2:
-        valid: Any = min(_margins(max(map(abs, rows)), *rows)) >= -ROUNDING
-    else:
-        largest = np.abs(made).max(axis=(-2, -1), initial=0.0)
-        valid = np.min(np.stack(_margins(largest, *rows)), axis=0) >= -ROUNDING
-    if valid is not True and not np.all(valid):
-        index = tuple(np.argwhere(~np.asarray(valid))[0])
-        raise ValueError(
-            f'{name} must be symmetric and positive semidefinite, got {made[index].tolist()}'
-        )
-    xx, xy, xt, _, yy, yt, _, _, tt = rows
-    return xx, xy, xt, yy, yt, tt
-
-
-def _margins(
-    largest: Any,
-    xx: Any,
-    xy: Any,
-    xt: Any,
-    yx: Any,
-    yy: Any,
-    yt: Any,
-    tx: Any,
-    ty: Any,
-    tt: Any,
-) -> tuple[Any, ...]:
-    """Compute quantities that must not be negative: all principal minors, and minus the asymmetry.
-
-    They are relative to the largest entry, so that products do not overflow.
-    """
-    scale = largest + (largest == 0.0)
-    a, b, c, d, e, f = xx / scale, xy / scale, xt / scale, yy / scale, yt / scale, tt / scale
-    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
-    return (
-        *(a, d, f, a * d - b * b, a * f - c * c, d * f - e * e, determinant),
-        *(-abs(yx / scale - b), -abs(tx / scale - c), -abs(ty / scale - e)),
-    )
-
-
-def _propagated(
-    pxx: Any,
-    pxy: Any,
-    pxt: Any,
-    pyy: Any,
-    pyt: Any,
-    ptt: Any,
-    theta: Any,
-    v: Any,
-    omega: Any,
-    dt: Any,
-    L: Any,
-    wheel_travel_variance: Any,
-) -> tuple[Any, ...]:
-    turn, path = omega * dt, v * dt
-    c, s = cos(theta + turn), sin(theta + turn)
-    # The displacement, in the body frame at the end of the arc, then in the world frame.
-    along, across = path * sinc(turn), -path * sinc(turn / 2.0) * sin(turn / 2.0)
-    dx, dy = c * along - s * across, s * along + c * across
-    # The noise, rotated from the body frame at the end into the world frame.
-    xx, xy, xt, yy, yt, tt = _noise_at_end(v, omega, dt, L, wheel_travel_variance)
-    # Phi P Phi^T, written out for Phi = [[1, 0, -dy], [0, 1, dx], [0, 0, 1]].
-    end_xx = pxx - 2.0 * dy * pxt + dy * dy * ptt + c * c * xx - 2.0 * c * s * xy + s * s * yy
-    end_xy = pxy - dy * pyt + dx * pxt - dx * dy * ptt + c * s * (xx - yy) + (c * c - s * s) * xy
-    end_xt = pxt - dy * ptt + c * xt - s * yt
-    end_yy = pyy + 2.0 * dx * pyt + dx * dx * ptt + s * s * xx + 2.0 * c * s * xy + c * c * yy
-    end_yt = pyt + dx * ptt + s * xt + c * yt
-    end_tt = ptt + tt
-    return end_xx, end_xy, end_xt, end_xy, end_yy, end_yt, end_xt, end_yt, end_tt
-
-
-def _wheel_variances(v: Any, omega: Any, L: Any, wheel_travel_variance: Any) -> tuple[Any, Any]:
-    """Compute the growth rates of the variances of right and left wheel travel (m^2/s)."""
-    half = omega * L / 2.0
-    return wheel_travel_variance * abs(v + half), wheel_travel_variance * abs(v - half)
-
-
-def _noise_at_end(v: Any, omega: Any, dt: Any, L: Any, wheel_travel_variance: Any) -> Any:
-    """Integrate `g W g^T` over an arc, in the body frame at its end; entries xx, xy, xt, yy, yt, tt.
+def _noise_at_end(v: Number, omega: Number, dt: Number, L: Number, k: Number) -> Rows:
+    """Integrate `g W g^T` over an arc, in the frame of the body at its end.
 
     With the remaining turn phi = omega (T - s), the columns of g are `[cos phi, -sin phi, 0]` and
     `[v (1 - cos phi) / omega, v sin(phi) / omega, 1]`. The integrals over s are written so that no
     digits cancel as omega goes to zero. Terms that would cancel are in `sinc_defect`.
     """
-    right, left = _wheel_variances(v, omega, L, wheel_travel_variance)
-    # W = [[vv, vw], [vw, ww]], times the duration.
-    vv, vw, ww = (
-        (right + left) / 4.0 * dt,
-        (right - left) / (2.0 * L) * dt,
-        (right + left) / (L * L) * dt,
-    )
+    vv, vw, ww = (density * dt for density in spectral_densities(v, omega, L, k))
     turn, path = omega * dt, v * dt
     whole, half = sinc(turn), sinc(turn / 2.0)
     once, twice = sinc_defect(turn), sinc_defect(2.0 * turn)
-    cosine = cos(turn)
-    return (
-        vv * (1.0 + whole * cosine) / 2.0
+    xx = (
+        vv * (1.0 + whole * cos(turn)) / 2.0
         + vw * path * turn * 2.0 * (2.0 * twice - once)
-        + ww * (path * path) * 2.0 * (once - twice),
-        -vv * turn * whole**2 / 2.0
-        + vw * path * half**2 * cosine / 2.0
-        + ww * (path * path) * turn * half**4 / 8.0,
-        vw * whole + ww * path * turn * once,
-        2.0 * twice * (vv * (turn * turn) - 2.0 * vw * path * turn + ww * (path * path)),
-        -vw * turn / 2.0 * half**2 + ww * path * half**2 / 2.0,
-        ww,
+        + ww * path**2 * 2.0 * (once - twice)
     )
+    xy = (
+        -vv * turn * whole**2 / 2.0
+        + vw * path * half**2 * cos(turn) / 2.0
+        + ww * path**2 * turn * half**4 / 8.0
+    )
+    xt = vw * whole + ww * path * turn * once
+    yy = 2.0 * twice * (vv * turn**2 - 2.0 * vw * path * turn + ww * path**2)
+    yt = (ww * path - vw * turn) * half**2 / 2.0
+    return [[xx, xy, xt], [xy, yy, yt], [xt, yt, ww]]
 
 
-def _matrix(*entries: Any) -> NDArray[np.float64]:
-    """Build square matrices from entries that broadcast, row by row."""
-    size = math.isqrt(len(entries))
-    matrix = stack(*entries)
-    return matrix.reshape(*matrix.shape[:-1], size, size)
+def covariance_of_pose(name: str, covariance: ArrayLike) -> NDArray[np.float64]:
+    """Return the covariance of one pose as an array, shape (3, 3).
+
+    Raises:
+        ValueError: The shape is another one, an entry is not finite, or the matrix is not symmetric and
+            positive semidefinite up to rounding.
+    """
+    made = array(name, covariance, 3, 3)
+    if made.ndim != 2:
+        raise ValueError(f'{name} must have shape (3, 3), got {made.shape}')
+    semidefinite(name, made)
+    return made

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics.se2 import compose, inverse, log
 from diffdrive_jacobian.numerics.checks import array
-from diffdrive_jacobian.simulation.odometry_noise import covariance_entries
+from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose
 
 Array = NDArray[np.float64]
 PROBABILITY = 0.95
@@ -82,9 +82,9 @@ def sampled_errors(
         )
     if np.any(noise[:, [0, 2]] < 0.0):
         raise ValueError('noise must have variances that are zero or positive')
-    covariance_entries('covariance', covariance)
+    covariance = covariance_of_pose('covariance', covariance)
     rng = np.random.default_rng(seed)
-    errors = rng.normal(size=(count, 3)) @ _root(np.asarray(covariance, dtype=np.float64))
+    errors = rng.normal(size=(count, 3)) @ _root(covariance)
     yield errors
     x, y, turned = errors.T
     for (before, after), (vv, vw, ww) in zip(pairwise(poses), noise.tolist(), strict=True):

@@ -7,8 +7,8 @@ timestamps. Times are integer nanoseconds, so that Unix time loses no precision.
 The state is stored at the last event (command, timeout, placement). Every later state is computed from
 it along one exact arc, so the motion does not depend, to the last bit, on when states are computed.
 
-A state is computed in floats, and its covariance and its arrays when they are first read. A node that
-needs no arrays reads `pose_tuple` and `covariance_tuple`.
+A state is computed in floats, its covariance when it is first read, and arrays whenever they are read. A
+node that needs no arrays reads `pose_tuple` and `covariance_tuple`.
 
 The pose is that of the odometry, computed from the turns of the wheels. The robot is truly there, unless
 its model has a `drift`. `true_pose` is where it truly is.
@@ -22,40 +22,38 @@ Source: doc/mathematics.md, "Motion".
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from math import inf, isfinite
-from typing import TYPE_CHECKING, Any, TypeAlias
+from math import isfinite
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.kinematics._arc import arc_end
 from diffdrive_jacobian.kinematics.se2 import compose
 from diffdrive_jacobian.numerics.checks import (
     MAX_NANOSECONDS,
-    array,
-    floats,
     instance,
     nanoseconds,
+    number,
+    numbers,
     positive,
     read_only,
 )
-from diffdrive_jacobian.numerics.elementary import components, operand
 from diffdrive_jacobian.simulation._uncertainty import Uncertainty
 from diffdrive_jacobian.simulation.actuators import Settling, Speeds
-from diffdrive_jacobian.simulation.exact_moments import Moments, gaussian_moments
-from diffdrive_jacobian.simulation.odometry_noise import covariance_entries, twist_covariance_entries
+from diffdrive_jacobian.simulation.arc import arc_end
+from diffdrive_jacobian.simulation.exact_moments import Moments, gaussian
+from diffdrive_jacobian.simulation.odometry_noise import twist_covariance
 from diffdrive_jacobian.simulation.robot_model import RobotModel as RobotModel
 from diffdrive_jacobian.simulation.robot_model import pair
 from diffdrive_jacobian.simulation.slip import Truth
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 STANDSTILL = (0.0, 0.0)
+_CERTAIN = read_only(np.zeros((3, 3)))
 _State: TypeAlias = tuple[tuple[float, float, float], tuple[float, float], Uncertainty, Truth | None]
 """Pose, wheel angles, uncertainty and truth at a time."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Robot:
     """A robot at a time. Every method returns a new one; none reads a clock.
 
@@ -64,77 +62,143 @@ class Robot:
             and positive semidefinite, or a time is not an integer.
     """
 
-    model: RobotModel
-    stamp: int
-    """Time of this state (ns)."""
-    pose: NDArray[np.float64]
-    """`[x, y, theta]`, shape (3,), read-only. `pose_tuple` has the same numbers without an array."""
-    covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 3)))
-    """Second moment of the error of `pose`, shape (3, 3), read-only: `E[(q - pose) (q - pose)^T]` of the
-    true pose q, in world coordinates, the heading unwrapped. It is exact under the noise model (see
-    `exact_moments`), and not the covariance about the mean, which is off the reported pose. Given to
-    the constructor, it is the covariance of a Gaussian error of mean zero. Computed when it is first
-    read, which raises ValueError if it overflows."""
-    wheel_angles: tuple[float, float] = (0.0, 0.0)
-    """`(right, left)`, unwrapped (rad)."""
-    command: tuple[float, float] = STANDSTILL
-    """The last commanded twist, `(v, omega)`."""
-    twist: tuple[float, float] = STANDSTILL
-    """The applied twist: the command after saturation, as the motors follow it."""
-    commanded_at: int | None = None
-    """Time at which the command took effect (ns); None: it is zero."""
-    expiry: int | None = field(init=False, repr=False)
-    """Time at which the timeout stops the robot (ns); None: it is not moving, or has no timeout."""
-    pose_tuple: tuple[float, float, float] = field(init=False, repr=False)
-    """`(x, y, theta)`, the pose as floats (m, m, rad)."""
-    _uncertainty: Uncertainty = field(init=False, repr=False)
+    __slots__ = (
+        *(
+            '_model',
+            '_stamp',
+            '_pose',
+            '_wheel_angles',
+            '_command',
+            '_twist',
+            '_commanded_at',
+            '_expiry',
+        ),
+        *('_uncertainty', '_truth', '_settling', '_ahead'),
+    )
+    _model: RobotModel
+    _stamp: int
+    _pose: tuple[float, float, float]
+    _wheel_angles: Speeds
+    _command: tuple[float, float]
+    _twist: tuple[float, float]
+    _commanded_at: int | None
+    _expiry: int | None
+    _uncertainty: Uncertainty
     # None: the pose is the true one.
-    _truth: Truth | None = field(init=False, repr=False)
+    _truth: Truth | None
     # None: the wheels have reached their commanded speeds.
-    _settling: Settling | None = field(init=False, repr=False, default=None)
+    _settling: Settling | None
     # The last state that was computed from this one, because often the same one is needed next.
-    _ahead: tuple[int, _State] | None = field(init=False, repr=False, default=None)
+    _ahead: tuple[int, _State] | None
 
-    def __post_init__(self) -> None:
-        """Check every value. The methods below construct their results without these checks."""
-        instance('model', self.model, RobotModel)
-        pose = array('pose', self.pose, 3)
-        if pose.ndim != 1:
-            raise ValueError(f'pose must have shape (3,), got {pose.shape}')
-        covariance = floats('covariance', self.covariance)
-        if covariance.ndim != 2:
-            raise ValueError(f'covariance must have shape (3, 3), got {covariance.shape}')
-        entries = covariance_entries('covariance', covariance)
-        pose, covariance = read_only(pose), read_only(covariance)
-        values: dict[str, Any] = {
-            'stamp': nanoseconds('stamp', self.stamp),
-            'pose': pose,
-            'covariance': covariance,
-            'pose_tuple': tuple(pose.tolist()),
-            '_uncertainty': Uncertainty(tuple(gaussian_moments(entries))),
-            '_truth': _truth(self.model, pose.tolist()),
-        }
-        for name in ('wheel_angles', 'command', 'twist'):
-            values[name] = pair(name, getattr(self, name))
-        if self.commanded_at is not None:
-            values['commanded_at'] = nanoseconds('commanded_at', self.commanded_at)
-        values['expiry'] = _expiry(self.model, values['stamp'], values.get('commanded_at'))
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+    def __init__(
+        self,
+        *,
+        model: RobotModel,
+        stamp: int,
+        pose: ArrayLike,
+        covariance: ArrayLike = _CERTAIN,
+        wheel_angles: ArrayLike = (0.0, 0.0),
+        command: ArrayLike = STANDSTILL,
+        twist: ArrayLike = STANDSTILL,
+        commanded_at: int | None = None,
+    ) -> None:
+        """Check every value. The methods below construct their results without these checks.
 
-    if not TYPE_CHECKING:
+        Args:
+            model: The parameters.
+            stamp: Time of this state (ns).
+            pose: `[x, y, theta]`, shape (3,) (m, m, rad).
+            covariance: Covariance of a Gaussian error of the pose, shape (3, 3).
+            wheel_angles: `(right, left)` (rad).
+            command: The last commanded twist, `(v, omega)` (m/s, rad/s).
+            twist: The applied twist.
+            commanded_at: Time at which the command took effect (ns); None: it is zero.
+        """
+        instance('model', model, RobotModel)
+        self._model, self._stamp = model, nanoseconds('stamp', stamp)
+        self._pose = _triple('pose', pose)
+        self._uncertainty = Uncertainty(tuple(gaussian(covariance)))
+        self._truth = _truth(model, self._pose)
+        self._wheel_angles = pair('wheel_angles', wheel_angles)
+        self._command, self._twist = pair('command', command), pair('twist', twist)
+        if commanded_at is not None:
+            commanded_at = nanoseconds('commanded_at', commanded_at)
+        self._commanded_at = commanded_at
+        self._expiry = _expiry(model, self._stamp, commanded_at)
+        self._settling = self._ahead = None
 
-        def __getattr__(self, name: str) -> Any:
-            """Create the arrays when they are first read: their slots are empty until then."""
-            if name == 'pose':
-                array = np.array(self.pose_tuple)
-            elif name == 'covariance':
-                array = np.array(self.covariance_tuple).reshape(3, 3)
-            else:
-                raise AttributeError(f"'Robot' object has no attribute {name!r}")
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
-            return array
+    def __repr__(self) -> str:
+        """Return a constructor call with the values."""
+        names = (
+            'model',
+            'stamp',
+            'pose',
+            'covariance',
+            'wheel_angles',
+            'command',
+            'twist',
+            'commanded_at',
+        )
+        return f'Robot({", ".join(f"{name}={getattr(self, name)!r}" for name in names)})'
+
+    @property
+    def model(self) -> RobotModel:
+        """The parameters."""
+        return self._model
+
+    @property
+    def stamp(self) -> int:
+        """Time of this state (ns)."""
+        return self._stamp
+
+    @property
+    def pose(self) -> NDArray[np.float64]:
+        """`[x, y, theta]`, shape (3,), read-only. `pose_tuple` has the same numbers without an array."""
+        return read_only(self._pose)
+
+    @property
+    def pose_tuple(self) -> tuple[float, float, float]:
+        """`(x, y, theta)`, the pose as floats (m, m, rad)."""
+        return self._pose
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """Second moment of the error of `pose`, shape (3, 3), read-only: `E[(q - pose) (q - pose)^T]`.
+
+        q is the true pose, in world coordinates, the heading unwrapped. It is exact under the noise
+        model (see `exact_moments`), and not the covariance about the mean, which is off the reported
+        pose.
+
+        Raises:
+            ValueError: It overflows.
+        """
+        return read_only(np.reshape(self.covariance_tuple, (3, 3)))
+
+    @property
+    def wheel_angles(self) -> Speeds:
+        """`(right, left)`, unwrapped (rad)."""
+        return self._wheel_angles
+
+    @property
+    def command(self) -> tuple[float, float]:
+        """The last commanded twist, `(v, omega)`."""
+        return self._command
+
+    @property
+    def twist(self) -> tuple[float, float]:
+        """The applied twist: the command after saturation, as the motors follow it."""
+        return self._twist
+
+    @property
+    def commanded_at(self) -> int | None:
+        """Time at which the command took effect (ns); None: it is zero."""
+        return self._commanded_at
+
+    @property
+    def expiry(self) -> int | None:
+        """Time at which the timeout stops the robot (ns); None: it is not moving, or has no timeout."""
+        return self._expiry
 
     @property
     def covariance_tuple(self) -> tuple[float, ...]:
@@ -207,14 +271,12 @@ class Robot:
         Raises:
             ValueError: As `twist_covariance`.
         """
-        model = self.model
-        if type(interval) is not float or not 0.0 < interval < inf:
-            interval = operand('interval', interval, positive)
-            if type(interval) is not float:
-                raise ValueError(f'interval must be a single number, got shape {np.shape(interval)}')
-        return twist_covariance_entries(
-            self.twist, model.wheel_separation, model.wheel_travel_variance, interval
-        )
+        L, k = self.model.wheel_separation, self.model.wheel_travel_variance
+        interval = number('interval', interval, positive)
+        (vv, vw), (wv, ww) = twist_covariance.formula(self.twist, L, k, interval)
+        if not isfinite(vv + abs(vw) + ww):
+            raise ValueError('twist and interval must give a finite result, but it overflows')
+        return vv, vw, wv, ww
 
     def at(self, stamp: int) -> Robot:
         """Advance to a time, through the timeout if it expires before.
@@ -269,7 +331,7 @@ class Robot:
             ValueError: The pose or the covariance is invalid, as in the constructor; or as `at`.
         """
         here = self.at(stamp)
-        placed = Robot(model=self.model, stamp=here.stamp, pose=pose, covariance=covariance)  # type: ignore[arg-type]
+        placed = Robot(model=self.model, stamp=here.stamp, pose=pose, covariance=covariance)
         truth = here._truth if odometry_only else placed._truth
         state = placed.pose_tuple, here.wheel_angles, placed._uncertainty, truth
         return here._with(state)
@@ -467,14 +529,8 @@ class Robot:
             raise ValueError(f'wheel_angles must be finite, got {list(angles)}')
         uncertainty = self._uncertainty.after((theta, twist, dt, L, k))
         state = arc_end(x, y, theta, v, omega, dt), angles, uncertainty, truth
-        object.__setattr__(self, '_ahead', (stamp, state))
+        self._ahead = stamp, state
         return state
-
-
-class _Draft:
-    """A robot while it is created: attributes of a frozen one are set in several times the time."""
-
-    __slots__ = Robot.__slots__
 
 
 def _robot(
@@ -487,16 +543,13 @@ def _robot(
     settling: Settling | None = None,
 ) -> Robot:
     """Return a robot with checked values, without checking them again for every message."""
-    robot: Any = _Draft()
-    robot.pose_tuple, robot.wheel_angles, robot._uncertainty, robot._truth = state
-    robot.model, robot.stamp = model, stamp
-    robot.command, robot.twist, robot.commanded_at = command, twist, commanded_at
-    robot.expiry = None if commanded_at is None else _expiry(model, stamp, commanded_at)
+    robot = object.__new__(Robot)
+    robot._model, robot._stamp = model, stamp
+    robot._pose, robot._wheel_angles, robot._uncertainty, robot._truth = state
+    robot._command, robot._twist, robot._commanded_at = command, twist, commanded_at
+    robot._expiry = _expiry(model, stamp, commanded_at)
     robot._settling, robot._ahead = settling, None
-    # Both classes have the same slots. Those of the arrays stay empty, see `Robot.__getattr__`.
-    robot.__class__ = Robot
-    created: Robot = robot
-    return created
+    return robot
 
 
 def _expiry(model: RobotModel, stamp: int, commanded_at: int | None) -> int | None:
@@ -515,9 +568,7 @@ def _triple(name: str, value: ArrayLike) -> tuple[float, float, float]:
     Raises:
         ValueError: It is something else.
     """
-    x, y, theta = components(name, value, 3)
-    if type(x) is not float:
-        raise ValueError(f'{name} must have shape (3,), got {np.shape(value)}')
+    x, y, theta = numbers(name, value, 3)
     return x, y, theta
 
 

@@ -6,13 +6,18 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
-from diffdrive_jacobian.kinematics.saturation import VelocityLimits, saturate
-from diffdrive_jacobian.numerics.checks import instance, nanoseconds, not_negative, number, positive
-from diffdrive_jacobian.numerics.elementary import components
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits, scaled_to_limits
+from diffdrive_jacobian.numerics.checks import (
+    instance,
+    nanoseconds,
+    not_negative,
+    number,
+    numbers,
+    positive,
+)
 from diffdrive_jacobian.simulation.actuators import Actuators, Speeds
 from diffdrive_jacobian.simulation.slip import Drift
 
@@ -66,11 +71,18 @@ class RobotModel:
         """Saturate a command `(v, omega)`, shape (2,), keeping its curvature.
 
         Raises:
-            ValueError: It has another shape or is not finite.
+            ValueError: It has another shape or is not finite, or the wheel speeds overflow.
         """
-        v, omega = saturate(
-            *pair('command', command), self.limits, max(self.radii), self.wheel_separation
-        )
+        v, omega = pair('command', command)
+        if self.limits.unlimited:
+            return v, omega
+        radius = max(self.radii)
+        try:
+            v, omega = scaled_to_limits.formula(
+                v, omega, *self.limits.all(), radius, self.wheel_separation
+            )
+        except ValueError as error:
+            raise ValueError(f'command must be smaller, got {command!r}: {error}') from None
         if self.limits.max_wheel_speed < math.inf:
             # The smaller wheel may still be too fast.
             fastest = max(map(abs, self.wheel_speeds(v, omega)))
@@ -133,7 +145,5 @@ def pair(name: str, value: Any) -> tuple[float, float]:
         # A finite sum has finite terms.
         if type(first) is type(second) is float and math.isfinite(first + second):
             return first, second
-    first, second = components(name, value, 2)
-    if type(first) is not float:
-        raise ValueError(f'{name} must have shape (2,), got {np.shape(value)}')
+    first, second = numbers(name, value, 2)
     return first, second

@@ -6,16 +6,17 @@ import csv
 import io
 import math
 import pickle
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.control import Arrival, Controller
-from diffdrive_jacobian.control.controllers import BUILT_IN, CONTROLLERS
+from diffdrive_jacobian.control.controller import KP, Gain
+from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.simulation import RobotModel, closed_loops
 from diffdrive_jacobian.simulation._batch import Outcomes
@@ -23,48 +24,16 @@ from diffdrive_jacobian.simulation._block import LOST
 
 Array = NDArray[np.float64]
 
-SWEPT_GAINS = ('kp', 'kv')
-"""Gains that a controller must have to be swept."""
-MEASURES = ('time', 'path_length', 'overshoot')
-"""Fields of `Outcomes` that are drawn and written."""
-COLUMNS = (
-    *('kp_per_s', 'kv_per_s', 'starts', 'arrived', 'time_mean_s', 'time_max_s'),
-    *('path_length_mean_m', 'path_length_max_m', 'overshoot_mean_m', 'overshoot_max_m'),
-)
-"""Columns of the CSV table."""
+MEASURES = {'time': 's', 'path_length': 'm', 'overshoot': 'm'}
+"""Fields of `Outcomes` that are drawn and written, and their units."""
+_SUFFIXES = {'1/s': '_per_s', '': ''}
+"""Units in names of columns."""
 LOOPS_PER_TASK = 4096
 """Number of loops, at least a row of the grid, in one task of an executor. Fewer take longer each."""
-MIN_GAIN, MAX_GAIN = 1e-3, 100.0
-"""Smallest and largest gain; the nodes accept no larger ones (1/s)."""
 MIN_LIMIT = 1e-6
 """Smallest velocity limit other than 0 (m/s, rad/s)."""
 MAX_LOOPS, MAX_SAMPLES = 1_000_000, 10_000_000_000
 """Largest number of loops and of samples: more would need too much memory or time."""
-
-
-class SweptControllers(Collection[str]):
-    """Names of the controllers that can be swept: those with the gains kp and kv.
-
-    Of installed controllers the gains are unknown until they are imported, so all of them are included.
-    """
-
-    def __contains__(self, name: object) -> bool:
-        """Return whether the controller of that name may be swept, without importing it."""
-        if isinstance(name, str) and name in BUILT_IN:
-            return _has_gains(BUILT_IN[name])
-        return name in CONTROLLERS
-
-    def __iter__(self) -> Iterator[str]:
-        """Return the names, sorted."""
-        return (name for name in CONTROLLERS if name in self)
-
-    def __len__(self) -> int:
-        """Return how many there are."""
-        return len(list(iter(self)))
-
-
-def _has_gains(controller: Controller) -> bool:
-    return set(SWEPT_GAINS) <= set(controller.gains)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,11 +46,10 @@ class Setup:
     """
 
     controller: str | Controller = 'go_to_goal'
-    """A controller with the gains kp and kv, or the name of one."""
-    kp: tuple[float, float] = (0.2, 6.0)
-    """First and last gain on the heading error (1/s)."""
-    kv: tuple[float, float] = (0.1, 3.0)
-    """First and last gain on the distance (1/s)."""
+    """A controller with at least two gains, or the name of one."""
+    gains: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
+    """By name, the first and the last value of a gain that is swept, or the value of one that is not. Of
+    the others the first are swept over their usual range, until two are; the rest has its default."""
     grid: int = 59
     """Number of values of each gain; 59: steps of 0.1 and 0.05."""
     starts: int = 12
@@ -94,25 +62,16 @@ class Setup:
     """Time after which a robot is given up (s)."""
     tolerance: float = 0.02
     """Distance that counts as arrived (m)."""
-    offset: float = 0.1
-    """X coordinate in the body frame of the driven point, for controllers that take it (m)."""
     robot: RobotModel = field(default_factory=RobotModel)
     """The robot; its wheels and limits are used."""
 
     def __post_init__(self) -> None:
         """Check every value, and that the sweep is not too large."""
-        if not isinstance(self.controller, Controller):
-            names = SweptControllers()
-            if self.controller not in names:
-                raise ValueError(
-                    f'controller must be one of {", ".join(names)}, got {self.controller!r}'
-                )
-        if not _has_gains(self.resolved_controller):
-            name, gains = self.resolved_controller.name, self.resolved_controller.gains
+        if not isinstance(self.controller, Controller) and self.controller not in CONTROLLERS:
             raise ValueError(
-                f'controller must have the gains kp and kv to be swept, but {name!r} has '
-                f'{", ".join(gains) or "none"}'
+                f'controller must be one of {", ".join(CONTROLLERS)}, got {self.controller!r}'
             )
+        self._check_gains()
         for name, least in (('grid', 2), ('starts', 1)):
             if getattr(self, name) < least:
                 raise ValueError(f'{name} must be at least {least}, got {getattr(self, name)}')
@@ -138,15 +97,51 @@ class Setup:
                 f'{MAX_SAMPLES} samples, which may take an hour; choose a smaller grid, fewer starts, '
                 'a shorter duration or a lower rate'
             )
-        for name in ('kp', 'kv'):
-            first, last = self.kp if name == 'kp' else self.kv
-            if not MIN_GAIN <= first < last <= MAX_GAIN:
-                raise ValueError(
-                    f'{name} must be MIN MAX with {MIN_GAIN:g} <= MIN < MAX <= {MAX_GAIN:g}, '
-                    f'got {first:g} {last:g}'
-                )
-            if not (np.diff(self.gains(name)) > 0.0).all():
-                raise ValueError(f'{name} must have {self.grid} different values, got {first} {last}')
+
+    def _check_gains(self) -> None:
+        """Check the names and the values of the gains."""
+        controller = self.resolved_controller
+        known = {gain.name: gain for gain in controller.gains}
+        if len(known) < 2:
+            raise ValueError(
+                f'controller must have two gains to be swept, but {controller.name!r} has '
+                f'{", ".join(known) or "none"}'
+            )
+        if unknown := self.gains.keys() - known.keys():
+            raise ValueError(
+                f'gains must be of {", ".join(known)}, those of {controller.name!r}, '
+                f'got {", ".join(map(repr, sorted(unknown)))}'
+            )
+        ranges = [name for name, value in self.gains.items() if isinstance(value, tuple)]
+        if len(ranges) > 2 or len(self.gains) - len(ranges) > len(known) - 2:
+            raise ValueError(f'two gains must be swept, got ranges of {", ".join(ranges) or "none"}')
+        for name, value in self.gains.items():
+            ends = value if isinstance(value, tuple) else (value,)
+            if len(ends) > 2 or (len(ends) == 2 and not ends[0] < ends[1]):
+                raise ValueError(f'{name} must be MIN MAX with MIN < MAX, got {value}')
+            for end in ends:
+                known[name].check(end)
+        for gain in self.axes:
+            if not (np.diff(self.values(gain)) > 0.0).all():
+                raise ValueError(f'{gain.name} must have {self.grid} different values')
+
+    @property
+    def axes(self) -> tuple[Gain, Gain]:
+        """The two gains that are swept, in the order of the law: along x, and along y."""
+        gains = self.resolved_controller.gains
+        swept = [gain for gain in gains if isinstance(self.gains.get(gain.name), tuple)]
+        swept += [gain for gain in gains if gain.name not in self.gains]
+        first, second = sorted(swept[:2], key=gains.index)
+        return first, second
+
+    def ends(self, gain: Gain) -> tuple[float, float]:
+        """Return the first and the last value of a gain that is swept."""
+        given = self.gains.get(gain.name, gain.usual)
+        return given if isinstance(given, tuple) else (given, given)
+
+    def values(self, gain: Gain) -> Array:
+        """Return the values of a gain that is swept, evenly spaced and rounded to 9 decimals."""
+        return np.asarray(np.linspace(*self.ends(gain), self.grid).round(9), dtype=np.float64)
 
     @property
     def resolved_controller(self) -> Controller:
@@ -167,13 +162,14 @@ class Setup:
         return Arrival(
             xy_tolerance=self.tolerance,
             use_heading=controller.takes_heading,
-            offset=self.offset if controller.offset else 0.0,
+            offset=self._number(controller.offset) if controller.offset else 0.0,
         )
 
-    def gains(self, name: str) -> Array:
-        """Return the values of `kp` or `kv`, evenly spaced and rounded to 9 decimals (1/s)."""
-        first, last = self.kp if name == 'kp' else self.kv
-        return np.asarray(np.linspace(first, last, self.grid).round(9), dtype=np.float64)
+    def _number(self, name: str) -> float:
+        """Return the value of a gain that is not swept."""
+        (gain,) = (one for one in self.resolved_controller.gains if one.name == name)
+        value = self.gains.get(name, gain.default)
+        return gain.default if isinstance(value, tuple) else value
 
     def poses(self) -> Array:
         """Return the start poses, shape (starts, 3), evenly spaced around the goal at the origin.
@@ -199,42 +195,42 @@ class Sweep(NamedTuple):
     """Outcomes of every pair of gains from every start."""
 
     setup: Setup
-    kp: Array
-    """Shape (n,) (1/s)."""
-    kv: Array
-    """Shape (n,) (1/s)."""
+    x: Array
+    """Values of the first gain that is swept, shape (n,)."""
+    y: Array
+    """Values of the second one, shape (n,)."""
     outcomes: Outcomes
-    """Shape (n, n, starts): kv, kp, starts."""
+    """Shape (n, n, starts): y, x, starts."""
 
     @property
     def arrived(self) -> NDArray[np.int_]:
-        """Number of starts from which the robot arrived, shape (n, n): kv, kp."""
+        """Number of starts from which the robot arrived, shape (n, n): y, x."""
         return np.asarray(np.count_nonzero(self.outcomes.arrived, axis=-1))
 
     @property
     def complete(self) -> NDArray[np.bool_]:
-        """Whether the robot arrived from all starts, shape (n, n): kv, kp."""
+        """Whether the robot arrived from all starts, shape (n, n): y, x."""
         return np.asarray(self.outcomes.arrived.all(axis=-1))
 
     def mean(self, measure: str) -> Array:
-        """Return the mean over the starts that arrived, shape (n, n): kv, kp; NaN: none arrived."""
+        """Return the mean over the starts that arrived, shape (n, n): y, x; NaN: none arrived."""
         arrived = self.outcomes.arrived
         total = np.where(arrived, getattr(self.outcomes, measure), 0.0).sum(axis=-1)
         return np.asarray(total / np.where(self.arrived > 0, self.arrived, np.nan))
 
     def largest(self, measure: str) -> Array:
-        """Return the maximum over the starts that arrived, shape (n, n): kv, kp; NaN: none arrived."""
+        """Return the maximum over the starts that arrived, shape (n, n): y, x; NaN: none arrived."""
         values = np.where(self.outcomes.arrived, getattr(self.outcomes, measure), -np.inf)
         return np.where(self.arrived > 0, values.max(axis=-1), np.nan)
 
     def fastest(self) -> tuple[int, int] | None:
-        """Return the indices of kv and kp with the least mean time among those that arrived from all
+        """Return the indices of y and x with the least mean time among those that arrived from all
         starts; None: there are none.
         """
         if not self.complete.any():
             return None
         best = int(np.argmin(np.where(self.complete, self.mean('time'), np.inf)))
-        row, column = divmod(best, len(self.kp))
+        row, column = divmod(best, len(self.x))
         return row, column
 
 
@@ -261,18 +257,24 @@ def sweep(
         outcomes = _drive(setup, slice(None), progress)
     else:
         outcomes = _drive_on(executor, setup, progress)
-    return Sweep(setup, setup.gains('kp'), setup.gains('kv'), outcomes)
+    x, y = setup.axes
+    return Sweep(setup, setup.values(x), setup.values(y), outcomes)
 
 
 def _drive(setup: Setup, rows: slice, progress: Callable[[int], object] | None = None) -> Outcomes:
     """Return the outcomes of some rows of the grid, shape (rows, n, starts)."""
     controller = setup.resolved_controller
+    x, y = setup.axes
     values: dict[str, Any] = {
-        'kp': setup.gains('kp')[np.newaxis, :, np.newaxis],
-        'kv': setup.gains('kv')[rows, np.newaxis, np.newaxis],
-        'offset': setup.offset,
+        x.name: setup.values(x)[np.newaxis, :, np.newaxis],
+        y.name: setup.values(y)[rows, np.newaxis, np.newaxis],
     }
-    gains = [values[name] for name in controller.gains]
+    for name in controller.gain_names:
+        values.setdefault(name, setup._number(name))
+    gains = [values[name] for name in controller.gain_names]
+    arrival = setup.arrival
+    if controller.offset:
+        arrival = replace(arrival, offset=values[controller.offset])
     starts, goal = setup.poses(), np.zeros(3 if controller.takes_heading else 2)
     _check_law(controller, starts, goal, gains)
     return closed_loops(
@@ -282,8 +284,8 @@ def _drive(setup: Setup, rows: slice, progress: Callable[[int], object] | None =
         *gains,
         rate=setup.rate,
         duration=setup.duration,
-        arrival=setup.arrival,
-        turning_gain=values['kp'],
+        arrival=arrival,
+        turning_gain=values.get('kp', KP.default),
         limits=setup.robot.limits,
         r=min(setup.robot.radii),
         L=setup.robot.wheel_separation,
@@ -324,8 +326,11 @@ def _check_law(controller: Controller, starts: Array, goal: Array, gains: list[A
     """
     first = [float(np.ravel(gain)[0]) for gain in gains]
     goals = np.broadcast_to(goal, (len(starts), len(goal)))
+    more: dict[str, Any] = {}
+    if controller.state:
+        more = {'state': np.tile(controller.state, (len(starts), 1)), 'dt': 0.0}
     try:
-        controller.law(starts, goals, *first)
+        controller.law(starts, goals, *first, **more)
     except Exception as error:
         raise ValueError(
             f'the law of controller {controller.name!r} must accept poses of shape '
@@ -333,17 +338,24 @@ def _check_law(controller: Controller, starts: Array, goal: Array, gains: list[A
         ) from error
 
 
+def columns(setup: Setup) -> tuple[str, ...]:
+    """Return the columns of the CSV table of a sweep."""
+    gains = [f'{gain.name}{_SUFFIXES.get(gain.unit, "_" + gain.unit)}' for gain in setup.axes]
+    measures = [f'{name}_{of}_{unit}' for name, unit in MEASURES.items() for of in ('mean', 'max')]
+    return (*gains, 'starts', 'arrived', *measures)
+
+
 def table(swept: Sweep) -> str:
-    """Return a sweep as CSV, one row for each pair of gains, with `COLUMNS`; empty: no start arrived."""
+    """Return a sweep as CSV, one row for each pair of gains, with `columns`; empty: no start arrived."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator='\n')
-    writer.writerow(COLUMNS)
-    kv, kp = np.meshgrid(swept.kv, swept.kp, indexing='ij')
-    starts = np.full(kp.shape, swept.setup.starts)
+    writer.writerow(columns(swept.setup))
+    y, x = np.meshgrid(swept.y, swept.x, indexing='ij')
+    starts = np.full(x.shape, swept.setup.starts)
     measured = [of(measure) for measure in MEASURES for of in (swept.mean, swept.largest)]
-    columns = [kp, kv, starts, swept.arrived, *measured]
-    # Sorted by kp, then by kv.
-    for row in zip(*(column.T.ravel().tolist() for column in columns), strict=True):
+    # Sorted by the first gain, then by the second.
+    entries = [x, y, starts, swept.arrived, *measured]
+    for row in zip(*(one.T.ravel().tolist() for one in entries), strict=True):
         writer.writerow(['' if value != value else repr(value) for value in row])
     return text.getvalue()
 
@@ -354,13 +366,14 @@ def describe(swept: Sweep) -> str:
     if found is None:
         return f'no gains bring the robot to the goal from every start within {setup.duration:g} s'
     row, column = found
+    x, y = setup.axes
     edges = [
         f'{"least" if index == 0 else "largest"} {name}'
-        for name, index in (('kp', column), ('kv', row))
+        for name, index in ((x.name, column), (y.name, row))
         if index in (0, setup.grid - 1)
     ]
     return (
-        f'fastest: kp {swept.kp[column]:.4g}, kv {swept.kv[row]:.4g}'
+        f'fastest: {x.name} {swept.x[column]:.4g}, {y.name} {swept.y[row]:.4g}'
         + (f' (the {" and the ".join(edges)} of the grid)' if edges else '')
         + f': at the goal after {swept.mean("time")[found]:.2f} s on average and '
         f'{swept.largest("time")[found]:.2f} s at most, by a path of '

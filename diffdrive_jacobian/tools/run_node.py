@@ -7,10 +7,11 @@ import importlib
 import textwrap
 from collections.abc import Sequence
 from dataclasses import fields
+from itertools import pairwise
 from typing import NamedTuple
 
 from diffdrive_jacobian.errors import UserError
-from diffdrive_jacobian.parameters.declaration import NodeParameters, specifications
+from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, specifications
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._startup import long_lived
@@ -65,7 +66,10 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
     if own:
         # Not otherwise: to create the parser describes all parameters, which takes time.
         hint = 'send_goal X Y sends a goal' if name == 'go_to_goal' else ''
-        parameters = parameters_of(name)
+        try:
+            parameters = parameters_of(name).extended(_given(ros))
+        except ParameterError as error:
+            return _cli.complain(name, error)
         parser = _parser(name, program, parameters)
         ros = _cli.with_params_file(ros, _cli.parse(parser, own, parameters=[parameters], hint=hint))
     with long_lived(), signals.ending_at_once():
@@ -85,6 +89,12 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
     except UserError as error:
         return _cli.complain(name, error)
     return _cli.DONE
+
+
+def _given(ros: Sequence[str]) -> dict[str, str]:
+    """Return the parameters among ROS arguments, as text."""
+    texts = [text for flag, text in pairwise(ros) if flag in ('-p', '--param') and ':=' in text]
+    return dict(text.split(':=', 1) for text in texts)
 
 
 def parameters_of(name: str) -> type[NodeParameters]:

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from diffdrive_jacobian.control import Controller, ControllerError
+from diffdrive_jacobian.control.controllers import BUILT_IN, CONTROLLERS
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import from_ros
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
@@ -17,7 +19,7 @@ from diffdrive_jacobian.plots import sweep_figure
 from diffdrive_jacobian.plots.output_files import FORMATS, create, extension, free_stem, new_file
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.simulation import RobotModel
-from diffdrive_jacobian.sweeps.sweep import Setup, Sweep, SweptControllers, describe, sweep, table
+from diffdrive_jacobian.sweeps.sweep import Setup, Sweep, describe, sweep, table
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._waiting import busy
 
@@ -31,7 +33,10 @@ class InterruptedByUserError(Exception):
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool; return the exit code."""
     own, ros = _cli.split_arguments(arguments)
-    parser = _parser()
+    try:
+        parser = _parser(_controller(own))
+    except (ControllerError, argparse.ArgumentError) as error:
+        return _cli.complain(PROGRAM, error)
     options = _cli.parse(parser, [*own, *ros], ros=False)
     _cli.refuse_without(parser, options, '--force', '--output', '--csv')
     try:
@@ -79,8 +84,7 @@ def _sweep(options: argparse.Namespace, signals: Signals) -> Sweep:
     """
     setup = Setup(
         controller=options.controller,
-        kp=tuple(options.kp),
-        kv=tuple(options.kv),
+        gains=_gains(options),
         grid=options.grid,
         starts=options.starts,
         distance=options.distance,
@@ -100,6 +104,28 @@ def _sweep(options: argparse.Namespace, signals: Signals) -> Sweep:
             bar.show(done)
 
         return sweep(setup, progress)
+
+
+def _controller(own: Sequence[str]) -> Controller:
+    """Return the controller that is chosen on the command line: its gains are options.
+
+    Raises:
+        ControllerError: There is none of that name, or it cannot be loaded.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument('--controller', nargs='?', default=Setup().controller)
+    name = parser.parse_known_args(own)[0].controller
+    return CONTROLLERS.find(name or '')
+
+
+def _gains(options: argparse.Namespace) -> dict[str, float | tuple[float, float]]:
+    """Return the gains that are given: a value, or a range."""
+    found: dict[str, float | tuple[float, float]] = {}
+    for gain in CONTROLLERS.find(options.controller).gains:
+        values = getattr(options, gain.name)
+        if values is not None:
+            found[gain.name] = values[0] if len(values) == 1 else tuple(values)
+    return found
 
 
 def _check(signals: Signals) -> None:
@@ -178,11 +204,11 @@ def _whole(text: str) -> int:
     return int(text)
 
 
-def _parser() -> _cli.Parser:
+def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
         usage=f'{PROGRAM} [options]',
-        description='Sweep the gains kp and kv of a control law over a grid: thousands of closed loops '
+        description='Sweep two gains of a control law over a grid: thousands of closed loops '
         'are simulated at once, from starts all around the goal. Time to the goal, path length and '
         'overshoot are drawn as heat maps, with the boundary beyond which the robot spirals in, and '
         'written as CSV. Without -o and --csv both are written, as sweep_DATE-TIME.png and .csv. '
@@ -190,15 +216,16 @@ def _parser() -> _cli.Parser:
         'written; 2: wrong arguments; 130: interrupted, and nothing was written.',
     )
     usual = Setup()
-    for name, what in (('kp', 'heading error'), ('kv', 'distance')):
-        first, last = getattr(usual, name)
+    for gain in controller.gains:
+        unit = f' ({gain.unit})' if gain.unit else ''
         parser.add_argument(
-            f'--{name}',
-            nargs=2,
-            metavar=('MIN', 'MAX'),
+            f'--{gain.name}',
+            nargs='+',
+            metavar='VALUE',
             type=_cli.number,
-            default=(first, last),
-            help=f'gain on the {what} (1/s) (default: {first:g} {last:g})',
+            help=f'{gain.description}{unit}: MIN MAX to sweep it, or one value (default: the first two '
+            f'gains are swept, this one over {gain.usual[0]:g} to {gain.usual[1]:g}; else '
+            f'{gain.default:g})',
         )
     parser.add_argument(
         '--grid',
@@ -224,10 +251,10 @@ def _parser() -> _cli.Parser:
     )
     parser.add_argument(
         '--controller',
-        choices=SweptControllers(),
+        choices=CONTROLLERS,
         metavar='NAME',
         default=usual.controller,
-        help='controller with the gains kp and kv: %(choices)s (default: %(default)s)',
+        help='controller, whose gains are options, too: %(choices)s (default: %(default)s)',
     )
     parser.add_argument(
         '--rate',

@@ -97,7 +97,7 @@ export class Chain {
   describe(robot) {
     const { law, chain } = robot;
     if (robot.by_hand || !robot.commanded || !law.twist) return '';
-    const gains = law.kp === null ? '' : `K_p = ${law.kp}, K_v = ${law.kv}`;
+    const gains = Object.entries(law.gains).map(([name, value]) => `${name} = ${value}`).join(', ');
     const factors = law.twist.map((value, k) => chain.command[k] / value).filter((_, k) => Math.abs(law.twist[k]) > 0.02);
     const limited = factors.length > 0 && Math.max(...factors) < 0.97 && Math.max(...factors) - Math.min(...factors) < 0.02;
     return limited ? `${gains}; the limits scale both by ${format(factors[0], 2)}` : gains;

@@ -1,4 +1,4 @@
-"""The arc of one unicycle in floats, for code that runs with every message."""
+"""The arc of one robot in floats, for what runs with every message."""
 
 from __future__ import annotations
 
