@@ -2,6 +2,7 @@
 
     python test/pages.py parameters            write the parameter tables of doc/nodes.md
     python test/pages.py outputs [PAGE ...]    run pages and write the outputs that they quote
+    python test/pages.py public                write doc/public.md
 
 A page is run from top to bottom in one empty directory. A `python` block is a program and a `bash` block
 a script. Programs of this package, `pytest` and `python` run in forks, see `forked`. `python3` is a new
@@ -24,6 +25,8 @@ Numbers in other outputs may differ.
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import os
 import re
 import signal
@@ -337,6 +340,54 @@ def with_parameter_tables(text: str) -> str:
     return text
 
 
+# --- Public names
+
+PUBLIC = (
+    *('control', 'kinematics', 'simulation', 'sweeps', 'calibration'),
+    *('reading', 'recovery', 'replay', 'drives', 'testing', 'faults', 'properties'),
+)
+"""Packages whose `__all__` is public."""
+
+
+def public_page() -> str:
+    """Return the page that lists the public names."""
+    lines = [
+        '# Public names',
+        '',
+        'What a program may import, with the first sentence of its docstring. Each name is in the',
+        '`__all__` of its package, from which it is imported. Type checkers refuse others. Everything',
+        'else may change without notice. Public are also the nodes, `nodes.virtual_robot.VirtualRobot`,',
+        '`nodes.go_to_goal.GoToGoal` and `nodes.wheel_bridge.WheelBridge`, and the decorator of',
+        'equations, `numerics.formula.formula` ([design](design.md)).',
+        '',
+        'Written by `python test/pages.py public`.',
+    ]
+    for name in PUBLIC:
+        package = importlib.import_module(f'diffdrive_jacobian.{name}')
+        lines += ['', f'## {name}', '', _sentence(package), '', '| name | |', '|---|---|']
+        for public in sorted(package.__all__):
+            value = getattr(package, public)
+            lines.append(f'| `{public}` | {_sentence(value)} |')
+            if inspect.ismodule(value) and value.__name__.startswith(f'{package.__name__}.'):
+                lines += [
+                    f'| `{public}.{one}` | {_sentence(function)} |'
+                    for one, function in sorted(vars(value).items())
+                    if getattr(function, '__module__', '') == value.__name__
+                    and not one.startswith('_')
+                    and callable(function)
+                ]
+    return '\n'.join([*lines, ''])
+
+
+def _sentence(value: object) -> str:
+    """Return the first sentence of a docstring."""
+    if not (inspect.ismodule(value) or callable(value)):
+        return str(getattr(value, 'description', ''))
+    text = ' '.join((inspect.getdoc(value) or '').partition('\n\n')[0].split())
+    found = re.match(r'.*?[.:](?= [A-Z]|$)', text)
+    return (found[0] if found else text).rstrip(':').replace('|', '\\|')
+
+
 def main(what: str, names: list[str]) -> None:
     """Write what is generated into the pages."""
     for name in names or PAGES:
@@ -356,6 +407,9 @@ def main(what: str, names: list[str]) -> None:
 
 
 if __name__ == '__main__':
+    if sys.argv[1:] == ['public']:
+        PAGES.get('doc/public.md', ROOT / 'doc' / 'public.md').write_text(public_page())
+        sys.exit()
     if sys.argv[1:2] not in (['parameters'], ['outputs']) or not {*sys.argv[2:]} <= {*PAGES}:
         sys.exit(__doc__)
     main(sys.argv[1], sys.argv[2:])

@@ -15,7 +15,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from ros_messages import twist
 from sensor_msgs.msg import JointState
-from test_reading import write_bag
+from test_reading import count_more, write_bag
 
 from diffdrive_jacobian.calibration import PARAMETERS, calibrate, fit
 from diffdrive_jacobian.parameters.nodes import WheelBridgeParameters
@@ -163,6 +163,14 @@ def test_another_clock_is_reported(folder, capsys):
     assert run('clock', '-o', 'found.yaml', '--no-plot') == 0
     np.testing.assert_allclose(multipliers(folder / 'found.yaml')[0], TRUE, atol=0.01)
     assert 'different clocks, so the times of recording are used' in capsys.readouterr().err
+
+
+def test_messages_that_the_bag_counts_and_lacks_are_reported(written, tmp_path):
+    path = shutil.copytree(written, tmp_path / 'bag')
+    assert read_wheels_and_reference(path).notes == ()
+    count_more(path, '/joint_states', 7)
+    notes = read_wheels_and_reference(path).notes
+    assert notes == ('7 messages on /joint_states are missing in the bag',)
 
 
 def test_wrapped_angles_are_unwrapped(folder):

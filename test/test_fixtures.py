@@ -69,7 +69,7 @@ def test_the_plugin_does_nothing_in_projects_without_ros(pytester):
     assert PLUGIN in found['modules']
     assert found['wanted'] == []
     ours = {name for name in found['modules'] if name.startswith('diffdrive_jacobian')}
-    parents = {'diffdrive_jacobian', 'diffdrive_jacobian.testing'}
+    parents = {'diffdrive_jacobian', 'diffdrive_jacobian.lazy', 'diffdrive_jacobian.testing'}
     assert ours == {*parents, PLUGIN, 'diffdrive_jacobian.testing.artifacts'}
     changed = {name for name, value in found['env'].items() if before.get(name) != value}
     assert all(name.startswith('PYTEST_') for name in changed)

@@ -36,10 +36,11 @@ DOORS = {
     'time_units': (),
     'bounded_yaml': ('text',),
     'errors': (),
+    'lazy': (),
     'signals': (),
 }
 # Modules beside the layers that every layer may import.
-COMMON = ('text', 'time_units', 'bounded_yaml', 'errors', 'signals')
+COMMON = ('text', 'time_units', 'bounded_yaml', 'errors', 'lazy', 'signals')
 
 LOUD = re.compile('print|stdout|stderr')
 

@@ -252,3 +252,8 @@ def test_design_lists_every_package_and_files_that_exist():
     assert set(listed) == {path.parent.name for path in package.glob('*/__init__.py')}
     for file in re.findall(r'`([\w/]+\.(?:py|rst))`', text):
         assert (package / file).exists() or (ROOT / file).exists(), file
+
+
+def test_the_page_of_public_names_is_as_generated():
+    """To write it, every public name is imported."""
+    assert pages.PAGES['doc/public.md'].read_text() == pages.public_page()

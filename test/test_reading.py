@@ -19,6 +19,7 @@ from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Parameter, ParameterEvent, ParameterType, ParameterValue
 from rclpy.serialization import serialize_message
 from ros_messages import goal, goals, joint_command, odometry, placement, stamp, twist, twist_stamped
+from ruamel.yaml import YAML
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
@@ -58,6 +59,17 @@ def write_bag(path, sent, *, parameters=None, storage='mcap'):
     texts = [Text(PARAMETERS + node, json.dumps(values)) for node, values in (parameters or {}).items()]
     build_bag(lambda: [*channels.values(), *texts, *data], path, storage)
     return path
+
+
+def count_more(bag, topic, more):
+    """Add to the number of messages of a topic in metadata.yaml."""
+    yaml, path = YAML(typ='safe'), bag / 'metadata.yaml'
+    content = yaml.load(path.read_text())
+    for one in content['rosbag2_bagfile_information']['topics_with_message_count']:
+        if one['topic_metadata']['name'] == topic:
+            one['message_count'] += more
+    with open(path, 'w') as file:
+        yaml.dump(content, file)
 
 
 def odom(x, y, theta, v=0.0, omega=0.0, *, seconds=0.0):

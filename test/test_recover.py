@@ -161,7 +161,7 @@ def test_a_bag_without_metadata(tmp_path, capsys, messages, storage, mode):
     code, out, err = recover(capsys, path)
     assert (code, err) == (0, '')
     recovered = tmp_path / 'run_recovered'
-    assert out.splitlines()[0].startswith(f'{recovered} is complete: 50 messages in 0.0 s')
+    assert out.splitlines()[0].startswith(f'{recovered} is written: 50 messages in 0.0 s')
     assert read_bag(recovered) == messages
     assert expected in (None, names_of(recovered))
     assert contents(path) == before

@@ -6,7 +6,7 @@ import os
 import sqlite3
 
 import pytest
-from test_recover import PLUGINS, contents, make_messages, read_bag, recover, write_bag
+from test_recover import PLUGINS, contents, make_messages, read_bag, recover, write_bag, write_journal
 
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.recover_run import main
@@ -46,11 +46,23 @@ def test_what_is_no_bag(tmp_path, capsys):
 
 
 @pytest.mark.parametrize('storage', PLUGINS)
-def test_a_complete_bag(tmp_path, capsys, messages, storage):
+def test_a_bag_without_damage_or_checksums(tmp_path, capsys, messages, storage):
     write_bag(tmp_path / 'run', storage, messages)
-    assert_refused(capsys, tmp_path, [tmp_path / 'run'], 1, 'run is complete: nothing to recover')
     file = next(one for one in (tmp_path / 'run').iterdir() if one.suffix != '.yaml')
-    assert_refused(capsys, tmp_path, [file], 1, 'is complete: nothing to recover')
+    before = contents(tmp_path / 'run')
+    for what in (tmp_path / 'run', file):
+        code, out, err = recover(capsys, what)
+        assert (code, out) == (3, '')
+        assert 'nothing was found missing' in err
+        assert 'has no checksums' in err
+    assert contents(tmp_path / 'run') == before
+
+
+def test_a_complete_bag(tmp_path, capsys, messages):
+    recover(capsys, write_journal(tmp_path / 'run', messages))
+    file = tmp_path / 'run' / 'run.mcap'
+    for what in (tmp_path / 'run', file):
+        assert_refused(capsys, tmp_path, [what], 1, f'{what} is complete: nothing to recover')
 
 
 def test_output_that_exists(tmp_path, capsys, messages):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 from contextlib import suppress
 
@@ -16,6 +17,7 @@ from recorded import recorded
 from ros_messages import goal, goals
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosgraph_msgs.msg import Clock
+from test_reading import count_more
 
 from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
@@ -70,6 +72,15 @@ def test_commands_come_as_recorded_and_only_they(world, bag):
     assert child.last_line == f'{len(run.cmd_vel)} messages played'
     assert twists(commands) == run.cmd_vel.values.tolist()
     assert told == []
+
+
+def test_messages_that_the_bag_counts_and_lacks_are_reported(world, bag, tmp_path, capsys):
+    path = shutil.copytree(bag[0], tmp_path / 'run')
+    count_more(path, '/cmd_vel', 7)
+    assert play(path, '-r', '10') == 0
+    assert 'warning: 7 messages are missing in the bag' in capsys.readouterr().err
+    assert play(path, '-r', '10', '--start-offset', '1') == 0
+    assert 'missing' not in capsys.readouterr().err
 
 
 def test_goals_drive_a_new_robot_to_the_same_place(world, bag):

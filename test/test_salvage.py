@@ -115,7 +115,8 @@ def test_complete_files_without_metadata(bag, capsys):
     broken = cut(path, len(data))
     code, out, _ = recover(capsys, broken)
     assert code == 0
-    assert 'no loss was found' in out
+    assert 'lost: ' not in out
+    assert 'loss cannot be excluded: there is no valid metadata.yaml' in out
     recovered = broken.with_name(f'{broken.name}_recovered')
     assert read_bag(recovered) == messages
     assert names_of(recovered) == names_of(path)
@@ -137,7 +138,8 @@ def add_checksums(data):
     return data
 
 
-def test_a_damaged_chunk_costs_no_other(tmp_path, capsys):
+def test_a_chunk_with_a_wrong_checksum_is_saved_and_reported(tmp_path, capsys):
+    """Its size is 1 MiB: a run of a minute."""
     messages = make_messages(400, 20_000)
     write_bag(tmp_path / 'run', 'mcap', messages)
     broken = cut(tmp_path / 'run', None)
@@ -147,11 +149,9 @@ def test_a_damaged_chunk_costs_no_other(tmp_path, capsys):
     code, out, _ = recover(capsys, broken)
     assert code == 0
     assert 'lost: run.mcap: a chunk of' in out
+    assert 'its messages may be altered' in out
     found = read_bag(broken.with_name(f'{broken.name}_recovered'))
-    assert_subset(found, messages)
-    assert found[0] == messages[0]
-    assert found[-1] == messages[-1]
-    assert len(found) >= 200
+    assert sum(one != other for one, other in zip(found, messages, strict=True)) == 1
 
 
 def test_a_damaged_page_costs_no_other(tmp_path, capsys):

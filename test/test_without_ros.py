@@ -159,7 +159,7 @@ def test_a_bag_is_recovered_without_ros(tmp_path, bag):
     (damaged / 'metadata.yaml').unlink()
     ended = run('recover_run', damaged)
     assert (ended.returncode, ended.stderr) == (0, '')
-    assert 'no loss was found' in ended.stdout
+    assert 'lost: ' not in ended.stdout
     assert 'not checked' not in ended.stdout
     assert len(read_run(tmp_path / 'bag_recovered').odometry) == len(read_run(bag).odometry)
 

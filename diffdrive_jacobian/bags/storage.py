@@ -1,15 +1,18 @@
-"""rosbags' reader and writer for bags at any path.
+"""rosbags' reader and writer for bags at any path, whose MCAP files have checksums.
 
 rosbags opens SQLite files as `file:PATH`, a URI in which `#`, `?` and `%` have a meaning, so that it
-would write and read a file of another name.
+would write and read a file of another name. In MCAP files it leaves all checksums at 0, which stands for
+unknown.
 """
 
 from __future__ import annotations
 
 import sqlite3
+import struct
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 from urllib.parse import quote
 
 from rosbags.rosbag2 import CompressionMode, ReaderError, StoragePlugin, Writer
@@ -22,6 +25,52 @@ if TYPE_CHECKING:
     from rosbags.rosbag2.writer import StorageWriter
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
+_CHUNK_CHECKSUM = 9 + 3 * 8
+"""Place of the checksum in the record of a chunk, after opcode, length, times and size."""
+_FOOTER_END = struct.Struct('<QQI8s')
+"""Start of the summary and of its offsets, checksum of the summary, and the magic."""
+_DATA_END = 9 + 4
+"""Size of the record that ends the data section and has its checksum."""
+_BLOCK = 1 << 20
+
+
+class CheckedMcapWriter(McapWriter):
+    """rosbags' writer, with checksums of chunks, data section and summary (mcap.dev/spec)."""
+
+    def close_chunk(self) -> None:
+        """Write the pending chunk."""
+        place = self.bio.tell() + _CHUNK_CHECKSUM
+        checksum = zlib.crc32(self.chunk.bio.getbuffer())
+        super().close_chunk()
+        end = self.bio.tell()
+        self.bio.seek(place)
+        self.bio.write(struct.pack('<I', checksum))
+        self.bio.seek(end)
+
+    def close(self, version: int, metadata: str) -> None:
+        """Write the last chunk, the metadata and the summary, and close the file."""
+        super().close(version, metadata)
+        with open(self.path, 'r+b') as file:
+            footer = file.seek(-_FOOTER_END.size, 2)
+            summary, *_ = _FOOTER_END.unpack(file.read())
+            self._write_checksum(file, 0, summary - _DATA_END, summary - 4)
+            self._write_checksum(file, summary, footer + 16, footer + 16)
+
+    @staticmethod
+    def _write_checksum(file: BinaryIO, start: int, end: int, place: int) -> None:
+        checksum = file_checksum(file, start, end)
+        file.seek(place)
+        file.write(struct.pack('<I', checksum))
+
+
+def file_checksum(file: BinaryIO, start: int, end: int) -> int:
+    """Return the CRC-32 of a part of a file."""
+    checksum = 0
+    file.seek(min(start, end))
+    while start < end and (block := file.read(min(end - start, _BLOCK))):
+        checksum = zlib.crc32(block, checksum)
+        start += len(block)
+    return checksum
 
 
 class PathSqlite3Writer(Sqlite3Writer):
@@ -69,7 +118,7 @@ class BagWriter(Writer):
     """Writes a bag to any path."""
 
     STORAGE_PLUGINS: Mapping[StoragePlugin, type[StorageWriter]] = {
-        StoragePlugin.MCAP: McapWriter,
+        StoragePlugin.MCAP: CheckedMcapWriter,
         StoragePlugin.SQLITE3: PathSqlite3Writer,
     }
 

@@ -8,9 +8,9 @@ worlds do not need it.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from diffdrive_jacobian import lazy
 from diffdrive_jacobian.exploration.errors import ExplorationError
 from diffdrive_jacobian.exploration.scenario import scenario_from
 
@@ -54,38 +54,20 @@ __all__ = [
     'waypoints',
 ]
 
-_MODULES = {
-    'explore': 'exploring',
-    'fault_schedules': 'schedules',
-    'reproducing': 'reproduction',
-    **dict.fromkeys(('Exploration', 'Finding', 'Replay'), 'result'),
-    **dict.fromkeys(('LocalExecutor', 'SerialExecutor'), 'executors'),
-    **dict.fromkeys(
-        (
-            'angles',
-            'gains',
-            'goals',
-            'numbers',
-            'points',
-            'poses',
-            'probabilities',
-            'times',
-            'waypoints',
-        ),
-        'strategies',
-    ),
-}
-"""Public names to the modules that are imported when they are used."""
+_STRATEGIES = (
+    *('angles', 'gains', 'goals', 'numbers', 'points', 'poses', 'probabilities', 'times', 'waypoints'),
+)
 
-
-def __getattr__(name: str) -> Any:
-    """Import a public name.
-
-    Raises:
-        ExplorationError: Hypothesis is needed and not installed.
-    """
-    if name not in _MODULES:
-        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    value = getattr(importlib.import_module(f'{__name__}.{_MODULES[name]}'), name)
-    globals()[name] = value
-    return value
+if not TYPE_CHECKING:
+    # They need Hypothesis.
+    __getattr__, __dir__ = lazy.attach(
+        __name__,
+        {
+            'explore': 'exploration.exploring',
+            'fault_schedules': 'exploration.schedules',
+            'reproducing': 'exploration.reproduction',
+            **dict.fromkeys(('Exploration', 'Finding', 'Replay'), 'exploration.result'),
+            **dict.fromkeys(('LocalExecutor', 'SerialExecutor'), 'exploration.executors'),
+            **dict.fromkeys(_STRATEGIES, 'exploration.strategies'),
+        },
+    )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from diffdrive_jacobian import lazy
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.kinematics import (
@@ -29,17 +30,13 @@ __all__ = [
     'planar_arm',
     'se2',
 ]
-_CLASSES = {'MobileManipulator': 'mobile_manipulator', 'PlanarArm': 'planar_arm'}
-
-
-def __getattr__(name: str) -> Any:
-    """Return a module or a class. Nodes, which need few of them, start faster than with all."""
-    if name not in __all__:
-        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    module = import_module(f'{__name__}.{_CLASSES.get(name, name)}')
-    return getattr(module, name) if name in _CLASSES else module
-
-
-def __dir__() -> list[str]:
-    """Return the names of the module."""
-    return sorted({*globals(), *__all__})
+if not TYPE_CHECKING:
+    # Nodes, which need few of them, start faster than with all.
+    __getattr__, __dir__ = lazy.attach(
+        __name__,
+        {name: f'kinematics.{name}' for name in __all__}
+        | {
+            'MobileManipulator': 'kinematics.mobile_manipulator',
+            'PlanarArm': 'kinematics.planar_arm',
+        },
+    )

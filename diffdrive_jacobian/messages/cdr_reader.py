@@ -89,7 +89,9 @@ class Reader:
         """Return the fields of a message, in the order in which they were asked for.
 
         As in rclpy, bytes after the message are ignored, strings end at the first NUL, and invalid UTF-8
-        is replaced by U+FFFD.
+        is replaced by U+FFFD. Unlike rclpy, a sequence that claims more elements than there are bytes is
+        refused everywhere. In a nested structure, such as `polygon.points`, rclpy reads it as empty and
+        the fields after it from the wrong place.
 
         Raises:
             DecodingError: The bytes are not a message of this type.

@@ -39,6 +39,7 @@ from diffdrive_jacobian.reading.calibration_samples import (
 )
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 
+MISSING = 'are missing in the bag'
 WHEELS, REFERENCE = 'joint_states', 'ground_truth'
 
 
@@ -97,7 +98,7 @@ def read_wheels_and_reference(
     measured, from_speeds = joints.of(chosen, where, wheels_topic)
     poses.check(where, poses_topic)
     notes = [
-        f'{count} messages on {printable(topic)} {why} and were skipped'
+        f'{count} messages on {printable(topic)} {why}{"" if why == MISSING else " and were skipped"}'
         for (topic, why), count in tally.items()
     ]
     observed = poses.samples()
@@ -142,10 +143,12 @@ def _read(
         for one in connections
         if recorded_definition_differs(one.msgtype, type_hashes(one, stored))
     }
+    found: Counter[str] = Counter()
     for connection, received, data in messages(reader, connections, invalid):
         if interrupted():
             raise ReadingInterruptedError
         topic = connection.topic
+        found[topic] += 1
         if connection.id in foreign:
             tally[topic, f'were recorded with another definition of {connection.msgtype}'] += 1
             continue
@@ -157,6 +160,10 @@ def _read(
             tally[topic, 'hold invalid or implausible values'] += 1
     for topic, count in invalid.items():
         tally[topic, 'cannot be decoded'] += count
+    for topic in sinks:
+        expected = sum(one.msgcount for one in connections if one.topic == topic)
+        if (missing := expected - found[topic] - invalid[topic]) > 0:
+            tally[topic, MISSING] = missing
     return tally
 
 

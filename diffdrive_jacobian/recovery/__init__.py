@@ -5,7 +5,15 @@ from diffdrive_jacobian.recovery.recover import (
     NothingToSaveError,
     Recovery,
     RecoveryInterruptedError,
+    UncheckedError,
     recover,
 )
 
-__all__ = ['NotABagError', 'NothingToSaveError', 'Recovery', 'RecoveryInterruptedError', 'recover']
+__all__ = [
+    'NotABagError',
+    'NothingToSaveError',
+    'Recovery',
+    'RecoveryInterruptedError',
+    'UncheckedError',
+    'recover',
+]

@@ -40,6 +40,7 @@ from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, TooLargeError, load_yam
 from diffdrive_jacobian.recovery.salvage_mcap import Topic, read_mcap
 from diffdrive_jacobian.recovery.salvage_sqlite import read_sqlite
 from diffdrive_jacobian.recovery.topic_types import definition_and_hash
+from diffdrive_jacobian.text import printable
 
 READERS = {'mcap': read_mcap, 'sqlite3': read_sqlite}
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
@@ -56,6 +57,7 @@ class DamagedBag:
         storage: Storage of a new bag that is like the old one, `mcap` or `sqlite3`.
         message_count: Number of messages according to metadata.yaml; None: it has none.
         lost: Descriptions of what could not be read; complete after all records were read.
+        unchecked: What cannot be checked, so that losses would not be noticed; complete as `lost`.
         left_out: Topics that cannot be written, and the reasons; complete as `lost`.
     """
 
@@ -75,11 +77,11 @@ class DamagedBag:
         self.kind = file_kind(self.files[0])
         self.storage = 'mcap' if self.kind == 'journal' else self.kind
         self.lost: list[str] = []
+        self.unchecked: list[str] = []
         self.left_out: dict[str, str] = {}
         folder = path if path.is_dir() else path.parent
         self._metadata, self._problem = _metadata(folder / 'metadata.yaml')
-        paths = self._metadata.get('relative_file_paths')
-        listed = {Path(str(name)).name for name in paths} if isinstance(paths, list) else set()
+        listed = _listed(self._metadata)
         self._missing = listed - {file.name for file in self.files}
         if path.is_file() and (self._missing or not listed):
             self._metadata, self._missing = {}, set()
@@ -96,8 +98,10 @@ class DamagedBag:
         """Yield all that can be read, from the beginning, and describe what cannot in `lost`."""
         self.lost = [self._missing_file(name) for name in sorted(self._missing)]
         self.lost += [f'metadata.yaml: {self._problem}'] if self._problem else []
-        self.left_out, self._seen = {}, 0
+        self.unchecked, self.left_out = [], {}
+        self._seen: Counter[str] = Counter()
         if self.kind == 'journal':
+            self.unchecked.append('what record_run had not written when it ended is not in its journal')
             if unread := (yield from self._of_journal()):
                 self.lost.append(
                     f'{self.path.name} is cut off: its last {unread} bytes are not a record'
@@ -106,11 +110,37 @@ class DamagedBag:
         for text in _custom_data(self._metadata):
             yield from self._text(text)
         channels: dict[tuple[str, str], Channel] = {}
+        self._copy: dict[str, Any] = {}
         for name, source in self._sources:
             yield from self._of_file(name, source, channels)
-        expected = self.message_count
-        if isinstance(expected, int) and expected > self._seen:
-            self.lost.append(f'metadata.yaml counts {expected} messages, {self._seen} were found')
+        self._compare_counts()
+
+    def _compare_counts(self) -> None:
+        """Compare the messages that were found with metadata.yaml, or with its copy in the file."""
+        source, metadata = 'metadata.yaml', self._metadata
+        if not isinstance(self.message_count, int):
+            source, metadata = 'the copy of metadata.yaml', self._copy
+            if not len(self.files) == len(_listed(metadata)) == 1:
+                # The copies in several files count what was written before them.
+                metadata = {}
+        if self.path.is_dir() and not (metadata is self._metadata and _listed(metadata)):
+            self.unchecked.append(
+                'there is no valid metadata.yaml, so files that are missing cannot be noticed'
+            )
+        seen, counts = self._seen, _counts_by_topic(metadata)
+        count = metadata.get('message_count')
+        pairs = [(count, seen.total())] if isinstance(count, int) else []
+        pairs += [(number, seen[topic]) for topic, number in counts.items()]
+        if any(number != found for number, found in pairs):
+            topics = ', '.join(
+                f'{printable(topic)} {seen[topic]} of {number}'
+                for topic, number in counts.items()
+                if number != seen[topic]
+            )
+            difference = f'{source} counts {count} messages, {seen.total()} were found'
+            difference += f' ({topics})' if topics else ''
+            fewer = any(number > found for number, found in pairs)
+            (self.lost if fewer else self.unchecked).append(difference)
 
     def _missing_file(self, name: str) -> str:
         """Describe a file that metadata.yaml lists and that cannot be read."""
@@ -191,13 +221,19 @@ class DamagedBag:
         self, name: str, source: Path, channels: dict[tuple[str, str], Channel]
     ) -> Iterator[Record]:
         ids: dict[int, int | None] = {}
+        names: dict[int, str] = {}
         faults: Counter[str] = Counter()
         budget = Budget(source.stat().st_size)
         with open(source, 'rb') as file:
             reader = READERS[file_kind(source)]
-            for one in reader(file, lambda what: self.lost.append(f'{name}: {what}')):
+            for one in reader(
+                file,
+                lambda what: self.lost.append(f'{name}: {what}'),
+                lambda what: self.unchecked.append(f'{name}: {what}'),
+            ):
                 if isinstance(one, str):
                     metadata, problem = _metadata(one)
+                    self._copy = metadata or self._copy
                     self.lost += [f'{name}: {problem}'] if problem else []
                     for text in _custom_data(metadata):
                         yield from self._text(text)
@@ -206,10 +242,11 @@ class DamagedBag:
                     new = (one.name, one.type_name) not in channels
                     channel = self._channel(one, channels)
                     ids[one.id] = None if channel is None else channel.id
+                    names[one.id] = one.name
                     if channel is not None and new:
                         yield channel
                     continue
-                self._seen += 1
+                self._seen[names.get(one.channel, '')] += 1
                 if one.channel not in ids:
                     faults['belong to no known topic'] += 1
                 elif (to := ids[one.channel]) is not None:
@@ -285,6 +322,23 @@ def _metadata(source: Path | str) -> tuple[dict[str, Any], str]:
         return {}, ''
     found = found.get('rosbag2_bagfile_information', found) if isinstance(found, dict) else {}
     return (found if isinstance(found, dict) else {}), ''
+
+
+def _listed(metadata: dict[str, Any]) -> set[str]:
+    """Return the names of the data files that metadata.yaml lists."""
+    paths = metadata.get('relative_file_paths')
+    return {Path(str(name)).name for name in paths} if isinstance(paths, list) else set()
+
+
+def _counts_by_topic(metadata: dict[str, Any]) -> Counter[str]:
+    """Return the numbers of messages in metadata.yaml, of the topics that it describes as it should."""
+    counts: Counter[str] = Counter()
+    topics = metadata.get('topics_with_message_count')
+    for topic in topics if isinstance(topics, list) else ():
+        described = topic.get('topic_metadata') if isinstance(topic, dict) else None
+        if isinstance(described, dict) and isinstance(count := topic.get('message_count'), int):
+            counts[str(described.get('name'))] += count
+    return counts
 
 
 def _custom_data(metadata: dict[str, Any]) -> Iterator[Text]:

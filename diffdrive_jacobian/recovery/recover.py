@@ -36,6 +36,10 @@ class NothingToSaveError(Exception):
     """There is nothing to recover; the arguments are the reason and what could not be read."""
 
 
+class UncheckedError(NothingToSaveError):
+    """Nothing is missing as far as could be checked; the arguments are that, and what could not be."""
+
+
 class RecoveryInterruptedError(Exception):
     """The recovery was interrupted; no bag was written."""
 
@@ -52,6 +56,8 @@ class Recovery:
     """Why readers refuse the old bag; '' if they do not, or if it is a journal."""
     lost: tuple[str, ...]
     """Descriptions of what could not be read."""
+    unchecked: tuple[str, ...]
+    """What could not be checked, so that other losses would not have been noticed."""
     lost_before: tuple[str, ...]
     """What the recorder reported as lost, one description for each topic."""
     topics_left_out: bool
@@ -81,6 +87,7 @@ def recover(
 
     Raises:
         NotABagError: There is nothing like a bag.
+        UncheckedError: Nothing is missing as far as could be checked, which is not all.
         NothingToSaveError: The bag is complete, or not a message can be read.
         JournalError: The journal is not one of record_run.
         FileExistsError: The new bag exists, and is not to be replaced or is the old one.
@@ -106,12 +113,15 @@ def recover(
                 yield record
 
         survey = _Survey(records())
-        lost, left_out = tuple(old.losses), bool(old.left_out)
+        lost, unchecked, left_out = tuple(old.losses), tuple(old.unchecked), bool(old.left_out)
         undecodable = tuple(survey.decoding.undecodable)
         damaged = '' if old.kind == 'journal' else find_damage(what)
         count = survey.kinds[Message]
         whole = old.message_count == count or (what.suffix == '.mcap' and what.is_file())
         if whole and not lost and not damaged:
+            if unchecked:
+                found = f'nothing was found missing in {what}, but it cannot be called complete:'
+                raise UncheckedError(found, *unchecked, *undecodable)
             complete = f'{what} is complete: nothing to recover'
             raise NothingToSaveError('; '.join([complete, *undecodable]))
         if not count:
@@ -126,6 +136,7 @@ def recover(
             summary=summary,
             damaged=damaged,
             lost=lost + summary.left_out,
+            unchecked=unchecked,
             lost_before=_lost_before(survey.notes),
             topics_left_out=left_out,
             records_left_out=bool(summary.left_out),

@@ -17,6 +17,8 @@ from diffdrive_jacobian.recovery.salvage_mcap import Found, Note, Topic
 _LEAF = 0x0D
 _WIDTHS = (0, 1, 2, 3, 4, 6, 8, 8, 0, 0)  # of the serial types below 10
 _MAX_COLUMNS = 32
+_MESSAGE = [int, int, bytes]
+"""Types of the columns of a message after its number: topic, time and data."""
 _COPIES = 4
 """Largest ratio of the size of all rows to that of the file: there may be older copies of pages."""
 
@@ -117,8 +119,15 @@ def _values(record: bytes) -> list[Any]:
     return values
 
 
-def read_sqlite(file: BinaryIO, note: Note) -> Iterator[Found]:
-    """Read an SQLite file of rosbag2, including rows that were not committed, in their order."""
+def read_sqlite(file: BinaryIO, note: Note, doubt: Note) -> Iterator[Found]:
+    """Read an SQLite file of rosbag2, including rows that were not committed, in their order.
+
+    Args:
+        file: The file.
+        note: Is called with a description of each loss.
+        doubt: Is called with what cannot be checked.
+    """
+    doubt('SQLite has no checksums, so altered messages cannot be noticed')
     pages = _Pages(file)
     if not pages.valid:
         note(f'its {pages.bytes} bytes are not the start of an SQLite database')
@@ -131,7 +140,7 @@ def read_sqlite(file: BinaryIO, note: Note) -> Iterator[Found]:
             if not values or values[0] is not None:
                 continue
             kinds = [type(value) for value in values[1:]]
-            if kinds == [int, int, bytes]:
+            if kinds == _MESSAGE:
                 starts.append((row, number))
                 break
             if kinds == [int, str]:
@@ -148,7 +157,7 @@ def read_sqlite(file: BinaryIO, note: Note) -> Iterator[Found]:
     for (_, number), (limit, _) in zip(starts, [*starts, (2**63, 0)][1:], strict=True):
         for row, values in pages.rows(number):
             # There may be older copies of pages.
-            if values and last < row < limit:
+            if values and [type(value) for value in values[1:]] == _MESSAGE and last < row < limit:
                 yield Message(*values[1:])
                 last, read = row, read + 1
     if last > read:

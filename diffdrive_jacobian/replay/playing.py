@@ -50,6 +50,8 @@ class ReplayResult:
     """If playback did not start: number of subscriptions of each topic that has fewer than required."""
     unacknowledged: tuple[str, ...] = ()
     """Topics with subscriptions that have not acknowledged all messages in time."""
+    missing: int = 0
+    """If the whole bag was played once: how many messages less than it counts were found in it."""
 
 
 class ReplayProgress(Protocol):
@@ -152,6 +154,7 @@ def replay(
             interrupted=signals.count > 0,
             messages=player.sent,
             unacknowledged=tuple(unacknowledged),
+            missing=max(0, player.expected - player.sent) if played else 0,
         )
 
 

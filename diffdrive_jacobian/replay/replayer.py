@@ -64,6 +64,10 @@ class Replayer(Node):  # type: ignore[misc]
         """Time in the bag at which playing starts (ns)."""
         self.end = reader.end_time
         """Time in the bag after its last message (ns)."""
+        self.expected = 0
+        """Number of messages that the bag counts; 0 if it is played in part or repeatedly."""
+        if not playback.start_offset and not playback.loop:
+            self.expected = sum(one.msgcount for one in connections)
         self.sent = 0
         """Number of messages published."""
         self.lateness = Lateness()

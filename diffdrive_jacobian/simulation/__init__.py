@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from diffdrive_jacobian import lazy
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
 from diffdrive_jacobian.simulation.slip import Drift
 
@@ -13,18 +13,13 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.simulation.tracking import track_line
 
 __all__ = ['Drift', 'Robot', 'RobotModel', 'closed_loops', 'track_line', 'trajectories']
-_MODULES = {'closed_loops': 'closed_loop', 'trajectories': 'closed_loop', 'track_line': 'tracking'}
-
-
-def __getattr__(name: str) -> Any:
-    """Return a function or its module. Nodes, which need none of them, start faster without."""
-    if name in _MODULES:
-        return getattr(import_module(f'{__name__}.{_MODULES[name]}'), name)
-    if name in _MODULES.values():
-        return import_module(f'{__name__}.{name}')
-    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-
-
-def __dir__() -> list[str]:
-    """Return the names of the module."""
-    return sorted({*globals(), *__all__})
+if not TYPE_CHECKING:
+    # Nodes, which need none of them, start faster without.
+    __getattr__, __dir__ = lazy.attach(
+        __name__,
+        {
+            'closed_loops': 'simulation.closed_loop',
+            'track_line': 'simulation.tracking',
+            'trajectories': 'simulation.closed_loop',
+        },
+    )

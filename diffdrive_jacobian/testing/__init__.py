@@ -15,11 +15,33 @@ pytest loads the plugin in every project, so this module imports neither rclpy n
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from diffdrive_jacobian import lazy
 
 if TYPE_CHECKING:
     from diffdrive_jacobian import faults, properties
+    from diffdrive_jacobian.exploration import (
+        Exploration,
+        ExplorationError,
+        Finding,
+        LocalExecutor,
+        Replay,
+        SerialExecutor,
+        angles,
+        explore,
+        fault_schedules,
+        gains,
+        goals,
+        numbers,
+        points,
+        poses,
+        probabilities,
+        reproducing,
+        scenario_from,
+        times,
+        waypoints,
+    )
     from diffdrive_jacobian.lockstep import (
         Answers,
         Every,
@@ -34,48 +56,51 @@ if TYPE_CHECKING:
 __all__ = [
     'Answers',
     'Every',
+    'Exploration',
+    'ExplorationError',
+    'Finding',
     'GoldenRun',
     'Idle',
+    'LocalExecutor',
     'Lockstep',
     'LockstepError',
     'PropertyViolation',
     'RecordedRun',
+    'Replay',
+    'SerialExecutor',
+    'angles',
+    'explore',
+    'fault_schedules',
     'faults',
+    'gains',
+    'goals',
+    'numbers',
+    'points',
+    'poses',
+    'probabilities',
     'properties',
+    'reproducing',
+    'scenario_from',
+    'times',
+    'waypoints',
 ]
 
-_PACKAGES = ('faults', 'properties')
-"""Packages beside this one that are names of it, too."""
-_MODULES = {
-    'Answers': 'lockstep',
-    'Every': 'lockstep',
-    'GoldenRun': 'testing.golden_run',
-    'Idle': 'lockstep',
-    'Lockstep': 'lockstep',
-    'LockstepError': 'lockstep',
-    'PropertyViolation': 'lockstep',
-    'RecordedRun': 'testing.recorded_run',
-}
-"""The module of each other name."""
+_LOCKSTEP = ('Answers', 'Every', 'Idle', 'Lockstep', 'LockstepError', 'PropertyViolation')
+_EXPLORATION = tuple(
+    name
+    for name in __all__
+    if name not in (*_LOCKSTEP, 'GoldenRun', 'RecordedRun', 'faults', 'properties')
+)
 
-
-def __getattr__(name: str) -> Any:
-    """Return a name of this package.
-
-    Raises:
-        AttributeError: There is no such name.
-        ModuleNotFoundError: ROS is not installed.
-    """
-    if name in _PACKAGES:
-        return importlib.import_module(f'diffdrive_jacobian.{name}')
-    if name in _MODULES:
-        return getattr(importlib.import_module(f'diffdrive_jacobian.{_MODULES[name]}'), name)
-    exploration = importlib.import_module('diffdrive_jacobian.exploration')
-    if name in exploration.__all__:
-        return getattr(exploration, name)
-    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-
-
-def __dir__() -> list[str]:
-    """Return the names of the module."""
-    return sorted({*globals(), *__all__})
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = lazy.attach(
+        __name__,
+        {
+            'GoldenRun': 'testing.golden_run',
+            'RecordedRun': 'testing.recorded_run',
+            'faults': 'faults',
+            'properties': 'properties',
+            **dict.fromkeys(_LOCKSTEP, 'lockstep'),
+            **dict.fromkeys(_EXPLORATION, 'exploration'),
+        },
+    )

@@ -9,9 +9,9 @@ from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli
 
 
-def describe(bag: Path, summary: Summary, *, complete: bool = True) -> str:
+def describe(bag: Path, summary: Summary, state: str = 'complete') -> str:
     """Return one line about the content of a bag."""
-    what = f'{printable(bag, PATH_LIMIT)} is {"complete" if complete else "incomplete"}'
+    what = f'{printable(bag, PATH_LIMIT)} is {state}'
     if summary.start is None or summary.end is None:
         return f'{what} and empty: no message was received'
     counts = sorted(summary.topics.items())

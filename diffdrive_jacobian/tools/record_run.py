@@ -126,7 +126,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         return _cli.complain(PROGRAM, error)
     except RecordingError as error:
         if error.summary is not None:
-            print(describe(bag, error.summary, complete=False))
+            print(describe(bag, error.summary, 'incomplete'))
         print(f'{PROGRAM}: error: {error}', file=sys.stderr)
         return _cli.FAILED
     print(describe(bag, summary))

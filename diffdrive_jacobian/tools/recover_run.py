@@ -15,6 +15,7 @@ from diffdrive_jacobian.recovery.recover import (
     NothingToSaveError,
     Recovery,
     RecoveryInterruptedError,
+    UncheckedError,
     recover,
 )
 from diffdrive_jacobian.signals import Signals
@@ -24,6 +25,8 @@ from diffdrive_jacobian.tools._bags import describe
 from diffdrive_jacobian.tools._waiting import busy
 
 PROGRAM = 'recover_run'
+UNCHECKED = 3
+"""Exit code: nothing was found missing, but not all could be checked."""
 MAX_LOSSES = 50
 """Number of losses that are listed."""
 MAX_LINE = 400
@@ -48,7 +51,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     except NothingToSaveError as error:
         reason, *losses = error.args
         print(f'{PROGRAM}: {printable(reason, PATH_LIMIT)}', *_listed(losses), sep='\n', file=sys.stderr)
-        return _cli.FAILED
+        return UNCHECKED if isinstance(error, UncheckedError) else _cli.FAILED
     except (NotABagError, JournalError, FileExistsError) as error:
         return _cli.complain(PROGRAM, printable(error, PATH_LIMIT))
     except (OSError, sqlite3.Error) as error:
@@ -64,11 +67,13 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
 
 def report(recovery: Recovery) -> str:
     """Return a description of a recovery, of several lines."""
-    lines = [describe(recovery.bag, recovery.summary)]
+    lines = [describe(recovery.bag, recovery.summary, 'written')]
     if recovery.damaged:
         lines.append(f'damaged: {recovery.damaged}')
     lost = _listed([*recovery.lost, *recovery.lost_before], 'lost: ')
-    lines += lost or ['no loss was found']
+    further = 'further ' if lost else ''
+    unchecked = _listed(recovery.unchecked, f'{further}loss cannot be excluded: ')
+    lines += [*lost, *unchecked] or ['no loss was found']
     lines += _listed(recovery.undecodable, 'saved as recorded: ')
     return '\n'.join(lines)
 
@@ -90,7 +95,8 @@ def _parser() -> _cli.Parser:
         'not changed. Exit code 0: all that could be read is in the new bag; 1: nothing to recover (the '
         'bag is complete, or no message can be read), or the disk is full, or topics were left out '
         'because their type is unknown, or records because they are too large; 2: wrong arguments; '
-        '130: interrupted.',
+        '3: nothing to recover (nothing was found missing, but not all could be checked, for want of '
+        'checksums or counts); 130: interrupted.',
     )
     parser.add_argument(
         'what',

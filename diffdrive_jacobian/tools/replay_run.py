@@ -106,6 +106,8 @@ def _report(result: ReplayResult, options: argparse.Namespace) -> int:
         print(f'nothing was played: {counts} after --timeout {options.timeout:g} s')
         return _cli.FAILED
     print(f'{result.messages} messages played')
+    if result.missing:
+        print(f'{PROGRAM}: warning: {result.missing} messages are missing in the bag', file=sys.stderr)
     if result.interrupted:
         return _cli.INTERRUPTED
     if result.unacknowledged:

@@ -1,0 +1,34 @@
+"""Public names that are imported on first use, for packages of which a program needs a part only."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from typing import Any
+
+
+def attach(
+    package: str, names: Mapping[str, str]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return `__getattr__` and `__dir__` of a package.
+
+    Type checkers must not see them: they would accept every name. The package imports the names for
+    them under `TYPE_CHECKING`.
+
+    Args:
+        package: Name of the package.
+        names: Each public name with the module that has it, or with itself if it is a module, both
+            relative to this distribution's package.
+    """
+    root = __name__.partition('.')[0]
+
+    def find(name: str) -> Any:
+        if name not in names:
+            raise AttributeError(f'module {package!r} has no attribute {name!r}')
+        module = import_module(f'{root}.{names[name]}')
+        value = module if names[name].rpartition('.')[2] == name else getattr(module, name)
+        setattr(sys.modules[package], name, value)
+        return value
+
+    return find, lambda: sorted({*vars(sys.modules[package]), *names})
