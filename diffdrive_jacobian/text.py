@@ -29,6 +29,19 @@ def printable(text: object, limit: int = 80) -> str:
     return ''.join(escaped) + _ELLIPSIS
 
 
+def printable_lines(text: str) -> str:
+    """Return text of several lines, in each of which characters are replaced as by `printable`."""
+    return ''.join(one if one.isprintable() or one == '\n' else _escape(one) for one in text)
+
+
+def error_text(error: BaseException) -> str:
+    """Return the message of an exception, which may be of a class with an `__str__` that fails."""
+    try:
+        return printable_lines(str(error))
+    except Exception as failure:
+        return f'(its __str__ raises {type(failure).__name__})'
+
+
 def format_size(size: int) -> str:
     """Return a number of bytes in a readable unit, such as `12.9 GB`."""
     for power, unit in ((9, 'GB'), (6, 'MB'), (3, 'kB')):

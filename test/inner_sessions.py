@@ -29,6 +29,7 @@ SETTING = """
 # Hypothesis would be imported for its report of each failure.
 OPTIONS = (
     *('-p', 'no:hypothesispytest', '-p', 'no:xdist', '-p', 'no:cacheprovider'),
+    *('-p', 'no:launch_testing'),
     *('-W', 'error', '-W', 'ignore::pytest.PytestAssertRewriteWarning'),
 )
 

@@ -129,7 +129,7 @@ class Session:
             'ROS_DOMAIN_ID': str(domain_id()),
             'PYTHONUNBUFFERED': '1',
             # They take longer to import than most tests of the pages run.
-            'PYTEST_ADDOPTS': '-p no:hypothesispytest -p no:xdist',
+            'PYTEST_ADDOPTS': '-p no:hypothesispytest -p no:xdist -p no:launch_testing',
         }
 
     def run(self, block: Block) -> str:

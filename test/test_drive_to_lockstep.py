@@ -10,6 +10,7 @@ import signal
 import threading
 from functools import partial
 
+import numpy as np
 import pytest
 from processes import open_world
 
@@ -62,6 +63,41 @@ def test_arrives_with_the_same_output_each_time(capsys, goals):
     x, y, distance, _ = map(float, numbers.groups())
     assert distance <= 0.02
     assert math.dist((x, y), goals[-2:]) <= 0.021
+
+
+def test_the_true_distance_of_a_robot_that_slips_is_that_of_its_ground_truth(tmp_path, capsys):
+    slip = ('-p', 'simulate_slip:=true', '-p', 'wheel_travel_variance:=0.002')
+    assert (
+        drive_to.main(['1', '1', '--lockstep', '-o', 'bag', '--no-plot', *QUICK, *slip], Signals()) == 0
+    )
+    line = last_line(capsys)
+    found = re.search(r' (\S+) m from the goal by odometry, (\S+) m by ground truth, after', line)
+    distance, truth = map(float, found.groups())
+    end = read_run(tmp_path / 'bag').ground_truth.values[-1, :2]
+    assert distance <= 0.02 < truth
+    assert truth == pytest.approx(math.dist(end, (1.0, 1.0)), abs=1e-3)
+
+
+@pytest.mark.parametrize('controller', CONTROLLERS)
+def test_the_error_of_the_heading_ends_where_the_robot_is(tmp_path, controller):
+    heading = 2.5
+    arguments = ('0.5', '0', '0.5', '0.5', '--lockstep', '-o', 'bag', '--no-plot')
+    options = ('--heading', str(heading), '--controller', controller)
+    assert drive_to.main([*arguments, *options, *QUICK], Signals()) == 0
+    run = read_run(tmp_path / 'bag')
+    one = trace(run)
+    last = one.goal == 1
+    theta = run.odometry.values[:, 2]
+    expected = np.angle(np.exp(1j * (heading - theta)))
+    np.testing.assert_allclose(one.goal_heading_error[last], expected[last], atol=1e-9)
+    assert np.isnan(one.goal_heading_error[~last]).all()
+    assert abs(one.goal_heading_error[-1]) <= 0.02
+    assert np.isnan(one.bearing_error[-1])
+
+
+def test_without_a_heading_there_is_no_error_of_it(tmp_path):
+    assert drive_to.main(['1', '1', '--lockstep', '-o', 'bag', '--no-plot', *QUICK], Signals()) == 0
+    assert np.isnan(trace(read_run(tmp_path / 'bag')).goal_heading_error).all()
 
 
 def test_duration_is_that_of_the_control_law(capsys):

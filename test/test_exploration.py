@@ -109,7 +109,7 @@ def test_what_is_written(found):
 
 def test_the_written_test_reproduces_it_until_the_controller_is_mended(found, pytester, monkeypatch):
     file = found.findings[0].directory / 'test_never_faster_than.py'
-    options = ('-p', 'no:cacheprovider', '-p', 'no:xdist', file)
+    options = ('-p', 'no:cacheprovider', '-p', 'no:xdist', '-p', 'no:launch_testing', file)
     result = pytester.runpytest_inprocess(*options)
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(
@@ -134,13 +134,10 @@ def test_another_exploration_replaces_what_was_written(found):
     folder = found.findings[0].directory
     before = (folder / 'counterexample.json').read_text()
     (folder / 'notes.txt').write_text('mine')
-    # The process of a recording had ended.
-    (folder / 'run.journal').touch()
     serial(follow, [SLOW], faults=LOSSES, worlds=12, seed=1, shrink_worlds=0, output=folder.parent)
     assert (folder / 'counterexample.json').read_text() != before
     assert (folder / 'notes.txt').read_text() == 'mine'
     assert (folder / 'run' / 'run.mcap').exists()
-    assert not (folder / 'run.journal').exists()
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
 
 

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import multiprocessing.spawn
+import os
+import random
 import re
+import signal
+import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -16,6 +21,7 @@ from hypothesis import strategies as st
 from diffdrive_jacobian.control import find_controller
 from diffdrive_jacobian.exploration import LocalExecutor, SerialExecutor, explore, fault_schedules
 from diffdrive_jacobian.exploration.child import call_in_child
+from diffdrive_jacobian.exploration.errors import ExplorationError
 from diffdrive_jacobian.exploration.replay import replay
 from diffdrive_jacobian.exploration.trial import Outcome
 from diffdrive_jacobian.faults import Loss
@@ -86,6 +92,40 @@ def test_the_same_results_on_another_executor(expected, monkeypatch, local, kind
             same_results(executor, expected, monkeypatch)
 
 
+def use_random_numbers_in_a_thread(_):
+    """As the threads of Dask do at any time."""
+    thread = Thread(target=random.random)
+    thread.start()
+    thread.join()
+
+
+def test_random_numbers_of_other_threads_do_not_end_the_generation_of_worlds():
+    cases = st.integers(0, 5).map(use_random_numbers_in_a_thread)
+    assert explore(follow, cases=cases, worlds=1, executor=SerialExecutor()).worlds == 1
+
+
+class FailsOnce(SerialExecutor):
+    """Fails with the nth of its tasks, and with no other."""
+
+    def __init__(self, number):
+        self.left = number
+
+    def submit(self, fn, /, *args, **kwargs):
+        self.left -= 1
+        return super().submit(fn, *args, **kwargs) if self.left else super().submit(lose_worker)
+
+
+def lose_worker():
+    raise ConnectionError('the worker is gone')
+
+
+@pytest.mark.parametrize('number', [2, 3], ids=['exploring', 'shrinking'])
+def test_an_executor_that_fails_once_is_reported(number):
+    """Also while Hypothesis shrinks, which would try again and call the results unreliable."""
+    with pytest.raises(ExplorationError, match=r'not be run: ConnectionError: the worker is gone$'):
+        follow_on(FailsOnce(number))
+
+
 def test_processes_of_worlds_import_little(monkeypatch):
     monkeypatch.setattr(sys, 'executable', PYTHON)
     with LocalExecutor(1) as executor:
@@ -104,6 +144,29 @@ def test_a_process_that_dies_is_a_finding(local, tmp_path, monkeypatch):
     monkeypatch.setattr(sys.modules[replay.__module__], 'run_world_afresh', lambda _: [Outcome()])
     # Not in this process.
     assert not died.replay().same_verdict
+
+
+ENDLESS = """
+from diffdrive_jacobian.exploration.child import ChildProcess
+child = ChildProcess()
+print(child._process.pid, flush=True)
+child.call(exec, 'print("busy", flush=True)\\nwhile True: pass')
+"""
+
+
+def test_a_process_ends_with_a_program_that_is_killed():
+    """Also while its world does not end."""
+    pipes = {'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE, 'text': True}
+    with subprocess.Popen([PYTHON, '-c', ENDLESS], **pipes) as program:
+        pid = int(program.stdout.readline())
+        assert program.stderr.readline() == 'busy\n'
+        program.kill()
+        try:
+            # Until nobody can write any more.
+            program.communicate(timeout=60.0)
+        except subprocess.TimeoutExpired:
+            os.kill(pid, signal.SIGKILL)
+            raise
 
 
 def test_a_scenario_that_reads_its_input_gets_none(local):

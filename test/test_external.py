@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 import random
 import signal
 import socket
@@ -409,6 +410,24 @@ def test_a_process_and_its_children_are_ended_with_the_world():
         assert polite.stop() == 7
     assert polite.stdout == 'hi\nbye\n'
     assert forgotten.returncode == -signal.SIGINT
+
+
+def test_a_process_in_a_session_of_its_own_is_ended_with_the_world(tmp_path):
+    """As the daemon of ros2, and what that has started. It goes on if another world ends."""
+    alive = tmp_path / 'alive'
+    os.mkfifo(alive)
+    reading = os.open(alive, os.O_RDONLY | os.O_NONBLOCK)
+    daemon = f'setsid sh -c "exec 3> {alive}; echo hi; sleep 60; echo bye" & sleep 60'
+    with Lockstep(external=[]) as world:
+        launcher = world.start('sh', '-c', daemon, use_sim_time=False)
+        until_says_hi(launcher)
+        launcher.kill()
+        external_process.end_all([external_process.ExternalProcess(['true'], {}, tmp_path, None)])
+        with pytest.raises(BlockingIOError):
+            os.read(reading, 1)
+    # At the end of the file: nobody has it open for writing.
+    assert os.read(reading, 1) == b''
+    os.close(reading)
 
 
 def test_a_process_that_ignores_sigint_is_killed_with_the_world(monkeypatch):

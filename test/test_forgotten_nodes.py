@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import sys
 
 import pytest
 from action_msgs.msg import GoalStatus
@@ -351,6 +352,18 @@ def test_an_integer_as_a_command_is_reported(lockstep, add, node, capfd, node_cl
     lockstep.settle()
     text = said(capfd)
     assert text.count('has the value 4.94e-324: was an int assigned to a float field?') == 1
+
+
+@pytest.mark.parametrize('value', [1, -1, 5, 2**40, True])
+def test_integers_are_reported_as_this_python_sends_them(lockstep, add, node, capfd, value):
+    add(VirtualRobot)
+    message = Twist()
+    # As `message.linear.x = value` without the checks of rclpy, which are on in these tests.
+    message.linear._x = value
+    node.create_publisher(Twist, 'cmd_vel', 10).publish(message)
+    lockstep.settle()
+    is_nan = value < 0 and sys.version_info < (3, 12)
+    assert ('twist must be finite, got' if is_nan else 'was an int assigned to a float') in said(capfd)
 
 
 @pytest.mark.parametrize('kind', [PoseStamped, Goals])

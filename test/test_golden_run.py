@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import sys
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
-from geometry_msgs.msg import Point32, PoseStamped, Twist
+from geometry_msgs.msg import Point32, PoseStamped, TransformStamped, Twist
 from inner_sessions import draw_quickly, run_inner
 from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message, serialize_message
@@ -276,6 +278,21 @@ def drive(pytester, monkeypatch):
         return result
 
     return drive
+
+
+class Broadcaster:
+    """Publishes on /tf, as tf2_ros does."""
+
+    def __init__(self, node):
+        publisher = node.create_publisher(TransformStamped, '/tf', 100)
+        self.sendTransform = publisher.publish
+
+
+def test_a_golden_run_is_the_same_with_and_without_tf2_ros(drive, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'tf2_ros', None)
+    drive('--update-golden-runs').assert_outcomes(passed=1)
+    monkeypatch.setitem(sys.modules, 'tf2_ros', SimpleNamespace(TransformBroadcaster=Broadcaster))
+    drive().assert_outcomes(passed=1)
 
 
 def test_the_golden_run_of_a_test(drive, pytester):

@@ -7,8 +7,11 @@ import struct
 import pytest
 from action_msgs.msg import GoalStatus
 from nav_msgs.msg import Goals, Odometry
+from rcl_interfaces.msg import ParameterEvent
+from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from ros_messages import goal, goals, odometry
+from sensor_msgs.msg import JointState
 
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
 from diffdrive_jacobian.ros import serialization
@@ -26,6 +29,29 @@ def test_invalid_messages_are_ignored_without_a_word(kind, capfd):
     assert received == []
     callback(data)
     assert received == [kind()]
+    assert capfd.readouterr() == ('', '')
+
+
+@pytest.mark.parametrize(
+    'message',
+    [
+        JointState(name=['a', 'b'], position=[1.0, 2.0], velocity=[1.0, 2.0]),
+        ParameterEvent(changed_parameters=[Parameter('a', value=[1, 2]).to_parameter_msg()] * 100),
+        goals(goal(1, 0), goal(2, 0)),
+    ],
+    ids=lambda message: type(message).__name__,
+)
+def test_sequences_that_are_cut_off_are_ignored_without_a_word(message, capfd):
+    """The code that rclpy generates for a type writes a line for each."""
+    received = []
+    callback = ignoring_invalid(type(message), received.append)
+    data = serialize_message(message)
+    # rclpy adds bytes at the end.
+    for end in range(0, len(data) // 2, 4):
+        callback(data[:end])
+    assert received == []
+    callback(data)
+    assert received == [message]
     assert capfd.readouterr() == ('', '')
 
 

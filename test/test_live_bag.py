@@ -166,3 +166,26 @@ def test_a_bag_is_watched_without_ros():
     program += 'print(*{name.split(".")[0] for name in sys.modules})'
     run = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True)
     assert not set(run.stdout.split()) & {*ROS_MODULES, 'rpyutils', 'matplotlib'}
+
+
+def test_the_ground_truth_of_a_bag(tmp_path):
+    recording = Recording(tmp_path / 'slip', 'mcap', lossless=True)
+    slip = ('simulate_slip:=true', 'wheel_travel_variance:=2e-3')
+    arguments = ['--ros-args', *(word for one in slip for word in ('-p', f'virtual_robot:{one}'))]
+    drive([[0.4, 0.0]], lockstep=True, parameters=QUICK, recording=recording, ros_arguments=arguments)
+    recording.finish()
+    player = Player(tmp_path / 'slip', read_robots(tmp_path / 'slip'))
+    run = read_run(tmp_path / 'slip')
+    trail = player.session.latest()[1].true_trails['/']
+    assert len(trail.points) == len(run.ground_truth)
+    for index in (10, len(run.odometry) - 1):
+        player.send(Seek((run.odometry.stamps[index] - run.odometry.stamps[0]) * 1e-9 + 1e-6))
+        latest = np.searchsorted(run.ground_truth.stamps, run.odometry.stamps[index], side='right') - 1
+        truth = run.ground_truth.values[latest, :3]
+        assert player.robot['truth'] == pytest.approx(truth.tolist(), abs=1e-5)
+        assert player.robot['truly_travelled'] == latest + 1
+
+
+def test_a_bag_without_ground_truth(player):
+    assert player.robot['truth'] is None
+    assert player.session.latest()[1].true_trails['/'].points == []

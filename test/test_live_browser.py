@@ -79,6 +79,45 @@ def test_a_click_sends_a_goal_and_the_robot_arrives(live):
     assert all(re.match(rf'(http|ws)://{own}/', url) for url in live.browser.requests)
 
 
+@pytest.mark.parametrize(
+    ('typed', 'heading'),
+    [
+        (' ', None),
+        ('1,5', 1.5),
+        ('-90°', -math.pi / 2),
+        ('180 deg', math.pi),
+        ('1 rad', 1.0),
+        ('90', 'refused'),
+        ('pi/2', 'refused'),
+        ('400°', 'refused'),
+        ('north', 'refused'),
+    ],
+)
+def test_a_heading_is_taken_as_typed_or_refused(live, typed, heading):
+    """Nothing that is typed is taken for no heading."""
+    browser = live.browser
+    browser.evaluate(
+        f'document.getElementById("goto-theta").value = {json.dumps(typed)};'
+        'document.getElementById("notices").replaceChildren();'
+        'window.sent = []; window.before ??= WebSocket.prototype.send;'
+        'WebSocket.prototype.send = (text) => window.sent.push(JSON.parse(text))'
+    )
+    browser.evaluate('document.getElementById("goto").requestSubmit()')
+    sent = browser.evaluate('window.sent')
+    notice = browser.text('#notices')
+    browser.evaluate(
+        'WebSocket.prototype.send = window.before; document.getElementById("goto-theta").value = "";'
+        'document.getElementById("notices").replaceChildren()'
+    )
+    if heading == 'refused':
+        assert sent == []
+        assert f'in radians, from \u22122\u03c0 to 2\u03c0, or in degrees as 90°, got {typed}' in notice
+    else:
+        (command,) = sent
+        assert command['theta'] == (None if heading is None else pytest.approx(heading))
+        assert notice == ''
+
+
 def test_a_slider_changes_the_gain_and_a_refused_value_goes_back(live):
     browser, kp = live.browser, '[data-key="controller/kp"] input'
     slider = browser.center(f'{kp}[type=range]')
@@ -171,12 +210,20 @@ def test_other_widths_and_colours(live):
 
 def test_nothing_is_clipped_on_usual_screens(live):
     browser = live.browser
-    for width, height in ((1440, 900), (1366, 768), (1000, 700), (420, 800)):
+    for width, height in ((1600, 900), (1440, 900), (1400, 900), (1366, 768), (1000, 700), (420, 800)):
         browser.size(width, height)
-        clipped = """[...document.querySelectorAll('.strip p, #goto, #actions')].filter(
+        clipped = """[...document.querySelectorAll('.strip p, #goto, #actions, #hint')].filter(
             (node) => node.scrollWidth > node.clientWidth).length"""
         assert browser.evaluate(clipped) == 0, width
         assert browser.evaluate("document.getElementById('goto').offsetHeight") < 40
+        # A notice covers no legend.
+        browser.evaluate('document.getElementById("goto-x").value = "x"')
+        browser.evaluate('document.getElementById("goto").requestSubmit()')
+        covered = """(([a, b]) => a.left < b.right && b.left < a.right
+            && a.top < b.bottom && b.top < a.bottom)(['.notice', '#legend'].map(
+            (one) => document.querySelector(one).getBoundingClientRect()))"""
+        assert not browser.evaluate(covered), width
+        browser.evaluate('document.getElementById("goto-x").value = "1"')
         if width >= 1280:
             # Neither column scrolls.
             scrolled = """['controls', 'mathematics'].filter((id) => {

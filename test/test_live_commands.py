@@ -22,6 +22,7 @@ from diffdrive_jacobian.live.commands import (
 
 GOAL = {'do': 'goal', 'robot': '/', 'x': 1, 'y': -2.5, 'theta': None, 'append': False}
 DRIVE = {'do': 'drive', 'robot': '/a', 'v': 0.2, 'omega': -1.0}
+SET = {'do': 'set', 'robot': '/', 'parameter': 'controller/controller', 'value': 'pose'}
 
 
 @pytest.mark.parametrize(
@@ -69,13 +70,22 @@ def test_commands(content, command):
         (json.dumps(DRIVE).replace('0.2', 'Infinity'), 'must be JSON'),
         (json.dumps(DRIVE).replace('0.2', '1e999'), 'v must be a number'),
         (json.dumps({**DRIVE, 'robot': 7}), 'robot must be a text'),
-        (json.dumps({**DRIVE, 'robot': 'x' * 300}), 'at most 256 characters'),
+        (json.dumps({**DRIVE, 'robot': 'x' * 300}), 'at most 256 printable characters'),
         (json.dumps({**GOAL, 'append': 0}), 'append must be true or false'),
         (json.dumps({**GOAL, 'theta': 99.0}), 'theta must be a number'),
         (json.dumps({**GOAL, 'x': 1e7}), 'x must be a number'),
         (json.dumps({'do': 'place', 'robot': '/', 'x': 0, 'y': 0, 'theta': None}), 'theta must be'),
         (json.dumps({'do': 'speed', 'speed': 0}), 'speed must be a number in 0.01'),
         (json.dumps({'do': 'set', 'robot': '/', 'parameter': 'a', 'value': [1]}), 'value must be'),
+        *(
+            (
+                json.dumps({**SET, key: f'pose{character}x'}),
+                f'{key} must be a text of at most 256 printable',
+            )
+            for key in SET
+            if key != 'do'
+            for character in ('\ud800', '\0', '\x1b', '\n')
+        ),
     ],
 )
 def test_what_is_refused(text, message):

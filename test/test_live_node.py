@@ -303,3 +303,71 @@ def test_robots_that_are_silent_and_gone(live, monkeypatch):
     live.world.remove(robot)
     monkeypatch.setattr(live_node, 'LOST', 0.0)
     live.until(lambda: live.robot() is None)
+
+
+def test_a_node_that_changes_its_name_leaves_nothing_behind(driven):
+    robot = driven.node.robots['/']
+    before = len(list(driven.node.clients))
+    for number in range(5):
+        robot.use_nodes({'robot': f'/robot_{number}', 'controller': f'/controller_{number}'})
+        refused = []
+        robot.links['robot'].set('x', 1.0, lambda *answer, to=refused: to.append(answer))
+    assert len(list(driven.node.clients)) <= before + 2 * 3
+    robot.use_nodes({'robot': '/virtual_robot'})
+    assert refused == [(False, '/robot_4 is gone')]
+    robot.destroy()
+    assert not list(driven.node.clients)
+
+
+def test_a_robot_too_many_is_named(live, monkeypatch):
+    monkeypatch.setattr(live_node, 'MAX_ROBOTS', 1)
+    first = live.world.add(make_complete(VirtualRobot, '/one'))
+    live.until(lambda: live.robot('/one'))
+    live.world.add(make_complete(VirtualRobot, '/two'))
+
+    def notes():
+        return live.session.latest()[1].fixed['notes']
+
+    live.until(notes)
+    assert notes() == ['at most 1 robots are shown; 1 more publish odometry: /two']
+    live.world.remove(first)
+    monkeypatch.setattr(live_node, 'LOST', 0.0)
+    live.until(lambda: live.robot('/two') and not notes())
+
+
+def test_a_robot_that_slips_is_shown_where_it_truly_is(live):
+    slip = {'simulate_slip': True, 'wheel_travel_variance': 2e-3}
+    robot = live.world.add(make_complete(VirtualRobot, command_interface='wheels', **slip))
+    for node in (WheelBridge, GoToGoal):
+        live.world.add(make_complete(node, **(QUICK if node is GoToGoal else {})))
+    live.until(lambda: live.robot() and len(live.settings()) > 8)
+    ends = []
+    live.node.robots['/'].on_end = ends.append
+    live.send(goal(1.0, 0.5))
+    live.until(lambda: live.state() == 'executing')
+    live.pass_time(0.2)
+    shown = live.robot()
+    assert shown['true_distance'] == pytest.approx(math.dist(shown['truth'][:2], (1.0, 0.5)), abs=1e-4)
+    assert shown['true_distance'] != shown['distance']
+    live.until(lambda: live.state() == 'succeeded')
+    live.pass_time(0.2)
+    assert live.robot()['truth'] == pytest.approx(robot.truth.tolist(), abs=1e-4)
+    (end,) = ends
+    assert end.distance <= 0.021 < end.true_distance
+    trail = live.session.latest()[1].true_trails['/']
+    assert len(trail.points) > 10
+    assert trail.points[-1] == pytest.approx(robot.truth[:2].tolist(), abs=0.011)
+    live.send(ClearPath('/'))
+    live.pass_time(0.02)
+    assert len(live.session.latest()[1].true_trails['/'].points) <= 1
+
+
+def test_the_error_of_the_heading_is_shown_where_it_counts(driven):
+    driven.send(goal(0.3, 0.0, 2.0))
+    driven.until(lambda: driven.state() == 'executing')
+    assert driven.robot()['goal_heading_error'] is None
+    driven.send(SetParameter('/', 'controller/use_goal_heading', value=True))
+    driven.until(lambda: driven.robot()['use_heading'])
+    shown = driven.robot()
+    assert shown['goal_heading_error'] == pytest.approx(2.0 - shown['pose'][2], abs=1e-4)
+    assert driven.robot()['truth'] is None

@@ -259,6 +259,20 @@ def test_a_path_is_bounded_and_interrupted_by_jumps():
     assert len(trail.extended(0.0, SPACING / 2).points) == len(trail.points)
 
 
+@pytest.mark.parametrize('piece', [1, 2, 3, 20])
+def test_a_path_of_many_jumps_goes_on(piece):
+    """The longest that odometry can jump about; what is shown ends where the robot is."""
+    trail, renewed = Trail(), 0
+    for step in range(12 * MAX_POINTS):
+        x = 1.1 * SPACING * step + 5.0 * (step // piece)
+        before, trail = trail, trail.extended(x, 0.0)
+        renewed += trail is not before
+        assert len(trail.points) <= MAX_POINTS
+        assert trail.points[-1][0] == pytest.approx(x, abs=0.5)
+    # A new path is sent to the page as a whole.
+    assert renewed < 60
+
+
 def test_a_page_receives_only_what_is_new():
     session = Session()
     trail = Trail().extended(0.0, 0.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
+import select
 import socket
 import threading
 import time
@@ -16,7 +17,7 @@ from websockets.sync.client import connect
 
 from diffdrive_jacobian.live.access import Access, Refusal
 from diffdrive_jacobian.live.commands import Drive
-from diffdrive_jacobian.live.server import MAX_INVALID, MAX_PAGES, LiveServer
+from diffdrive_jacobian.live.server import MAX_INVALID, MAX_PAGES, MAX_STRANGERS, PATIENCE, LiveServer
 from diffdrive_jacobian.live.session import Session, Snapshot
 
 DRIVE = json.dumps({'do': 'drive', 'robot': '/', 'v': 0.2, 'omega': 0.0})
@@ -251,6 +252,24 @@ def test_what_is_no_http_is_disconnected(server):
                     received += data
             assert b'200' not in received.split(b'\r\n')[0]
     assert get(server, f'/{server.access.token}/')[0] == 200
+
+
+def test_connections_that_ask_for_nothing_do_not_use_up_descriptors(server):
+    with page(server) as first, contextlib.ExitStack() as stack:
+        idle = [
+            stack.enter_context(socket.create_connection(('127.0.0.1', server.port), timeout=20))
+            for _ in range(5 * MAX_STRANGERS)
+        ]
+        assert get(server, f'/{server.access.token}/')[0] == 200
+
+        def left():
+            """Return how many the server has not disconnected."""
+            gone, _, _ = select.select(idle, [], [], 0)
+            return len(idle) - len(gone)
+
+        until(lambda: left() <= MAX_STRANGERS, 'others are disconnected', PATIENCE / 2)
+        first.send(DRIVE)
+        until(session_of(server).take_commands, 'the page is served')
 
 
 def test_a_page_that_does_not_read_delays_nobody(server):

@@ -304,8 +304,10 @@ def test_the_report_contains_what_was_received(lockstep):
     message._x = 1
     publisher.publish(message)
     lockstep.settle()
-    assert heard[0].x == lockstep.last('a').x == 5e-324
-    assert 'Vector3(x=5e-324)' in lockstep.report()
+    # Which one depends on the version of Python.
+    assert 0.0 < heard[0].x < 1e-300
+    assert lockstep.last('a').x == heard[0].x
+    assert f'Vector3(x={heard[0].x})' in lockstep.report()
 
 
 def test_the_report_contains_a_message_that_is_not_valid_any_more(lockstep):

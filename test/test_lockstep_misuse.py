@@ -9,9 +9,11 @@ import pytest
 import rclpy
 from geometry_msgs.msg import Twist, Vector3
 from rclpy.context import Context
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.task import Future
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Empty, Trigger
@@ -69,6 +71,119 @@ def test_invalid_use_is_refused(lockstep):
     assert failures == ['Lockstep must be created and used in the main thread']
     with Lockstep() as world:
         world.add(Blinker())
+
+
+def test_a_second_initialization_is_an_error_with_its_remedy(lockstep):
+    """Also for those who expect that of rclpy."""
+    for error in (LockstepError, RuntimeError):
+        with pytest.raises(error, match=r'leave out rclpy.init\(\)'):
+            rclpy.init()
+    lockstep.add(Blinker())
+    with Context() as other:
+        assert other.ok()
+    lockstep.close()
+    rclpy.init()
+    rclpy.shutdown()
+
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def test_a_message_that_does_not_reach_a_latched_subscription_is_an_error(lockstep):
+    """Alone, and beside one that it reaches."""
+    planner, heard = lockstep.add(Node('planner')), []
+    planner.create_subscription(Vector3, 'map', heard.append, LATCHED)
+    words = (
+        r'/map is subscribed to by /planner with .* reliable, transient local, .*'
+        r'reliable, volatile, .* reach it: publish\(..., latched=True\)'
+    )
+    for _ in range(2):
+        with pytest.raises(LockstepError, match=words):
+            lockstep.publish('map', Vector3())
+    beside = lockstep.listen(Vector3, 'map')
+    with pytest.raises(LockstepError, match=words):
+        lockstep.publish('map', Vector3())
+    lockstep.publish('map', Vector3(x=1.0), latched=True)
+    assert heard == beside == [Vector3(x=1.0)]
+
+
+def test_a_quality_of_service_without_a_remedy_is_named(lockstep):
+    planner = lockstep.add(Node('planner'))
+    often = QoSProfile(depth=1, deadline=Duration(seconds=0.1))
+    planner.create_subscription(Vector3, 'map', print, often)
+    for latched in (False, True):
+        with pytest.raises(LockstepError, match=r'/map is subscribed to by /planner .* not reach it\n'):
+            lockstep.publish('map', Vector3(), latched=latched)
+
+
+def test_a_latched_message_waits_for_its_subscriptions(lockstep):
+    for number in range(3):
+        lockstep.publish('map', Vector3(x=float(number)), latched=True)
+    planner, heard = Node('planner'), []
+    planner.create_subscription(Vector3, 'map', heard.append, LATCHED)
+    lockstep.add(planner)
+    assert heard == [Vector3(x=2.0)]
+    assert len(lockstep.listen(Vector3, 'map', latched=True)) == 3
+
+
+class Threaded(Node):
+    """Publishes in threads of its own, also while its callback waits for one."""
+
+    def __init__(self):
+        super().__init__('threaded', start_parameter_services=False)
+        self.publisher = self.create_publisher(Vector3, 'spectrum', 10)
+        self.client = self.create_client(Empty, 'erase')
+        self.create_subscription(Twist, 'twist', lambda _: self.in_thread(self.publish), 10)
+
+    def publish(self):
+        self.publisher.publish(Vector3())
+
+    def call(self):
+        self.client.call_async(Empty.Request())
+
+    def in_thread(self, function):
+        thread = threading.Thread(target=function, name='worker')
+        thread.start()
+        thread.join()
+
+
+def test_what_a_node_sends_from_a_thread_of_its_own_is_an_error(lockstep):
+    node = Threaded()
+    # Before it is known whose thread it was.
+    node.in_thread(node.publish)
+    publishes = "node /threaded publishes /spectrum from a thread of its own ('worker')"
+    with pytest.raises(LockstepError, match=re.escape(publishes)):
+        lockstep.add(node)
+    lockstep.run_for(0.1)
+    for use in (
+        lambda: lockstep.last('spectrum'),
+        lambda: lockstep.run_for(0.1),
+        lambda: lockstep.step(0.1),
+        lambda: lockstep.finish(),
+    ):
+        node.in_thread(node.publish)
+        with pytest.raises(LockstepError, match=re.escape(publishes)):
+            use()
+    node.in_thread(node.call)
+    with pytest.raises(LockstepError, match='node /threaded calls or answers /erase from a thread of'):
+        lockstep.run_for(0.1)
+    with pytest.raises(LockstepError, match=re.escape(publishes)):
+        lockstep.publish('twist', Twist())
+    lockstep.run_for(0.1)
+    node.publish()
+    lockstep.settle()
+    assert lockstep.last('spectrum') == Vector3()
+
+
+def test_threads_of_others_do_not_matter(lockstep):
+    with Context() as context:
+        stranger = Node('stranger', context=context)
+        publisher = stranger.create_publisher(Vector3, 'spectrum', 10)
+        thread = threading.Thread(target=publisher.publish, args=(Vector3(),))
+        thread.start()
+        thread.join()
+        lockstep.run_for(0.1)
+        stranger.destroy_node()
 
 
 def test_nodes_that_cannot_be_added_are_refused(lockstep):

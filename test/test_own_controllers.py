@@ -500,7 +500,9 @@ def test_the_example_is_given_in_python(pytester):
     kwargs = {'cwd': pytester.path, 'env': {**os.environ, 'PYTHONPATH': str(pytester.path)}}
     session = 'import sys, pytest\nsys.exit(pytest.main(sys.argv[1:]))'
     ended = forked.run(
-        session, ['-p', 'no:hypothesispytest', '-p', 'no:xdist', 'test_my_law.py'], **kwargs
+        session,
+        ['-p', 'no:hypothesispytest', '-p', 'no:xdist', '-p', 'no:launch_testing', 'test_my_law.py'],
+        **kwargs,
     )
     assert ended.returncode == 0
     assert re.search(r'^=+ 1 passed\b', ended.stdout, re.MULTILINE)

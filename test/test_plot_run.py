@@ -211,7 +211,7 @@ def test_the_axes_show_the_run_with_units(run):
     error = wrap_angle(np.arctan2(0.5 - y, 1.0 - x) - theta)
     reached = np.flatnonzero(np.hypot(1.0 - x, 0.5 - y) <= 0.05)
     until = reached[0] if len(reached) else len(x)
-    shown = drawn(axes[LABELS['heading_error']])
+    shown = drawn(axes[LABELS['bearing_error']])
     assert shown[:, 1] == pytest.approx(error[:until], abs=1e-12)
 
 
@@ -321,7 +321,7 @@ def test_the_next_waypoint_counts_from_within_the_tolerance(tmp_path, parameters
     times = [round((x - tolerance) / 0.5, 6) for x in (0.5, 1.0, 1.5)]
     assert goals_of(run) == [(0.0, 0), (times[0], 1), (times[1], 2)]
     one = trace(run)
-    reached = np.flatnonzero(np.isnan(one.heading_error))
+    reached = np.flatnonzero(np.isnan(one.bearing_error))
     assert one.time[reached[0]] == pytest.approx(times[2])
     assert not np.isnan(one.distance).any()
 
@@ -392,7 +392,7 @@ def test_a_goal_is_reached_when_the_node_says_so(tmp_path):
     run = read_run(write_bag(tmp_path / 'bag', sorted([*sent, *extra], key=lambda one: one[0])))
     one = trace(run)
     # Within 0.02 m of it again since 12.92 s.
-    assert np.flatnonzero(np.isnan(one.heading_error))[0] == 146
+    assert np.flatnonzero(np.isnan(one.bearing_error))[0] == 146
     assert np.flatnonzero(np.isnan(one.distance)).tolist() == list(range(175, 200))
 
 
@@ -501,7 +501,8 @@ def test_csv_holds_the_numbers_of_the_run(recorded, run, tmp_path):
     rounded = {'rtol': 0.0, 'atol': 5.1e-10}
     np.testing.assert_allclose(rows[:, 1:6], run.odometry.values, **rounded)
     np.testing.assert_allclose(columns['distance_m'], one.distance, **rounded)
-    np.testing.assert_allclose(columns['heading_error_rad'], one.heading_error, **rounded)
+    assert np.isnan(columns['goal_heading_error_rad']).all()
+    np.testing.assert_allclose(columns['bearing_error_rad'], one.bearing_error, **rounded)
     assert columns['omega_right_radps'].tolist() == run.wheels.values[:, 0].tolist()
     assert columns['omega_left_radps'].tolist() == run.wheels.values[:, 1].tolist()
     held = [math.nan] * 25 + [0.5] * 75 + [0.25] * 100
@@ -519,8 +520,8 @@ def test_csv_has_exact_times_and_no_artefacts_of_floats(tmp_path):
     bag = write_bag(tmp_path / 'bag', sent)
     assert plot(bag, '--csv', tmp_path / 'a.csv') == 0
     _, first, second = (tmp_path / 'a.csv').read_text().splitlines()
-    assert first == '0,57.304,0.3,0,0,0,,,,,,'
-    assert second == '0.123456789,-999999.123456789,0.000000001,0,0,0,,,,,,'
+    assert first == '0,57.304,0.3,0,0,0,,,,,,,'
+    assert second == '0.123456789,-999999.123456789,0.000000001,0,0,0,,,,,,,'
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 
 import pytest
 from nav_msgs.msg import Odometry
@@ -211,6 +212,26 @@ def test_never_faster_than(lockstep, send, v, omega, allowed):
         lockstep.finish()
     else:
         assert '/cmd_vel: v ' in violated(lockstep, 'NeverFasterThan')
+
+
+def test_a_long_property_does_not_hide_what_is_wrong(lockstep):
+    """Its message is short. Its `repr` is complete."""
+    path = [(0.1 * number, 0.0) for number in range(61)]
+    near = StaysNear(path, 0.1, odom='pose')
+    assert eval(repr(near)) == near
+    shown = "StaysNear(((0.0, 0.0), (0.1, 0.0), ... 61 in all), 0.1, odom='pose')"
+    assert str(near) == shown
+    lockstep.require(near)
+    with pytest.raises(LockstepError, match=re.escape(f'{shown} observes /pose, which no node')):
+        lockstep.finish()
+    publisher = lockstep.node.create_publisher(Odometry, 'pose', 10)
+    lockstep.require(near)
+    message = Odometry()
+    message.pose.pose.position.y = 1.0
+    publisher.publish(message)
+    with pytest.raises(PropertyViolation) as caught:
+        lockstep.settle()
+    assert str(caught.value).startswith(f'{shown} is violated at 0 s: /pose: ')
 
 
 def test_the_speed_of_odometry_in_a_namespace_as_messages_and_as_bytes(lockstep, send, robot_at):

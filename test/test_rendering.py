@@ -48,3 +48,16 @@ def test_a_figure_is_drawn_once(monkeypatch):
     monkeypatch.setattr(Figure, 'draw', lambda self, *given: drawn.append(1) or draw(self, *given))
     render(sample(), 'png')
     assert len(drawn) == 1
+
+
+@pytest.mark.parametrize('end', [0.8, 1.7])
+def test_labels_are_inside_although_the_ticks_change_with_the_layout(end):
+    """With equal scales the limits, and so the tick labels, follow from the size of the axes."""
+    drawing = Figure(figsize=(3.4, 2.0), layout='constrained')
+    plane, _ = drawing.subplots(1, 2)
+    plane.plot([0.0, end], [0.0, end])
+    plane.margins(0.2)
+    plane.set_aspect('equal', adjustable='datalim')
+    plane.set(ylabel='y [m]')
+    render(drawing, 'png')
+    assert plane.yaxis.label.get_window_extent().x0 > 2.0

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from rclpy.context import Context
 from rclpy.node import Node
 
+from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.parameters.file import concerns, robot_parameters, sections
+from diffdrive_jacobian.ros.parameters import report_unknown
 from diffdrive_jacobian.ros.runner import ros_context
-from diffdrive_jacobian.tools._unused_files import concerns, node_names, warn_of_unused_files
+from diffdrive_jacobian.tools._unused_files import warn_of_unused_files
 
 NAMESPACES = ('', '/a', '/a/b')
 KEYS = (
@@ -38,6 +44,10 @@ def written(path, text):
     return str(path)
 
 
+def node_names(path):
+    return [name for name, _ in sections(path)]
+
+
 @pytest.mark.parametrize('key', KEYS)
 def test_a_name_concerns_the_nodes_to_which_rclpy_gives_the_parameters(tmp_path, key):
     file = written(tmp_path / 'p.yaml', f'"{key}":\n  ros__parameters:\n    given: 1.0\n')
@@ -59,24 +69,71 @@ def _node(namespace: str, context: Context) -> Node:
     ('text', 'names'),
     [
         ('a:\n  b:\n    ros__parameters: {x: {y: 1}, z: [1, {q: 2}]}\n', ['/a/b']),
-        ('{a: {ros__parameters: {x: 1}}, /b: {ros__parameters: {}}}', ['/a', '/b']),
+        ('{a: {ros__parameters: {x: 1}}, /b: {ros__parameters: {}}}', ['/a']),
         ('a: &p\n  ros__parameters: {x: 1}\nb: *p\n', ['/a', '/b']),
         ('a: [1, 2]\nb: {c: 1}\n', []),
         ('', []),
-        ('a: [1, {', []),
-        ('? {a: 1}\n: {ros__parameters: {}}\n', []),
+        ('text', []),
+        ('a: {ros__parameters: }', []),
     ],
 )
 def test_the_names_in_a_file_are_found(tmp_path, text, names):
     assert node_names(written(tmp_path / 'p.yaml', text)) == names
 
 
-def test_unreadable_and_large_files_have_no_names(tmp_path):
-    assert node_names(str(tmp_path / 'missing.yaml')) == []
-    (tmp_path / 'binary.yaml').write_bytes(b'\xff\xfe\x00')
-    assert node_names(str(tmp_path / 'binary.yaml')) == []
-    large = 'a: {ros__parameters: {}}\n' + '#' * 2_000_000
-    assert node_names(written(tmp_path / 'large.yaml', large)) == []
+@pytest.mark.parametrize(
+    'content', [b'a: [1, {', b'? {a: 1}\n: 1', b'\xff\xfe\0', b'#' * 2_000_001, None]
+)
+def test_a_file_that_cannot_be_read_is_refused_and_not_called_empty(tmp_path, capsys, content):
+    path = tmp_path / 'p.yaml'
+    if content is not None:
+        path.write_bytes(content)
+    for read in (sections, robot_parameters):
+        with pytest.raises(UserError, match=f'must be a file of ROS parameters, got {path}'):
+            read(str(path))
+    warn_of_unused_files('drive_to', ['--ros-args', '--params-file', str(path)], ['/virtual_robot'])
+    assert capsys.readouterr().err == ''
+
+
+EMPTY = ['', '# nothing\n', '{}', 'text', 'virtual_robot: {ros__parameters: {}}']
+
+
+@pytest.mark.parametrize('text', EMPTY)
+def test_a_file_without_parameters_is_reported(tmp_path, capsys, text):
+    """All of these rcl accepts without a word."""
+    file = written(tmp_path / 'p.yaml', text)
+    ros = ['--ros-args', '--params-file', file]
+    with ros_context(['test', *ros]):
+        warn_of_unused_files('virtual_robot', ros, ['/virtual_robot'])
+    assert f'virtual_robot: warning: --params-file {file} has no parameters: ' in capsys.readouterr().err
+    with pytest.raises(UserError, match='it has none of virtual_robot'):
+        robot_parameters(file)
+
+
+def test_a_tool_without_nodes_refuses_a_file_for_others(tmp_path):
+    text = '/**/wheel_bridge: {ros__parameters: {wheel_radius: 0.1}}'
+    with pytest.raises(UserError, match='none of virtual_robot, but of '):
+        robot_parameters(written(tmp_path / 'p.yaml', text))
+    for name in ('/a/virtual_robot', 'a: {b: {virtual_robot', '/**', '"*"'):
+        text = f'{name}: {{ros__parameters: {{linear: {{x: 1.0}}}}' + '}' * (name.count('{') + 1)
+        assert robot_parameters(written(tmp_path / 'p.yaml', text)) == {'linear.x': 1.0}
+
+
+SHARED = """
+/**: {ros__parameters: {wheel_radius: 0.1, left_wheel_name: l, own: 1, another.name: 2, kpp: 1.0}}
+/**/go_to_goal: {ros__parameters: {colour: red}}
+"""
+
+
+def test_a_parameter_for_all_nodes_need_not_be_of_each(tmp_path, capfd):
+    """A misspelt one is reported, and so is one that is only for this node."""
+    file = written(tmp_path / 'p.yaml', SHARED)
+    with ros_context(['go_to_goal', '--ros-args', '--params-file', file, '-p', 'shape:=1']) as context:
+        node = GoToGoal(context=context)
+        report_unknown([node])
+        node.destroy_node()
+    reported = re.findall("unknown parameter '([^']*)'", capfd.readouterr().err)
+    assert reported == ['colour', 'kpp', 'shape']
 
 
 def test_a_file_for_other_nodes_is_reported_with_the_names(tmp_path, capsys):

@@ -87,10 +87,15 @@ class PathSqlite3Writer(Sqlite3Writer):
             raise ValueError('SQLite files cannot be compressed as a whole while they are written')
         self.path = path.absolute() / f'{path.name}.db3'
         self.conn = sqlite3.connect(self.path)
-        # A bag gets its name after its files were synced. Until then it need not survive a power cut.
-        self.conn.execute('PRAGMA synchronous = OFF')
-        self.conn.execute('PRAGMA journal_mode = MEMORY')
-        self.conn.executescript(self.SQLITE_SCHEMA)
+        try:
+            # A bag gets its name after its files were synced. Until then it need not survive
+            # a power cut.
+            self.conn.execute('PRAGMA synchronous = OFF')
+            self.conn.execute('PRAGMA journal_mode = MEMORY')
+            self.conn.executescript(self.SQLITE_SCHEMA)
+        except BaseException:
+            self.conn.close()  # Nobody else can: there is no writer yet.
+            raise
         self.cursor = self.conn.cursor()
 
 

@@ -58,7 +58,9 @@ class Outcome:
     pose: NDArray[np.float64] | None
     """`[x, y, theta]` where the robot stopped, shape (3,) (m, m, rad). None: there was no odometry."""
     distance: float
-    """Distance from the driven point to the last goal (m)."""
+    """Distance from the driven point to the last goal by the odometry (m)."""
+    true_distance: float
+    """The same by the ground truth (m). NaN: the robot has no drift."""
     offset: float
     """x of the driven point in the body frame (m). 0: the axle centre."""
     seconds: float
@@ -241,11 +243,17 @@ def drive_in(
 
     runner.spin(settled_or_late)
     client.index = len(goals) - 1
+    true_distance = math.nan
+    if robot.parameters.drift() is not None:
+        true_distance = float(
+            controller.arrival.distance(*robot.truth.tolist(), *goals[-1, :2].tolist())
+        )
     return Outcome(
         status=status,
         interrupted=signals.count > 0,
         pose=None if client.robot is None else client.robot.pose,
         distance=client.distance,
+        true_distance=true_distance,
         offset=controller.arrival.offset,
         seconds=seconds,
     )

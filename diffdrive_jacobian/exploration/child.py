@@ -2,7 +2,7 @@
 
 A `Lockstep` needs the main thread of its process. So a thread, of the default executor or of a worker
 of Dask, has a process of its own. It lives as long as its thread, and ends with the process that started
-it, because its input ends then.
+it, also if that was killed while a world runs that does not end.
 """
 
 from __future__ import annotations
@@ -10,12 +10,15 @@ from __future__ import annotations
 import importlib
 import os
 import pickle
+import select
 import struct
 import subprocess
 import sys
 import threading
 from contextlib import suppress
 from typing import IO, Any
+
+from diffdrive_jacobian.text import error_text
 
 serving = False
 """Whether this is a process that runs worlds."""
@@ -189,6 +192,7 @@ def _serve(descriptor: int) -> None:
     importlib.import_module(MODULE).serving = True  # type: ignore[attr-defined]
     requests = os.fdopen(os.dup(0), 'rb')
     answers = os.fdopen(descriptor, 'wb')
+    threading.Thread(target=_end_with, args=(requests,), daemon=True).start()
     # A scenario that reads its input must not wait for that of this function.
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)
@@ -212,12 +216,21 @@ def _serve(descriptor: int) -> None:
             os._exit(0)
 
 
+def _end_with(requests: IO[bytes]) -> None:
+    """End this process when that which sends requests has ended, also while a request is executed."""
+    hung_up = select.poll()
+    # Not for what can be read, which is for the main thread.
+    hung_up.register(requests, 0)
+    hung_up.poll()
+    os._exit(0)
+
+
 def _picklable(error: Exception) -> Exception:
     """Return an error that another process can read."""
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:
-        return RuntimeError(f'{type(error).__name__}: {error}')
+        return RuntimeError(f'{type(error).__name__}: {error_text(error)}')
     return error
 
 

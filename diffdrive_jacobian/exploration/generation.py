@@ -8,6 +8,7 @@ switched off here.
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -18,7 +19,7 @@ from diffdrive_jacobian.exploration.trial import Trial
 try:
     import hypothesis
     from hypothesis import HealthCheck, Phase, Verbosity, settings, strategies
-    from hypothesis.errors import HypothesisException
+    from hypothesis.errors import HypothesisDeprecationWarning, HypothesisException
 except ModuleNotFoundError as missing:
     if missing.name != 'hypothesis':
         raise
@@ -79,21 +80,30 @@ def shrink(
         block: Number of the block.
         count: Size of the block.
         fails: Returns whether a trial fails. It must return the same for equal trials. It may raise
-            StopShrinking.
+            StopShrinking. Other exceptions end the search, too, and are raised.
 
     Raises:
         ExplorationError: No trial of the block fails.
     """
     smallest: list[Trial] = []
+    errors: list[Exception] = []
 
     def check(trial: Trial) -> None:
-        if fails(trial):
+        try:
+            failed = fails(trial)
+        except Exception as error:
+            # Hypothesis would take it for a failure, run the trial again, and report what differs.
+            errors.append(error)
+            raise StopShrinking from error
+        if failed:
             smallest[:] = [trial]
             raise _FoundError
 
     try:
         _run(strategy, seed, block, count, [Phase.generate, Phase.shrink], check)
     except (_FoundError, StopShrinking):
+        if errors:
+            raise errors[0] from None
         # Hypothesis ends with the smallest one.
         if smallest:
             return smallest[0]
@@ -132,7 +142,9 @@ def _run(
     def test(trial: Trial) -> None:
         use(trial)
 
-    with _own_constants_only():
+    with warnings.catch_warnings(), _own_constants_only():
+        # Hypothesis takes random numbers of other threads, as of Dask's, for such of the strategy.
+        warnings.filterwarnings('ignore', 'Do not use the `random` module', HypothesisDeprecationWarning)
         try:
             test()
         except HypothesisException as error:

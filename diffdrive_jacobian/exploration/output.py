@@ -2,35 +2,38 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
-import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-from diffdrive_jacobian.bags.journal import JOURNAL
 from diffdrive_jacobian.exploration.child import ChildDiedError, call_in_child
 from diffdrive_jacobian.exploration.errors import ExplorationError
 from diffdrive_jacobian.exploration.recorded_world import BAG, PICTURE, record
-from diffdrive_jacobian.exploration.result import Finding
+from diffdrive_jacobian.exploration.result import LONGEST_KEY, Finding
 from diffdrive_jacobian.exploration.scenario import ScenarioName
 from diffdrive_jacobian.exploration.source import Source
 from diffdrive_jacobian.exploration.worker import can_run_here
+from diffdrive_jacobian.text import error_text, printable
 
 CASE = 'counterexample.json'
 """Name of the file with the case."""
-WRITTEN = 'Found and written by explore'
-"""Words of each test that is written."""
+MARK = '.written_by_explore'
+"""Name of the file that lists what was written into a folder, with SHA-256 sums."""
+MARK_TITLE = '# written by explore into {folder}; it removes a file only if it has this SHA-256 sum'
+"""First line of that file. A folder that was renamed or copied has another name."""
 TEST = '''"""{title}
 
 {description}
 
-{written}(seed={seed}). Passes once the controller is mended.
+Found and written by explore(seed={seed}). Passes once the controller is mended.
 """
 
 {imports}
@@ -71,7 +74,8 @@ def write_finding(
 ) -> Finding:
     """Write a finding into a folder of its own, in the place of one of an earlier exploration.
 
-    What cannot be written is noted in the finding.
+    Nothing else is overwritten: where it is in the way, the folder gets a number. What cannot be written
+    is noted in the finding.
 
     Args:
         finding: The finding.
@@ -87,16 +91,18 @@ def write_finding(
     taken = {other.directory for other in others}
     stem = re.sub(r'\W+', '_', finding.violation.name)
     number, folder = 1, output / stem
-    while folder in taken or _is_foreign(folder):
+    while folder in taken or not _is_free(folder):
         number += 1
         folder = output / f'{stem}_{number}'
     notes = list(finding.notes)
     try:
+        _remove(folder)
         folder.mkdir(exist_ok=True)
-        _remove_earlier(folder)
-        (folder / CASE).write_text(_case(finding, seed))
-        name = _snake(folder.name)
-        (folder / f'test_{name}.py').write_text(test_source(finding, folder, name, seed))
+        test = _test(folder)
+        _create(folder / MARK, MARK_TITLE.format(folder=folder.name) + '\n')
+        _create(folder / CASE, _case(finding, seed))
+        _create(test, test_source(finding, folder, test.stem.removeprefix('test_'), seed))
+        _mark(folder, [folder / CASE, test])
         if executor is not None:
             notes += _record(finding, folder, executor)
     except OSError as error:
@@ -107,56 +113,117 @@ def write_finding(
 def remove_others(output: Path, findings: Sequence[Finding]) -> None:
     """Remove what an earlier exploration has written, other than what was found again.
 
-    Other files stay, and so do the files of a counterexample that was renamed or copied from elsewhere.
+    A folder that was renamed or copied stays, and so does one in which a file was changed or renamed.
+    Files that were added stay, too.
 
     Args:
         output: Folder of all findings.
         findings: What was found now.
     """
     kept = {finding.directory.name for finding in findings if finding.directory is not None}
-    for case in output.glob(f'*/{CASE}'):
-        folder = case.parent
-        test = folder / f'test_{_snake(folder.name)}.py'
-        if folder.name in kept or folder.is_symlink() or not _is_written(test):
-            continue
-        with suppress(OSError):
-            # What pytest compiled would keep the folders.
-            for file in (test, *folder.glob(f'__pycache__/{test.stem}.*')):
-                file.unlink()
-            _remove_earlier(folder)
-            for empty in (folder / '__pycache__', folder):
-                if empty.is_dir() and not any(empty.iterdir()):
-                    empty.rmdir()
+    for mark in output.glob(f'*/{MARK}'):
+        if mark.parent.name not in kept:
+            with suppress(OSError):
+                _remove(mark.parent)
 
 
-def _is_written(test: Path) -> bool:
-    """Return whether a file is a test that `explore` has written."""
-    try:
-        return WRITTEN in test.read_text(errors='replace')
-    except OSError:
-        return False
+# --- What explore has written into a folder
 
 
-def _is_foreign(folder: Path) -> bool:
-    """Return whether a folder has files, and none of an earlier exploration."""
-    return folder.is_dir() and not (folder / CASE).exists() and any(folder.iterdir())
+def _is_free(folder: Path) -> bool:
+    """Return whether a finding can be written into a folder without overwriting anything else."""
+    if not os.path.lexists(folder):
+        return True
+    with suppress(OSError):
+        return not folder.is_symlink() and (bool(_own(folder)) or not any(folder.iterdir()))
+    return False
 
 
-def _remove_earlier(folder: Path) -> None:
-    """Remove what an earlier exploration has written into a folder."""
-    shutil.rmtree(folder / BAG, ignore_errors=True)
-    # The journal is there if the process of the recording ended.
-    for file in (folder / PICTURE, folder / CASE, folder / (BAG + JOURNAL)):
-        file.unlink(missing_ok=True)
+def _own(folder: Path) -> list[Path]:
+    """Return the files that an exploration has written into a folder, which may be removed.
+
+    None if one of them was changed, if the test was renamed, or if there is anything else in the bag or
+    under the name of a file of a finding.
+    """
+    mark = folder / MARK
+    if folder.is_symlink() or mark.is_symlink() or not mark.is_file():
+        return []
+    title, *lines = mark.read_text(encoding='utf-8', errors='replace').split('\n')
+    if title != MARK_TITLE.format(folder=folder.name):
+        return []
+    written = {name: checksum for checksum, _, name in (line.partition('  ') for line in lines)}
+    present = {str(path.relative_to(folder)): path for path in _files(folder)}
+    own = {
+        name: path
+        for name, path in present.items()
+        if name in written and path.is_file() and not path.is_symlink()
+        if written[name] == _checksum(path)
+    }
+    reserved = {CASE, _test(folder).name, BAG, PICTURE, *written}
+    others = {name.partition('/')[0] for name in present.keys() - own.keys()}
+    return [] if _test(folder).name not in own or others & reserved else [*own.values(), mark]
+
+
+def _remove(folder: Path) -> None:
+    """Remove what an exploration has written into a folder, and the folder if nothing else is in it."""
+    own = _own(folder)
+    cache = folder / '__pycache__'
+    if own and not cache.is_symlink():
+        # What pytest compiled.
+        own += cache.glob(f'{_test(folder).stem}.*.pyc')
+    for file in own:
+        file.unlink()
+    for part in (folder / BAG, cache, folder) if own else ():
+        if part.is_dir() and not part.is_symlink() and not any(part.iterdir()):
+            part.rmdir()
+
+
+def _test(folder: Path) -> Path:
+    """Return the path of the test in the folder of a finding."""
+    return folder / f'test_{_snake(folder.name)}.py'
+
+
+def _create(path: Path, text: str) -> None:
+    """Write a file that does not exist yet."""
+    with path.open('x', encoding='utf-8') as file:
+        file.write(text)
+
+
+def _mark(folder: Path, files: Iterable[Path]) -> None:
+    """Note that files were written into a folder."""
+    with (folder / MARK).open('a', encoding='utf-8') as file:
+        file.writelines(f'{_checksum(one)}  {one.relative_to(folder)}\n' for one in files)
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """Yield all files below a folder, and the links, which are not followed."""
+    for root, folders, files in os.walk(folder):
+        for name in (*files, *folders):
+            path = Path(root, name)
+            if path.is_symlink() or not path.is_dir():
+                yield path
+
+
+def _checksum(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _record(finding: Finding, folder: Path, executor: Executor) -> list[str]:
     """Record the smallest case. Return notes on what could not be written."""
-    arguments = finding.setting, finding.trial, finding.violation.index, str(folder)
-    try:
-        return executor.submit(_record_in_process, *arguments).result()
-    except ChildDiedError as error:
-        return [f'not recorded: {error}']
+    # Apart until it is complete: after Ctrl-C the process of the recording goes on for a moment.
+    with TemporaryDirectory(prefix='.recording_', dir=folder, ignore_cleanup_errors=True) as apart:
+        arguments = finding.setting, finding.trial, finding.violation.index, apart
+        try:
+            notes = executor.submit(_record_in_process, *arguments).result()
+        except ChildDiedError as error:
+            notes = [f'not recorded: {error}']
+        except Exception as error:
+            # The finding must not be lost.
+            notes = [f'not recorded: {type(error).__name__}: {error_text(error)}']
+        for path in Path(apart).iterdir():
+            new = path.rename(folder / path.name)
+            _mark(folder, _files(new) if new.is_dir() else [new])
+    return notes
 
 
 def _record_in_process(*arguments: Any) -> list[str]:
@@ -215,14 +282,14 @@ def test_source(finding: Finding, folder: Path, name: str, seed: int) -> str:
     loads += [_load(folder, setting.scenario, *one) for one in sorted(local)]
     loads = [line for line in loads if line]
     imports += [f'from {module} import {", ".join(sorted(names[module]))}' for module in sorted(names)]
-    title, description = f'{violation.key}, at {violation.seconds:g} s.', violation.headline
+    key = printable(violation.key, LONGEST_KEY)
+    title, description = f'{key}, at {violation.seconds:g} s.', violation.headline
     if violation.index >= 0:
-        title = f'{violation.key} is violated at {violation.seconds:g} s.'
+        title = f'{key} is violated at {violation.seconds:g} s.'
         description = '\n'.join(violation.text.strip().splitlines()[:10])
     return TEST.format(
         title=_quoted(title),
         description=_quoted(description),
-        written=WRITTEN,
         seed=seed,
         imports='\n'.join(imports) + '\n',
         loads='\n'.join(loads),

@@ -12,6 +12,7 @@ from diffdrive_jacobian.exploration.result import described_replay
 from diffdrive_jacobian.exploration.trial import of_exception, seconds
 from diffdrive_jacobian.exploration.versions import differences, versions
 from diffdrive_jacobian.lockstep import Lockstep, PropertyViolation
+from diffdrive_jacobian.text import printable_lines
 
 
 @contextmanager
@@ -25,13 +26,13 @@ def reproducing(world: Lockstep, case: Path) -> Iterator[None]:
         world: The world in which the body runs the case.
         case: The file counterexample.json.
     """
-    found = json.loads(case.read_text())
+    found = json.loads(case.read_text(encoding='utf-8'))
     with MessageDigest(world) as messages:
         try:
             yield
         except (Exception, SystemExit) as error:
             if isinstance(error, PropertyViolation):
-                key, time = repr(error.property), seconds(world)
+                key, time = printable_lines(repr(error.property)), seconds(world)
             else:
                 violation = of_exception(error, world)
                 key, time = violation.key, violation.seconds

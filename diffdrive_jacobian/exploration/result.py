@@ -8,7 +8,10 @@ from pathlib import Path
 from diffdrive_jacobian.exploration.source import Source
 from diffdrive_jacobian.exploration.trial import Setting, Trial, Violation
 from diffdrive_jacobian.exploration.versions import differences, versions
+from diffdrive_jacobian.text import printable
 
+LONGEST_KEY = 200
+"""Length beyond which a property is cut where it is a title (characters)."""
 NOTED = 10
 """Number of notes that are printed."""
 
@@ -49,7 +52,7 @@ class Finding:
         source = Source()
         event = 'violated' if self.violation.index >= 0 else 'failed'
         lines = [
-            f'{self.violation.key}',
+            printable(self.violation.key, LONGEST_KEY),
             f'  {self.count} worlds, the first is number {self.first_world}; '
             f'smallest case after {self.shrink_worlds} worlds'
             + ('' if self.complete else ' (not shrunk to the end)'),

@@ -23,6 +23,7 @@ from diffdrive_jacobian.lockstep import (
     PropertyViolation,
 )
 from diffdrive_jacobian.properties import Property, Watch
+from diffdrive_jacobian.text import error_text, printable_lines
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 QUIET = ('--disable-rosout-logs', '--disable-stdout-logs', '--disable-external-lib-logs')
@@ -149,10 +150,10 @@ class _CollectingWatch:
         watched, found = self._collecting.watched, self._collecting.found
         found.violations.append(
             Violation(
-                key=repr(watched),
+                key=printable_lines(repr(watched)),
                 name=type(watched).__name__,
                 seconds=seconds(self._world),
-                text=text[:LONGEST_TEXT],
+                text=printable_lines(text)[:LONGEST_TEXT],
                 index=self._collecting.index,
             )
         )
@@ -255,13 +256,13 @@ def of_exception(error: BaseException, world: Lockstep) -> Violation:
     kind = type(error).__name__
     place = _place(error.__traceback__)
     # The last messages of all topics may follow.
-    first = str(error).strip().partition('\n')[0]
+    first = error_text(error).strip().partition('\n')[0]
     text = ''.join(traceback.format_exception(type(error), error, error.__traceback__))
     return Violation(
-        key=f'{kind}{place}',
+        key=printable_lines(f'{kind}{place}'),
         name=f'NoException{kind}',
         seconds=seconds(world),
-        text=text[-LONGEST_TEXT:],
+        text=printable_lines(text)[-LONGEST_TEXT:],
         message=f'{kind}: {first}'[:LONGEST_LINE] if first else kind,
     )
 

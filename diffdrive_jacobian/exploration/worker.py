@@ -14,6 +14,7 @@ import rclpy
 from diffdrive_jacobian.exploration.child import ChildDiedError, call_in_child, call_in_fresh_child
 from diffdrive_jacobian.exploration.errors import ExplorationError
 from diffdrive_jacobian.exploration.trial import DIED, Outcome, Setting, Trial, Violation, run
+from diffdrive_jacobian.text import error_text
 
 
 def packed(
@@ -29,7 +30,7 @@ def packed(
     except Exception as error:
         raise ExplorationError(
             'properties, cases and faults are sent to other processes, so they must be picklable: '
-            f'{type(error).__name__}: {error}'
+            f'{type(error).__name__}: {error_text(error)}'
         ) from error
 
 
@@ -114,4 +115,6 @@ def result_of(future: Future[list[Outcome]], timeout: float | None) -> list[Outc
     except Exception as error:
         if isinstance(error, FutureTimeoutError) and not future.done():
             raise NotEndedError from None
-        raise ExplorationError(f'a world could not be run: {type(error).__name__}: {error}') from error
+        raise ExplorationError(
+            f'a world could not be run: {type(error).__name__}: {error_text(error)}'
+        ) from error

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields
 from typing import Any
+
+LONG, SHOWN = 8, 2
+"""Length beyond which a message shows the beginning of a sequence only, and how many elements of it."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -16,6 +20,13 @@ class Expression:
 
     def __repr__(self) -> str:
         """Return the expression that makes this value."""
+        return self._expression(literal)
+
+    def __str__(self) -> str:
+        """Return the expression with long sequences cut, for messages."""
+        return self._expression(brief)
+
+    def _expression(self, literal: Callable[[Any], str]) -> str:
         shown = []
         for one in sorted(fields(self), key=lambda one: bool(one.kw_only)):
             value = getattr(self, one.name)
@@ -45,3 +56,11 @@ def literal(value: Any) -> str:
         inner = ', '.join(map(literal, value))
         return f'[{inner}]' if isinstance(value, list) else f'({inner}{"," * (len(value) == 1)})'
     return repr(value)
+
+
+def brief(value: Any) -> str:
+    """Return `literal` of a value, of a long sequence only the beginning."""
+    if isinstance(value, (list, tuple)) and len(value) > LONG:
+        first = literal(value[:SHOWN])
+        return f'{first[:-1]}, ... {len(value)} in all{first[-1]}'
+    return literal(value)

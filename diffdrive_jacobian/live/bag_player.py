@@ -15,11 +15,13 @@ from diffdrive_jacobian.live import settings
 from diffdrive_jacobian.live.commands import Command, Pause, Seek, SetSpeed, Step
 from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.live.recorded_runs import RecordedRobot
-from diffdrive_jacobian.live.robot_state import RobotState
+from diffdrive_jacobian.live.robot_state import TRUTH_LIFE, RobotState
 from diffdrive_jacobian.live.session import Session, Snapshot
 from diffdrive_jacobian.live.trail import MAX_POINTS, Trail
 from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.reading.trace import jumps
 
+Array = NDArray[np.float64]
 PERIOD = 1.0 / 30.0
 """Time between two states (s)."""
 STEP = 0.02
@@ -79,6 +81,7 @@ class BagPlayer:
             Snapshot(
                 robots=[film.shown(self.time) for film in self._films],
                 trails={film.robot.name: film.trail for film in self._films},
+                true_trails={film.robot.name: film.true_trail for film in self._films},
                 world={
                     'kind': 'bag',
                     'time': round(self.time, 3),
@@ -106,6 +109,27 @@ class BagPlayer:
             self._session.notify('this is a recording: it cannot be steered', 'warning')
 
 
+def _trail(times: Array, poses: Array, breaks: NDArray[np.intp]) -> tuple[Trail, list[float]]:
+    """Return a path with a bounded number of points, and the time of each (s).
+
+    Args:
+        times: Time of each pose, shape (n,) (s).
+        poses: `[x, y, ...]`, shape (n, k) (m).
+        breaks: Indices of the poses before which the path is interrupted.
+    """
+    trail, at = Trail(), []
+    step = max(1, len(times) // MAX_POINTS)
+    broken = set(breaks.tolist())
+    for index in range(0, len(times), step):
+        if any(one in broken for one in range(index - step + 1, index + 1)) and trail.points:
+            trail.points.append(None)
+            at.append(float(times[index]))
+        x, y = poses[index, :2].tolist()
+        trail.points.append((round(x, 4), round(y, 4)))
+        at.append(float(times[index]))
+    return trail, at
+
+
 class _Film:
     """One robot of a bag, at any time."""
 
@@ -116,17 +140,11 @@ class _Film:
         self._state.robot_values = run.of_node('virtual_robot')
         self._commands, self._wheels = robot.times(run.cmd_vel), robot.times(run.wheels)
         self._statuses = robot.run.goal_status.received
-        self.trail = Trail()
-        self._trail_times: list[float] = []
-        step = max(1, len(robot.time) // MAX_POINTS)
-        breaks = set(robot.trace.breaks.tolist())
-        for index in range(0, len(robot.time), step):
-            if any(one in breaks for one in range(index - step + 1, index + 1)) and self.trail.points:
-                self.trail.points.append(None)
-                self._trail_times.append(float(robot.time[index]))
-            x, y = run.odometry.values[index, :2].tolist()
-            self.trail.points.append((round(x, 4), round(y, 4)))
-            self._trail_times.append(float(robot.time[index]))
+        self._truths = np.maximum.accumulate(robot.times(run.ground_truth))
+        self.trail, self._trail_times = _trail(robot.time, run.odometry.values, robot.trace.breaks)
+        self.true_trail, self._true_times = _trail(
+            self._truths, run.ground_truth.values, jumps(run.ground_truth)
+        )
 
     def next(self, time: float) -> float:
         """Return the time of the next odometry (s)."""
@@ -144,8 +162,15 @@ class _Film:
         state.command = robot.latest(self._commands, run.cmd_vel, time, COMMAND_LIFE)
         state.wheels = robot.latest(self._wheels, run.wheels, time, WHEELS_LIFE)
         self._set_goal(index)
-        travelled = int(np.searchsorted(self._trail_times, time, side='right'))
-        shown = state.shown(age=max(0.0, time - state.time), by_hand=False, travelled=travelled)
+        latest = int(np.searchsorted(self._truths, time, side='right')) - 1
+        known = latest >= 0 and time - self._truths[latest] < TRUTH_LIFE
+        state.truth = run.ground_truth.values[latest, :3] if known else None
+        travelled, truly = (
+            int(np.searchsorted(times, time, side='right'))
+            for times in (self._trail_times, self._true_times)
+        )
+        age = max(0.0, time - state.time)
+        shown = state.shown(age=age, by_hand=False, travelled=travelled, truly_travelled=truly)
         assert shown is not None
         return shown
 
@@ -159,7 +184,7 @@ class _Film:
         route = np.flatnonzero(run.goals.received == stamp)
         goal.goals = run.goals.values[route]
         goal.index = int(np.searchsorted(route, number))
-        reached = bool(np.isnan(trace.heading_error[index]))
+        reached = bool(np.isnan(trace.bearing_error[index]))
         goal.state = GoalState.SUCCEEDED if reached else GoalState.EXECUTING
 
     def settings(self) -> list[dict[str, Any]]:
@@ -177,12 +202,13 @@ class _Film:
         robot, run, trace = self.robot, self.robot.run, self.robot.trace
         chosen = np.unique(np.linspace(0, len(robot.time) - 1, STRIP_POINTS).astype(np.intp))
         at = robot.time[chosen]
-        curves: dict[str, NDArray[np.float64]] = {
+        curves: dict[str, Array] = {
             'time': at,
             'v': run.odometry.values[chosen, 3],
             'omega': run.odometry.values[chosen, 4],
             'distance': trace.distance[chosen],
-            'heading_error': trace.heading_error[chosen],
+            'bearing_error': trace.bearing_error[chosen],
+            'goal_heading_error': trace.goal_heading_error[chosen],
         }
         for names, times, series in (
             (('command_v', 'command_omega'), self._commands, run.cmd_vel),

@@ -152,9 +152,10 @@ def _number(low: float, high: float) -> Callable[[str, Any], float]:
 
 
 def _text(name: str, value: Any) -> str:
-    if not isinstance(value, str) or len(value) > MAX_TEXT:
+    # Nodes cannot encode a lone surrogate, and cut a text at NUL.
+    if not isinstance(value, str) or len(value) > MAX_TEXT or not value.isprintable():
         raise CommandError(
-            f'{name} must be a text of at most {MAX_TEXT} characters, got {_short(value)}'
+            f'{name} must be a text of at most {MAX_TEXT} printable characters, got {_short(value)}'
         )
     return value
 
@@ -176,7 +177,7 @@ def _setting(name: str, value: Any) -> float | str | bool | None:
 
 
 _position = _number(-MAX_POSITION, MAX_POSITION)
-_angle = _number(-2.0 * math.tau, 2.0 * math.tau)
+_angle = _number(-math.tau, math.tau)
 _velocity = _number(-MAX_SPEED, MAX_SPEED)
 _plausible = _number(-1e6, 1e6)
 _READERS: dict[str, Callable[[str, Any], Any]] = {

@@ -31,7 +31,9 @@ class GoalEnd(NamedTuple):
     pose: NDArray[np.float64] | None
     """`[x, y, theta]` of the robot, shape (3,) (m, m, rad). None: there is no odometry."""
     distance: float
-    """Distance from the driven point to the goal (m). NaN without odometry."""
+    """Distance from the driven point to the goal by the odometry (m). NaN without odometry."""
+    true_distance: float
+    """The same by the ground truth (m). NaN: it is not known."""
 
 
 class GoalProgress:
@@ -61,6 +63,11 @@ class GoalProgress:
     def current(self) -> NDArray[np.float64] | None:
         """The goal that is driven to, shape (3,). None: none or unknown."""
         return None if self.goals is None or not self.active else self.goals[self.index]
+
+    @property
+    def last(self) -> bool:
+        """Whether the goal that is driven to is the last one."""
+        return self.goals is not None and self.index == len(self.goals) - 1
 
     def remaining(self, *, fresh: bool = False) -> NDArray[np.float64]:
         """Return the goals that are not reached yet, shape (n, 3).

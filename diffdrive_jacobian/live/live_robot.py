@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,6 @@ from diffdrive_jacobian.live.parameter_link import ParameterLink
 from diffdrive_jacobian.live.robot_state import RobotState
 from diffdrive_jacobian.live.robot_topics import RobotTopics
 from diffdrive_jacobian.live.session import Session
-from diffdrive_jacobian.live.trail import Trail
 from diffdrive_jacobian.live.trigger_link import TriggerLink
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
@@ -50,6 +50,16 @@ SERVICES = {
     'reset_odometry': 'the odometry cannot be reset',
 }
 """Services of a robot, and what it means if they fail."""
+
+
+def _motion(message: Any) -> tuple[float, NDArray[np.float64], tuple[float, float]]:
+    """Return stamp (s), pose (m, m, rad) and twist (m/s, rad/s) of an odometry.
+
+    Raises:
+        MessageError: A value is invalid.
+    """
+    pose, twist = messages.from_pose(message.pose.pose), messages.from_twist(message.twist.twist)
+    return seconds(messages.from_time(message.header.stamp)), pose, twist
 
 
 class LiveRobot:
@@ -102,6 +112,10 @@ class LiveRobot:
         odometry = self.topics.odometry.take()
         if odometry is not None:
             self._on_odometry(odometry, now)
+        truth = self.topics.truth.take()
+        if truth is not None:
+            with suppress(MessageError):
+                self.state.truly_moved(*_motion(truth))
         joints = self.topics.joints.take()
         if joints is not None:
             try:
@@ -120,9 +134,7 @@ class LiveRobot:
 
     def _on_odometry(self, message: Any, now: float) -> None:
         try:
-            pose = messages.from_pose(message.pose.pose)
-            twist = messages.from_twist(message.twist.twist)
-            stamp = messages.from_time(message.header.stamp)
+            stamp, pose, twist = _motion(message)
         except MessageError:
             return
         try:
@@ -130,7 +142,7 @@ class LiveRobot:
         except MessageError:
             covariance = None
         self._seen, self._frame = now, message.header.frame_id
-        self.state.moved(seconds(stamp), pose, twist, covariance)
+        self.state.moved(stamp, pose, twist, covariance)
 
     def _on_goal_pose(self, message: PoseStamped) -> None:
         self._on_poses([message], message.header.stamp)
@@ -187,7 +199,7 @@ class LiveRobot:
                 self.topics.publish_pose(pose, self._frame, self._now())
                 self.state.interrupt()
         elif isinstance(command, ClearPath):
-            self.state.trail = Trail()
+            self.state.clear_path()
         elif isinstance(command, SetParameter):
             self._set(command)
 
@@ -307,9 +319,14 @@ class LiveRobot:
         self.topics.destroy()
         for service in self._services.values():
             service.destroy()
+        for link in self.links.values():
+            link.destroy()
 
     def use_nodes(self, found: dict[str, str]) -> None:
         """Take the nodes that have the parameters, by role."""
         for role, name in found.items():
-            if role not in self.links or self.links[role].target != name:
+            link = self.links.get(role)
+            if link is not None and link.target != name:
+                link.destroy()
+            if link is None or link.target != name:
                 self.links[role] = ParameterLink(self._node, name)

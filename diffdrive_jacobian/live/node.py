@@ -21,6 +21,7 @@ from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.parameter_values import changed_parameters
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
+from diffdrive_jacobian.text import printable
 
 NAME = 'live_page'
 """Name of the node."""
@@ -32,7 +33,10 @@ MAX_ROBOTS = 16
 """Largest number of robots that are shown."""
 LOST = 30.0
 """Time without odometry and publisher after which a robot is no longer shown (s)."""
-TOPICS = ('odom', 'joint_states', 'cmd_vel', 'goal_pose', 'goals', 'goal_status', 'initialpose')
+TOPICS = (
+    *('odom', 'ground_truth', 'joint_states', 'cmd_vel', 'goal_pose', 'goals', 'goal_status'),
+    'initialpose',
+)
 
 
 class LivePage(Node):  # type: ignore[misc]
@@ -64,6 +68,7 @@ class LivePage(Node):  # type: ignore[misc]
         """Robots by namespace."""
         self._names = {topic: self.resolve_topic_name(topic).rpartition('/')[2] for topic in TOPICS}
         self._refused: set[str] = set()
+        self._unshown: list[str] = []
         self._discovered = self._worked = -1.0
         received = ignoring_invalid(ParameterEvent, self._on_parameter_event)
         self.create_subscription(ParameterEvent, '/parameter_events', received, 10, raw=True)
@@ -99,11 +104,22 @@ class LivePage(Node):  # type: ignore[misc]
         return Snapshot(
             robots=[one for one in shown.values() if one is not None],
             trails={name: robot.state.trail for name, robot in self.robots.items()},
+            true_trails={name: robot.state.true_trail for name, robot in self.robots.items()},
             world={'kind': 'robots'} if self._pacing is None else self._pacing.shown(),
             fixed={
                 'settings': {name: robot.settings() for name, robot in self.robots.items()},
+                'notes': self._notes(),
             },
         )
+
+    def _notes(self) -> list[str]:
+        """Return what the page does not show although it is there."""
+        count = len(self._unshown)
+        if not count:
+            return []
+        names = ', '.join(printable(name, 40) for name in self._unshown[:3])
+        more = ', ...' if count > 3 else ''
+        return [f'at most {MAX_ROBOTS} robots are shown; {count} more publish odometry: {names}{more}']
 
     def _obey(self, page: int, command: Command) -> None:
         if isinstance(command, (Pause, Step, SetSpeed, Seek)):
@@ -127,6 +143,7 @@ class LivePage(Node):  # type: ignore[misc]
 
     def _discover(self) -> None:
         types = dict(self.get_topic_names_and_types())
+        self._unshown = []
         for topic, kinds in types.items():
             namespace, _, name = topic.rpartition('/')
             if name == self._names['odom'] and 'nav_msgs/msg/Odometry' in kinds:
@@ -145,10 +162,13 @@ class LivePage(Node):  # type: ignore[misc]
                 self._refuse(robot.topics.full('cmd_vel'), error)
 
     def _add(self, namespace: str) -> None:
-        if namespace in self.robots or namespace in self._refused or len(self.robots) >= MAX_ROBOTS:
+        if namespace in self.robots or namespace in self._refused:
             return
         if not self._nodes(f'{namespace.rstrip("/")}/{self._names["odom"]}'):
             # Only somebody who listens, or the publisher's node is not discovered yet.
+            return
+        if len(self.robots) >= MAX_ROBOTS:
+            self._unshown.append(namespace)
             return
         try:
             self.robots[namespace] = LiveRobot(

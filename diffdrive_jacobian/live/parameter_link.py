@@ -47,6 +47,14 @@ class ParameterLink:
             self._client.remove_pending_request(one[1])
             one[2](False, f'{printable(self.target)} did not answer within {PATIENCE:g} s')
 
+    def destroy(self) -> None:
+        """Destroy the clients. Who waits for an answer gets a refusal."""
+        self._query.destroy()
+        for _, _, answer in self._waiting:
+            answer(False, f'{printable(self.target)} is gone')
+        if self._client is not None:
+            self._node.destroy_client(self._client)
+
     def changed(self, values: Mapping[str, Any]) -> None:
         """Take new values from a parameter event."""
         self.values.update(values)

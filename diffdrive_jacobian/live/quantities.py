@@ -57,7 +57,7 @@ def region(covariance: Array) -> dict[str, Any] | None:
 
 
 def errors(pose: Array, goal: Array, offset: float) -> Pair:
-    """Return the distance of the driven point to a goal (m), and the heading error (rad).
+    """Return the distance of the driven point to a goal (m), and the bearing error (rad).
 
     Args:
         pose: `[x, y, theta]`, shape (3,).

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.control import Arrival, LawError
 from diffdrive_jacobian.control.controllers import BUILT_IN
+from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.live import quantities
 from diffdrive_jacobian.live.goal_progress import GoalEnd, GoalProgress
 from diffdrive_jacobian.live.quantities import rounded
@@ -21,6 +22,7 @@ from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.reading.run import number
+from diffdrive_jacobian.reading.trace import heading_counts
 
 ROBOT_DEFAULTS = VirtualRobotParameters()
 CONTROLLER_DEFAULTS = GoToGoalParameters()
@@ -29,6 +31,8 @@ PLACED_JUMP = 0.03
 """Step from which the path of a robot is interrupted that is being placed (m)."""
 PLACED_LIFE = 15
 """Number of odometry messages within which that counts."""
+TRUTH_LIFE = 1.0
+"""Difference of the stamps of odometry and ground truth up to which both are shown (s)."""
 MIN_LENGTH = 1e-4
 """Smallest wheel radius and separation that count (m). Parameters of any node may be anything."""
 
@@ -36,6 +40,11 @@ MIN_LENGTH = 1e-4
 def _number(values: Values, name: str, default: float) -> float:
     value = number(values.get(name))
     return value if math.isfinite(value) else default
+
+
+def _longest(elapsed: float, *twists: tuple[float, float]) -> float:
+    """Return how long a motion is at most (m): three times what speed and time (s) say."""
+    return 3.0 * max(abs(v) for v, _ in twists) * abs(elapsed)
 
 
 class RobotState:
@@ -58,6 +67,10 @@ class RobotState:
         """Latest cmd_vel. None: none was received lately."""
         self.goal = GoalProgress()
         self.trail = Trail()
+        self.truth: NDArray[np.float64] | None = None
+        """Pose by ground_truth. None: none was received lately."""
+        self.true_trail = Trail()
+        self._true_time = 0.0
         self._placed = 0
         self.robot_values: Values = {}
         """Parameters of the node that publishes odom."""
@@ -108,9 +121,7 @@ class RobotState:
         offset = 0.0
         if controller is not None and controller.offset:
             offset = _number(values, controller.offset, CONTROLLER_DEFAULTS.offset)
-        heading = values.get('use_goal_heading') is True or (
-            controller is not None and controller.takes_heading
-        )
+        heading = heading_counts(values)
         return Arrival(xy_tolerance=max(tolerance, 0.0), use_heading=heading, offset=offset)
 
     def goal_end(self) -> GoalEnd:
@@ -118,13 +129,11 @@ class RobotState:
         state, goals = self.goal.state, self.goal.goals
         assert goals is not None
         goal = goals[-1 if state is GoalState.SUCCEEDED else self.goal.index]
-        distance = math.nan
-        if self.pose is not None:
-            x, y, theta = self.pose.tolist()
-            offset = float(self.arrival.offset)
-            x, y = x + offset * math.cos(theta), y + offset * math.sin(theta)
-            distance = math.hypot(float(goal[0]) - x, float(goal[1]) - y)
-        return GoalEnd(self.name, state, goal, self.pose, distance)
+        distance, true_distance = (
+            math.nan if pose is None else quantities.errors(pose, goal, self.arrival.offset)[0]
+            for pose in (self.pose, self.truth)
+        )
+        return GoalEnd(self.name, state, goal, self.pose, distance, true_distance)
 
     def moved(
         self,
@@ -134,16 +143,27 @@ class RobotState:
         covariance: NDArray[np.float64] | None,
     ) -> None:
         """Take an odometry."""
-        # A motion is at most three times as long as speed and time say.
-        far = 3.0 * max(abs(twist[0]), abs(self.twist[0])) * abs(time - self.time)
         jump = JUMP
         if self._placed:
             self._placed, jump = self._placed - 1, PLACED_JUMP
+        far = _longest(time - self.time, twist, self.twist)
         self.trail = self.trail.extended(float(pose[0]), float(pose[1]), max(jump, far))
         self.time, self.pose, self.twist = time, pose, twist
+        if abs(time - self._true_time) > TRUTH_LIFE:
+            self.truth = None
         if covariance is not None:
             self.covariance = covariance
         self.goal.moved(pose, self.arrival)
+
+    def truly_moved(self, time: float, pose: NDArray[np.float64], twist: tuple[float, float]) -> None:
+        """Take a ground truth."""
+        far = _longest(time - self._true_time, twist, self.twist)
+        self.true_trail = self.true_trail.extended(float(pose[0]), float(pose[1]), max(JUMP, far))
+        self._true_time, self.truth = time, pose
+
+    def clear_path(self) -> None:
+        """Forget the paths."""
+        self.trail, self.true_trail = Trail(), Trail()
 
     def interrupt(self) -> None:
         """Expect a jump of the path: the robot is placed elsewhere."""
@@ -161,9 +181,13 @@ class RobotState:
             return None
         arrival, geometry = self.arrival, self.geometry
         target = self.goal.current
-        distance, error = (
-            (None, None) if target is None else quantities.errors(self.pose, target, arrival.offset)
-        )
+        distance = bearing = heading = true_distance = None
+        if target is not None:
+            distance, bearing = quantities.errors(self.pose, target, arrival.offset)
+            if self.truth is not None:
+                true_distance, _ = quantities.errors(self.truth, target, arrival.offset)
+            if arrival.use_heading and self.goal.last:
+                heading = wrap_angle(target[2] - self.pose[2])
         command = self.command or (0.0, 0.0)
         return {
             'name': self.name,
@@ -178,7 +202,10 @@ class RobotState:
             'use_heading': arrival.use_heading,
             'offset': arrival.offset,
             'distance': rounded(distance),
-            'heading_error': rounded(error),
+            'true_distance': rounded(true_distance),
+            'bearing_error': rounded(bearing),
+            'goal_heading_error': rounded(heading),
+            'truth': rounded(self.truth),
             'law': self._law(target),
             'by_hand': by_hand,
             'commanded': self.command is not None,

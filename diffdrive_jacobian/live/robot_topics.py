@@ -20,7 +20,7 @@ from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.ros.rclpy_internals import Polled, waiting_messages
-from diffdrive_jacobian.ros.serialization import MAX_SIZE, deserialized, ignoring_invalid
+from diffdrive_jacobian.ros.serialization import MAX_SIZE, checked_reader, ignoring_invalid
 from diffdrive_jacobian.ros.topic_errors import explaining_failure, type_name
 
 T = TypeVar('T')
@@ -48,7 +48,8 @@ class Latest:
         Raises:
             ParameterError: The topic has another type in this process.
         """
-        self._kind, self._polled = kind, polled
+        self._read: Callable[[bytes], Any] = checked_reader(kind)
+        self._polled = polled
         self._data: bytes | None = None
         group = Polled() if polled else None
         with explaining_failure(node, kind, topic):
@@ -69,7 +70,7 @@ class Latest:
         if latest is None or len(latest) > MAX_SIZE:
             return None
         try:
-            return deserialized(latest, self._kind)
+            return self._read(latest)
         except MessageError:
             return None
 
@@ -97,6 +98,7 @@ class RobotTopics:
         self._publishers: dict[str, Publisher] = {}
         self.odometry = Latest(node, Odometry, self.full('odom'), polled=polled)
         self.joints = Latest(node, JointState, self.full('joint_states'), polled=polled)
+        self.truth = Latest(node, Odometry, self.full('ground_truth'), polled=polled)
         self.command: Latest | None = None
         """cmd_vel. None: nobody publishes or reads it yet."""
         self.twist_type: type = Twist
@@ -190,7 +192,7 @@ class RobotTopics:
 
     def destroy(self) -> None:
         """Destroy all subscriptions and publishers."""
-        for latest in (self.odometry, self.joints, self.command):
+        for latest in (self.odometry, self.joints, self.truth, self.command):
             if latest is not None:
                 latest.destroy(self._node)
         for subscription in self._subscriptions:

@@ -9,7 +9,9 @@ import logging
 import socket
 import threading
 import time
+from functools import partial
 from http import HTTPStatus
+from typing import Any
 
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
@@ -29,6 +31,8 @@ MAX_PAGES = 8
 """Largest number of pages at once."""
 COMMAND_RATE, COMMAND_BURST = 100.0, 200.0
 """Commands of a page per second, and at once. A page that sends more is disconnected."""
+MAX_STRANGERS = 32
+"""Largest number of connections at once without a websocket, and of those that wait to be accepted."""
 MAX_INVALID = 20
 """Invalid commands after which a page is disconnected."""
 PING_PERIOD = 2.0
@@ -37,6 +41,32 @@ PATIENCE = 5.0
 """Longest wait for the thread of the server (s)."""
 POLICY_VIOLATION, TRY_AGAIN_LATER = 1008, 1013
 """Codes with which a websocket is closed."""
+
+
+class _Connection(ServerConnection):
+    """A connection that is aborted if too many others come before it has shown the token.
+
+    Otherwise they would exhaust the descriptors of the process, in which nodes may run.
+    """
+
+    def __init__(
+        self, *args: Any, strangers: dict[ServerConnection, asyncio.Transport], **kwargs: Any
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        self._strangers = strangers
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        assert isinstance(transport, asyncio.Transport)
+        self._strangers[self] = transport
+        if len(self._strangers) > MAX_STRANGERS:
+            # A browser has sent its request by now: the oldest one is none.
+            oldest = next(iter(self._strangers))
+            self._strangers.pop(oldest).abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._strangers.pop(self, None)
+        super().connection_lost(exc)
 
 
 class LiveServer:
@@ -59,6 +89,7 @@ class LiveServer:
         self._socket = socket.create_server((ADDRESS, port))
         self.port: int = self._socket.getsockname()[1]
         """TCP port."""
+        self._strangers: dict[ServerConnection, asyncio.Transport] = {}
         self._loop = asyncio.new_event_loop()
         self._closing = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name='live page', daemon=True)
@@ -101,9 +132,13 @@ class LiveServer:
         # Who cannot connect is told so. Nothing of that is for the terminal.
         logger.addHandler(logging.NullHandler())
         logger.propagate = False
+        # Any factory does, as it says.
+        bounded: Any = partial(_Connection, strangers=self._strangers)
         server = await serve(
             self._handle,
             sock=self._socket,
+            backlog=MAX_STRANGERS,
+            create_connection=bounded,
             process_request=self._answer,
             compression=None,
             max_size=MAX_SIZE,
@@ -118,9 +153,10 @@ class LiveServer:
         await self._closing.wait()
         await self._close(server)
 
-    @staticmethod
-    async def _close(server: Server) -> None:
+    async def _close(self, server: Server) -> None:
         server.close()
+        for transport in self._strangers.values():
+            transport.abort()
         with contextlib.suppress(asyncio.TimeoutError):
             await asyncio.wait_for(server.wait_closed(), 0.5)
 
@@ -136,6 +172,7 @@ class LiveServer:
         if kind == 'redirect':
             return _response(HTTPStatus.SEE_OTHER, 'text/plain', b'', Location=name)
         if kind == 'socket':
+            self._strangers.pop(connection, None)
             return None
         if name not in self._files:
             return _response(HTTPStatus.NOT_FOUND, 'text/plain', b'there is no such file\n')

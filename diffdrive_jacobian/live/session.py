@@ -32,6 +32,8 @@ class Snapshot:
     """One JSON object for each robot; `name` is unique."""
     trails: Mapping[str, Trail] = field(default_factory=dict)
     """Path of each robot, by name."""
+    true_trails: Mapping[str, Trail] = field(default_factory=dict)
+    """Its path by the ground truth, by name."""
     world: Mapping[str, Any] = field(default_factory=dict)
     """Simulated time or bag: what can be controlled."""
     fixed: Mapping[str, Any] = field(default_factory=dict)
@@ -47,7 +49,7 @@ class Page:
         self._version = -1
         self._notice = notice
         self._fixed: Mapping[str, Any] | None = None
-        self._trails: dict[str, tuple[Trail, int]] = {}
+        self._trails: dict[tuple[str, str], tuple[Trail, int]] = {}
 
     def frame(self, session: Session) -> dict[str, Any] | None:
         """Return what has changed since the last frame. None: nothing."""
@@ -62,11 +64,15 @@ class Page:
             frame['notices'] = notices
         if snapshot.fixed != self._fixed:
             self._fixed = frame['fixed'] = snapshot.fixed
-        paths = {name: self._path(name, trail) for name, trail in snapshot.trails.items()}
-        frame['paths'] = {name: path for name, path in paths.items() if path is not None}
+        frame['paths'] = self._paths('paths', snapshot.trails)
+        frame['true_paths'] = self._paths('true_paths', snapshot.true_trails)
         return frame
 
-    def _path(self, name: str, trail: Trail) -> dict[str, Any] | None:
+    def _paths(self, kind: str, trails: Mapping[str, Trail]) -> dict[str, Any]:
+        paths = {name: self._path((kind, name), trail) for name, trail in trails.items()}
+        return {name: path for name, path in paths.items() if path is not None}
+
+    def _path(self, name: tuple[str, str], trail: Trail) -> dict[str, Any] | None:
         known, count = self._trails.get(name, (None, 0))
         start = count if known is trail else 0
         points = trail.points[start:]

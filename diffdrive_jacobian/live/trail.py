@@ -7,7 +7,7 @@ import math
 MAX_POINTS = 6000
 """Largest number of points of a path."""
 SPACING = 0.01
-"""Distance between two points of a path (m). It doubles when the path is full."""
+"""Distance between two points of a path (m). It doubles when the path is full, unless jumps fill it."""
 JUMP = 0.3
 """A longer step is not a motion: the path is interrupted (m)."""
 
@@ -39,6 +39,11 @@ class Trail:
         return self if len(self.points) < MAX_POINTS else self._thinned()
 
     def _thinned(self) -> Trail:
+        if self.points.count(None) > MAX_POINTS // 4:
+            # Pieces would not become fewer: the oldest are forgotten.
+            trail = Trail(self._spacing)
+            trail.points = self.points[MAX_POINTS // 2 :]
+            return trail
         trail = Trail(2.0 * self._spacing)
         trail.points = [
             point for index, point in enumerate(self.points) if point is None or index % 2 == 0

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import inspect
 import sys
+import threading
 from collections import deque
 from collections.abc import Callable, Container, Iterable
 from typing import Any, TypeAlias
@@ -42,6 +43,10 @@ class Deliveries:
         """Creates the reader of a subscription of a node."""
         self.held: set[str] = set()
         """Topics whose messages are not polled: they come from other processes, see `_external`."""
+        self.thread = threading.get_ident()
+        """The thread of the nodes."""
+        self.elsewhere: dict[Any, str] = {}
+        """Publishers, clients and services that another thread has used, with its name."""
         self._readers: dict[Subscription, Reader] = {}
         self._by_topic: dict[str, list[Reader]] = {}
         self._observers: dict[str, list[Delivered]] = {}
@@ -87,6 +92,10 @@ class Deliveries:
         reader = self.new_reader(subscription, node)
         reader.owner, reader.observers = node, self.observers_of(reader.topic)
         return reader
+
+    def note_thread(self, entity: Any) -> None:
+        """Note that this thread, another one, uses a publisher, client or service."""
+        self.elsewhere[entity] = threading.current_thread().name
 
     def replace(self, nodes: Iterable[Node]) -> None:
         """Create the readers of all present subscriptions again, by `new_reader`."""

@@ -13,6 +13,10 @@ class LockstepError(Exception):
     """
 
 
+class InitializedError(LockstepError, RuntimeError):
+    """The user has called `rclpy.init`. A RuntimeError, as without lockstep."""
+
+
 class IneffectiveFaultsError(LockstepError):
     """Injected faults met nothing that they could affect."""
 
@@ -61,5 +65,5 @@ class PropertyViolation(LockstepError):  # noqa: N818
 
     def __str__(self) -> str:
         """Return the message."""
-        first = f'{self.property!r} is violated at {self.seconds:g} s: {self.text}'
+        first = f'{self.property} is violated at {self.seconds:g} s: {self.text}'
         return f'{first}\n{self.report}' if self.report else first

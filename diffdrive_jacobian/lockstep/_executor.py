@@ -10,6 +10,7 @@ that vary.
 from __future__ import annotations
 
 import inspect
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -88,10 +89,12 @@ class QuiescentExecutor:
 
     def _noting(self, send: Callable[..., Any]) -> Callable[..., Any]:
         """Return a method that sends a request or a response, and takes its place among the messages."""
-        pending = self.deliveries.pending
+        deliveries, pending = self.deliveries, self.deliveries.pending
 
-        def sent(*args: Any, **kwargs: Any) -> Any:
-            result = send(*args, **kwargs)
+        def sent(entity: Any, *args: Any, **kwargs: Any) -> Any:
+            if threading.get_ident() != deliveries.thread:
+                deliveries.note_thread(entity)
+            result = send(entity, *args, **kwargs)
             pending.append(None)
             return result
 

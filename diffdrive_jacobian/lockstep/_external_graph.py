@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+from rclpy.duration import Infinite
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import (
     DurabilityPolicy,
+    LivelinessPolicy,
     QoSCompatibility,
     QoSProfile,
     qos_check_compatible,
@@ -84,7 +86,7 @@ class ExternalGraph:
         """Yield what a publisher of the world still lacks."""
         topic = publisher.topic_name
         infos = self._node.get_subscriptions_info_by_topic(topic)
-        wanted = sum(_compatible(publisher.qos_profile, info.qos_profile) for info in infos)
+        wanted = sum(compatible(publisher.qos_profile, info.qos_profile) for info in infos)
         matched = publisher.get_subscription_count()
         if matched < wanted:
             yield f'the publisher of {topic} is matched with {matched} of {wanted} subscriptions'
@@ -99,24 +101,36 @@ class ExternalGraph:
             if info.topic_type != own_type:
                 yield f'{where} is of type {own_type}, the publisher of {info.topic_type}'
                 return
-            if not _compatible(info.qos_profile, requested):
+            if not compatible(info.qos_profile, requested):
                 yield (
-                    f'{where} and its publisher have incompatible QoS: {_qos(requested)}, and '
-                    f'{_qos(info.qos_profile)}'
+                    f'{where} and its publisher have incompatible QoS: {qos_name(requested)}, and '
+                    f'{qos_name(info.qos_profile)}'
                 )
                 return
-        wanted = sum(_compatible(info.qos_profile, requested) for info in infos)
+        wanted = sum(compatible(info.qos_profile, requested) for info in infos)
         matched = subscription.get_publisher_count()
         if matched < wanted:
             yield f'{where} is matched with {matched} of {wanted} publishers'
 
 
-def _compatible(offered: QoSProfile, requested: QoSProfile) -> bool:
+def compatible(offered: QoSProfile, requested: QoSProfile) -> bool:
+    """Return whether a publisher and a subscription with these profiles are matched."""
+    lease = offered.liveliness_lease_duration
+    # What is not given is 0 in a profile, and infinite in the graph, to which rmw compares it.
+    offered = QoSProfile(
+        depth=1,
+        reliability=offered.reliability,
+        durability=offered.durability,
+        deadline=offered.deadline if offered.deadline.nanoseconds else Infinite,
+        liveliness=offered.liveliness or LivelinessPolicy.AUTOMATIC,
+        liveliness_lease_duration=lease if lease.nanoseconds else Infinite,
+    )
     compatibility, _ = qos_check_compatible(offered, requested)
     return bool(compatibility != QoSCompatibility.ERROR)
 
 
-def _qos(profile: QoSProfile) -> str:
+def qos_name(profile: QoSProfile) -> str:
+    """Return what decides whether a profile is compatible, in words."""
     latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
     return f'{profile.reliability.name.lower()}, {"transient local" if latched else "volatile"}'
 

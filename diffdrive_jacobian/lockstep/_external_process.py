@@ -12,7 +12,7 @@ import threading
 import time
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
@@ -27,6 +27,8 @@ CLOSING = 5.0
 """Time for a process to end after SIGINT (s). Then it is killed."""
 NAP = 0.005
 """Period at which the end of a process is checked (s)."""
+WORLD = 'LOCKSTEP_WORLD'
+"""Environment variable of all processes that a world has started, and of those that they start."""
 _numbers = itertools.count()
 
 
@@ -79,7 +81,7 @@ class ExternalProcess:
         Args:
             command: The program and its arguments.
             environment: Variables that differ from those of this process.
-            directory: Folder for what it prints.
+            directory: Folder for what it prints, of the world alone.
             cwd: Its working directory; None: that of this process.
 
         Raises:
@@ -87,6 +89,8 @@ class ExternalProcess:
         """
         self.command = shlex.join(command)
         """The command line."""
+        self.world = str(directory)
+        """What identifies the world that has started it."""
         self.ended_by_test = False
         """Whether the test has ended it."""
         self._kept: dict[int, str] = {}
@@ -107,7 +111,7 @@ class ExternalProcess:
                     stdin=subprocess.DEVNULL,
                     stdout=out,
                     stderr=err,
-                    env={**inherited, **environment},
+                    env={**inherited, **environment, WORLD: str(directory)},
                     cwd=cwd,
                     # With a group of its own, so that children, as of `ros2 run`, receive signals, too.
                     start_new_session=True,
@@ -211,12 +215,31 @@ def _children_receive_sigint() -> Iterator[None]:
 
 
 def end_all(processes: Sequence[ExternalProcess]) -> None:
-    """End processes at the same time."""
+    """End processes at the same time, with all that they have started."""
     for process in processes:
         process.signal(signal.SIGCONT)
         process.signal(signal.SIGINT)
     for process in processes:
         process.close()
+    for world in {process.world for process in processes}:
+        # They may start others meanwhile.
+        while left := list(_processes_of(world)):
+            for pid in left:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            time.sleep(NAP)
+
+
+def _processes_of(world: str) -> Iterator[int]:
+    """Yield the ids of the processes that a world has started, also in sessions of their own.
+
+    Only on Linux. The variable is not there any more if a program has replaced its environment.
+    """
+    marked = f'{WORLD}={world}'.encode()
+    for variables in Path('/proc').glob('[0-9]*/environ'):
+        with suppress(OSError):
+            if marked in variables.read_bytes().split(b'\0'):
+                yield int(variables.parent.name)
 
 
 def _signal_name(number: int) -> str:

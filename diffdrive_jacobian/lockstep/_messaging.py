@@ -10,7 +10,9 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from diffdrive_jacobian.lockstep._deliveries import is_latched
 from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._external_graph import compatible, node_name, qos_name
 from diffdrive_jacobian.lockstep._simulated_time import SimulatedTime
 from diffdrive_jacobian.ros.rclpy_internals import SERVICES_OF_RCLPY
 
@@ -27,15 +29,21 @@ class Messaging(SimulatedTime):
     def __init__(self, start: int) -> None:
         """Start at a time (ns)."""
         super().__init__(start)
-        self._publishers: dict[tuple[type, str], Publisher] = {}
+        self._publishers: dict[tuple[type, str, bool], Publisher] = {}
         self._all_served: dict[Publisher, tuple[int, int]] = {}
 
-    def publish(self, topic: str, message: Any) -> None:
+    def publish(self, topic: str, message: Any, *, latched: bool = False) -> None:
         """Publish a message and execute all callbacks that it causes (within a callback: later).
 
+        Args:
+            topic: Name of the topic.
+            message: The message.
+            latched: Whether latched (transient local) subscriptions receive it, too, also later ones.
+
         Raises:
-            LockstepError: The topic has no subscription, or another type, or it is subscribed to by a
-                node that was not added. Or the arguments are no topic and no message.
+            LockstepError: The topic has no subscription (and the message is not latched), one of another
+                quality of service, or another type, or it is subscribed to by a node that was not added.
+                Or the arguments are no topic and no message.
         """
         self._check_open()
         if not isinstance(topic, str) or not _is_message(message):
@@ -44,30 +52,53 @@ class Messaging(SimulatedTime):
             if isinstance(message, (bytes, bytearray, memoryview)):
                 hint = '; serialized messages: node.create_publisher(TYPE, TOPIC, 10).publish(BYTES)'
             raise LockstepError(f'publish takes a topic and a message, got {got}{hint}')
-        key = type(message), topic
+        key = type(message), topic, latched
         if key not in self._publishers:
+            profile = QoSProfile(depth=10)
+            if latched:
+                profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
             create = self.node.create_publisher
-            self._publishers[key] = self._with_type(topic, create, *key, 10)
+            self._publishers[key] = self._with_type(topic, create, type(message), topic, profile)
         publisher = self._publishers[key]
         self._settle_unless_busy()
         self.connect()
         subscriptions = publisher.get_subscription_count()
-        if subscriptions == 0 and self._external is not None and not self._busy:
+        if subscriptions == 0 and not latched and self._external is not None and not self._busy:
             self._external.waiting.for_subscription(publisher)
             self.connect()
             subscriptions = publisher.get_subscription_count()
-        if subscriptions == 0:
-            raise LockstepError(
-                f'{publisher.topic_name} has no subscription of type {_type_name(type(message))}\n'
-                f'{self.report()}'
-            )
         # Both: a node that was not added may have come in place of one that was removed.
         counts = subscriptions, len(self._executor.deliveries.readers_of(publisher.topic_name))
-        if counts != self._all_served.get(publisher):
+        if counts != self._all_served.get(publisher) or subscriptions == 0:
+            self._check_compatible(topic, publisher)
+            if subscriptions == 0 and not latched:
+                raise LockstepError(
+                    f'{publisher.topic_name} has no subscription of type {_type_name(type(message))}\n'
+                    f'{self.report()}'
+                )
             self._check_all_served(topic, publisher.topic_name)
             self._all_served[publisher] = counts
         publisher.publish(message)
         self._settle_unless_busy()
+
+    def _check_compatible(self, given: str, publisher: Publisher) -> None:
+        """Check that all subscriptions of a topic receive what a publisher sends.
+
+        Args:
+            given: Name of the topic, before it is remapped.
+            publisher: The publisher.
+        """
+        offered = publisher.qos_profile
+        for info in self.node.get_subscriptions_info_by_topic(given):
+            requested = info.qos_profile
+            if info.topic_type == _type_name(publisher.msg_type) and not compatible(offered, requested):
+                volatile = offered.durability != DurabilityPolicy.TRANSIENT_LOCAL
+                hint = ': publish(..., latched=True)' if volatile and is_latched(info) else ''
+                raise LockstepError(
+                    f'{publisher.topic_name} is subscribed to by {node_name(info)} with the quality of '
+                    f'service {qos_name(requested)}, and published with {qos_name(offered)}, which does '
+                    f'not reach it{hint}\n{self.report()}'
+                )
 
     def _check_all_served(self, given: str, topic: str) -> None:
         """Check that all subscriptions of a topic are those of nodes that were added.
@@ -117,6 +148,7 @@ class Messaging(SimulatedTime):
         self._check_open()
         if not isinstance(topic, str):
             raise LockstepError(f'last takes a topic, got {described(topic)}')
+        self._check_threads()
         name = self.node.resolve_topic_name(topic)
         message = self._traffic.last(name)
         if message is None:

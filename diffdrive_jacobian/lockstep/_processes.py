@@ -87,7 +87,8 @@ class Processes(Messaging):
         cwd: str | os.PathLike[str] | None = None,
         env: Mapping[str, str] | None = None,
     ) -> ExternalProcess:
-        """Start a process in the ROS domain of this world. It is ended when the world is closed.
+        """Start a process in the ROS domain of this world. When the world is closed, it is ended
+        with all that it has started.
 
         Args:
             command: The program and its arguments: `'ros2', 'run', 'my_package', 'my_node'`.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import count
 from typing import Any, Protocol, TypeAlias
@@ -91,9 +92,12 @@ class Traffic:
         traffic, records, now, numbers = self, self._records, self._now, self._numbers
         self._deliveries = deliveries
         extend, observers_of = deliveries.pending.extend, self.observers_of
+        thread, get_ident = deliveries.thread, threading.get_ident
 
         def counting(publish: Callable[..., None]) -> Callable[..., None]:
             def counted(self: Publisher, msg: Any) -> None:
+                if get_ident() != thread:
+                    deliveries.note_thread(self)
                 if (intercept := traffic.intercept) is not None and intercept(self, msg):
                     return
                 publish(self, msg)

@@ -78,6 +78,7 @@ class Requirements(Disturbed):
                 that no node has had, or a fault met nothing. A name may be misspelt.
         """
         self._check_open()
+        self._check_threads()
         if self._watches or self._expected:
             # Not otherwise: a test may have passed because a callback raises what it expects.
             self.settle()
@@ -91,7 +92,7 @@ class Requirements(Disturbed):
             if id(requirement) in left and self._offered.isdisjoint(names):
                 known = ', '.join(sorted(self._offered.difference(OMITTED))) or 'none'
                 raise LockstepError(
-                    f'{requirement!r} observes {" and ".join(names)}, which no node has offered; topics '
+                    f'{requirement} observes {" and ".join(names)}, which no node has offered; topics '
                     f'and services: {known}'
                 )
         for required in watches:

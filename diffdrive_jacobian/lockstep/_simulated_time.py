@@ -6,12 +6,15 @@
 from __future__ import annotations
 
 import inspect
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
 
 from diffdrive_jacobian.lockstep._errors import LockstepError, PropertyViolation
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
@@ -243,6 +246,8 @@ class SimulatedTime:
         self._guard.arm()
         try:
             yield
+            if self._executor.deliveries.elsewhere:
+                self._check_threads()
         except ExternalShutdownException:
             raise LockstepError(SHUT_DOWN) from None
         except (Stuck, RuntimeError) as error:
@@ -256,6 +261,21 @@ class SimulatedTime:
         finally:
             self._guard.disarm()
             self._busy = False
+
+    def _check_threads(self) -> None:
+        """Check that nodes have sent nothing from threads of their own.
+
+        Raises:
+            LockstepError: One has.
+        """
+        elsewhere = self._executor.deliveries.elsewhere
+        for entity, node in itertools.product(list(elsewhere), self._executor.nodes):
+            if (sends := _sending(node, entity)) is not None:
+                raise LockstepError(
+                    f'node {node.get_fully_qualified_name()} {sends} from a thread of its own '
+                    f"('{elsewhere.pop(entity)}'): when that is done cannot be known, so it cannot run "
+                    f'in lockstep; do it in a callback, for example of a timer\n{self.report()}'
+                )
 
     def _check_requirements(self) -> None:
         """Check what is required at the current time, when all callbacks have been executed."""
@@ -290,6 +310,15 @@ def checked_nanoseconds(name: str, seconds: float) -> int:
             f'{name} must be a positive number of seconds, at most {MAX_SECONDS}, got {seconds!r}'
         )
     return round(seconds * NANOSECONDS)
+
+
+def _sending(node: Node, entity: Any) -> str | None:
+    """Return what a node does with a publisher, a client or a service; None: it is of another node."""
+    if any(one is entity for one in node.publishers):
+        return f'publishes {entity.topic_name}'
+    if any(one is entity for one in (*node.clients, *node.services)):
+        return f'calls or answers {entity.service_name}'
+    return None
 
 
 def _place(condition: Callable[[], object]) -> str:

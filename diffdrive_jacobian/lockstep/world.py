@@ -17,7 +17,7 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
-from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._errors import InitializedError, LockstepError
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
 from diffdrive_jacobian.lockstep._external_answers import Expectation
 from diffdrive_jacobian.lockstep._guard import Guard
@@ -26,7 +26,7 @@ from diffdrive_jacobian.lockstep._processes import Processes
 from diffdrive_jacobian.lockstep._requirements import Requirements
 from diffdrive_jacobian.lockstep._simulated_time import checked_nanoseconds
 from diffdrive_jacobian.ros.fastdds_profiles import withdraw
-from diffdrive_jacobian.ros.rclpy_internals import wrap_sleep
+from diffdrive_jacobian.ros.rclpy_internals import refuse_init, wrap_sleep
 from diffdrive_jacobian.ros.runner import UserError, environment, ros_context
 
 ISOLATED = ('--ros-args', '-p', 'start_type_description_service:=false')
@@ -46,9 +46,10 @@ class Lockstep(Requirements, Processes):
             controller = world.add(MyController())
             world.run_for(2.0)
 
-    An exception in a callback is raised by the method that executed it. Nodes must not publish from
-    threads of their own, because the end of their work cannot be detected. Timers on another clock than
-    that of the node run on wall time. Only for the main thread, and on systems with POSIX signals.
+    An exception in a callback is raised by the method that executed it. If a node publishes from a
+    thread of its own, the next method raises an error, because the end of that work cannot be detected.
+    Timers on another clock than that of the node run on wall time. Only for the main thread, and on
+    systems with POSIX signals.
     """
 
     _open: ClassVar[Lockstep | None] = None
@@ -108,6 +109,7 @@ class Lockstep(Requirements, Processes):
                 context = self._closing.enter_context(ros_context(arguments, default=True))
         except UserError as error:
             raise LockstepError(str(error)) from error
+        refuse_init(context, _refuse_init)
         withdraw()
         self._executor = QuiescentExecutor(context, self._on_registered)
         self._closing.callback(self._destroy_nodes)
@@ -265,3 +267,11 @@ class Lockstep(Requirements, Processes):
                 f'node {node.get_fully_qualified_name()} runs on wall time: '
                 'its parameter use_sim_time must be true'
             )
+
+
+def _refuse_init(*_: Any, **__: Any) -> None:
+    """Raise the error of a second `rclpy.init`."""
+    raise InitializedError(
+        'lockstep has initialized rclpy: leave out rclpy.init() and rclpy.shutdown(), which belong into '
+        'the main() of a program; ROS arguments: Lockstep(args=...), @pytest.mark.lockstep(args=...)'
+    )

@@ -1,7 +1,9 @@
 """Integers that were assigned to fields of floats.
 
 rclpy writes the bytes of an `int` into a `float64` field without conversion, unless the environment has
-ROS_PYTHON_CHECK_FIELDS=1. Small integers arrive as subnormal numbers, such as 5e-324.
+ROS_PYTHON_CHECK_FIELDS=1. What arrives is not the integer, but a part of its object that states how many
+digits it has: 1 is 5e-324 on Python 3.10 and 3.11, 4e-323 since 3.12. It is a subnormal number, but NaN
+for integers below zero on 3.10 and 3.11. NaN is refused everywhere.
 """
 
 from __future__ import annotations

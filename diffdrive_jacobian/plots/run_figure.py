@@ -1,7 +1,8 @@
 """A figure of one or several runs.
 
-It shows the paths in the plane, and over time the distance to the goal, the heading error, v, omega and
-the wheel speeds with their limits. matplotlib is imported when it is drawn. No display is needed.
+It shows the paths in the plane, and over time the distance to the goal, the bearing error, v, omega and
+the wheel speeds with their limits. Where the heading of a goal counts, its error is beside that of the
+bearing. matplotlib is imported when it is drawn. No display is needed.
 """
 
 from __future__ import annotations
@@ -45,10 +46,11 @@ COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
 """The colors of Okabe and Ito that contrast with white. The line styles differ between runs as well."""
 STYLES: tuple[Any, ...] = ('-', (0, (5, 1.5)), '-.', (0, (1.2, 1)), (0, (7, 1.5, 1, 1.5, 1, 1.5)))
 LIMIT = (0, (6, 3))
+HEADING = (0, (1, 1.2))
 GREY, COMMAND = '#777777', '#d2d2d2'
 LABELS = {
     'distance': 'distance to goal [m]',
-    'heading_error': 'heading error [rad]',
+    'bearing_error': 'bearing error [rad]',
     'v': r'speed $v$ [m/s]',
     'omega': r'yaw rate $\omega$ [rad/s]',
     'right': r'right wheel $\omega_R$ [rad/s]',
@@ -126,7 +128,7 @@ def figure(runs: Sequence[Run], violations: Sequence[ViolationMark] = ()) -> Fig
 
     traces = [trace(run) for run in runs]
     quantities = [
-        *(('distance', 'heading_error') if any(len(run.goals) for run in runs) else ()),
+        *(('distance', 'bearing_error') if any(len(run.goals) for run in runs) else ()),
         *('v', 'omega'),
         *(('right', 'left') if any(len(run.wheels) + len(run.wheel_commands) for run in runs) else ()),
     ]
@@ -265,8 +267,14 @@ def _draw_over_time(
     elif alone:
         panel.plot(*command.T, color=COMMAND, lw=4.5, drawstyle='steps-post', zorder=1.5)
     panel.plot(*measurement.T, color=color, ls=style, lw=1.5)
+    if quantity == 'bearing_error' and _heading_counts(one):
+        panel.plot(*measured(one, 'goal_heading_error').T, color=color, ls=HEADING, lw=2.2)
     for bound in limits(one).get(quantity, ()):
         panel.plot(*bound.T, color='black', ls=LIMIT, lw=1.0, drawstyle='steps-post', zorder=3)
+
+
+def _heading_counts(one: Trace) -> bool:
+    return bool(np.isfinite(one.goal_heading_error).any())
 
 
 def _draw_goal_changes(panels: Iterable[Axes], one: Trace) -> None:
@@ -314,6 +322,9 @@ def _marks(traces: Sequence[Trace]) -> list[Line2D]:
         marks.append(Line2D([], [], ls=':', lw=0.9, color=GREY, label='goal begins or ends'))
     if alone and any(len(commanded(traces[0], quantity)) for quantity in LABELS):
         marks.append(Line2D([], [], lw=4.5, color=COMMAND, label='commanded'))
+    if any(map(_heading_counts, traces)):
+        label = 'error of the heading at the goal'
+        marks.append(Line2D([], [], ls=HEADING, lw=2.2, color=GREY, label=label))
     if any(np.isfinite(bounds[..., 1]).any() for one in traces for bounds in limits(one).values()):
         marks.append(Line2D([], [], ls=LIMIT, lw=1.0, color='black', label='limit'))
     return marks

@@ -17,8 +17,8 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 
 COLUMNS = (
     *('time_s', 'x_m', 'y_m', 'theta_rad', 'v_mps', 'omega_radps'),
-    *('distance_m', 'heading_error_rad', 'v_command_mps', 'omega_command_radps'),
-    *('omega_right_radps', 'omega_left_radps'),
+    *('distance_m', 'bearing_error_rad', 'v_command_mps', 'omega_command_radps'),
+    *('omega_right_radps', 'omega_left_radps', 'goal_heading_error_rad'),
 )
 """Columns of the table, with their units."""
 DECIMALS = 9
@@ -42,9 +42,10 @@ def table(run: Run) -> NDArray[np.float64]:
             one.time,
             run.odometry.values,
             one.distance,
-            one.heading_error,
+            one.bearing_error,
             _latest(one, commands),
             _interpolated(one, run.wheels),
+            one.goal_heading_error,
         ]
     )
 

@@ -32,10 +32,10 @@ def measured(one: Trace, quantity: str) -> Array:
     if quantity in _TWIST:
         values = run.odometry.values[:, 3 + _TWIST[quantity]]
         return line(np.column_stack([one.time, values]), one.breaks)
-    values = one.distance if quantity == 'distance' else one.heading_error
-    jumps = np.abs(np.diff(values)) > (np.pi if quantity == 'heading_error' else np.inf)
+    error: Array = getattr(one, quantity)
+    jumps = np.abs(np.diff(error)) > (np.inf if quantity == 'distance' else np.pi)
     breaks = np.union1d(one.breaks, np.flatnonzero(jumps | (np.diff(one.goal) != 0)) + 1)
-    return line(np.column_stack([one.time, values]), breaks)
+    return line(np.column_stack([one.time, error]), breaks)
 
 
 def commanded(one: Trace, quantity: str) -> Array:

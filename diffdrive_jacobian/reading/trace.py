@@ -5,8 +5,10 @@ Times are seconds since the first odometry, by its own stamps.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +44,10 @@ class Trace:
     """Which of `run.goals` is driven to; -1: none."""
     distance: Array
     """To that goal, of the point that the controller drives (m); NaN: none."""
-    heading_error: Array
+    bearing_error: Array
     """From the heading to the direction of that goal (rad); NaN: none, or it is reached."""
+    goal_heading_error: Array
+    """From the heading to that of the goal (rad); NaN: none, or its heading does not count."""
 
 
 def trace(run: Run) -> Trace:
@@ -53,6 +57,7 @@ def trace(run: Run) -> Trace:
     aborted (`goal_status`). Of several waypoints the next one counts from the first odometry within
     xy_goal_tolerance of go_to_goal (0.02 m if that was not recorded), as the node has it; if none is,
     though the node says that it succeeded or nothing is known of it, from the closest approach.
+    The heading of the last goal counts if the controller takes one, or by `use_goal_heading`.
     The last goal is reached when the node reports success, or, if `goal_status` was not recorded, at
     the first odometry within the tolerance. A reached goal has no direction. Its distance continues
     until the odometry is reset, or, without `goal_status`, reset while the robot is at the goal.
@@ -68,17 +73,19 @@ def trace(run: Run) -> Trace:
     breaks = _breaks(run)
     goal, reached = _progress(run, breaks)
     x, y, theta = odometry.values[:, :3].T
-    targets = np.full((len(odometry), 2), np.nan)
-    targets[goal >= 0] = run.goals.values[goal[goal >= 0], :2]
+    targets = np.full((len(odometry), 3), np.nan)
+    targets[goal >= 0] = run.goals.values[goal[goal >= 0]]
     dx, dy = targets[:, 0] - x, targets[:, 1] - y
-    to_goal = targets - _driven_points(run)
+    to_goal = targets[:, :2] - _driven_points(run)
+    last = [route[-1] for route in _routes(run) if heading_counts(run.of_node('go_to_goal'))]
     return Trace(
         run=run,
         time=seconds(run, odometry),
         breaks=breaks,
         goal=goal,
         distance=np.hypot(*to_goal.T),
-        heading_error=np.where(reached, np.nan, wrap(np.arctan2(dy, dx) - theta)),
+        bearing_error=np.where(reached, np.nan, wrap(np.arctan2(dy, dx) - theta)),
+        goal_heading_error=np.where(np.isin(goal, last), wrap(targets[:, 2] - theta), np.nan),
     )
 
 
@@ -248,6 +255,13 @@ def _statuses(run: Run, begin: int, end: int) -> tuple[Array, NDArray[np.int64]]
     """Return the goal states recorded from `begin` until before `end` (ns), and their times."""
     first, last = np.searchsorted(run.goal_status.received, [begin, end])
     return run.goal_status.values[first:last, 0], run.goal_status.received[first:last]
+
+
+def heading_counts(parameters: Mapping[str, Any]) -> bool:
+    """Return whether a controller with these parameters turns to the heading of its last goal."""
+    controller = BUILT_IN.get(str(parameters.get('controller')))
+    takes_heading = controller is not None and controller.takes_heading
+    return parameters.get('use_goal_heading') is True or takes_heading
 
 
 def tolerance(run: Run) -> float:

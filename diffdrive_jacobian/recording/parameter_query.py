@@ -47,6 +47,7 @@ class ParameterQuery:
             on_values: Called once with the values by name that were received.
             on_trouble: Called at most once, before that, with a description of what is missing.
         """
+        self._node = node
         self._target = target
         self._on_values = on_values
         self._on_trouble = on_trouble
@@ -56,21 +57,30 @@ class ParameterQuery:
         self._size = 0
         self._deadline: float | None = None
         self._done = False
+        self._clients: list[Any] = []
         try:
             self._list = node.create_client(ListParameters, f'{target}/list_parameters')
+            self._clients.append(self._list)
             self._get = node.create_client(GetParameters, f'{target}/get_parameters')
+            self._clients.append(self._get)
         except (RuntimeError, NameValidationException) as error:
             self._finish(f'its services cannot be called: {_short(error)}')
 
     def advance(self) -> None:
         """Send the request if the services are available, and end on a timeout; to be called often."""
         if self._done:
-            return
-        if self._deadline is None:
+            self.destroy()
+        elif self._deadline is None:
             if self._list.service_is_ready() and self._get.service_is_ready():
                 self._call(self._list, ListParameters.Request(), self._on_names)
         elif time.monotonic() > self._deadline:
             self._finish(f'it did not answer within {PATIENCE:g} s')
+
+    def destroy(self) -> None:
+        """Destroy the clients; nothing is called any more."""
+        self._done = True
+        while self._clients:
+            self._node.destroy_client(self._clients.pop())
 
     def _call(self, client: Any, request: Any, on_answer: Callable[[Any], None]) -> None:
         self._deadline = time.monotonic() + PATIENCE

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from itertools import pairwise
 from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -11,9 +14,11 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
+from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import (
     NodeParameters,
     ParameterError,
@@ -141,10 +146,39 @@ def _program(node: Node) -> str:
     return ours[0].rpartition('.')[2] if ours else str(node.get_name())
 
 
+_files: WeakKeyDictionary[Context, list[str]] = WeakKeyDictionary()
+"""The parameter files of contexts."""
+
+
+def use_files(context: Context, arguments: Sequence[str]) -> None:
+    """Note which parameter files a context has, for `report_unknown`.
+
+    Args:
+        context: The context.
+        arguments: Its ROS arguments, in which files follow `--params-file`.
+    """
+    _files[context] = [path for flag, path in pairwise(arguments) if flag == '--params-file']
+
+
+def _shared(context: Context) -> set[str]:
+    """Return the names of the parameters that files give to nodes of any name, as under `/**`."""
+    # Slow to import.
+    from diffdrive_jacobian.parameters.file import is_shared, sections
+
+    found: set[str] = set()
+    for path in _files.get(context, ()):
+        # What is wrong for rcl is an error before.
+        with suppress(UserError):
+            found.update(*(values for name, values in sections(path) if is_shared(name)))
+    return found
+
+
 def report_unknown(nodes: Sequence[Node]) -> None:
     """Log a warning for each parameter that the user gave and that no node of this process declares.
 
-    The nodes of a process share its command line, so one of them must declare the parameter.
+    The nodes of a process share its command line, so one of them must declare the parameter. What a file
+    gives to nodes of any name may be for other processes, unless it resembles a parameter that is
+    declared.
     """
     declared = {name for node in nodes for name in declared_parameters(node)}
     unknown: dict[str, Node] = {}
@@ -156,12 +190,18 @@ def report_unknown(nodes: Sequence[Node]) -> None:
     # Slow to import.
     import difflib
 
+    from diffdrive_jacobian.parameters.nodes import NODE_PARAMETERS
+
+    ours = {name for one in NODE_PARAMETERS for name in specifications(one)}
     known = sorted(name for name in declared if not name.startswith(PARAMETERS_OF_RCLPY))
     programs = sorted({f'{_program(node)} --help' for node in nodes})
+    shared = set().union(*(_shared(node.context) for node in nodes))
     for name, node in sorted(unknown.items()):
         close = difflib.get_close_matches(name, known, n=1)
         if not close and len(name) <= SHORT:
             close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+        if name in shared and (name in ours or not close):
+            continue
         hint = ' or '.join(f"'{one}'" for one in sorted(close))
         hint = f'did you mean {hint}?' if close else f'see {" or ".join(programs)}'
         node.get_logger().warning(f"unknown parameter '{name}' is ignored; {hint}")

@@ -400,6 +400,18 @@ def receives_info(subscription: Subscription) -> bool:
     return bool(subscription._callback_type is Subscription.CallbackType.WithMessageInfo)
 
 
+def refuse_init(context: Context, refuse: Callable[..., None]) -> None:
+    """Let `rclpy.init` of a context that is initialized call a function, which raises an error.
+
+    Relies on `rclpy.init` calling `Context.init`.
+
+    Args:
+        context: The context.
+        refuse: The function. It receives the arguments of `Context.init`.
+    """
+    context.init = refuse
+
+
 def wrap_calls(wrap: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Callable[[], None]:
     """Replace the methods of all clients and services that send a request or a response.
 

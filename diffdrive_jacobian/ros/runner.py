@@ -24,6 +24,7 @@ from diffdrive_jacobian.ros.guarded_executor import GuardedExecutor, NodeExecuto
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.node import ParameterizedNode
 from diffdrive_jacobian.ros.node_runner import MAX_NAME_LENGTH, NodeRunner
+from diffdrive_jacobian.ros.parameters import use_files
 from diffdrive_jacobian.ros.rclpy_internals import UnknownROSArgsError, events_executor, reason
 from diffdrive_jacobian.text import printable
 
@@ -102,6 +103,7 @@ def ros_context(arguments: Sequence[str], *, default: bool = False) -> Iterator[
         ) from error
     except (RuntimeError, UnicodeError) as error:
         raise UserError(_rule_error(arguments) or f'ROS arguments: {reason(error)}') from error
+    use_files(context, arguments)
     try:
         yield context
     finally:

@@ -39,6 +39,21 @@ def deserialized(data: bytes, message_type: type[T]) -> T:
     return message
 
 
+def checked_reader(message_type: type[T]) -> Callable[[bytes], T]:
+    """Return a function as `deserialized` that reads sequences only if they are complete.
+
+    For each other one, the code that rclpy generates for a type writes a line to standard error.
+    """
+    check = Reader(message_type, ())
+
+    def read(data: bytes) -> T:
+        if data[:2] == LITTLE_ENDIAN:
+            check(data)
+        return deserialized(data, message_type)
+
+    return read
+
+
 def ignoring_invalid(
     message_type: type[Any], callback: Callable[..., object], fields: Sequence[str] | None = None
 ) -> Callable[[bytes], None]:
@@ -82,7 +97,8 @@ def _values_reader(
 ) -> Callable[[bytes], tuple[Any, ...]]:
     """Return a function that reads these fields of serialized messages; None: the message itself."""
     if fields is None:
-        return lambda data: (deserialized(data, message_type),)
+        read = checked_reader(message_type)
+        return lambda data: (read(data),)
     return reader(message_type, fields)
 
 

@@ -183,7 +183,10 @@ def _or_error(describe: Callable[[], str]) -> str:
     except BaseException as error:
         # Also of pytest.fail and pytest.skip, which a timeout of a plugin may raise here.
         complete = type(error).__name__ == 'RecordingError'
-        return str(error) if complete else f'not available: {error!r}'
+        from diffdrive_jacobian.text import error_text
+
+        text = error_text(error)
+        return text if complete else f'not available: {type(error).__name__}: {text}'
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:

@@ -23,8 +23,8 @@ from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
 TOLERANCE = 1e-9
 """Default tolerance of floats: the last bits may differ between CPUs."""
-NOT_COMPARED = ('/clock', '/parameter_events', '/rosout')
-"""Topics that are neither stored nor compared."""
+NOT_COMPARED = ('/clock', '/parameter_events', '/rosout', '/tf')
+"""Topics that are neither stored nor compared. `/tf` is published only where tf2_ros is installed."""
 MAX_TOPICS = 8
 """Number of topics with differences that are listed."""
 
@@ -71,8 +71,8 @@ class GoldenRun:
             tolerance: Largest difference of two floats, relative to the smaller one if that exceeds 1.
                 Everything else must be equal, except identifiers (UUID), which are random: each one
                 must stand for one of the golden run.
-            without: Topics that are not compared, besides `/clock`, `/rosout` and `/parameter_events`.
-                Fully qualified names.
+            without: Topics that are not compared, besides `/clock`, `/rosout`, `/parameter_events` and
+                `/tf`. Fully qualified names.
 
         Raises:
             GoldenRunError: The run differs, or there is no golden run. Not if it is to be updated.

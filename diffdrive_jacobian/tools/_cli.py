@@ -174,6 +174,13 @@ def given_heading(parser: argparse.ArgumentParser, options: argparse.Namespace) 
     return value
 
 
+def distances(distance: float, true_distance: float) -> str:
+    """Return how far a robot is from its goal (m), in words. A true distance of NaN is not known."""
+    if math.isnan(true_distance):
+        return f'{distance:.3f} m from the goal'
+    return f'{distance:.3f} m from the goal by odometry, {true_distance:.3f} m by ground truth'
+
+
 def add_force(parser: argparse.ArgumentParser, what: str) -> None:
     """Add the option to overwrite files.
 

@@ -96,7 +96,7 @@ def _report(end: GoalEnd) -> None:
         x, y, theta = end.pose
         where = (
             f'the robot is at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, '
-            f'{end.distance:.3f} m from the goal'
+            f'{_cli.distances(end.distance, end.true_distance)}'
         )
     robot = '' if end.robot == '/' else f'{end.robot}: '
     print(f'{robot}goal ({end.goal[0]:g}, {end.goal[1]:g}) {ENDS[end.state]}: {where}', flush=True)

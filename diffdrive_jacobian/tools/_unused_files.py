@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
+
+from diffdrive_jacobian.errors import UserError
 
 
 def warn_of_unused_files(program: str, ros: Sequence[str], nodes: Sequence[str]) -> None:
@@ -19,47 +18,21 @@ def warn_of_unused_files(program: str, ros: Sequence[str], nodes: Sequence[str])
         nodes: Fully qualified names of the nodes.
     """
     for flag, path in pairwise(ros):
-        if flag != '--params-file':
-            continue
-        names = node_names(path)
-        if names and not any(concerns(name, node) for name in names for node in nodes):
-            print(
-                f'{program}: warning: --params-file {path} has no parameters of these nodes: '
-                f'it is for {", ".join(names)}, the nodes are {", ".join(nodes)}',
-                file=sys.stderr,
-            )
+        if flag == '--params-file' and (why := _unused(path, nodes)):
+            print(f'{program}: warning: --params-file {path} has no parameters{why}', file=sys.stderr)
 
 
-def node_names(path: str) -> list[str]:
-    """Return the names of the nodes, with wildcards, that have parameters in a file.
-
-    The list is empty if the file is invalid.
-    """
+def _unused(path: str, nodes: Sequence[str]) -> str:
+    """Describe why a file has no effect. Empty: it has one, or is only readable by rcl."""
     # Slow to import, and a node without such a file does not need it.
-    from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, load_yaml
+    from diffdrive_jacobian.parameters.file import concerns, sections
 
     try:
-        content = load_yaml(Path(path))
-    except (OSError, *YAML_ERRORS):
-        return []
-    return list(dict.fromkeys(_node_names(content, '')))
-
-
-def _node_names(section: Any, prefix: str) -> Iterator[str]:
-    for key, value in section.items() if isinstance(section, dict) else ():
-        if key == 'ros__parameters':
-            yield prefix or '/'
-        else:
-            yield from _node_names(value, f'{prefix}/{str(key).strip("/")}')
-
-
-def concerns(name: str, node: str) -> bool:
-    """Return whether rcl applies the parameters under a name to a node.
-
-    Args:
-        name: Name in a parameter file. `*` stands for one token, `**` for any number of tokens.
-        node: Fully qualified name of the node.
-    """
-    tokens = {'*': '/[^/]+', '**': '(/[^/]+)*'}
-    pattern = ''.join(tokens.get(token, '/' + re.escape(token)) for token in name.strip('/').split('/'))
-    return re.fullmatch(pattern, node) is not None
+        names = list(dict.fromkeys(name for name, _ in sections(path)))
+    except UserError:
+        return ''
+    if not names:
+        return ': they stand under NODE: ros__parameters:'
+    if any(concerns(name, node) for name in names for node in nodes):
+        return ''
+    return f' of these nodes: it is for {", ".join(names)}, the nodes are {", ".join(nodes)}'

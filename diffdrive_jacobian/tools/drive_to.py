@@ -194,7 +194,8 @@ def _report(outcome: Outcome, options: argparse.Namespace) -> int:
         simulated = ' of simulated time' if options.lockstep else ''
         where = (
             f'the robot stopped at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, '
-            f'{outcome.distance:.3f} m from the goal{point}, after {outcome.seconds:.1f} s{simulated}'
+            f'{_cli.distances(outcome.distance, outcome.true_distance)}{point}, '
+            f'after {outcome.seconds:.1f} s{simulated}'
         )
     if outcome.arrived:
         print(f'arrived: {where}')

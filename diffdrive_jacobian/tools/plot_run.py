@@ -204,7 +204,7 @@ def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
         description='Draw runs that record_run or ros2 bag record has written: the path with its goals, '
-        'and over time the distance to the goal, the heading error, the speeds and their limits. '
+        'and over time the distance to the goal, the bearing error, the speeds and their limits. '
         'Several runs are drawn into the same axes. Existing files are not overwritten without --force. '
         'Exit code 0: drawn; 1: a file cannot be written; 2: wrong arguments, or a bag cannot be read; '
         '130: interrupted.',

@@ -70,7 +70,7 @@ export class Chain {
     const { chain, law, goal } = robot, active = robot.distance !== null && goal.active;
     const target = active && goal.goals ? goal.goals[goal.index] : null;
     setText(this.goal, target
-      ? `(${format(target[0], 2)}, ${format(target[1], 2)}) m   →   d = ${format(robot.distance)} m,  e = ${format(robot.heading_error)} rad`
+      ? `(${format(target[0], 2)}, ${format(target[1], 2)}) m   →   d = ${format(robot.distance)} m,  e = ${format(robot.bearing_error)} rad${robot.goal_heading_error === null ? '' : `, heading at the goal: Δθ = ${format(robot.goal_heading_error)} rad`}`
       : robot.by_hand ? 'none: driven by hand' : 'none: click on the map');
     this.links.goal.node.classList.toggle('idle', !target);
     const [formula, source] = LAWS[law.name] ?? ['[v, ω] = law(pose, goal)', law.name || 'not known'];
@@ -90,7 +90,8 @@ export class Chain {
     this.world.set(chain.world);
     const [r, L] = robot.geometry;
     setText(this.note, `q = (${format(robot.pose[0])} m, ${format(robot.pose[1])} m, ${format(robot.pose[2])} rad), r = ${format(r)} m, L = ${format(L)} m. `
-      + (chain.measured ? 'The wheel speeds that move the body are those of joint_states.' : 'No joint_states: the wheels are taken to do as told.'));
+      + (chain.measured ? 'The wheel speeds that move the body are those of joint_states.' : 'No joint_states: the wheels are taken to do as told.')
+      + (robot.truth ? ` By ground truth (${format(robot.truth[0])} m, ${format(robot.truth[1])} m, ${format(robot.truth[2])} rad).` : ''));
   }
 
   /** Return the gains, and the factor by which limits scale what the law computes. */

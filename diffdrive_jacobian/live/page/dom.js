@@ -45,6 +45,14 @@ export function parseNumber(text) {
   return plain === '' ? NaN : Number(plain);
 }
 
+/** Return a heading that a person typed (rad), as `--heading` and `--degrees` take it; null: none; NaN: it is invalid. */
+export function parseHeading(text) {
+  if (text.trim() === '') return null;
+  const [, number, unit] = text.match(/^(.*?)\s*(°|deg|degrees|rad)?\s*$/s);
+  const value = parseNumber(number) * (unit && unit !== 'rad' ? Math.PI / 180 : 1);
+  return Math.abs(value) <= 2 * Math.PI ? value : NaN;
+}
+
 /** Make the canvas as sharp as the screen; return its context and its size in CSS pixels. */
 export function prepared(canvas) {
   const ratio = window.devicePixelRatio || 1;

@@ -1,6 +1,6 @@
 // Quantities of one robot over time, for the strips.
 
-export const CURVES = ['v', 'omega', 'command_v', 'command_omega', 'right', 'left', 'distance', 'heading_error'];
+export const CURVES = ['v', 'omega', 'command_v', 'command_omega', 'right', 'left', 'distance', 'bearing_error', 'goal_heading_error'];
 const KEPT = 20;
 
 export class History {
@@ -32,7 +32,8 @@ export class History {
       right: chain.wheels[0],
       left: chain.wheels[1],
       distance: robot.distance,
-      heading_error: robot.heading_error,
+      bearing_error: robot.bearing_error,
+      goal_heading_error: robot.goal_heading_error,
     };
     this.time.push(robot.time);
     for (const name of CURVES) this.curves[name].push(values[name]);

@@ -2,7 +2,7 @@
 
 import { Chain } from './chain.js';
 import { Connection } from './connection.js';
-import { byId, element, parseNumber, setText } from './dom.js';
+import { byId, element, parseHeading, parseNumber, setText } from './dom.js';
 import { HandDriving } from './hand.js';
 import { MapDrawing, themeColors } from './map.js';
 import { Model } from './model.js';
@@ -16,10 +16,10 @@ import { Transport } from './transport.js';
 import { View } from './view.js';
 
 const HINTS = {
-  goal: 'click: goal · drag: with heading · shift-click: waypoint · drag the robot: place it · WASD or arrow keys: drive',
-  waypoint: 'click: a further place after the present goal · drag: with heading',
-  move: 'drag: move the map · wheel or pinch: zoom',
-  bag: 'drag: move the map · wheel or pinch: zoom · click a curve: go to that time · space: pause',
+  goal: 'click: goal · drag: with heading · shift-click: waypoint · drag the robot: place it · WASD or arrow keys: drive',
+  waypoint: 'click: a further place after the present goal · drag: with heading',
+  move: 'drag: move the map · wheel or pinch: zoom',
+  bag: 'drag: move the map · wheel or pinch: zoom · click a curve: go to that time · space: pause',
 };
 
 let changed = true;
@@ -74,7 +74,10 @@ function showPanels() {
   byId('hand').hidden = recorded || !robot;
   byId('tools').hidden = byId('actions').hidden = byId('goto').hidden = recorded;
   byId('chain').hidden = byId('legend').hidden = !robot;
+  byId('truth').hidden = !robot?.truth;
   setText(byId('title'), model.bag || 'diffdrive_jacobian');
+  setText(byId('notes'), model.notes.join('; '));
+  byId('notes').title = model.notes.join('\n');
   setText(byId('hint'), HINTS[recorded ? 'bag' : pointer.tool]);
   byId('map').classList.toggle('grab', recorded || pointer.tool === 'move');
   if (robot) chain.show(robot);
@@ -97,7 +100,7 @@ onSelected('reset', 'reset');
 onSelected('clear', 'clear_path');
 byId('follow').addEventListener('click', () => { view.follow = !view.follow; changed = true; showFollow(); byId('follow').blur(); });
 byId('fit').addEventListener('click', () => {
-  const points = [...model.paths.values()].flat().filter((point) => point !== null);
+  const points = [...model.paths.values(), ...model.truePaths.values()].flat().filter((point) => point !== null);
   for (const robot of model.robots.values()) points.push(robot.pose, ...(robot.goal.goals ?? []));
   view.fit(points.map(([x, y]) => [x, y]));
   showFollow();
@@ -109,9 +112,11 @@ byId('map').addEventListener('wheel', () => { changed = true; }, { passive: true
 byId('map').addEventListener('pointerup', () => { changed = true; });
 byId('goto').addEventListener('submit', (event) => {
   event.preventDefault();
-  const [x, y, theta] = ['x', 'y', 'theta'].map((name) => parseNumber(byId(`goto-${name}`).value));
+  const [x, y] = ['x', 'y'].map((name) => parseNumber(byId(`goto-${name}`).value)), heading = byId('goto-theta').value;
+  const theta = parseHeading(heading);
   if (!Number.isFinite(x) || !Number.isFinite(y)) notices.show('error', 'x and y of the goal must be numbers, in metres');
-  else if (model.selected) send({ do: 'goal', robot: model.selected.name, x, y, theta: Number.isFinite(theta) ? theta : null, append: false });
+  else if (Number.isNaN(theta)) notices.show('error', `the heading must be in radians, from −2π to 2π, or in degrees as 90°, got ${heading}`);
+  else if (model.selected) send({ do: 'goal', robot: model.selected.name, x, y, theta, append: false });
 });
 addEventListener('keydown', (event) => {
   if (event.code === 'Escape' && model.selected && !model.recorded) send({ do: 'cancel', robot: model.selected.name });

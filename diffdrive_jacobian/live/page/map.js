@@ -1,10 +1,10 @@
 // The map: grid, paths, goals and robots on a canvas.
 
 import { niceStep, prepared } from './dom.js';
-import { drawHandle, drawRegion, drawRobot } from './robot_shape.js';
+import { drawHandle, drawRegion, drawRobot, drawTruth } from './robot_shape.js';
 
 const TAU = 2 * Math.PI;
-const NAMES = ['map', 'grid', 'grid-strong', 'muted', 'text', 'path', 'goal', 'region', 'body', 'body-edge',
+const NAMES = ['map', 'grid', 'grid-strong', 'muted', 'text', 'path', 'goal', 'region', 'truth', 'body', 'body-edge',
   'wheel', 'right', 'left', 'surface', 'accent', 'v', 'omega', 'line'];
 
 /** Return the colours of the theme by name. */
@@ -32,10 +32,14 @@ export class MapDrawing {
     // Where the robot is on the canvas, for tests of the page.
     if (selected) this.canvas.dataset.robot = view.toScreen(selected.pose[0], selected.pose[1]).map(Math.round).join(' ');
     this.drawGrid(context, width, height);
-    for (const robot of model.robots.values()) this.drawPath(context, robot);
+    for (const robot of model.robots.values()) {
+      this.drawPath(context, model.paths.get(robot.name), robot.travelled, robot.pose, colors.path, []);
+      this.drawPath(context, model.truePaths.get(robot.name), robot.truly_travelled, robot.truth, colors.truth, [2, 5]);
+    }
     for (const robot of model.robots.values()) this.drawGoals(context, robot, robot === selected);
     for (const robot of model.robots.values()) drawRegion(context, view, robot, colors);
     const last = [...model.robots.values()].sort((a, b) => Number(a === selected) - Number(b === selected));
+    for (const robot of last) drawTruth(context, view, robot, colors);
     for (const robot of last) this.drawRobot(context, robot, robot === selected, seconds);
     if (this.preview) this.drawPreview(context, selected);
     this.drawScale(context, width, height);
@@ -63,10 +67,11 @@ export class MapDrawing {
     }
   }
 
-  drawPath(context, robot) {
-    const points = this.model.paths.get(robot.name) ?? [], { view, colors } = this;
-    const travelled = robot.travelled ?? points.length;
-    for (const [from, to, alpha] of [[0, travelled, 0.9], [Math.max(0, travelled - 1), points.length, 0.28]]) {
+  /** Draw a path up to a pose: of a bag, what is still to come is pale. */
+  drawPath(context, points = [], travelled, pose, color, dashes) {
+    const { view } = this, past = travelled ?? points.length;
+    context.setLineDash(dashes);
+    for (const [from, to, alpha] of [[0, past, 0.9], [Math.max(0, past - 1), points.length, 0.28]]) {
       context.beginPath();
       let pen = false;
       for (let index = from; index < to; index += 1) {
@@ -76,16 +81,15 @@ export class MapDrawing {
         if (pen) context.lineTo(px, py); else context.moveTo(px, py);
         pen = true;
       }
-      if (pen && to === points.length && robot.travelled === undefined) {
-        context.lineTo(...view.toScreen(robot.pose[0], robot.pose[1]));
-      }
+      if (pen && pose && to === points.length && travelled === undefined) context.lineTo(...view.toScreen(pose[0], pose[1]));
       context.globalAlpha = alpha;
-      context.strokeStyle = colors.path;
+      context.strokeStyle = color;
       context.lineWidth = 2.5;
       context.lineJoin = context.lineCap = 'round';
       context.stroke();
     }
     context.globalAlpha = 1;
+    context.setLineDash([]);
   }
 
   drawGoals(context, robot, selected) {

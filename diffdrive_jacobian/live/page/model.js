@@ -6,11 +6,13 @@ export class Model {
   constructor() {
     this.robots = new Map();
     this.paths = new Map();
+    this.truePaths = new Map();
     this.histories = new Map();
     this.settings = {};
     this.strips = null;
     this.world = { kind: 'robots' };
     this.bag = '';
+    this.notes = [];
     this.selectedName = null;
   }
 
@@ -30,14 +32,17 @@ export class Model {
       if (!this.histories.has(robot.name)) this.histories.set(robot.name, new History());
       if (!this.recorded) this.histories.get(robot.name).add(robot);
     }
-    for (const [name, path] of Object.entries(frame.paths)) {
-      if (path.new || !this.paths.has(name)) this.paths.set(name, []);
-      const points = this.paths.get(name);
-      for (const point of path.points) points.push(point);
+    for (const [paths, news] of [[this.paths, frame.paths], [this.truePaths, frame.true_paths]]) {
+      for (const [name, path] of Object.entries(news)) {
+        if (path.new || !paths.has(name)) paths.set(name, []);
+        const points = paths.get(name);
+        for (const point of path.points) points.push(point);
+      }
     }
     if (frame.fixed) {
       this.settings = frame.fixed.settings ?? {};
       this.bag = frame.fixed.bag ?? '';
+      this.notes = frame.fixed.notes ?? [];
       for (const [name, strips] of Object.entries(frame.fixed.strips ?? {})) {
         this.histories.set(name, History.recorded(strips));
       }
@@ -47,5 +52,6 @@ export class Model {
   /** Forget what a new connection sends again. */
   reconnected() {
     this.paths.clear();
+    this.truePaths.clear();
   }
 }

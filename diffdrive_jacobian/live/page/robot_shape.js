@@ -38,6 +38,24 @@ export function drawRegion(context, view, robot, colors) {
   context.restore();
 }
 
+/** Draw where the robot truly is: its outline and heading. */
+export function drawTruth(context, view, robot, colors) {
+  if (!robot.truth) return;
+  const [x, y, theta] = robot.truth, [px, py] = view.toScreen(x, y), radius = Math.max(bodyRadius(robot) * view.scale, 5);
+  context.save();
+  context.translate(px, py);
+  context.rotate(-theta);
+  context.strokeStyle = colors.truth;
+  context.lineWidth = 1.8;
+  context.setLineDash([3, 3]);
+  context.beginPath();
+  context.arc(0, 0, radius, 0, TAU);
+  context.moveTo(0, 0);
+  context.lineTo(1.3 * radius, 0);
+  context.stroke();
+  context.restore();
+}
+
 /** Draw a robot at a pose; `angles` are those of the right and the left wheel (rad). */
 export function drawRobot(context, view, robot, pose, angles, colors, { selected, ghost }) {
   const [r, L] = robot.geometry;

@@ -21,7 +21,8 @@ function described(robot) {
   if (!goal.active) return [badge, kind, goal.state === 'unknown' ? 'click on the map to send one' : ''];
   if (!goal.goals) return [badge, kind, 'the goal was sent before this page listened'];
   const many = goal.goals.length > 1 ? `waypoint ${goal.index + 1} of ${goal.goals.length}, ` : '';
-  return [badge, kind, `${many}${format(robot.distance, 2)} m to go`];
+  const truly = robot.true_distance === null ? '' : `, truly ${format(robot.true_distance, 2)} m`;
+  return [badge, kind, `${many}${format(robot.distance, 2)} m to go${truly}`];
 }
 
 export function showStatus(model, open) {

@@ -7,7 +7,7 @@ const STRIPS = [
   { name: 'ω', unit: 'rad/s', curves: [['command_omega', 'muted', 'set', true], ['omega', 'omega', 'ω']] },
   { name: 'wheels', unit: 'rad/s', digits: 1, curves: [['left', 'left', 'L'], ['right', 'right', 'R']] },
   { name: 'distance', unit: 'm', curves: [['distance', 'v', 'd']], zero: true },
-  { name: 'heading error', unit: 'rad', curves: [['heading_error', 'omega', 'e']] },
+  { name: 'bearing error', unit: 'rad', curves: [['goal_heading_error', 'muted', 'Δθ', true], ['bearing_error', 'omega', 'e']] },
 ];
 
 /** Room for the labels (px). */
