@@ -9,7 +9,8 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 CAUGHT = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -27,9 +28,15 @@ class Signals:
     _read = 0.0
     _ignored = False
 
-    def __init__(self) -> None:
-        """Start with no signal."""
+    def __init__(self, end: Callable[[], object] = lambda: None) -> None:
+        """Start with no signal.
+
+        Args:
+            end: Ends the process (`os._exit`), for `ending_at_once` (default: nothing does).
+        """
         self._count = 0
+        self._end = end
+        self._at_once = False
 
     @property
     def count(self) -> int:
@@ -45,6 +52,20 @@ class Signals:
         """Count signals from now on."""
         for number in CAUGHT:
             signal.signal(number, self._on_signal)
+
+    @contextmanager
+    def ending_at_once(self) -> Iterator[None]:
+        """End the process on a signal, without clean-up, also if it was caught before.
+
+        For what takes long and leaves nothing, such as imports.
+        """
+        self._at_once = True
+        try:
+            if self._count:
+                self._end()
+            yield
+        finally:
+            self._at_once = False
 
     def ignore(self) -> None:
         """Ignore signals from now on, so that none disturbs the interpreter while it exits."""
@@ -91,3 +112,5 @@ class Signals:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._count += 1
+        if self._at_once:
+            self._end()

@@ -6,6 +6,7 @@ import csv
 import math
 import os
 import shutil
+import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +29,7 @@ from diffdrive_jacobian.reading import trace as _trace
 from diffdrive_jacobian.reading.reader import BagError, read_run
 from diffdrive_jacobian.reading.time_series import limits, line
 from diffdrive_jacobian.reading.trace import trace
-from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.signals import CAUGHT, Signals
 from diffdrive_jacobian.tools.plot_run import main
 
 RATE = 50
@@ -786,3 +787,27 @@ def test_a_bag_of_another_robot_is_drawn(tmp_path):
     _, rows = read_csv(tmp_path / 'a.csv')
     assert rows[:, 4].max() == pytest.approx(0.15)
     assert len(trace(read_run(bag)).breaks) == 0
+
+
+def test_a_signal_ends_the_drawing(bag, tmp_path, monkeypatch):
+    class EndedError(Exception):
+        pass
+
+    def end():
+        raise EndedError
+
+    def signaled(*_):
+        os.kill(os.getpid(), signal.SIGHUP)
+        return b''
+
+    signals = Signals(end)
+    monkeypatch.setattr('diffdrive_jacobian.plots.run_figure.render', signaled)
+    before = {number: signal.getsignal(number) for number in CAUGHT}
+    try:
+        signals.catch()
+        with pytest.raises(EndedError):
+            main([str(bag), '-o', str(tmp_path / 'run.png')], signals)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert not (tmp_path / 'run.png').exists()

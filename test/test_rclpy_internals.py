@@ -8,12 +8,14 @@ from __future__ import annotations
 import ast
 import math
 import sys
+import time
 from pathlib import Path
 
 import pytest
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, ParameterEvent
 from rcl_interfaces.srv import GetParameters
 from rclpy.clock import Clock
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidParameterValueException, ParameterAlreadyDeclaredException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity
@@ -423,20 +425,53 @@ def test_publish_is_wrapped_and_restored(ros):
     assert published == [('/words', 'one')]
 
 
-def test_waiting_messages_are_taken_serialized_with_their_info(ros):
+def test_waiting_messages_are_taken_serialized_with_what_the_middleware_knows(ros):
     subscription = ros.peer.create_subscription(
         String, 'words', lambda _: None, QoSProfile(depth=10), raw=True
     )
-    publisher = ros.talk(String, 'words')
-    for word in ('one', 'two', 'three'):
-        publisher.publish(String(data=word))
+    publishers = [ros.talk(String, 'words') for _ in range(2)]
+    before = time.time_ns()
+    for word in ('one', 'two', 'x' * 100_000):
+        for publisher in publishers:
+            publisher.publish(String(data=word))
     taken = list(internals.waiting_messages(subscription))
-    assert [deserialize_message(data, String).data for data, _ in taken] == ['one', 'two', 'three']
-    assert taken[0][0] == serialize_message(String(data='one'))
-    numbers = [info['publication_sequence_number'] for _, info in taken]
-    assert numbers == [1, 2, 3]
-    assert all(info['received_timestamp'] > 0 and info['source_timestamp'] > 0 for _, info in taken)
+    assert [one.data for one in taken[::2]] == [
+        serialize_message(String(data=word)) for word in ('one', 'two', 'x' * 100_000)
+    ]
+    assert [one.number for one in taken] == [1, 1, 2, 2, 3, 3]
+    assert all(before <= one.sent <= one.received <= time.time_ns() for one in taken)
+    endpoints = ros.peer.get_publishers_info_by_topic(subscription.topic_name)
+    assert {bytes(one.endpoint_gid) for one in endpoints} == {one.publisher for one in taken}
+    assert len({one.publisher for one in taken[::2]}) == 1
     assert list(internals.waiting_messages(subscription)) == []
+
+
+def test_the_single_threaded_executor_leaves_polled_subscriptions_alone(ros):
+    polled = ros.peer.create_subscription(
+        String, 'words', pytest.fail, QoSProfile(depth=10), raw=True, callback_group=internals.Polled()
+    )
+    heard = []
+    ros.peer.create_subscription(String, 'words', heard.append, 10)
+    publisher = ros.talk(String, 'words')
+    ros.executor.shutdown()
+    executor = SingleThreadedExecutor(context=ros.context)
+    executor.add_node(ros.peer)
+    publisher.publish(String(data='one'))
+    while not heard:
+        executor.spin_once()
+    executor.shutdown()
+    assert len(list(internals.waiting_messages(polled))) == 1
+
+
+def test_lost_messages_are_counted_where_the_middleware_reports_them(ros):
+    def subscribe(**events):
+        callbacks = SubscriptionEventCallbacks(use_default_callbacks=False, **events)
+        return ros.peer.create_subscription(
+            String, 'words', print, 1, callback_group=internals.Polled(), event_callbacks=callbacks
+        )
+
+    assert internals.lost_messages(subscribe()) == 0
+    assert internals.lost_messages(subscribe(message_lost=print)) == 0
 
 
 # --- Log

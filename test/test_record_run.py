@@ -10,16 +10,18 @@ from conftest import PATIENCE
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Goals, Odometry
 from processes import open_world
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
+from std_msgs.msg import Header
 
 from diffdrive_jacobian.bags.journal import JournalWriter, Message, read_journal
 from diffdrive_jacobian.recording.record import Status
-from diffdrive_jacobian.ros.runner import discovery_off
+from diffdrive_jacobian.ros.runner import discovery_off, ros_context
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import record_run
 
@@ -120,6 +122,26 @@ def test_the_bag_contains_the_messages_that_were_sent(world, bag, storage):
     assert 'MSG: geometry_msgs/PoseStamped' in kinds['/goals'].msgdef.data
 
 
+def test_a_latched_message_is_recorded_beside_a_publisher_that_is_not_latched(world, bag):
+    plain = Talk(world, ('goals', Goals, 10))
+    recorder = world.start('record_run', 'goals', '-o', str(bag))
+    plain.until_heard()
+    # In another context, as in another process, a new publisher knows no subscription.
+    with ros_context(['other']) as context:
+        node = Node('other', context=context)
+        latched = node.create_publisher(Goals, 'goals', LATCHED)
+        sent = [serialize_message(Goals(header=Header(frame_id=name))) for name in ('map', 'odom')]
+        latched.publish(sent[0])
+        world.harness.until(latched.get_subscription_count, 'it is matched', PATIENCE)
+        latched.publish(sent[1])
+        plain.say('goals', Goals())
+        world.harness.until(lambda: _arrived(bag, 3), 'all are in the journal', PATIENCE)
+        node.destroy_node()
+    recorder.signal(signal.SIGINT)
+    assert (recorder.exit(), recorder.stderr) == (0, '')
+    assert sorted(content(bag)['/goals']) == sorted(sent + plain.sent['goals'])
+
+
 def _arrived(bag, messages):
     """Whether so many messages are in the journal."""
     journal = bag.with_name('bag.journal')
@@ -179,13 +201,17 @@ def test_a_signal_in_a_burst_leaves_a_valid_bag(world, bag, number):
     assert _digest(found) == _digest(talk.sent['cmd_vel'])[: len(found)]
 
 
-def test_a_signal_at_the_start_leaves_an_empty_bag(world, bag):
+def test_a_signal_at_the_start_leaves_no_bag_or_an_empty_one(world, bag):
     recorder = world.start('record_run', '-o', str(bag), fresh=True)
     recorder.until_catches(signal.SIGTERM)
     recorder.signal(signal.SIGTERM)
-    assert recorder.exit() == 0
-    assert recorder.last_line == f'{bag} is complete and empty: no message was received'
-    assert content(bag) == {}
+    if recorder.exit() == 130:
+        assert recorder.stderr == 'record_run: interrupted\n'
+        assert list(bag.parent.glob('bag*')) == []
+    else:
+        assert recorder.exit() == 0
+        assert recorder.last_line == f'{bag} is complete and empty: no message was received'
+        assert content(bag) == {}
 
 
 def test_topics_are_selected_and_time_is_limited(world, bag):

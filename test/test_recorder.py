@@ -93,27 +93,52 @@ def setting(ros, executor_kind, request):
     return Setting(ros, reliability=request.param)
 
 
-def test_what_was_overwritten_while_it_waited_is_counted(setting):
-    setting.send(1, publisher=0)
-    setting.send(1, publisher=1)
-    setting.until_recorded(2)
+@pytest.mark.parametrize('second_is_silent', [False, True])
+def test_what_was_overwritten_while_it_waited_is_counted(setting, second_is_silent):
+    first_of_each = [0] if second_is_silent else [0, 1]
+    for publisher in first_of_each:
+        setting.send(1, publisher)
+    setting.until_recorded(len(first_of_each))
     for count in (DEPTH + 700, DEPTH + 55):
         # Nobody serves the recorder meanwhile.
-        setting.send(count - 20, publisher=0)
-        setting.send(20, publisher=1)
+        setting.send(count - 20)
+        setting.send(20, publisher=first_of_each[-1])
         before = len(setting.sink.data)
         setting.until_recorded(before + DEPTH)
     setting.until_drained()
-    assert len(setting.sink.data) == 2 + 2 * DEPTH
+    assert len(setting.sink.data) == len(first_of_each) + 2 * DEPTH
     assert setting.sink.missed == {'/cmd_vel': 755}
 
 
-def test_bursts_are_recorded_in_order(setting):
+def test_the_only_message_of_a_publisher_may_have_been_overwritten(setting):
+    setting.send(1, publisher=1)
     setting.send(DEPTH)
     setting.until_recorded(DEPTH)
     setting.until_drained()
+    assert setting.sink.data == setting.sent[1:]
+    assert setting.sink.missed == {}
+    assert setting.sink.left_out == {'possibly part of /cmd_vel': f'its queue of {DEPTH} was full'}
+
+
+def test_what_was_overwritten_at_the_end_is_counted(setting):
+    setting.send(1)
+    setting.until_recorded(1)
+    setting.send(5)
+    setting.recorder.end()
+    setting.send(DEPTH)
+    setting.harness.until(setting.recorder.drained, 'all is collected')
+    assert setting.sink.data == setting.sent[:1]
+    assert setting.sink.missed == {'/cmd_vel': 5}
+
+
+def test_bursts_are_recorded_in_order(setting):
+    for count in (DEPTH - 1, 20, DEPTH - 1):
+        setting.send(count)
+        setting.until_recorded(len(setting.sent))
+    setting.until_drained()
     assert setting.sink.data == setting.sent
     assert setting.sink.missed == {}
+    assert setting.sink.left_out == {}
 
 
 def test_what_waits_at_the_end_is_collected_and_what_comes_later_is_not(setting):
@@ -236,6 +261,50 @@ def test_a_later_publisher_with_weaker_qos_is_recorded(ros, executor_kind, first
     assert len(sink.channel.qos) == 2
 
 
+LATCHED = QoSProfile(depth=3, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+@pytest.mark.parametrize('latched_first', [False, True])
+@pytest.mark.parametrize('reliability', list(ReliabilityPolicy)[1:3], ids=str)
+def test_a_latched_message_is_recorded_once_beside_another_publisher(
+    ros, executor_kind, latched_first, reliability
+):
+    sink = Sink()
+    recorder = ros.add(Recorder, selection=Selection(topics=('cmd_vel',)), sink=sink, with_info=True)
+    profiles = {'plain': QoSProfile(depth=10, reliability=reliability), 'latched': LATCHED}
+    made = {}
+
+    def recorded(count):
+        recorder.discover()
+        return len(sink.data) == count
+
+    def publish(name, value):
+        message = Twist()
+        message.linear.x = value
+        made[name].publish(message)
+
+    for name in sorted(profiles, reverse=not latched_first):
+        made[name] = ros.peer.create_publisher(Twist, 'cmd_vel', profiles[name])
+        if name == 'latched':
+            # Nobody who is not latched receives the first ones, at least if it is the first publisher.
+            for value in range(5):
+                publish(name, float(value))
+        ros.until(
+            lambda one=made[name]: (recorder.discover(), one.get_subscription_count())[1], 'matched'
+        )
+    expected = 5 if not latched_first else 3
+    ros.until(lambda: recorded(expected), 'the latched ones are recorded')
+    ros.until(lambda: made['latched'].get_subscription_count() == 2, 'both receive')
+    for value in (10.0, 11.0):
+        publish('latched', value)
+        publish('plain', -value)
+    ros.until(lambda: recorded(expected + 4), 'all are recorded')
+    recorder.end()
+    ros.until(recorder.drained, 'all is collected')
+    assert len(sink.data) == len(set(sink.data)) == expected + 4
+    assert (sink.missed, sink.left_out) == ({}, {})
+
+
 def test_other_topics_are_not_recorded(ros, executor_kind):
     other = ros.peer.create_publisher(Twist, 'another_twist', 10)
     setting = Setting(ros)
@@ -246,10 +315,10 @@ def test_other_topics_are_not_recorded(ros, executor_kind):
 def test_a_middleware_without_events_is_recorded_from(ros, executor_kind, monkeypatch):
     create = Recorder.create_subscription
 
-    def without_events(*arguments, event_callbacks=None, **options):
-        if event_callbacks is not None:
+    def without_events(*arguments, event_callbacks, **options):
+        if event_callbacks.message_lost is not None:
             raise UnsupportedEventTypeError('no events')
-        return create(*arguments, **options)
+        return create(*arguments, event_callbacks=event_callbacks, **options)
 
     monkeypatch.setattr(Recorder, 'create_subscription', without_events)
     setting = Setting(ros)

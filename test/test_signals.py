@@ -20,7 +20,7 @@ from diffdrive_jacobian.tools.entry_points import _exit
 signals.TOGETHER, signals.GRACE = float(sys.argv[1]), 0.1
 caught = signals.Signals()
 caught.catch()
-caught.exit_on_second(lambda: _exit('tool'))
+caught.exit_on_second(lambda: _exit('tool', 'ended by a second signal'))
 lock = threading.Lock()
 lock.acquire()
 print('hangs', flush=True)
@@ -50,7 +50,35 @@ def test_a_second_signal_ends_a_process_that_hangs(number):
         threading.Event().wait(0.01)
     timer.cancel()
     assert child.returncode == 130
-    assert child.communicate()[1] == 'tool: ended by a second signal, before it could finish\n'
+    assert child.communicate()[1] == 'tool: ended by a second signal\n'
+
+
+AT_ONCE = """
+import os, signal, sys
+from diffdrive_jacobian.signals import Signals
+caught = Signals(lambda: os._exit(7))
+caught.catch()
+if sys.argv[1] == 'before':
+    os.kill(os.getpid(), signal.SIGINT)
+with caught.ending_at_once():
+    print('reached', flush=True)
+    if sys.argv[1] == 'while':
+        os.kill(os.getpid(), signal.SIGINT)
+        print('too late', flush=True)
+os.kill(os.getpid(), signal.SIGINT)
+print('counted', caught.count, flush=True)
+"""
+
+
+@pytest.mark.parametrize(
+    ('when', 'code', 'printed'),
+    [('before', 7, ''), ('while', 7, 'reached\n'), ('after', 0, 'reached\ncounted 1\n')],
+)
+def test_what_leaves_nothing_is_ended_at_once(when, code, printed):
+    ended = subprocess.run(
+        [sys.executable, '-c', AT_ONCE, when], capture_output=True, text=True, check=False
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (code, printed, '')
 
 
 class Watched:

@@ -10,7 +10,6 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist, TwistStamped
 from nav_msgs.msg import Goals, Odometry
 from numpy.typing import NDArray
-from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -20,7 +19,7 @@ from sensor_msgs.msg import JointState
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages import wire
 from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.ros.rclpy_internals import waiting_messages
+from diffdrive_jacobian.ros.rclpy_internals import Polled, waiting_messages
 from diffdrive_jacobian.ros.serialization import MAX_SIZE, checked_reader, ignoring_invalid
 from diffdrive_jacobian.ros.topic_errors import explaining_failure, type_name
 
@@ -32,24 +31,6 @@ LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 TWISTS: dict[str, type] = {type_name(kind): kind for kind in (Twist, TwistStamped)}
 """Types of cmd_vel by their names."""
 _twist, _twist_stamped = wire.twist_writer(Twist()), wire.twist_stamped_writer(TwistStamped())
-
-
-class Polled(CallbackGroup):  # type: ignore[misc]
-    """Entities of this group are left to `Latest.take`: no executor waits for them.
-
-    Many messages per second then cost next to nothing. The EventsExecutor ignores groups.
-    """
-
-    def can_execute(self, entity: Any) -> bool:
-        """Return False."""
-        return False
-
-    def beginning_execution(self, entity: Any) -> bool:
-        """Return False."""
-        return False
-
-    def ending_execution(self, entity: Any) -> None:
-        """Do nothing."""
 
 
 class Latest:
@@ -83,8 +64,8 @@ class Latest:
         """Return the message that was received since the last call. None: none, or an invalid one."""
         if self._polled:
             # The queue has one place; more than that is a flood, which must not hold up the page.
-            for data, _ in islice(waiting_messages(self._subscription), 2):
-                self._data = data
+            for message in islice(waiting_messages(self._subscription), 2):
+                self._data = message.data
         latest, self._data = self._data, None
         if latest is None or len(latest) > MAX_SIZE:
             return None

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from itertools import cycle, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -72,6 +73,7 @@ def draw(
     *,
     replace: bool = False,
     violations: Sequence[ViolationMark] = (),
+    drawing: AbstractContextManager[object] | None = None,
 ) -> None:
     """Draw runs into one set of axes, and write the figure to a new file.
 
@@ -80,6 +82,7 @@ def draw(
         path: Ends in .png, .svg or .pdf.
         replace: Whether to replace the file if it exists.
         violations: Violated properties of a single run.
+        drawing: Is entered while the figure is drawn, before the file is written (default: nothing).
 
     Raises:
         BagError: A run has no odometry.
@@ -93,7 +96,7 @@ def draw(
         raise ValueError(f'{path} must end in .{", .".join(FORMATS)}')
     if path.exists() and not replace:
         raise FileExistsError(f'{path} exists already')
-    with warnings.catch_warnings(), styled():
+    with drawing or nullcontext(), warnings.catch_warnings(), styled():
         # The font may lack a letter of a bag's name.
         warnings.filterwarnings('ignore', message='Glyph')
         # With many runs there may be no room for their names.

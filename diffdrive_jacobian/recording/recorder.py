@@ -5,32 +5,32 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from math import inf
 from typing import Any, Protocol
 
-from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, qos_check_compatible
-from rclpy.subscription import Subscription
 
 from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Record, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
 from diffdrive_jacobian.parameters.declaration import ParameterError
-from diffdrive_jacobian.recording.missed import MissedMessages
 from diffdrive_jacobian.recording.parameter_query import ParameterQuery
+from diffdrive_jacobian.recording.reception import (
+    CallbackReception,
+    CountingReception,
+    Intake,
+    Reception,
+)
 from diffdrive_jacobian.recording.selection import Selection as Selection
-from diffdrive_jacobian.ros.qos import subscription_profile, to_fields
-from diffdrive_jacobian.ros.rclpy_internals import reason, waiting_messages
+from diffdrive_jacobian.ros.qos import to_fields
+from diffdrive_jacobian.ros.rclpy_internals import ReceivedMessage, reason
 from diffdrive_jacobian.text import printable
 
 DEPTH = 4000
 """Depth of the queue of each subscription."""
-BURST = 0.01
-"""Longest time in which the queued messages of one topic are taken at once (s)."""
 DRAIN_PATIENCE = 3.0
 """Longest time at the end in which messages that were sent before are received (s)."""
 IN_TRANSIT = 0.1
@@ -69,10 +69,10 @@ class Recorder(Node):  # type: ignore[misc]
         Args:
             selection: Which topics.
             sink: The recording.
-            with_info: Whether the executor passes message info to callbacks. All do except the
-                EventsExecutor of Jazzy. Missed messages are then counted, and a message is recorded
-                with the time at which the middleware received it. Otherwise, and always with simulated
-                time, it is recorded with the time of the node's clock when its callback runs.
+            with_info: Whether messages are taken with their info, which the EventsExecutor of Jazzy does
+                not support. Missed messages are then counted, and a message is recorded with the time
+                at which the middleware received it. Otherwise, and always with simulated time, it is
+                recorded with the time of the node's clock when its callback runs.
             now: Returns the time with which messages are recorded (ns), for a clock that may go back
                 (default: that of the node's clock).
             kwargs: As for `rclpy.node.Node`.
@@ -86,16 +86,12 @@ class Recorder(Node):  # type: ignore[misc]
         self._names = {self._resolved(topic) for topic in selection.topics}
         self._pattern = re.compile(selection.pattern) if selection.pattern else None
         self._channels: dict[str, Channel] = {}
-        self._subscriptions_by_topic: dict[str, Subscription] = {}
-        self._takers: dict[str, Callable[[bytes, dict[str, int]], None]] = {}
+        self._receptions: dict[str, Reception] = {}
+        self._intake = Intake(self) if with_info else None
         self._refused: set[str] = set()
         self._queries: dict[str, ParameterQuery] = {}
-        self._with_info = with_info
         self._clock_now = now or (lambda: int(self.get_clock().now().nanoseconds))
         self._stamped = with_info and not self.get_parameter('use_sim_time').value
-        self._missed: dict[str, MissedMessages] = {}
-        self._reported: Counter[str] = Counter()
-        self._lost_before: Counter[str] = Counter()
         self._end: int | None = None
         self._drain_deadline = self._last_added = 0.0
         self.messages = 0
@@ -147,16 +143,18 @@ class Recorder(Node):  # type: ignore[misc]
 
     def drained(self) -> bool:
         """Return whether all messages sent before `end` were received, as far as can be determined."""
+        assert self._intake is not None, 'requires with_info'
+        self._intake.take_all()
         self._report_missed()
         now = time.monotonic()
         return now - self._last_added > IN_TRANSIT or now > self._drain_deadline
 
     def _report_missed(self) -> None:
-        for topic in self._channels:
-            # The sequence numbers show messages that were overwritten in the queue, but not those lost
-            # before the first message. The count of the middleware shows only the latter.
-            if missed := max(self._missed[topic].count, self._reported[topic]):
+        for topic, reception in self._receptions.items():
+            if missed := reception.missed:
                 self._sink.set_missed(topic, missed)
+            elif reception.doubtful:
+                self._sink.set_left_out(f'possibly part of {topic}', f'its queue of {DEPTH} was full')
 
     def _resolved(self, topic: str) -> str:
         try:
@@ -192,64 +190,27 @@ class Recorder(Node):  # type: ignore[misc]
             type_hash=described.type_hash,
             qos=_profiles(publishers),
         )
-        profile = subscription_profile((one.qos_profile for one in publishers), DEPTH)
         self._channels[topic] = channel
-        self._missed[topic] = MissedMessages(partial(self.count_publishers, topic))
+        self._receptions[topic] = self._reception(channel, message)
         self._sink.add(channel)
-        self._create_subscription(channel, message, profile)
+        self._match(channel, publishers)
 
     def _match(self, channel: Channel, publishers: list[Any]) -> None:
-        """Replace a subscription that is too strict for one of the publishers.
-
-        Messages that are sent until the new subscription is matched are missed, and counted with
-        `with_info`.
-        """
-        before = self._subscriptions_by_topic[channel.topic]
-        offered = [one.qos_profile for one in publishers if one.topic_type == channel.type_name]
-        if all(
-            qos_check_compatible(one, before.qos_profile)[0] != QoSCompatibility.ERROR for one in offered
-        ):
-            return
-        profile = subscription_profile([*offered, before.qos_profile], DEPTH)
-        # Latched messages are already recorded.
-        profile.durability = DurabilityPolicy.VOLATILE
-        for data, info in waiting_messages(before):
-            self._take(channel, data, info)
-        self.destroy_subscription(before)
-        self._lost_before[channel.topic] = self._reported[channel.topic]
-        self._create_subscription(channel, before.msg_type, profile)
-
-    def _take(self, channel: Channel, data: bytes, info: dict[str, int]) -> None:
-        if self._with_info:
-            self._takers[channel.topic](data, info)
-        else:
-            self._on_message(channel.id, data)
-
-    def _create_subscription(self, channel: Channel, message: Any, profile: QoSProfile) -> None:
         try:
-            subscription = self._new_subscription(channel, message, profile)
+            self._receptions[channel.topic].match(
+                [one.qos_profile for one in publishers if one.topic_type == channel.type_name]
+            )
         except (RuntimeError, NameValidationException) as error:
             self._leave_out(channel.topic, reason(error))
-            return
-        self._subscriptions_by_topic[channel.topic] = subscription
 
-    def _new_subscription(self, channel: Channel, message: Any, profile: QoSProfile) -> Subscription:
-        topic = channel.topic
-        if not self._with_info:
-            return self.create_subscription(
-                message, topic, partial(self._on_message, channel.id), profile, raw=True
-            )
-        self._takers[topic] = partial(self._record, channel.id, self._missed[topic])
-        callback = partial(self._on_informed, topic)
-        # rclpy passes message info to a callable with two arguments.
-        create = partial(self.create_subscription, message, topic, callback, profile, raw=True)
-        # Latched messages that a publisher overwrites before they are sent would be reported as lost.
-        latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        on_lost = None if latched else partial(self._on_lost, topic)
-        try:
-            return create(event_callbacks=SubscriptionEventCallbacks(message_lost=on_lost))
-        except UnsupportedEventTypeError:
-            return create()
+    def _reception(self, channel: Channel, message: type) -> Reception:
+        if self._intake is None:
+            on_data = partial(self._on_data, channel.id)
+            return CallbackReception(self, message, channel.topic, DEPTH, on_data)
+        on_message = partial(self._on_message, channel.id)
+        return CountingReception(
+            self, message, channel.topic, DEPTH, self._intake, on_message, self._is_late
+        )
 
     def _leave_out(self, topic: str, why: str) -> None:
         """Report once that a topic, or its publishers of one type, are not recorded."""
@@ -273,32 +234,16 @@ class Recorder(Node):  # type: ignore[misc]
 
     # --- Messages
 
-    def _on_message(self, channel: int, data: bytes) -> None:
+    def _on_data(self, channel: int, data: bytes) -> None:
         self._add(channel, self._now(), data)
 
-    def _on_informed(self, topic: str, data: bytes, info: dict[str, int]) -> None:
-        self._takers[topic](data, info)
-        # The executor takes one message at a time, at many times the cost: the queue would overflow.
-        subscription, end = self._subscriptions_by_topic[topic], time.monotonic() + BURST
-        for taken in waiting_messages(subscription):
-            self._takers[topic](*taken)
-            if time.monotonic() >= end:
-                break
+    def _on_message(self, channel: int, message: ReceivedMessage) -> None:
+        self._last_added = time.monotonic()
+        self._add(channel, message.received if self._stamped else self._now(), message.data)
 
-    def _record(self, channel: int, missed: MissedMessages, data: bytes, info: dict[str, int]) -> None:
-        if self._end is not None:
-            # Clocks of other machines may be ahead, so either time is sufficient.
-            if min(info['received_timestamp'], info['source_timestamp'] or self._end + 1) > self._end:
-                return
-            self._last_added = time.monotonic()
-        number = info['publication_sequence_number']
-        # None: the middleware has no sequence numbers.
-        if number is not None:
-            missed.received(number)
-        self._add(channel, info['received_timestamp'] if self._stamped else self._now(), data)
-
-    def _on_lost(self, topic: str, event: Any) -> None:
-        self._reported[topic] = self._lost_before[topic] + event.total_count
+    def _is_late(self, message: ReceivedMessage) -> bool:
+        # Clocks of other machines may be ahead, so either time is sufficient.
+        return self._end is not None and min(message.received, message.sent or inf) > self._end
 
     def _now(self) -> int:
         # A bag cannot contain a negative time.

@@ -16,9 +16,10 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import redirect_stderr
 from functools import cache
-from typing import Any, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.callback_groups import CallbackGroup
 from rclpy.client import Client
 from rclpy.clock import Clock
 from rclpy.context import Context
@@ -451,15 +452,126 @@ def wrap_publish(wrap: Callable[[Callable[..., None]], Callable[..., None]]) -> 
     return restore
 
 
-def waiting_messages(subscription: Subscription) -> Iterator[tuple[bytes, dict[str, Any]]]:
-    """Yield the serialized messages that wait in a subscription, with their message info.
+class ReceivedMessage(NamedTuple):
+    """A serialized message, and what the middleware knows about it."""
 
-    Relies on `Subscription.handle.take_message`. Executors take one message for each call of their own.
+    data: bytes
+    publisher: bytes
+    """The GID of the publisher."""
+    number: int | None
+    """Number of the message; its publisher counts 1, 2, 3, ... None: the middleware has no numbers."""
+    sent: int
+    """Time at which it was sent, by the clock of its publisher (ns). 0: unknown."""
+    received: int
+    """Time at which it was received, by the clock of this machine (ns). 0: unknown."""
+
+
+class Polled(CallbackGroup):  # type: ignore[misc]
+    """Entities of this group are left to `waiting_messages`: no executor waits for them.
+
+    Many messages per second then cost next to nothing. The EventsExecutor ignores groups.
     """
-    handle, message_type = subscription.handle, subscription.msg_type
-    with handle:
-        while (taken := handle.take_message(message_type, True)) is not None:
-            yield taken
+
+    def can_execute(self, entity: Any) -> bool:
+        """Return False."""
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        """Return False."""
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        """Do nothing."""
+
+
+class _MessageInfo(ctypes.Structure):
+    """`rmw_message_info_t` of Jazzy."""
+
+    _fields_: ClassVar = [
+        ('source_timestamp', ctypes.c_int64),
+        ('received_timestamp', ctypes.c_int64),
+        ('publication_sequence_number', ctypes.c_uint64),
+        ('reception_sequence_number', ctypes.c_uint64),
+        ('implementation_identifier', ctypes.c_char_p),
+        ('publisher_gid', ctypes.c_uint8 * 16),
+        ('from_intra_process', ctypes.c_bool),
+    ]
+
+
+class _Allocator(ctypes.Structure):
+    """`rcutils_allocator_t`."""
+
+    _fields_: ClassVar = [
+        (name, ctypes.c_void_p)
+        for name in ('allocate', 'deallocate', 'reallocate', 'zero_allocate', 'state')
+    ]
+
+
+class _SerializedMessage(ctypes.Structure):
+    """`rcutils_uint8_array_t`, which rcl enlarges as needed."""
+
+    _fields_: ClassVar = [
+        ('buffer', ctypes.c_void_p),
+        ('buffer_length', ctypes.c_size_t),
+        ('buffer_capacity', ctypes.c_size_t),
+        ('allocator', _Allocator),
+    ]
+
+
+_UNSUPPORTED = 2**64 - 1
+"""`RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED`."""
+
+
+@cache
+def _take_functions() -> tuple[Callable[..., int], Callable[..., int], _Allocator]:
+    """Return functions that take and free a serialized message, and the allocator of its buffer."""
+    library = ctypes.CDLL(rclpy_implementation.__file__)
+    library.rcutils_get_default_allocator.restype = _Allocator
+    take, free = library.rcl_take_serialized_message, library.rcutils_uint8_array_fini
+    take.argtypes, take.restype = [ctypes.c_void_p] * 4, ctypes.c_int
+    free.argtypes, free.restype = [ctypes.c_void_p], ctypes.c_int
+    return take, free, library.rcutils_get_default_allocator()
+
+
+def waiting_messages(subscription: Subscription) -> Iterator[ReceivedMessage]:
+    """Yield the messages that wait in a subscription.
+
+    Executors take one message for each call of their own, and rclpy does not say from which publisher.
+    Relies on `Subscription.handle.pointer`, and on `rcl_take_serialized_message` of the libraries with
+    which rclpy is linked.
+    """
+    take, free, allocator = _take_functions()
+    message, info = _SerializedMessage(allocator=allocator), _MessageInfo()
+    into = ctypes.byref(message), ctypes.byref(info), None
+    handle = subscription.handle
+    try:
+        with handle:
+            # RCL_RET_OK is 0.
+            while not take(handle.pointer, *into):
+                number = info.publication_sequence_number
+                yield ReceivedMessage(
+                    ctypes.string_at(message.buffer, message.buffer_length),
+                    bytes(info.publisher_gid),
+                    None if number == _UNSUPPORTED else number,
+                    info.source_timestamp,
+                    info.received_timestamp,
+                )
+    finally:
+        free(ctypes.byref(message))
+
+
+def lost_messages(subscription: Subscription) -> int:
+    """Return how many messages the middleware has reported as lost.
+
+    The subscription belongs to the group `Polled` and has a callback `message_lost` at most. Without
+    one this returns 0.
+    Relies on `EventHandler.take_data` and on `_ready_to_take_data`, which an executor sets.
+    """
+    count = 0
+    for handler in subscription.event_handlers:
+        handler._ready_to_take_data = True
+        count += handler.take_data().total_count
+    return count
 
 
 def with_message_info(

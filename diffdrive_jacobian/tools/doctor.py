@@ -82,7 +82,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
 
 def _observe(options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> tuple[str, Graph]:
     """Return the name of the middleware, and the graph."""
-    with long_lived():
+    with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS, and a diagnosis without ROS is one as well.
         from rclpy import get_rmw_implementation_identifier
 

@@ -51,7 +51,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         from diffdrive_jacobian.tools._live_drive import drive_with_page
 
         return drive_with_page(options, heading, ros, signals)
-    with long_lived():
+    with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
         from diffdrive_jacobian.drives import DriveError, drive, waypoints_through
         from diffdrive_jacobian.recording.record import open_recording, saved_on_error

@@ -21,10 +21,13 @@ from diffdrive_jacobian.tools._startup import (
     without_message_generator,
 )
 
+DONE = 0
 INTERRUPTED = 130
 OUTPUT_ERROR = 'the standard output cannot be written'
 NODES = ('virtual_robot', 'go_to_goal', 'wheel_bridge')
 """Programs that run a node."""
+UNTIL_SIGNAL = (*NODES, 'watch_run')
+"""Programs that run until a signal: it is no interruption."""
 ROS_MODULES = (
     *('rclpy', 'action_msgs', 'builtin_interfaces', 'geometry_msgs', 'nav_msgs', 'rcl_interfaces'),
     *('rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs', 'unique_identifier_msgs'),
@@ -73,7 +76,10 @@ def _run(module: str, function: str, *arguments: str, watched: bool = False) -> 
         watched: Whether a second signal ends the process even if the function does not react.
     """
     program = arguments[0] if arguments else module
-    signals = Signals()
+    if program in UNTIL_SIGNAL:
+        signals = Signals(partial(os._exit, DONE))
+    else:
+        signals = Signals(partial(_exit, program, 'interrupted'))
     signals.catch()
     for name in ('stdout', 'stderr'):
         if getattr(sys, name) is None:
@@ -84,10 +90,11 @@ def _run(module: str, function: str, *arguments: str, watched: bool = False) -> 
     without_message_generator()
     without_blas_threads()
     try:
-        with long_lived():
+        with long_lived(), signals.ending_at_once():
             run = getattr(importlib.import_module(f'diffdrive_jacobian.tools.{module}'), function)
         if watched:
-            signals.exit_on_second(partial(_exit, module))
+            why = 'ended by a second signal, before it could finish'
+            signals.exit_on_second(partial(_exit, program, why))
         code: int = run(*arguments, sys.argv[1:], signals)
     except BrokenPipeError:
         # The reader of the output is gone, as `head` when it has enough.
@@ -132,9 +139,9 @@ def _remedy(module: str | None) -> str | None:
     return None
 
 
-def _exit(program: str) -> None:
-    """End the process without clean-up, and print that."""
-    line = f'{program}: ended by a second signal, before it could finish\n'
+def _exit(program: str, why: str) -> None:
+    """End the process without clean-up, and print why."""
+    line = f'{program}: {why}\n'
     error = sys.stderr.fileno()
     # Whoever reads it may have stopped reading.
     if select.select([], [error], [], 0.0)[1]:

@@ -96,7 +96,8 @@ def _write(
     runs: Sequence[Run], picture: Path, tables: Sequence[Path], signals: Signals, *, replace: bool
 ) -> int:
     """Write the picture, then the tables, and return the exit code."""
-    writers = [partial(draw, runs, picture, replace=replace)]
+    # Drawing takes a second.
+    writers = [partial(draw, runs, picture, replace=replace, drawing=signals.ending_at_once())]
     writers += [
         partial(_write_table, *pair, replace=replace) for pair in zip(runs, tables, strict=bool(tables))
     ]

@@ -87,7 +87,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     for option in ('--regex', 'topics'):
         if options.all and getattr(options, option.lstrip('-')):
             parser.error(f'{option.replace("topics", "TOPIC")} has no effect with --all')
-    with long_lived():
+    with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
         from diffdrive_jacobian.recording.record import open_recording, record
         from diffdrive_jacobian.recording.recording import RecordingError
@@ -174,8 +174,9 @@ def _parser() -> _cli.Parser:
         usage=f'{PROGRAM} [TOPIC ...] [options] [--ros-args ...]',
         description='Record topics as a rosbag2 bag until Ctrl-C. Messages are on the disk within a '
         'second: after a crash recover_run writes the bag from them. Exit code 0: the bag is complete; '
-        '1: it is not complete (messages were lost, a topic cannot be recorded, or the disk failed), or '
-        'no message of a named TOPIC was received; 2: wrong arguments.',
+        '1: it is not complete (messages were or may be lost, a topic cannot be recorded, or the disk '
+        'failed), or no message of a named TOPIC was received; 2: wrong arguments; 130: interrupted '
+        'before it has begun.',
     )
     parser.add_argument(
         'topics',

@@ -26,7 +26,7 @@ MATCH_PATIENCE = 5.0
 
 
 def _replay(bag: Path, options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> int:
-    with long_lived():
+    with long_lived(), signals.ending_at_once():
         from diffdrive_jacobian.replay import COMMANDS, GOALS, NothingToPlayError, Playback, replay
 
     playback = Playback(

@@ -72,7 +72,7 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
             return _cli.complain(name, error)
         parser = _parser(name, program, parameters)
         ros = _cli.with_params_file(ros, _cli.parse(parser, own, parameters=[parameters], hint=hint))
-    with long_lived():
+    with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS. Only the node that runs: each takes time to import.
         from diffdrive_jacobian.ros.runner import ros_context, running
 

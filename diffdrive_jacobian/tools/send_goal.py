@@ -27,7 +27,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     options = _cli.parse(parser, own)
     heading = _cli.given_heading(parser, options)
     _cli.refuse_with(parser, options, '--timeout', '--no-wait')
-    with long_lived():
+    with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
         from diffdrive_jacobian.ros.remote_goal import send_goal
 

@@ -53,7 +53,7 @@ def _bag(options: argparse.Namespace, signals: Signals) -> int:
 
 
 def _nodes(options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> int:
-    with long_lived():
+    with long_lived(), signals.ending_at_once():
         from diffdrive_jacobian.live.running import watch_nodes
 
     try:

@@ -1,0 +1,244 @@
+"""Reception of the messages of a topic, whatever quality of service its publishers offer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import islice
+from typing import Any, Protocol
+
+from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
+from rclpy.node import Node
+from rclpy.qos import (
+    DurabilityPolicy,
+    QoSCompatibility,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
+from rclpy.subscription import Subscription
+from rclpy.waitable import NumberOfEntities, Waitable
+
+from diffdrive_jacobian.recording.missed import MissedMessages
+from diffdrive_jacobian.ros.qos import subscription_profile
+from diffdrive_jacobian.ros.rclpy_internals import (
+    Polled,
+    ReceivedMessage,
+    lost_messages,
+    waiting_messages,
+)
+
+BURST = 1000
+"""Largest number of messages that are taken from a queue at once."""
+
+
+class Reception(Protocol):
+    """Receives the messages of a topic."""
+
+    @property
+    def missed(self) -> int:
+        """Number of messages that are known to be missed."""
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether messages may be missed of which nothing is known."""
+
+    def match(self, offered: Sequence[QoSProfile]) -> None:
+        """Receive from publishers with these profiles, too.
+
+        Raises:
+            RuntimeError, NameValidationException: The topic cannot be subscribed to.
+        """
+
+
+class CallbackReception:
+    """Receives from one subscription, whose callback an executor calls.
+
+    For nodes in this process: losses are not noticed, and latched messages from before the
+    subscription are not received where another publisher is not latched.
+    """
+
+    missed = 0
+    doubtful = False
+
+    def __init__(
+        self, node: Node, kind: type, topic: str, depth: int, callback: Callable[[bytes], None]
+    ) -> None:
+        """Prepare; `match` subscribes."""
+        self._node, self._depth, self._callback = node, depth, callback
+        self._create = partial(node.create_subscription, kind, topic, callback, raw=True)
+        self._subscription: Subscription | None = None
+
+    def match(self, offered: Sequence[QoSProfile]) -> None:
+        """Subscribe, or replace a subscription that is too strict for one of the publishers."""
+        before = self._subscription
+        if before is None:
+            self._subscription = self._create(subscription_profile(offered, self._depth))
+            return
+        demanded = before.qos_profile
+        if all(qos_check_compatible(one, demanded)[0] != QoSCompatibility.ERROR for one in offered):
+            return
+        profile = subscription_profile([*offered, demanded], self._depth)
+        # Latched messages are already received.
+        profile.durability = DurabilityPolicy.VOLATILE
+        for message in waiting_messages(before):
+            self._callback(message.data)
+        self._node.destroy_subscription(before)
+        self._subscription = self._create(profile)
+
+
+class Queue:
+    """A subscription from whose queue messages are taken."""
+
+    def __init__(self, subscription: Subscription, receive: Callable[[ReceivedMessage], None]) -> None:
+        """Take messages of a subscription of the group `Polled` later.
+
+        Args:
+            subscription: The subscription.
+            receive: Receives each message.
+        """
+        self.subscription = subscription
+        self._receive = receive
+        self._taken = 0
+        self.full = False
+        """Whether it may have been full, and a message overwritten."""
+
+    def take(self, most: int) -> None:
+        """Take so many messages, or all."""
+        count = 0
+        for message in islice(waiting_messages(self.subscription), most):
+            count += 1
+            self._receive(message)
+        self._taken += count
+        # After an overwritten message at least as many as it has places are taken before it is empty.
+        self.full |= self._taken >= self.subscription.qos_profile.depth
+        if count < most:
+            self._taken = 0
+
+
+class Intake(Waitable):  # type: ignore[misc]
+    """Waits for the messages of all queues of a node."""
+
+    def __init__(self, node: Node) -> None:
+        """Start without queues."""
+        super().__init__(node.default_callback_group)
+        self._queues: list[Queue] = []
+        self._ready: list[Queue] = []
+        node.add_waitable(self)
+
+    def add(self, queue: Queue) -> None:
+        """Wait for its messages."""
+        self._queues.append(queue)
+
+    def take_all(self) -> None:
+        """Take all messages that wait."""
+        for queue in self._queues:
+            queue.take(queue.subscription.qos_profile.depth)
+
+    def get_num_entities(self) -> NumberOfEntities:
+        """Return the number of subscriptions."""
+        return NumberOfEntities(num_subs=len(self._queues))
+
+    def add_to_wait_set(self, wait_set: Any) -> None:
+        """Add the subscriptions to a wait set."""
+        self._indices = [
+            (wait_set.add_subscription(queue.subscription.handle), queue) for queue in self._queues
+        ]
+
+    def is_ready(self, wait_set: Any) -> bool:
+        """Return whether messages wait."""
+        self._ready = [
+            queue for index, queue in self._indices if wait_set.is_ready('subscription', index)
+        ]
+        return bool(self._ready)
+
+    def take_data(self) -> list[Queue]:
+        """Return the queues in which messages wait."""
+        return self._ready
+
+    async def execute(self, taken_data: list[Queue]) -> None:
+        """Take messages of each of these queues."""
+        for queue in taken_data:
+            queue.take(BURST)
+
+
+class CountingReception:
+    """Receives each message once, and notices those that are missed.
+
+    A single subscription that receives from every publisher would demand the least that one of them
+    offers: it would lose messages of reliable publishers, and not receive what latched ones sent before.
+    So there is a subscription for each offered combination of reliability and durability. A message that
+    several of them receive is recognized by its publisher and its number.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        kind: type,
+        topic: str,
+        depth: int,
+        intake: Intake,
+        on_message: Callable[[ReceivedMessage], None],
+        is_late: Callable[[ReceivedMessage], bool],
+    ) -> None:
+        """Prepare; `match` subscribes.
+
+        Args:
+            node: The node that subscribes.
+            kind: Type of the messages.
+            topic: Name of the topic.
+            depth: Length of the queue of each subscription.
+            intake: Waits for the messages.
+            on_message: Receives each message.
+            is_late: Returns whether a message came after the end of the recording.
+        """
+        self._create = partial(
+            node.create_subscription, kind, topic, _ignore, raw=True, callback_group=Polled()
+        )
+        self._depth, self._intake = depth, intake
+        self._on_message, self._is_late = on_message, is_late
+        self._numbers = MissedMessages()
+        self._queues: dict[tuple[Any, Any], Queue] = {}
+
+    @property
+    def missed(self) -> int:
+        """Number of messages that are known to be missed."""
+        # The numbers show messages that were overwritten in the queue, but not those lost before the
+        # first message of a publisher. The middleware reports only those lost on the way.
+        reported = sum(lost_messages(queue.subscription) for queue in self._queues.values())
+        return max(self._numbers.count, reported)
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether a queue may have been full: a publisher's only or last message may be missed."""
+        return any(queue.full for queue in self._queues.values())
+
+    def match(self, offered: Sequence[QoSProfile]) -> None:
+        """Subscribe for each combination of reliability and durability that is new."""
+        for one in offered:
+            demanded = one.reliability, one.durability
+            if demanded not in self._queues:
+                queue = Queue(self._subscribe(*demanded), self._receive)
+                self._queues[demanded] = queue
+                self._intake.add(queue)
+
+    def _subscribe(self, reliability: ReliabilityPolicy, durability: DurabilityPolicy) -> Subscription:
+        profile = QoSProfile(depth=self._depth, reliability=reliability, durability=durability)
+        # Latched messages that a publisher overwrites before they are sent would be reported as lost.
+        latched = durability == DurabilityPolicy.TRANSIENT_LOCAL
+        events = partial(SubscriptionEventCallbacks, use_default_callbacks=False)
+        try:
+            lost = None if latched else _ignore
+            return self._create(profile, event_callbacks=events(message_lost=lost))
+        except UnsupportedEventTypeError:
+            return self._create(profile, event_callbacks=events())
+
+    def _receive(self, message: ReceivedMessage) -> None:
+        if self._is_late(message):
+            self._numbers.received_late(message)
+        elif self._numbers.received(message):
+            self._on_message(message)
+
+
+def _ignore(event: Any) -> None:
+    """Do nothing. Messages and events are taken by those who ask for them."""
