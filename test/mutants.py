@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import ast
 import faulthandler
+import gc
 import hashlib
 import importlib
 import itertools
@@ -200,6 +201,8 @@ def run_tests(files: Iterable[str], plugin: Plugin, directory: Path) -> int:
 
     settings.register_profile('mutants', derandomize=True, database=None, deadline=None)
     settings.load_profile('mutants')
+    # What the tests of this process have left behind cannot always be freed in a fork.
+    gc.freeze()
     os.environ.pop('PYTEST_ADDOPTS', None)
     # Assertions are not rewritten: for that pytest would load the modules itself.
     options = ['-q', '--tb=no', '--assert=plain', '-p', 'no:cacheprovider', '-p', 'no:xdist']
