@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest import mock
+
 import pytest
 from conftest import PATIENCE
 from domains import domain_id
@@ -13,10 +15,12 @@ from rclpy.serialization import serialize_message
 
 from diffdrive_jacobian.bags.journal import Channel, Message
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError
-from diffdrive_jacobian.recording import recorder
+from diffdrive_jacobian.recording import reception, recorder
 from diffdrive_jacobian.recording.recorder import Recorder, Selection
+from diffdrive_jacobian.ros.rclpy_internals import ReceivedMessage
 from diffdrive_jacobian.ros.runner import ros_context
 
+BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
 DEPTH = 200
 """Messages that may wait: fewer than the recorder allows."""
 
@@ -84,8 +88,10 @@ def executor_kind():
 
 
 @pytest.fixture(autouse=True)
-def depth(monkeypatch):
+def limits(monkeypatch):
     monkeypatch.setattr(recorder, 'DEPTH', DEPTH)
+    # Bursts lose nothing in one process.
+    monkeypatch.setattr(recorder, 'HEARTBEAT', 0.0)
 
 
 @pytest.fixture(params=list(ReliabilityPolicy)[1:3], ids=str)
@@ -159,6 +165,129 @@ def test_the_recording_ends_although_messages_are_still_published(setting):
 
     setting.harness.until(drained, 'all is collected')
     assert setting.sink.data == []
+
+
+class Doubt:
+    """A recording that has ended after a burst, of which a heartbeat may bring more for a long time."""
+
+    def __init__(self, ros, monkeypatch, reliability=ReliabilityPolicy.RELIABLE):
+        monkeypatch.setattr(recorder, 'HEARTBEAT', 1e6)
+        monkeypatch.setattr(recorder, 'BURST_VOLUME', 10 * recorder.OVERHEAD)
+        self.setting = Setting(ros, reliability=reliability)
+        self.send(11)
+
+    def send(self, count):
+        for publisher in (0, 1):
+            self.setting.send(count, publisher)
+        self.setting.until_recorded(2 * count)
+
+    def end(self):
+        self.setting.recorder.end()
+        # So that nothing is expected, were it not for the burst.
+        monotonic = recorder.time.monotonic
+        self.setting.recorder._last_added = monotonic() - 2 * recorder.IN_TRANSIT
+
+
+def test_after_a_burst_late_messages_are_waited_for(ros, executor_kind, monkeypatch):
+    doubt = Doubt(ros, monkeypatch)
+    doubt.end()
+    assert not doubt.setting.recorder.drained()
+    assert doubt.setting.recorder.awaited == ['/cmd_vel']
+    monkeypatch.setattr(recorder, 'HEARTBEAT', 0.0)
+    assert doubt.setting.recorder.drained()
+    assert doubt.setting.sink.left_out == {}
+
+
+def test_without_a_burst_nothing_is_waited_for(ros, executor_kind, monkeypatch):
+    monkeypatch.setattr(recorder, 'HEARTBEAT', 1e6)
+    setting = Setting(ros)
+    setting.send(20)
+    setting.until_recorded(20)
+    setting.until_drained()
+    assert setting.sink.left_out == {}
+
+
+def test_a_best_effort_publisher_is_not_waited_for(ros, executor_kind, monkeypatch):
+    doubt = Doubt(ros, monkeypatch, ReliabilityPolicy.BEST_EFFORT)
+    doubt.end()
+    assert doubt.setting.recorder.drained()
+
+
+def test_a_reliable_publisher_confirms_by_its_next_message(ros, executor_kind, monkeypatch):
+    doubt = Doubt(ros, monkeypatch)
+    setting = doubt.setting
+    setting.recorder.end()
+    setting.send(1, publisher=0)
+    setting.harness.until(lambda: setting.recorder._receptions['/cmd_vel'].confirmed, 'one confirms')
+    assert not setting.recorder.drained()
+    setting.send(1, publisher=1)
+    setting.harness.until(setting.recorder.drained, 'both have confirmed')
+    assert setting.recorder.awaited == []
+    assert setting.sink.left_out == {}
+
+
+def test_a_publisher_that_ended_is_not_waited_for(ros, executor_kind, monkeypatch):
+    setting = Doubt(ros, monkeypatch).setting
+    for publisher in setting.publishers:
+        ros.peer.destroy_publisher(publisher)
+    setting.until_drained()
+    assert setting.sink.left_out == {}
+
+
+def test_a_wait_that_is_cut_short_or_too_long_makes_the_recording_incomplete(
+    ros, executor_kind, monkeypatch
+):
+    doubt = Doubt(ros, monkeypatch)
+    doubt.end()
+    doubt.setting.recorder.give_up('no time')
+    assert doubt.setting.sink.left_out == {'possibly the end of /cmd_vel': 'no time'}
+    monkeypatch.setattr(recorder, 'DRAIN_PATIENCE', -1.0)
+    doubt.end()
+    assert doubt.setting.recorder.drained()
+    assert 'still arriving' in doubt.setting.sink.left_out['possibly the end of /cmd_vel']
+
+
+class Subscriptions:
+    """The subscriptions of a reception, whose messages a test chooses."""
+
+    def __init__(self, monkeypatch, lost):
+        self.recorded = []
+        self.queues = {}
+        monkeypatch.setattr(reception, 'lost_messages', lambda subscription: lost[subscription])
+        self.reception = reception.CountingReception(
+            mock.Mock(create_subscription=lambda *_, **options: options),
+            Twist,
+            '/cmd_vel',
+            DEPTH,
+            mock.Mock(),
+            lambda message: self.recorded.append(message.number),
+            lambda message: False,
+        )
+        monkeypatch.setattr(self.reception, '_subscribe', lambda reliability, durability: reliability)
+        self.reception.match([QoSProfile(depth=1, reliability=one) for one in lost])
+        for (reliability, _), queue in self.reception._queues.items():
+            self.queues[reliability] = queue
+
+    def receive(self, reliability, *numbers):
+        for number in numbers:
+            self.queues[reliability]._receive(ReceivedMessage(b'', b'R', number, 0, 0))
+
+
+def test_a_reliable_publisher_beside_a_best_effort_one_is_recorded_in_order_and_without_loss(
+    monkeypatch,
+):
+    subscriptions = Subscriptions(monkeypatch, {BEST_EFFORT: 3, RELIABLE: 0})
+    subscriptions.receive(BEST_EFFORT, 1, 2)
+    subscriptions.receive(RELIABLE, 2, 3)
+    subscriptions.receive(BEST_EFFORT, 3, 7)
+    subscriptions.receive(RELIABLE, 4, 5, 6, 7)
+    assert subscriptions.recorded == [1, 2, 3, 4, 5, 6, 7]
+    assert subscriptions.reception.missed == 0
+
+
+@pytest.mark.parametrize('reliability', list(ReliabilityPolicy)[1:3], ids=str)
+def test_losses_that_the_middleware_reports_are_counted(monkeypatch, reliability):
+    assert Subscriptions(monkeypatch, {reliability: 3}).reception.missed == 3
 
 
 def test_what_a_latched_topic_overwrote_before_is_not_missed(ros, executor_kind):

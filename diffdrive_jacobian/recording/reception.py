@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from functools import partial
 from itertools import islice
+from math import inf
 from typing import Any, Protocol
 
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
@@ -43,6 +44,10 @@ class Reception(Protocol):
     def doubtful(self) -> bool:
         """Whether messages may be missed of which nothing is known."""
 
+    @property
+    def confirmed(self) -> Set[bytes]:
+        """Reliable publishers (GID) that have delivered all that they sent before the end."""
+
     def match(self, offered: Sequence[QoSProfile]) -> None:
         """Receive from publishers with these profiles, too.
 
@@ -60,6 +65,7 @@ class CallbackReception:
 
     missed = 0
     doubtful = False
+    confirmed: Set[bytes] = frozenset()
 
     def __init__(
         self, node: Node, kind: type, topic: str, depth: int, callback: Callable[[bytes], None]
@@ -169,6 +175,9 @@ class CountingReception:
     offers: it would lose messages of reliable publishers, and not receive what latched ones sent before.
     So there is a subscription for each offered combination of reliability and durability. A message that
     several of them receive is recognized by its publisher and its number.
+
+    A best-effort subscription also receives from reliable publishers, with gaps. What a reliable one
+    receives, too, is taken from that one only: nothing is missing there, and it is in order.
     """
 
     def __init__(
@@ -199,14 +208,19 @@ class CountingReception:
         self._on_message, self._is_late = on_message, is_late
         self._numbers = MissedMessages()
         self._queues: dict[tuple[Any, Any], Queue] = {}
+        # The first message of each publisher that a reliable subscription received.
+        self._reliable_from: dict[bytes, float] = {}
+        self.confirmed: set[bytes] = set()
 
     @property
     def missed(self) -> int:
         """Number of messages that are known to be missed."""
         # The numbers show messages that were overwritten in the queue, but not those lost before the
-        # first message of a publisher. The middleware reports only those lost on the way.
-        reported = sum(lost_messages(queue.subscription) for queue in self._queues.values())
-        return max(self._numbers.count, reported)
+        # first message of a publisher. The middleware reports only those lost on the way, for each
+        # subscription: what a best-effort one lost may have been received by a reliable one.
+        lost = {demanded: lost_messages(one.subscription) for demanded, one in self._queues.items()}
+        reliable = [count for demanded, count in lost.items() if _is_reliable(demanded)]
+        return max(self._numbers.count, sum(reliable or lost.values()))
 
     @property
     def doubtful(self) -> bool:
@@ -218,7 +232,8 @@ class CountingReception:
         for one in offered:
             demanded = one.reliability, one.durability
             if demanded not in self._queues:
-                queue = Queue(self._subscribe(*demanded), self._receive)
+                receive = self._receive_reliable if _is_reliable(demanded) else self._receive_best_effort
+                queue = Queue(self._subscribe(*demanded), receive)
                 self._queues[demanded] = queue
                 self._intake.add(queue)
 
@@ -233,11 +248,27 @@ class CountingReception:
         except UnsupportedEventTypeError:
             return self._create(profile, event_callbacks=events())
 
+    def _receive_reliable(self, message: ReceivedMessage) -> None:
+        if message.number is not None:
+            self._reliable_from.setdefault(message.publisher, message.number)
+        if self._is_late(message):
+            # A reliable publisher delivers in order.
+            self.confirmed.add(message.publisher)
+        self._receive(message)
+
+    def _receive_best_effort(self, message: ReceivedMessage) -> None:
+        if message.number is None or message.number < self._reliable_from.get(message.publisher, inf):
+            self._receive(message)
+
     def _receive(self, message: ReceivedMessage) -> None:
         if self._is_late(message):
             self._numbers.received_late(message)
         elif self._numbers.received(message):
             self._on_message(message)
+
+
+def _is_reliable(demanded: tuple[Any, Any]) -> bool:
+    return bool(demanded[0] == ReliabilityPolicy.RELIABLE)
 
 
 def _ignore(event: Any) -> None:

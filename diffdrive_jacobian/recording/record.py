@@ -23,6 +23,8 @@ NAME = 'record_run'
 """Name of the node."""
 DISCOVERY_PERIOD = 0.2
 """Time between two searches for new topics (s)."""
+WAIT_SHOWN = 0.5
+"""A wait for late messages that is longer than this is shown (s)."""
 EVERY_NODE = ('/parameter_events', '/rosout')
 """Topics that every node publishes."""
 
@@ -104,6 +106,7 @@ def record(
     ros_arguments: Sequence[str] = (),
     signals: Signals | None = None,
     on_status: Callable[[Status], object] | None = None,
+    on_wait: Callable[[Sequence[str]], object] | None = None,
     on_end: Callable[[], object] | None = None,
 ) -> Summary:
     """Record until a signal is caught, the time is over, ROS is shut down or the disk fails.
@@ -115,6 +118,7 @@ def record(
         ros_arguments: ROS arguments of the node.
         signals: Counter of the signals that end the recording. None: no signal does.
         on_status: Receives the status, several times a second.
+        on_wait: Called if late messages are waited for at the end, with their topics.
         on_end: Called when nothing more is received, before the bag is written.
 
     Returns:
@@ -134,6 +138,7 @@ def record(
                 signals,
                 max_duration,
                 on_status or (lambda status: None),
+                on_wait or (lambda topics: None),
             )
     if on_end is not None:
         on_end()
@@ -147,6 +152,7 @@ def _receive(
     signals: Signals,
     max_duration: float | None,
     on_status: Callable[[Status], object],
+    on_wait: Callable[[Sequence[str]], object],
 ) -> None:
     with (
         ros_context([NAME, *ros_arguments]) as context,
@@ -167,9 +173,21 @@ def _receive(
 
         if runner.spin(over) and recording.error is None:
             recorder.end()
-            # A second signal does not wait.
-            before = signals.count
-            runner.spin(lambda: recorder.drained() or signals.count > before)
+            before, ended, told = signals.count, time.monotonic(), False
+
+            def drained() -> bool:
+                nonlocal told
+                if recorder.drained():
+                    return True
+                if recorder.awaited and not told and time.monotonic() - ended > WAIT_SHOWN:
+                    told = True
+                    on_wait(recorder.awaited)
+                if signals.count > before:
+                    recorder.give_up('a second signal ended the wait for late messages')
+                    return True
+                return False
+
+            runner.spin(drained)
 
 
 def _status(recorder: Recorder, recording: Recording) -> Status:

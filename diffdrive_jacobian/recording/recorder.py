@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
+from rclpy.qos import ReliabilityPolicy
 
 from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Record, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
@@ -31,10 +32,21 @@ from diffdrive_jacobian.text import printable
 
 DEPTH = 4000
 """Depth of the queue of each subscription."""
-DRAIN_PATIENCE = 3.0
+DRAIN_PATIENCE = 12.0
 """Longest time at the end in which messages that were sent before are received (s)."""
 IN_TRANSIT = 0.1
-"""After this time without such a message no more is expected (s)."""
+"""After this time without such a message no more is expected, unless there was a burst (s)."""
+HEARTBEAT = 3.5
+"""Time after a burst in which reliable publishers send what was lost in it (s).
+
+Fast DDS: by default a publisher that sends nothing else says every 3 s which messages it has sent.
+"""
+BURST_VOLUME = 80_000
+"""Volume with which the buffer of a socket may have overflowed (bytes; Linux: 212,992 by default)."""
+BURST_TIME = 0.05
+"""Time within which such a volume is a burst (s)."""
+OVERHEAD = 768
+"""What a message takes up in the buffer of a socket besides its data (bytes)."""
 MAX_REPORT = 500
 """Largest length of the report on a topic (characters)."""
 
@@ -93,7 +105,10 @@ class Recorder(Node):  # type: ignore[misc]
         self._clock_now = now or (lambda: int(self.get_clock().now().nanoseconds))
         self._stamped = with_info and not self.get_parameter('use_sim_time').value
         self._end: int | None = None
-        self._drain_deadline = self._last_added = 0.0
+        self._drain_deadline = self._last_added = self._checked = 0.0
+        self._window, self._volume, self._last_burst = 0.0, 0, -inf
+        self.awaited: list[str] = []
+        """After `end`: topics with reliable publishers that have not confirmed that all is received."""
         self.messages = 0
         """Number of messages received."""
 
@@ -138,16 +153,51 @@ class Recorder(Node):  # type: ignore[misc]
         Requires `with_info`.
         """
         self._end = time.time_ns()
-        self._last_added = time.monotonic()
+        self._last_added = self._checked = time.monotonic()
         self._drain_deadline = self._last_added + DRAIN_PATIENCE
+        self.awaited = self._unconfirmed()
 
     def drained(self) -> bool:
-        """Return whether all messages sent before `end` were received, as far as can be determined."""
+        """Return whether all messages sent before `end` were received, as far as can be determined.
+
+        Or the time for them is over: `give_up` is then called.
+
+        A reliable publisher has delivered all if a message arrives that it sent after the end. Otherwise
+        a message may be missing after a burst, which may have exceeded the buffer: the publisher then
+        sends it again within `HEARTBEAT`.
+        """
         assert self._intake is not None, 'requires with_info'
         self._intake.take_all()
         self._report_missed()
         now = time.monotonic()
-        return now - self._last_added > IN_TRANSIT or now > self._drain_deadline
+        if now - self._checked > IN_TRANSIT:
+            self._checked = now
+            self.awaited = self._unconfirmed()
+        in_doubt = self.awaited and now - self._last_burst < HEARTBEAT
+        if now - self._last_added > IN_TRANSIT and not in_doubt:
+            return True
+        if now > self._drain_deadline:
+            self.give_up(f'messages were still arriving {DRAIN_PATIENCE:.0f} s after the end')
+            return True
+        return False
+
+    def give_up(self, why: str) -> None:
+        """Report that messages sent before `end` may be missing, because it was not waited for them."""
+        for topic in self._unconfirmed() or self.topics:
+            self._sink.set_left_out(f'possibly the end of {topic}', why)
+
+    def _unconfirmed(self) -> list[str]:
+        """Return the topics that have a reliable publisher of which more may come."""
+        return [
+            topic
+            for topic, channel in self._channels.items()
+            if any(
+                one.topic_type == channel.type_name
+                and one.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+                and bytes(one.endpoint_gid) not in self._receptions[topic].confirmed
+                for one in self.get_publishers_info_by_topic(topic)
+            )
+        ]
 
     def _report_missed(self) -> None:
         for topic, reception in self._receptions.items():
@@ -238,7 +288,12 @@ class Recorder(Node):  # type: ignore[misc]
         self._add(channel, self._now(), data)
 
     def _on_message(self, channel: int, message: ReceivedMessage) -> None:
-        self._last_added = time.monotonic()
+        self._last_added = now = time.monotonic()
+        if now - self._window > BURST_TIME:
+            self._window, self._volume = now, 0
+        self._volume += len(message.data) + OVERHEAD
+        if self._volume > BURST_VOLUME:
+            self._last_burst = now
         self._add(channel, message.received if self._stamped else self._now(), message.data)
 
     def _is_late(self, message: ReceivedMessage) -> bool:

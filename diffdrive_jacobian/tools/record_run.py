@@ -72,6 +72,15 @@ class StatusLine:
             f'\r{line}\x1b[K' if self._terminal else line, end='' if self._terminal else '\n', flush=True
         )
 
+    def wait(self, topics: Sequence[str]) -> None:
+        """Show that late messages are waited for."""
+        self.end()
+        print(
+            f'waiting some seconds for late messages of {_listed(topics)}; '
+            'Ctrl-C again ends at once, and the bag is incomplete',
+            flush=True,
+        )
+
     def end(self) -> None:
         """End the line."""
         if self._terminal and self._shown:
@@ -117,6 +126,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                 ros_arguments=ros,
                 signals=signals,
                 on_status=line.show,
+                on_wait=line.wait,
                 on_end=lambda: ending.enter_context(busy(PROGRAM, f'writing {bag}')),
             )
         finally:
