@@ -17,7 +17,7 @@ from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
-from std_msgs.msg import Header
+from std_msgs.msg import Header, String
 
 from diffdrive_jacobian.bags.journal import JournalWriter, Message, read_journal
 from diffdrive_jacobian.recording.record import Status
@@ -199,6 +199,22 @@ def test_a_signal_in_a_burst_leaves_a_valid_bag(world, bag, number):
     assert recorder.exit() == 0
     found = content(bag)['/cmd_vel']
     assert _digest(found) == _digest(talk.sent['cmd_vel'])[: len(found)]
+
+
+def test_a_second_signal_that_ends_the_wait_for_late_messages_makes_the_bag_incomplete(world, bag):
+    talk = Talk(world, ('text', String, 10))
+    recorder = world.start('record_run', 'text', '-o', str(bag))
+    talk.until_heard()
+    # As large as the buffer of a socket: a further one may have been lost.
+    talk.say('text', String(data=100_000 * 'x'))
+    world.harness.until(lambda: _arrived(bag, 1), 'it is in the journal')
+    recorder.signal(signal.SIGINT)
+    recorder.until_says('waiting some seconds for late messages of /text')
+    recorder.signal(signal.SIGINT)
+    assert recorder.exit() == 1
+    assert 'possibly the end of /text was not recorded: a second signal' in recorder.stderr
+    assert f'{bag} is incomplete: 1 message' in recorder.last_line
+    assert content(bag)['/text'] == talk.sent['text']
 
 
 def test_a_signal_at_the_start_leaves_no_bag_or_an_empty_one(world, bag):
