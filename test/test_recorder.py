@@ -247,6 +247,22 @@ def test_a_wait_that_is_cut_short_or_too_long_makes_the_recording_incomplete(
     assert 'still arriving' in doubt.setting.sink.left_out['possibly the end of /cmd_vel']
 
 
+def test_a_large_last_message_cannot_be_confirmed_by_waiting(ros, executor_kind, monkeypatch):
+    monkeypatch.setattr(recorder, 'LARGE', 10)
+    doubt = Doubt(ros, monkeypatch)
+    doubt.end()
+    monkeypatch.setattr(recorder, 'HEARTBEAT', 0.0)
+    assert doubt.setting.recorder.drained()
+    assert 'cannot be confirmed' in doubt.setting.sink.left_out['possibly the end of /cmd_vel']
+
+
+def test_a_recorder_that_was_held_at_the_end_still_waits(ros, executor_kind, monkeypatch):
+    doubt = Doubt(ros, monkeypatch, ReliabilityPolicy.BEST_EFFORT)
+    doubt.end()
+    doubt.setting.recorder._called -= 2 * recorder.HELD
+    assert not doubt.setting.recorder.drained()
+
+
 class Subscriptions:
     """The subscriptions of a reception, whose messages a test chooses."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from functools import partial
 from math import inf
@@ -45,6 +45,10 @@ BURST_VOLUME = 80_000
 """Volume with which the buffer of a socket may have overflowed (bytes; Linux: 212,992 by default)."""
 BURST_TIME = 0.05
 """Time within which such a volume is a burst (s)."""
+LARGE = 200_000
+"""Size of messages that exceed such a buffer (bytes): several heartbeats may be needed to repair one."""
+HELD = 0.5
+"""Time between two calls of `drained` after which the process was held, and nothing was received (s)."""
 OVERHEAD = 768
 """What a message takes up in the buffer of a socket besides its data (bytes)."""
 MAX_REPORT = 500
@@ -105,8 +109,10 @@ class Recorder(Node):  # type: ignore[misc]
         self._clock_now = now or (lambda: int(self.get_clock().now().nanoseconds))
         self._stamped = with_info and not self.get_parameter('use_sim_time').value
         self._end: int | None = None
-        self._drain_deadline = self._last_added = self._checked = 0.0
+        self._drain_deadline = self._last_added = self._checked = self._called = 0.0
         self._window, self._volume, self._last_burst = 0.0, 0, -inf
+        # Publishers of large messages, and when the last one was received.
+        self._large: dict[bytes, float] = {}
         self.awaited: list[str] = []
         """After `end`: topics with reliable publishers that have not confirmed that all is received."""
         self.messages = 0
@@ -153,8 +159,10 @@ class Recorder(Node):  # type: ignore[misc]
         Requires `with_info`.
         """
         self._end = time.time_ns()
-        self._last_added = self._checked = time.monotonic()
+        self._last_added = self._checked = self._called = time.monotonic()
         self._drain_deadline = self._last_added + DRAIN_PATIENCE
+        large = {one for one, at in self._large.items() if self._last_added - at < HEARTBEAT}
+        self._large = dict.fromkeys(large, 0.0)
         self.awaited = self._unconfirmed()
 
     def drained(self) -> bool:
@@ -170,11 +178,17 @@ class Recorder(Node):  # type: ignore[misc]
         self._intake.take_all()
         self._report_missed()
         now = time.monotonic()
+        if now - self._called > HELD:
+            self._last_added = self._last_burst = now
+            self._drain_deadline = now + DRAIN_PATIENCE
+        self._called = now
         if now - self._checked > IN_TRANSIT:
             self._checked = now
             self.awaited = self._unconfirmed()
         in_doubt = self.awaited and now - self._last_burst < HEARTBEAT
         if now - self._last_added > IN_TRANSIT and not in_doubt:
+            for topic in self._unconfirmed(self._large):
+                self._leave_end_out(topic, 'its last messages are large, and cannot be confirmed')
             return True
         if now > self._drain_deadline:
             self.give_up(f'messages were still arriving {DRAIN_PATIENCE:.0f} s after the end')
@@ -184,10 +198,13 @@ class Recorder(Node):  # type: ignore[misc]
     def give_up(self, why: str) -> None:
         """Report that messages sent before `end` may be missing, because it was not waited for them."""
         for topic in self._unconfirmed() or self.topics:
-            self._sink.set_left_out(f'possibly the end of {topic}', why)
+            self._leave_end_out(topic, why)
 
-    def _unconfirmed(self) -> list[str]:
-        """Return the topics that have a reliable publisher of which more may come."""
+    def _leave_end_out(self, topic: str, why: str) -> None:
+        self._sink.set_left_out(f'possibly the end of {topic}', why)
+
+    def _unconfirmed(self, among: Collection[bytes] | None = None) -> list[str]:
+        """Return the topics with a reliable publisher, among these or all, of which more may come."""
         return [
             topic
             for topic, channel in self._channels.items()
@@ -195,6 +212,7 @@ class Recorder(Node):  # type: ignore[misc]
                 one.topic_type == channel.type_name
                 and one.qos_profile.reliability == ReliabilityPolicy.RELIABLE
                 and bytes(one.endpoint_gid) not in self._receptions[topic].confirmed
+                and (among is None or bytes(one.endpoint_gid) in among)
                 for one in self.get_publishers_info_by_topic(topic)
             )
         ]
@@ -294,6 +312,8 @@ class Recorder(Node):  # type: ignore[misc]
         self._volume += len(message.data) + OVERHEAD
         if self._volume > BURST_VOLUME:
             self._last_burst = now
+        if len(message.data) > LARGE:
+            self._large[message.publisher] = now
         self._add(channel, message.received if self._stamped else self._now(), message.data)
 
     def _is_late(self, message: ReceivedMessage) -> bool:

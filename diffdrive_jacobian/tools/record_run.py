@@ -75,6 +75,7 @@ class StatusLine:
     def wait(self, topics: Sequence[str]) -> None:
         """Show that late messages are waited for."""
         self.end()
+        self._shown = 0.0
         print(
             f'waiting some seconds for late messages of {_listed(topics)}; '
             'Ctrl-C again ends at once, and the bag is incomplete',

@@ -76,7 +76,7 @@ PROGRAMS = (
         'joint_command',
     ),
     Program('send_goal', _paths('50', '0'), (130, 1), 'm to go|waiting: ', 'cmd_vel'),
-    Program('record_run', _paths('-o', 'NEW'), (0, 130), 'recording to'),
+    Program('record_run', _paths('-o', 'NEW'), (0, 130, 1), 'recording to'),
     Program('replay_run', _paths('BAG'), (130, 0), '', 'cmd_vel'),
     Program('drive_to', _paths('5', '0', '-o', 'NEW', '--no-plot'), (130,), 'm to go|drives to|goal'),
     Program('watch_run', _paths('--no-browser'), (0,), 'http://'),
