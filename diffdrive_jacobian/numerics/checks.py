@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable
+from functools import partial
 from numbers import Real
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,27 @@ def not_negative(name: str, value: Any) -> None:
     inside = (value >= 0.0) & (value < np.inf)
     if inside is not True and not np.all(inside):
         raise ValueError(f'{name} must be zero or positive and finite, got {_first(value, inside)}')
+
+
+def not_negative_or_infinite(name: str, value: Any) -> None:
+    """Require a number to be zero or positive. Infinity means no limit.
+
+    Raises:
+        ValueError: An entry is negative or NaN.
+    """
+    inside = value >= 0.0
+    if inside is not True and not np.all(inside):
+        raise ValueError(f'{name} must be zero or positive, got {value}')
+
+
+def between(low: float, high: float) -> Callable[[str, float], None]:
+    """Return a check that requires a single number between two limits, which are allowed."""
+
+    def check(name: str, value: float) -> None:
+        if not low <= value <= high:
+            raise ValueError(f'{name} must be between {low:g} and {high:g}, got {value}')
+
+    return check
 
 
 def offset(name: str, value: Any) -> None:
@@ -144,12 +166,27 @@ def number(name: str, value: Any, check: Callable[[str, Any], None]) -> float:
         ValueError: The check fails, or the value is not a single number.
     """
     if type(value) is not float:
+        if isinstance(value, bool | np.bool_ | str | None):
+            raise ValueError(f'{name} must be a number, got {value!r}')
         result = floats(name, value)
         if result.ndim:
             raise ValueError(f'{name} must be a single number, got shape {result.shape}')
         value = float(result)
     check(name, value)
     return float(value)
+
+
+def scalar(check: Callable[[str, Any], None]) -> Callable[[str, Any], float]:
+    """Return `number` with a check, as dataclasses declare it for a field (`fields.Checked`)."""
+    return partial(number, check=check)
+
+
+Finite = Annotated[float, scalar(finite)]
+Positive = Annotated[float, scalar(positive)]
+PositiveOrInfinite = Annotated[float, scalar(positive_or_infinite)]
+NotNegative = Annotated[float, scalar(not_negative)]
+NotNegativeOrInfinite = Annotated[float, scalar(not_negative_or_infinite)]
+Probability = Annotated[float, scalar(between(0.0, 1.0))]
 
 
 def array(name: str, value: Any, *trailing: int | str) -> NDArray[np.float64]:
