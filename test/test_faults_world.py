@@ -217,7 +217,7 @@ def test_the_expression_of_a_fault_is_short():
         ),
         (
             lambda: faults.Delay('a', float('nan')),
-            'seconds must be zero or positive and finite, got nan',
+            'must be zero or positive and finite, got nan',
         ),
         (lambda: faults.Reorder('a', 0.5, 0.0), 'seconds must be positive and finite, got 0.0'),
         (lambda: faults.Duplicate('a', copies=1.5), 'copies must be an integer of at least 1, got 1.5'),

@@ -36,8 +36,8 @@ from diffdrive_jacobian.numerics.checks import (
     instance,
     number,
     numbers,
-    short,
 )
+from diffdrive_jacobian.numerics.fields import short
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 Law = Callable[..., tuple[Any, ...]]

@@ -20,8 +20,8 @@ from diffdrive_jacobian.numerics.checks import (
     number,
     numbers,
     read_only,
-    short,
 )
+from diffdrive_jacobian.numerics.fields import short
 
 Pose: TypeAlias = NDArray[np.float64] | tuple[float, float, float]
 Law: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]

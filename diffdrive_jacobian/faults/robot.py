@@ -12,6 +12,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Annotated, ClassVar
 
 from rclpy.node import Node
@@ -19,7 +20,7 @@ from rclpy.node import Node
 from diffdrive_jacobian.faults.fault import Fault
 from diffdrive_jacobian.lockstep import Injection, LockstepError
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.numerics.checks import Finite, Positive, between, boolean, scalar
+from diffdrive_jacobian.numerics.checks import Finite, Positive, between, boolean, number
 from diffdrive_jacobian.numerics.fields import Name, integer, one_of
 from diffdrive_jacobian.simulation.actuators import Actuators
 from diffdrive_jacobian.simulation.encoders import MAX_PER_REVOLUTION
@@ -29,7 +30,7 @@ from diffdrive_jacobian.simulation.slip import MAX_SEED, Drift
 Undo = Callable[[], None]
 """Ends the effect of a fault on a robot."""
 Wheel = Annotated[str, one_of('left', 'right')]
-Multiplier = Annotated[float, scalar(between(0.01, 100.0))]
+Multiplier = Annotated[float, partial(number, check=between(0.01, 100.0))]
 
 
 @dataclass(frozen=True, repr=False)
@@ -153,7 +154,7 @@ class EncoderSteps(RobotFault):
         per_revolution: Number of increments of a turn of the wheel.
     """
 
-    per_revolution: Annotated[int, integer(1, MAX_PER_REVOLUTION)]
+    per_revolution: Annotated[int, partial(integer, low=1, high=MAX_PER_REVOLUTION)]
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
         """Set the resolution of the encoders."""

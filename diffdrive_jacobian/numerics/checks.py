@@ -12,6 +12,8 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.numerics.fields import short
+
 MAX_NANOSECONDS = 2**63 - 1
 """Largest time of ROS clocks (ns)."""
 FLOAT64 = np.dtype(np.float64)
@@ -74,6 +76,17 @@ def between(low: float, high: float) -> Callable[[str, float], None]:
             raise ValueError(f'{name} must be between {low:g} and {high:g}, got {value}')
 
     return check
+
+
+def not_positive_or_infinite(name: str, value: Any) -> None:
+    """Require a number to be zero or negative. Infinity means no limit.
+
+    Raises:
+        ValueError: An entry is positive or NaN.
+    """
+    inside = value <= 0.0
+    if inside is not True and not np.all(inside):
+        raise ValueError(f'{name} must be zero or negative, got {value}')
 
 
 def offset(name: str, value: Any) -> None:
@@ -167,7 +180,7 @@ def number(name: str, value: Any, check: Callable[[str, Any], None]) -> float:
     """
     if type(value) is not float:
         if isinstance(value, bool | np.bool_ | str | None):
-            raise ValueError(f'{name} must be a number, got {value!r}')
+            raise ValueError(f'{name} must be a number, got {short(value, repr)}')
         result = floats(name, value)
         if result.ndim:
             raise ValueError(f'{name} must be a single number, got shape {result.shape}')
@@ -176,17 +189,12 @@ def number(name: str, value: Any, check: Callable[[str, Any], None]) -> float:
     return float(value)
 
 
-def scalar(check: Callable[[str, Any], None]) -> Callable[[str, Any], float]:
-    """Return `number` with a check, as dataclasses declare it for a field (`fields.Checked`)."""
-    return partial(number, check=check)
-
-
-Finite = Annotated[float, scalar(finite)]
-Positive = Annotated[float, scalar(positive)]
-PositiveOrInfinite = Annotated[float, scalar(positive_or_infinite)]
-NotNegative = Annotated[float, scalar(not_negative)]
-NotNegativeOrInfinite = Annotated[float, scalar(not_negative_or_infinite)]
-Probability = Annotated[float, scalar(between(0.0, 1.0))]
+Finite = Annotated[float, partial(number, check=finite)]
+Positive = Annotated[float, partial(number, check=positive)]
+PositiveOrInfinite = Annotated[float, partial(number, check=positive_or_infinite)]
+NotNegative = Annotated[float, partial(number, check=not_negative)]
+NotNegativeOrInfinite = Annotated[float, partial(number, check=not_negative_or_infinite)]
+Probability = Annotated[float, partial(number, check=between(0.0, 1.0))]
 
 
 def array(name: str, value: Any, *trailing: int | str) -> NDArray[np.float64]:
@@ -268,7 +276,7 @@ def boolean(name: str, value: Any) -> bool:
     return bool(value)
 
 
-def instance(name: str, value: Any, wanted: type) -> None:
+def instance(name: str, value: Any, wanted: type) -> Any:
     """Require an object of a class.
 
     Raises:
@@ -276,9 +284,10 @@ def instance(name: str, value: Any, wanted: type) -> None:
     """
     if not isinstance(value, wanted):
         raise ValueError(f'{name} must be of class {wanted.__name__}, got {short(value)}')
+    return value
 
 
-def function(name: str, value: Any) -> None:
+def function(name: str, value: Any) -> Any:
     """Require a callable object.
 
     Raises:
@@ -286,6 +295,7 @@ def function(name: str, value: Any) -> None:
     """
     if not callable(value):
         raise ValueError(f'{name} must be a function, got {short(value)}')
+    return value
 
 
 def read_only(value: Any) -> NDArray[np.float64]:
@@ -328,15 +338,6 @@ def leading(**shapes: tuple[int, ...]) -> tuple[int, ...]:
         raise ValueError(
             f'{" and ".join(several)} must have leading axes that broadcast, got {shown}'
         ) from None
-
-
-def short(value: Any) -> str:
-    """Return a value as text of at most 60 characters."""
-    try:
-        got = str(value)
-    except ValueError:  # of an integer with thousands of digits
-        got = f'an object of class {type(value).__name__}'
-    return got if len(got) <= 60 else f'{got[:57]}...'
 
 
 def _first(value: Any, inside: Any) -> str:

@@ -4,7 +4,7 @@
     class Delay(Checked):
         topic: Name
         seconds: Positive
-        copies: Annotated[int, integer(1)] = 1
+        copies: Annotated[int, partial(integer, low=1)] = 1
 
 A check is a function `check(name, value)`. It returns the value, converted if need be, or raises a
 ValueError that says what is wrong, what was got and what is allowed. Those of numbers are in `checks`.
@@ -12,11 +12,12 @@ ValueError that says what is wrong, what was got and what is allowed. Those of n
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Iterable
-from functools import cache
+from functools import cache, partial
 from numbers import Integral
-from typing import Annotated, Any, TypeAlias, get_type_hints
+from typing import Annotated, Any, TypeAlias
 
 Check: TypeAlias = Callable[[str, Any], Any]
 
@@ -45,8 +46,10 @@ class Checked:
 @cache
 def _checks(kind: type) -> list[tuple[str, Check]]:
     """Return the fields of a class that have a check, and the checks."""
-    hints = get_type_hints(kind, include_extras=True)
-    return [(name, check) for name, hint in hints.items() for check in getattr(hint, '__metadata__', ())]
+    declared: dict[str, Any] = {}
+    for base in reversed(kind.__mro__):
+        declared |= inspect.get_annotations(base, eval_str=True)
+    return [(name, check) for name, of in declared.items() for check in getattr(of, '__metadata__', ())]
 
 
 def optional(check: Check) -> Check:
@@ -57,24 +60,24 @@ def optional(check: Check) -> Check:
 def text(name: str, value: Any) -> str:
     """Require a string."""
     if not isinstance(value, str):
-        raise ValueError(f'{name} must be a string, got {value!r}')
+        raise ValueError(f'{name} must be a string, got {short(value, repr)}')
     return value
 
 
 def nonempty(name: str, value: Any) -> str:
     """Require a string that is not empty."""
     if not isinstance(value, str) or not value:
-        raise ValueError(f'{name} must be a string that is not empty, got {value!r}')
+        raise ValueError(f'{name} must be a string that is not empty, got {short(value, repr)}')
     return value
 
 
 def names(name: str, value: Any) -> tuple[str, ...]:
     """Require strings that are not empty, but not a single string. Returns a tuple."""
     if isinstance(value, str) or not isinstance(value, Iterable):
-        raise ValueError(f'{name} must be a tuple of names, got {value!r}')
+        raise ValueError(f'{name} must be a tuple of names, got {short(value, repr)}')
     found = tuple(value)
     if not all(isinstance(one, str) and one for one in found):
-        raise ValueError(f'{name} must be a tuple of names, got {value!r}')
+        raise ValueError(f'{name} must be a tuple of names, got {short(value, repr)}')
     return found
 
 
@@ -83,25 +86,32 @@ def one_of(*allowed: Any) -> Check:
 
     def check(name: str, value: Any) -> Any:
         if value not in allowed:
-            raise ValueError(f'{name} must be one of {", ".join(map(repr, allowed))}, got {value!r}')
+            raise ValueError(
+                f'{name} must be one of {", ".join(map(repr, allowed))}, got {short(value, repr)}'
+            )
         return value
 
     return check
 
 
-def integer(low: int, high: float = math.inf) -> Check:
-    """Return a check that requires an integer from `low` to `high`."""
-    allowed = f'from {low} to {high}' if high < math.inf else f'of at least {low}'
+def integer(name: str, value: Any, low: int, high: float = math.inf) -> int:
+    """Require an integer from `low` to `high`."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or not low <= int(value) <= high:
+        allowed = f'of at least {low}' if high == math.inf else f'from {low} to {high}'
+        raise ValueError(f'{name} must be an integer {allowed}, got {short(value, repr)}')
+    return int(value)
 
-    def check(name: str, value: Any) -> int:
-        if type(value) is bool or not isinstance(value, Integral) or not low <= int(value) <= high:
-            raise ValueError(f'{name} must be an integer {allowed}, got {value!r}')
-        return int(value)
 
-    return check
+def short(value: Any, express: Callable[[Any], str] = str) -> str:
+    """Return a value as text of at most 60 characters."""
+    try:
+        got = express(value)
+    except ValueError:  # of an integer with thousands of digits
+        got = f'an object of class {type(value).__name__}'
+    return got if len(got) <= 60 else f'{got[:57]}...'
 
 
 Text = Annotated[str, text]
 Name = Annotated[str, nonempty]
 Names = Annotated[tuple[str, ...], names]
-Count = Annotated[int, integer(1)]
+Count = Annotated[int, partial(integer, low=1)]

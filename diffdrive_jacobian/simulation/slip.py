@@ -35,7 +35,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from diffdrive_jacobian.numerics.checks import number, positive, short
+from diffdrive_jacobian.numerics.checks import number, positive
+from diffdrive_jacobian.numerics.fields import short
 from diffdrive_jacobian.simulation.arc import arc_end
 from diffdrive_jacobian.time_units import NANOSECONDS
 
