@@ -305,6 +305,17 @@ def read_only(value: Any) -> NDArray[np.float64]:
     return copy
 
 
+def constant(name: str, value: Any, check: Callable[[str, Any], None]) -> Any:
+    """Convert and check a field of an immutable object. Returns a float, or a read-only array.
+
+    Raises:
+        ValueError: The check fails, or an entry is not a number.
+    """
+    result = floats(name, value)
+    check(name, result)
+    return read_only(result) if result.ndim else float(result)
+
+
 def equal(first: Any, second: Any) -> bool:
     """Return whether numbers or arrays have equal shapes and entries. NaN equals NaN."""
     return bool(np.array_equal(first, second, equal_nan=True))

@@ -86,9 +86,8 @@ def one_of(*allowed: Any) -> Check:
 
     def check(name: str, value: Any) -> Any:
         if value not in allowed:
-            raise ValueError(
-                f'{name} must be one of {", ".join(map(repr, allowed))}, got {short(value, repr)}'
-            )
+            choices = ', '.join(map(repr, allowed))
+            raise ValueError(f'{name} must be one of {choices}, got {short(value, repr)}')
         return value
 
     return check
