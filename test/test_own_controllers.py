@@ -553,7 +553,7 @@ def test_every_field_is_described():
         ({'takes_heading': 1}, 'takes_heading must be True or False'),
         ({'advice': ()}, 'advice must be a function'),
         ({'boundary': (1.0, '')}, 'boundary must be of class Boundary'),
-        ({'summary': None}, 'summary must be of class str'),
+        ({'summary': None}, 'summary must be a string'),
     ],
     ids=str,
 )
@@ -576,7 +576,7 @@ def test_an_invalid_controller_is_refused(changes, words):
         ({'bounds': (1.0,)}, 'bounds must have shape (..., 2)'),
         ({'usual': (1.0, 1.0)}, 'usual must be (first, last) with first < last'),
         ({'usual': (0.0, 3.0)}, 'ki must be in [-1, 2], got 3'),
-        ({'unit': None}, 'unit must be of class str'),
+        ({'unit': None}, 'unit must be a string'),
     ],
     ids=str,
 )

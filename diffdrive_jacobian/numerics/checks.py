@@ -311,9 +311,10 @@ def constant(name: str, value: Any, check: Callable[[str, Any], None]) -> Any:
     Raises:
         ValueError: The check fails, or an entry is not a number.
     """
-    result = floats(name, value)
+    array = floats(name, value)
+    result = read_only(array) if array.ndim else float(array)
     check(name, result)
-    return read_only(result) if result.ndim else float(result)
+    return result
 
 
 def equal(first: Any, second: Any) -> bool:
