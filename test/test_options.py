@@ -238,7 +238,7 @@ def test_plot_run_writes_one_of_several_robots(robots, capsys, monkeypatch):
     from diffdrive_jacobian.tools import plot_run
 
     drawn = []
-    monkeypatch.setattr(plot_run, 'draw', lambda runs, path, replace: drawn.append((runs[0], path)))
+    monkeypatch.setattr(plot_run, 'draw', lambda runs, path, **_: drawn.append((runs[0], path)))
     assert run('plot_run', robots, '--namespace', 'two') == 0
     ((data, path),) = drawn
     assert (round(data.odometry.values[0, 0]), path.name) == (5, 'two_two.png')

@@ -661,5 +661,10 @@ def test_ctrl_c_ends_the_process(folder):
         child.until_catches(signal.SIGHUP)
         child.signal(signal.SIGINT)
         assert child.exit() == 130
-        assert (child.stdout, child.stderr) == ('', 'sweep_gains: interrupted: nothing was written\n')
+        # It may still be importing.
+        assert child.stdout == ''
+        assert child.stderr in (
+            'sweep_gains: interrupted\n',
+            'sweep_gains: interrupted: nothing was written\n',
+        )
     assert left(folder) == []

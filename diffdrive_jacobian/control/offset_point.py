@@ -49,11 +49,12 @@ def offset_point(state: Vector, goal: Vector, k: Number, d: Number) -> tuple[Num
     """
     x_d, y_d = diff_drive.offset_point.formula(state, d)
     x_goal, y_goal = goal
-    dx, dy = x_goal - x_d, y_goal - y_d
-    theta = state[2]
-    a = cos(theta) * dx + sin(theta) * dy
-    b = cos(theta) * dy - sin(theta) * dx
-    return k * a, k * b / d
+    x_dot, y_dot = k * (x_goal - x_d), k * (y_goal - y_d)
+    # The inverse of [x_dot, y_dot] = R(theta) [[1, 0], [0, d]] [v, omega], which is J_d without J_w.
+    _, _, theta = state
+    v = cos(theta) * x_dot + sin(theta) * y_dot
+    omega = (cos(theta) * y_dot - sin(theta) * x_dot) / d
+    return v, omega
 
 
 def _advice(gains: GainValues, limits: VelocityLimits) -> Iterator[str]:

@@ -2,7 +2,8 @@
 
 State: pose `q = [x, y, theta]` (m, m, rad). Inputs: wheel speeds `w = [omega_R, omega_L]` (rad/s,
 positive drives forward) or the body twist `u = [v, omega]` (m/s, rad/s). Wheel radius `r` and wheel
-separation `L` in m. **The order of wheels is right, left.**
+separation `L` in m. **The order of wheels is right, left.** Documents B and E have left, right: their
+columns are exchanged here.
 
     w --J_w--> u --S(theta)--> q_dot
 
@@ -183,6 +184,7 @@ def offset_point_jacobian(theta: Number, r: Number, L: Number, d: Number) -> Row
         [cos(theta), -sin(theta)],
         [sin(theta), cos(theta)],
     ]
+    # The point has the velocity [v, d omega] in the body frame.
     in_body = [
         [r / 2.0, r / 2.0],
         [d * r / L, -d * r / L],

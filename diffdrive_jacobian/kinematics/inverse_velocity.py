@@ -123,13 +123,15 @@ def pseudoinverse(J: Any, *, weights: Vector = None) -> Array:
         ValueError: `J W^-1/2` or the pseudo-inverse overflows.
     """
     W_half = root(weights)
-    inverse = svd(J / W_half).damped_inverse(damping=0.0)  # (J W^-1/2)^+
-    return inverse / column(W_half)  # W^-1/2 (J W^-1/2)^+
+    J_plus = svd(J / W_half).inverse()  # (J W^-1/2)^+
+    return J_plus / column(W_half)  # W^-1/2 (J W^-1/2)^+
 
 
 @formula('(),(),() -> ()', manipulability=not_negative, threshold=positive, maximum=not_negative)
 def damping(manipulability: Number, threshold: Number, maximum: Number) -> Number:
-    """Return a lambda that grows as the manipulability falls: `lambda_max (1 - w / w_0)`, or 0 (A).
+    """Return a lambda that grows as the manipulability falls: `lambda_max (1 - w / w_0)`, or 0.
+
+    Document A asks for such a lambda without a formula.
 
     Args:
         manipulability: w, zero or positive, shape (...).
@@ -161,8 +163,10 @@ def damped_least_squares(J: Any, x_dot: Vector, damping: Number, *, weights: Vec
         ValueError: `J W^-1/2` or a joint velocity overflows.
     """
     W_half = root(weights)
-    inverse = svd(J / W_half).damped_inverse(damping)  # J^T (J J^T + lambda^2 I)^-1 of J W^-1/2
-    return times(inverse, x_dot) / W_half
+    J = J / W_half  # J W^-1/2
+    J_plus = svd(J).damped_inverse(damping)  # J^T (J J^T + lambda^2 I)^-1
+    q_dot = times(J_plus, x_dot)
+    return q_dot / W_half
 
 
 @formula('(m,n),(),(n) -> (n,n)', damping=not_negative, weights=positive)
@@ -184,8 +188,9 @@ def null_space_projector(J: Any, damping: Number = 0.0, *, weights: Vector = Non
         ValueError: `J W^-1/2` or N overflows.
     """
     W_half = root(weights)
-    N = svd(J / W_half).projector(damping)  # I - J^+ J of J W^-1/2
-    return N * W_half / column(W_half)
+    J = J / W_half  # J W^-1/2
+    N = svd(J).projector(damping)  # I - J^+ J
+    return N * W_half / column(W_half)  # W^-1/2 N W^1/2
 
 
 @formula('(m,n),(m),(n),(),(n) -> (n)', damping=not_negative, weights=positive)
@@ -213,6 +218,9 @@ def redundant(
         ValueError: `J W^-1/2` or a joint velocity overflows.
     """
     W_half = root(weights)
-    values = svd(J / W_half)
-    q_dot = times(values.damped_inverse(damping), x_dot)  # J^T (J J^T + lambda^2 I)^-1 x_dot
-    return (q_dot + values.projected(W_half * q_dot_0, damping)) / W_half  # + N q_dot_0
+    J, q_dot_0 = J / W_half, W_half * q_dot_0  # J W^-1/2 and W^1/2 q_dot_0
+    values = svd(J)
+    J_plus = values.damped_inverse(damping)  # J^T (J J^T + lambda^2 I)^-1
+    N_q_dot_0 = values.projected(q_dot_0, damping)  # (I - J^+ J) q_dot_0
+    q_dot = times(J_plus, x_dot) + N_q_dot_0
+    return q_dot / W_half

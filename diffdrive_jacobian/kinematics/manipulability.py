@@ -6,7 +6,8 @@ gradient over the inputs is `G^T gradient`.
 
 Everything broadcasts over leading axes. Wrong shapes and values that are not finite raise ValueError.
 
-Source: document A, 3.2.3 and 3.2.5; document D, 3; doc/mathematics.md, "Manipulators".
+Source: T. Yoshikawa, "Manipulability of robotic mechanisms", 1985, which documents A (3.2.5) and D (3)
+refer to; doc/mathematics.md, "Manipulators".
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _STEP = float(np.finfo(np.float64).eps) ** (1.0 / 3.0)
 
 @formula('(m,n) -> ()')
 def manipulability(J: Any) -> Array:
-    """Return Yoshikawa's distance of a Jacobian from singular: `w = sqrt(det(J J^T))` (A, D).
+    """Return Yoshikawa's distance of a Jacobian from singular: `w = sqrt(det(J J^T))`.
 
     Args:
         J: Jacobians, shape (..., m, n).
@@ -40,8 +41,10 @@ def manipulability(J: Any) -> Array:
         ValueError: w overflows.
     """
     if len(J) == 2:
+        # Cauchy and Binet: det(J J^T) is the sum of the squared minors.
         minors = [a * d - b * c for (a, c), (b, d) in combinations(zip(*J, strict=True), 2)]
         return np.asarray(np.sqrt(sum(minor * minor for minor in minors)))
+    # And the product of the squared singular values.
     s = np.linalg.svd(np.moveaxis(J, (0, 1), (-2, -1)), compute_uv=False)
     return np.asarray(s.prod(axis=-1) * (len(J) <= len(J[0])))
 

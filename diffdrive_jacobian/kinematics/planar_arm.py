@@ -6,7 +6,7 @@ the x axis of the arm's base. Task: the tip's position x, y (m) and heading (rad
 Everything broadcasts over leading axes: q has shape (..., n). Wrong shapes and values that are not
 finite raise ValueError.
 
-Source: document A, 3.2.1 (two links) and 3.2.5 (more than the task needs); document D, 2 and 5;
+Source: document A, 3.2.1 (two links) and 3.2.5 (more than the task needs); document D, 2 and 6;
 doc/mathematics.md, "Manipulators".
 """
 
@@ -28,24 +28,27 @@ from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, f
 @formula('(n),(n) -> (3)')
 def arm_forward_kinematics(lengths: Vector, q: Vector) -> Entries:
     """Return the pose of the tip, as `PlanarArm.forward_kinematics` of links of these lengths (m)."""
-    x, y = zip(*arm_links(lengths, q), strict=True)
+    x, y = arm_links(lengths, q)
     return [sum(x), sum(y), wrap(sum(q))]
 
 
 @formula('(n),(n) -> (2,n)')
 def arm_jacobian(lengths: Vector, q: Vector) -> Rows:
     """Return the Jacobian of the position, as `PlanarArm.jacobian` of links of these lengths (m)."""
-    x, y = zip(*arm_links(lengths, q), strict=True)
-    # Each joint moves the links from there to the tip.
+    x, y = arm_links(lengths, q)
+    # Two links: [[-l1 s1 - l2 s12, -l2 s12], [l1 c1 + l2 c12, l2 c12]]. Joint i moves links i to n.
     return [
-        [-sum(y[joint:]) for joint in range(len(q))],
-        [sum(x[joint:]) for joint in range(len(q))],
+        [-sum(y[i:]) for i in range(len(q))],
+        [sum(x[i:]) for i in range(len(q))],
     ]
 
 
-def arm_links(lengths: Vector, q: Vector) -> list[tuple[Number, Number]]:
-    """Return the links as vectors `(l_i cos(q_1 + ... + q_i), l_i sin(q_1 + ... + q_i))`, unchecked."""
-    return [(l_i * cos(a), l_i * sin(a)) for l_i, a in zip(lengths, accumulate(q), strict=True)]
+def arm_links(lengths: Vector, q: Vector) -> tuple[list[Number], list[Number]]:
+    """Return `l_i cos(q_1 + ... + q_i)` and `l_i sin(q_1 + ... + q_i)` of each link, unchecked."""
+    angles = list(accumulate(q))  # q_1, q_1 + q_2, ...
+    x = [l_i * cos(angle) for l_i, angle in zip(lengths, angles, strict=True)]
+    y = [l_i * sin(angle) for l_i, angle in zip(lengths, angles, strict=True)]
+    return x, y
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +164,7 @@ class PlanarArm:
         return _inverse_velocity(self.lengths, q, x_dot)
 
     def joint_torques(self, q: ArrayLike, wrench: ArrayLike) -> NDArray[np.float64]:
-        """Return the joint torques of a wrench at the tip: `tau = J^T W` (D, 5).
+        """Return the joint torques of a wrench at the tip: `tau = J^T W` (D, 6).
 
         Args:
             q: Joint angles, shape (..., n) (rad).
@@ -197,7 +200,7 @@ class PlanarArm:
 
 @formula('(n),(n) -> (j,2)')
 def _joint_positions(lengths: Vector, q: Vector) -> Rows:
-    x, y = zip(*arm_links(lengths, q), strict=True)
+    x, y = arm_links(lengths, q)
     return [[sum(x[:joint], 0.0), sum(y[:joint], 0.0)] for joint in range(len(q) + 1)]
 
 
@@ -228,11 +231,10 @@ def _inverse_velocity(lengths: Vector, q: Vector, x_dot: Vector) -> Entries:
 
 @formula('(n),(n),(m) -> (n)')
 def _joint_torques(lengths: Vector, q: Vector, wrench: Vector) -> Entries:
-    rows = [*arm_jacobian.formula(lengths, q), [1.0] * len(q)]
-    return [
-        sum(f * J_ij for f, J_ij in zip(wrench, column, strict=False))
-        for column in zip(*rows, strict=True)
-    ]
+    J_x, J_y = arm_jacobian.formula(lengths, q)
+    # A moment acts on every joint alike.
+    f_x, f_y, m_z = [*wrench, 0.0][:3]
+    return [J_xi * f_x + J_yi * f_y + m_z for J_xi, J_yi in zip(J_x, J_y, strict=True)]
 
 
 @formula('(n),(n),() -> (n)')

@@ -196,22 +196,31 @@ class _Open(NamedTuple):
         return self if rows.all() else _Open._make(values[..., rows] for values in self)
 
 
+# Steps of q, shape (n, k). J and e are `sqrt(M) J` and `sqrt(M) e`, and JT_e is `J^T e`.
+
+
 def newton_step(J: Floats, e: Floats) -> Floats:
-    """Return `J^+ e`, shape (n, k)."""
-    return times(svd(J).damped_inverse(), e)
+    """Return `J^+ e` (C)."""
+    J_plus = svd(J).inverse()
+    return times(J_plus, e)
 
 
-def best_alpha(J: Floats, gradient: Floats) -> Floats:
+def transpose_step(JT_e: Floats, alpha: float | Floats) -> Floats:
+    """Return `alpha J^T e` (D)."""
+    return alpha * JT_e
+
+
+def levenberg_marquardt_step(J: Floats, JT_e: Floats, damping: Floats) -> Floats:
+    """Return `(J^T J + lambda I)^-1 J^T e` (D), with lambda of shape (k,)."""
+    JT_J = outer(J, J)
+    diagonal = np.einsum('iik->ik', JT_J)  # a view
+    diagonal += damping + REGULAR * diagonal  # J^T J + lambda I
+    return np.asarray(np.linalg.solve(JT_J.transpose(2, 0, 1), JT_e.T[..., np.newaxis])[..., 0].T)
+
+
+def best_alpha(J: Floats, JT_e: Floats) -> Floats:
     """Return with which alpha the error would be least if forward were linear, shape (k,)."""
-    return np.asarray((norm(gradient) / norm(times(J, gradient))) ** 2)
-
-
-def levenberg_marquardt_step(J: Floats, gradient: Floats, factor: Floats) -> Floats:
-    """Return `(J^T M J + lambda I)^-1 J^T M e`, shape (n, k), with lambda of shape (k,)."""
-    H = outer(J, J)
-    diagonal = np.einsum('iik->ik', H)  # a view
-    diagonal += factor + REGULAR * diagonal
-    return np.asarray(np.linalg.solve(H.transpose(2, 0, 1), gradient.T[..., np.newaxis])[..., 0].T)
+    return np.asarray((norm(JT_e) / norm(times(J, JT_e))) ** 2)
 
 
 @dataclass
@@ -241,34 +250,34 @@ class Search:
         ended = np.zeros(len(still.which), dtype=np.bool_)
         self._differentiate(still, ~ended)
         for _ in range(max_iterations):
-            J, gradient = self._free(still)
-            ended |= ~self._movable(still, J, gradient)
+            J, JT_e = self._free(still)
+            ended |= ~self._movable(still, J, JT_e)
             again = np.zeros_like(ended)
             if ended.any():
                 again = ended & self._may_restart(still, ended, found)
                 kept = again | ~ended
                 still, again = still.keep(kept), again[kept]
-                J, gradient = J[..., kept], gradient[..., kept]
+                J, JT_e = J[..., kept], JT_e[..., kept]
             if not len(still.which):
                 break
-            tried = self._tried(still, found, J, gradient, again)
-            still, ended = self._judged(still, found, gradient, again, tried)
+            tried = self._tried(still, found, J, JT_e, again)
+            still, ended = self._judged(still, found, JT_e, again, tried)
         return found
 
     def _free(self, still: _Open) -> tuple[Floats, Floats]:
         """Return J and `J^T M e`, zero for joints at a limit that would have to go beyond it."""
-        gradient = np.einsum('mnk,mk->nk', still.J, still.e)
+        JT_e = np.einsum('mnk,mk->nk', still.J, still.e)
         if self.task.limits is None:
-            return still.J, gradient
+            return still.J, JT_e
         lower, upper = map(column, self.task.limits)
-        blocked = ((still.q <= lower) & (gradient < 0.0)) | ((still.q >= upper) & (gradient > 0.0))
-        return np.where(blocked, 0.0, still.J), np.where(blocked, 0.0, gradient)
+        blocked = ((still.q <= lower) & (JT_e < 0.0)) | ((still.q >= upper) & (JT_e > 0.0))
+        return np.where(blocked, 0.0, still.J), np.where(blocked, 0.0, JT_e)
 
-    def _movable(self, still: _Open, J: Floats, gradient: Floats) -> Flags:
+    def _movable(self, still: _Open, J: Floats, JT_e: Floats) -> Flags:
         """Return which targets have a joint that lowers the error to first order."""
         # Joint by joint, so that their units do not matter.
         most = np.sqrt(np.einsum('mnk,mnk->nk', J, J)) * still.error
-        movable = (np.abs(gradient) > STATIONARY[self.method] * most).any(axis=0)
+        movable = (np.abs(JT_e) > STATIONARY[self.method] * most).any(axis=0)
         return np.asarray(movable & np.isfinite(_square(J)))
 
     def _differentiate(self, still: _Open, where: Flags) -> None:
@@ -287,9 +296,9 @@ class Search:
     def _first_factor(self) -> float:
         return {'newton': 0.0, 'transpose': RELAXED, 'levenberg_marquardt': self.damping}[self.method]
 
-    def _tried(self, still: _Open, found: Outcome, J: Floats, gradient: Floats, again: Flags) -> Floats:
+    def _tried(self, still: _Open, found: Outcome, J: Floats, JT_e: Floats, again: Flags) -> Floats:
         """Return joints a step further, or where the next search begins, shape (n, k)."""
-        tried = still.q + self._step(still, found, J, gradient)
+        tried = still.q + self._step(still, found, J, JT_e)
         tried = self.task.within_limits(tried.T).T
         # A step that overflows is not taken.
         tried = np.where(np.isfinite(tried).all(axis=0), tried, still.q)
@@ -297,20 +306,20 @@ class Search:
             tried[:, again] = self._restart(still, found, again)
         return tried
 
-    def _step(self, still: _Open, found: Outcome, J: Floats, gradient: Floats) -> Floats:
+    def _step(self, still: _Open, found: Outcome, J: Floats, JT_e: Floats) -> Floats:
         """Return the step of the method, shape (n, k)."""
         if self.method == 'newton':
             return newton_step(J, still.e)
         if self.method == 'transpose':
-            alpha = still.factor * best_alpha(J, gradient) if self.alpha is None else self.alpha
-            return alpha * gradient
-        step = levenberg_marquardt_step(J, gradient, still.factor)
+            alpha = still.factor * best_alpha(J, JT_e) if self.alpha is None else self.alpha
+            return transpose_step(JT_e, alpha)
+        step = levenberg_marquardt_step(J, JT_e, still.factor)
         late = found.iterations[still.which] - found.began[still.which] >= SECOND_ORDER_AFTER
         if late.any():
-            step[:, late] = self._second_order_step(still._replace(J=J).keep(late), gradient[:, late])
+            step[:, late] = self._second_order_step(still._replace(J=J).keep(late), JT_e[:, late])
         return step
 
-    def _second_order_step(self, still: _Open, gradient: Floats) -> Floats:
+    def _second_order_step(self, still: _Open, JT_e: Floats) -> Floats:
         """Return `(|H| + lambda I)^-1 J^T M e`, with the second derivatives of forward, shape (n, k).
 
         `H = J^T M J - sum (M e)_i d^2 forward_i / dq^2`. Its eigenvalues are made positive, so that the
@@ -329,19 +338,19 @@ class Search:
         H = outer(J, J).transpose(2, 0, 1)
         H = H - np.where(counts, 0.5 * (bend + np.swapaxes(bend, 1, 2)), 0.0)
         values, V = np.linalg.eigh(H)
-        along = np.einsum('kij,ik->jk', V, gradient) / (np.abs(values.T) + still.factor)
+        along = np.einsum('kij,ik->jk', V, JT_e) / (np.abs(values.T) + still.factor)
         return np.asarray(np.einsum('kij,jk->ik', V, along))
 
     # --- What became of a step
 
     def _judged(
-        self, still: _Open, found: Outcome, gradient: Floats, again: Flags, tried: Floats
+        self, still: _Open, found: Outcome, JT_e: Floats, again: Flags, tried: Floats
     ) -> tuple[_Open, Flags]:
         """Take steps or reject them. Return the open rows, and whose search ended."""
         e, error = self.task.errors(tried.T, still.which)
         by = tried - still.q
         change = (error - still.error) * (error + still.error)
-        slope, length = dot(by, gradient), norm(by)
+        slope, length = dot(by, JT_e), norm(by)
         finite, rounding = np.isfinite(error), ROUNDING * still.error**2
         taken = finite & (change < -rounding) if self._descends else finite
         ended = length <= np.maximum(EPS * norm(still.q), self.step_tolerance)

@@ -33,7 +33,11 @@ class SingularValues(NamedTuple):
     v: Array
     """Shape (k, n, ...)."""
 
-    def damped_inverse(self, damping: Any = 0.0, least: Any = None) -> Array:
+    def inverse(self) -> Array:
+        """Return the pseudo-inverse J^+, shape (n, m, ...)."""
+        return self.damped_inverse(0.0)
+
+    def damped_inverse(self, damping: Any, least: Any = None) -> Array:
         """Return `J^T (J J^T + lambda^2 I)^-1`, which without damping is the pseudo-inverse J^+.
 
         Args:
@@ -46,7 +50,7 @@ class SingularValues(NamedTuple):
         """
         u, s, v = self
         gain = np.where(self._counts(damping, least), s / (s * s + damping * damping), 0.0)
-        return outer(column(gain) * v, u)
+        return outer(column(gain) * v, u)  # V diag(gain) U^T
 
     def projector(self, damping: Any = 0.0, least: Any = None) -> Array:
         """Return the projector N to the null space, which without damping is `I - J^+ J`.
@@ -115,12 +119,12 @@ def _of_two_rows(J: Array) -> SingularValues:
 
 def _rotation(J: Array) -> Array:
     """Return the rotation by at most 45 deg that makes two rows orthogonal."""
-    (a, b), (_, c) = np.einsum('in...,jn...->ij...', J, J)  # J J^T
-    difference, twice = a - c, 2.0 * b
+    (a, b), (_, d) = np.einsum('in...,jn...->ij...', J, J)  # J J^T
+    difference, twice = a - d, 2.0 * b
     tangent = twice / (difference + np.copysign(np.hypot(difference, twice) + TINY**2, difference))
-    c = 1.0 / np.sqrt(1.0 + tangent * tangent)
-    s = c * tangent
-    return np.array([[c, s], [-s, c]])
+    cosine = 1.0 / np.sqrt(1.0 + tangent * tangent)
+    sine = cosine * tangent
+    return np.array([[cosine, sine], [-sine, cosine]])
 
 
 def refuse_singular(determinant: Any, singular: Any) -> None:

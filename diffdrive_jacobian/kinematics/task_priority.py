@@ -86,9 +86,11 @@ def prioritized(
     for k, (J_k, x_k) in enumerate(pairs):
         J, x_dot = entries_first(J_k, 2, axes) / W_half, entries_first(x_k, 1, axes)
         finite(f'J of task {k} and weights', norm(J))
-        J_N, least = svd(product(J, N)), cutoff * norm(J)
-        q_dot += times(N, times(J_N.damped_inverse(damping, least), x_dot - times(J, q_dot)))
-        N = product(N, J_N.projector(damping, least))
+        values, least = svd(product(J, N)), cutoff * norm(J)
+        J_N_plus, N_k = values.damped_inverse(damping, least), values.projector(damping, least)
+        # q_dot += N (J N)^+ (x_dot - J q_dot), N = N N_k
+        q_dot += times(N, times(J_N_plus, x_dot - times(J, q_dot)))
+        N = product(N, N_k)
     q_dot = entries_last(q_dot / W_half, 1)
     finite('result of tasks, damping and weights', q_dot)
     return q_dot if max_velocity is None else limit_velocity(q_dot, max_velocity)
