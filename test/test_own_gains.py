@@ -116,10 +116,23 @@ def test_the_default_of_a_shared_gain_is_that_of_the_controller_chosen():
     assert GoToGoalParameters().kp == 3.0
 
 
-def test_a_gain_cannot_take_the_name_of_another_parameter(lockstep):
-    taken = replace(POLAR, gains=(Gain(name='odom_timeout', default=1.0), *POLAR.gains[1:]))
-    with pytest.raises(ParameterError, match="has a gain 'odom_timeout', which is another parameter"):
+@pytest.mark.parametrize(
+    'name', ['odom_timeout', 'limits', 'check', 'extended', 'linear_x_max_velocity', 'use_sim_time']
+)
+def test_a_gain_cannot_take_a_name_that_the_node_uses(lockstep, name):
+    taken = replace(POLAR, gains=(Gain(name=name, default=1.0), *POLAR.gains[1:]))
+    with pytest.raises(ParameterError, match=f"has a gain '{name}', a name that go_to_goal uses"):
         GoToGoal(controller=taken)
+
+
+def test_gains_of_one_name_have_one_range(lockstep):
+    """The parameter keeps its range when the controller is changed."""
+    for gain in (
+        Gain(name='kp', default=-2.0, bounds=(-10.0, 0.0)),
+        Gain(name='offset', default=0.1, unit='m', bounds=(-1.0, 1.0)),
+    ):
+        with pytest.raises(ParameterError, match='with another unit or other bounds'):
+            GoToGoal(controller=replace(POLAR, gains=(gain, *POLAR.gains[1:])))
 
 
 def test_help_describes_the_gains_of_the_controller_that_is_chosen(install, capsys):
@@ -251,8 +264,8 @@ def test_an_equation_may_have_a_state_too():
 @pytest.mark.parametrize(
     ('result', 'words'),
     [
-        ((0.0, 0.0), 'must return (v, omega), two numbers, and the state, 1 numbers, got (0.0, 0.0)'),
-        ((0.0, 0.0, [1.0, 2.0]), 'and the state, 1 numbers'),
+        ((0.0, 0.0), 'must return (v, omega), two numbers, and the state, shape (1,), got (0.0, 0.0)'),
+        ((0.0, 0.0, [1.0, 2.0]), 'and the state, shape (1,)'),
         ((0.0, 0.0, [math.nan]), 'must return finite (v, omega), got (0, 0) and the state [nan]'),
     ],
 )
@@ -260,3 +273,43 @@ def test_an_invalid_state_is_named(result, words):
     own = replace(INTEGRAL, law=lambda *given, state, dt: result)
     with pytest.raises(LawError, match=re.escape(words)):
         own.bind(SimpleNamespace(kp=1.0, kv=1.0, ki=1.0))(np.zeros(3), np.ones(3))
+
+
+def test_time_that_goes_back_is_no_time():
+    seen = []
+
+    def law(pose, to, kp, state, dt):
+        seen.append(dt)
+        return 0.0, 0.0, state
+
+    bound = control.Controller(name='back', law=law, gains=(KP,), state=(0.0,)).bind(
+        SimpleNamespace(kp=1.0)
+    )
+    for bound.now in (10**9, 5 * 10**8, 10**9):
+        bound(np.zeros(3), np.zeros(2))
+    assert seen == [0.0, 0.0, 0.5]
+
+
+def test_gains_named_as_options_are_swept_under_another_name(capsys, monkeypatch, tmp_path):
+    odd = replace(
+        POLAR,
+        gains=(
+            Gain(name='grid', default=0.5, bounds=(0.0, 10.0)),
+            Gain(name='max_velocity', default=2.0, bounds=(0.0, 20.0)),
+            Gain(name='k_beta', default=-0.5),
+        ),
+    )
+    monkeypatch.setattr(sweep_gains.CONTROLLERS, '_given', {'polar': odd})
+    monkeypatch.chdir(tmp_path)
+    arguments = ['--controller', 'polar', '--gain-grid', '0.3', '0.6', '--gain-max_velocity', '1', '2']
+    more = ['--k_beta', '-0.3', '--max-velocity', '1', '--grid', '2', '--starts', '1', '--csv', 'a.csv']
+    assert sweep_gains.main([*arguments, *more], Signals()) == 0
+    assert 'fastest: grid 0.6, max_velocity' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('bad', ['x', None, (1.0,), [1.0, 2.0, 3.0], 1j, math.nan], ids=str)
+def test_gains_of_a_setup_are_numbers_or_ranges(bad):
+    with pytest.raises(ValueError, match='kp must be'):
+        Setup(gains={'kp': bad})
+    with pytest.raises(ValueError, match='gains must be of class Mapping'):
+        Setup(gains=[('kp', 1.0)])

@@ -65,7 +65,7 @@ class Gain(Checked):
 
     name: str
     """Name of the parameter: a lower-case letter, then letters, digits or `_`, at most 32. Laws with a
-    gain of the same name share the parameter."""
+    gain of the same name share the parameter, and must give it the same unit and bounds."""
     default: Finite
     unit: Text = '1/s'
     description: Text = 'Gain'
@@ -98,6 +98,10 @@ class Gain(Checked):
             raise ValueError(f'usual must be (first, last) with first < last, got {self.usual}')
         self.check(first)
         self.check(last)
+
+    def shares_range(self, other: Gain) -> bool:
+        """Return whether a gain of the same name allows the same values, so that it can be shared."""
+        return (self.unit, self.bounds, self.above) == (other.unit, other.bounds, other.above)
 
     def check(self, value: float) -> None:
         """Raise ValueError if a value is not allowed."""
@@ -175,7 +179,8 @@ class Controller(Checked):
     """Gains that are passed to the law, in this order."""
     state: tuple[float, ...] = ()
     """What the law remembers when a goal begins, such as `(0.0,)` for an integral. Such a law is called
-    with `state`, shape (..., n), and with the time dt since the call before (s), at first 0, by keyword.
+    with `state`, shape (..., n), and with the time dt since the call before (s), at first and where the
+    clock goes back 0, by keyword.
     It returns `(v, omega, state)`."""
     takes_heading: Annotated[bool, boolean] = False
     """Whether the law takes the heading of the goal. The robot then always turns to it at the end."""
@@ -292,16 +297,16 @@ class BoundLaw:
         try:
             if state:
                 v, omega, state = twist
-                state = tuple(map(float, np.ravel(state)))
-                if len(state) != len(self._state):
-                    raise ValueError(f'{len(state)} numbers')
+                if np.shape(state) != (len(self._state),):
+                    raise ValueError(f'shape {np.shape(state)}')
+                state = tuple(map(float, state))
             else:
                 v, omega = twist
             v, omega = _number(v), _number(omega)
         except (TypeError, ValueError) as error:
             raise LawError(
                 f'the law of controller {name!r} must return (v, omega), two numbers'
-                + (f', and the state, {len(self._state)} numbers' if self._state else '')
+                + (f', and the state, shape ({len(self._state)},)' if self._state else '')
                 + f', got {short(twist)}'
             ) from error
         if not (isfinite(v) and isfinite(omega) and all(map(isfinite, state))):
@@ -321,7 +326,8 @@ class BoundLaw:
             law, at, to = self._equation, pose, np.asarray(goal)[: self._size].tolist()
         if not self._state:
             return law(at, to, *self._values)
-        dt = 0.0 if self._before is None else (self.now - self._before) / NANOSECONDS
+        # The clock may go back.
+        dt = 0.0 if self._before is None else max(0, self.now - self._before) / NANOSECONDS
         return law(at, to, *self._values, state=state, dt=dt)
 
 

@@ -18,10 +18,11 @@ from diffdrive_jacobian.parameters.declaration import (
     ParameterError,
     default_of,
     parameter,
-    specifications,
 )
 from diffdrive_jacobian.parameters.limits import LimitParameters
 
+OF_RCLPY = ('use_sim_time', 'start_type_description_service')
+"""Parameters of every node."""
 MIN_OFFSET = 1e-3
 """Smallest absolute offset (m). The yaw rate of the law is proportional to the inverse of the offset."""
 
@@ -87,7 +88,8 @@ class GoToGoalParameters(LimitParameters):
         """Return the class that has the gains of the controller, too, with the defaults it declares.
 
         Raises:
-            ParameterError: The controller cannot be loaded, or a gain has the name of another parameter.
+            ParameterError: The controller cannot be loaded, or a gain has the name of something else, or
+                another range than the gain of that name.
         """
         name = values.get('controller', default_of(cls, 'controller'))
         if name not in cls.controllers or name in BUILT_IN:
@@ -95,10 +97,16 @@ class GoToGoalParameters(LimitParameters):
         controller = _found(cls.controllers, name)
         new = [gain for gain in controller.gains if cls.declared_gains.get(gain.name) != gain]
         for gain in new:
-            if gain.name in specifications(cls).keys() - cls.declared_gains.keys():
+            known = cls.declared_gains.get(gain.name)
+            if known is None and (hasattr(cls, gain.name) or gain.name in OF_RCLPY):
                 raise ParameterError(
-                    f"parameter 'controller': {name!r} has a gain {gain.name!r}, which is another "
-                    'parameter of go_to_goal'
+                    f"parameter 'controller': {name!r} has a gain {gain.name!r}, a name that go_to_goal "
+                    'uses otherwise: choose another one'
+                )
+            if known is not None and not gain.shares_range(known):
+                raise ParameterError(
+                    f"parameter 'controller': {name!r} has a gain {gain.name!r} with another unit or "
+                    'other bounds than the parameter of that name: choose another name'
                 )
         gains = {**cls.declared_gains, **{gain.name: gain for gain in new}}
         fields = [(gain.name, float, _gain(gain)) for gain in new]

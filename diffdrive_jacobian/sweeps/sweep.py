@@ -19,8 +19,8 @@ from diffdrive_jacobian.control import Arrival, Controller
 from diffdrive_jacobian.control.controller import KP, Gain
 from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
-from diffdrive_jacobian.numerics.checks import Positive
-from diffdrive_jacobian.numerics.fields import Checked, Count, integer
+from diffdrive_jacobian.numerics.checks import Positive, array, instance
+from diffdrive_jacobian.numerics.fields import Checked, Count, integer, short
 from diffdrive_jacobian.simulation import RobotModel, closed_loops
 from diffdrive_jacobian.simulation._batch import Outcomes
 from diffdrive_jacobian.simulation._block import LOST
@@ -105,17 +105,20 @@ class Setup(Checked):
                 f'controller must have two gains to be swept, but {controller.name!r} has '
                 f'{", ".join(known) or "none"}'
             )
+        instance('gains', self.gains, Mapping)
         if unknown := self.gains.keys() - known.keys():
             raise ValueError(
                 f'gains must be of {", ".join(known)}, those of {controller.name!r}, '
                 f'got {", ".join(map(repr, sorted(unknown)))}'
             )
-        ranges = [name for name, value in self.gains.items() if isinstance(value, tuple)]
+        given = {name: _gain_value(name, value) for name, value in self.gains.items()}
+        object.__setattr__(self, 'gains', given)
+        ranges = [name for name, value in given.items() if isinstance(value, tuple)]
         if len(ranges) > 2 or len(self.gains) - len(ranges) > len(known) - 2:
             raise ValueError(f'two gains must be swept, got ranges of {", ".join(ranges) or "none"}')
         for name, value in self.gains.items():
             ends = value if isinstance(value, tuple) else (value,)
-            if len(ends) > 2 or (len(ends) == 2 and not ends[0] < ends[1]):
+            if len(ends) == 2 and not ends[0] < ends[1]:
                 raise ValueError(f'{name} must be MIN MAX with MIN < MAX, got {value}')
             for end in ends:
                 known[name].check(end)
@@ -187,6 +190,21 @@ class Setup(Checked):
         error = math.tau * (index * step % number + 0.25) / number
         x, y = self.distance * np.cos(bearing), self.distance * np.sin(bearing)
         return np.column_stack([x, y, wrap_angle(bearing + math.pi - error)])
+
+
+def _gain_value(name: str, value: object) -> float | tuple[float, float]:
+    """Return a gain, or its range, as floats.
+
+    Raises:
+        ValueError: It is something else.
+    """
+    made = array(name, value)
+    if made.shape not in ((), (2,)):
+        raise ValueError(f'{name} must be a number or (MIN, MAX), got {short(value)}')
+    if not made.ndim:
+        return float(made)
+    first, last = made.tolist()
+    return first, last
 
 
 class Sweep(NamedTuple):

@@ -122,7 +122,7 @@ def _gains(options: argparse.Namespace) -> dict[str, float | tuple[float, float]
     """Return the gains that are given: a value, or a range."""
     found: dict[str, float | tuple[float, float]] = {}
     for gain in CONTROLLERS.find(options.controller).gains:
-        values = getattr(options, gain.name)
+        values = getattr(options, f'gain_{gain.name}')
         if values is not None:
             found[gain.name] = values[0] if len(values) == 1 else tuple(values)
     return found
@@ -216,17 +216,6 @@ def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:
         'written; 2: wrong arguments; 130: interrupted, and nothing was written.',
     )
     usual = Setup()
-    for gain in controller.gains:
-        unit = f' ({gain.unit})' if gain.unit else ''
-        parser.add_argument(
-            f'--{gain.name}',
-            nargs='+',
-            metavar='VALUE',
-            type=_cli.number,
-            help=f'{gain.description}{unit}: MIN MAX to sweep it, or one value (default: the first two '
-            f'gains are swept, this one over {gain.usual[0]:g} to {gain.usual[1]:g}; else '
-            f'{gain.default:g})',
-        )
     parser.add_argument(
         '--grid',
         metavar='N',
@@ -305,4 +294,18 @@ def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:
     parser.add_argument(
         '--csv', metavar='FILE', help=f'table, .csv (default: {default.format("csv", "-o")})'
     )
+    for gain in controller.gains:
+        unit = f' ({gain.unit})' if gain.unit else ''
+        # It may have the name of another option.
+        taken = {f'--{gain.name}', f'--{gain.name.replace("_", "-")}'} & set(parser.long_options)
+        parser.add_argument(
+            f'--gain-{gain.name}' if taken else f'--{gain.name}',
+            dest=f'gain_{gain.name}',
+            nargs='+',
+            metavar='VALUE',
+            type=_cli.number,
+            help=f'{gain.description}{unit}: MIN MAX to sweep it, or one value (default: the first two '
+            f'gains are swept, this one over {gain.usual[0]:g} to {gain.usual[1]:g}; else '
+            f'{gain.default:g})',
+        )
     return parser
