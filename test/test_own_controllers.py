@@ -554,7 +554,7 @@ def test_every_field_is_described():
         ({'advice': ()}, 'advice must be a function'),
         ({'slope': 1.0}, 'slope must be a function'),
         ({'boundary': (1.0, '')}, 'boundary must be of class Boundary'),
-        ({'summary': None}, 'summary must be of class str'),
+        ({'summary': None}, 'summary must be a string'),
     ],
     ids=str,
 )
@@ -578,8 +578,8 @@ def test_an_invalid_controller_is_refused(changes, words):
         ({'usual': (1.0, 1.0)}, 'usual must be (first, last) with first < last'),
         ({'usual': (0.0, 3.0)}, 'ki must be in [-1, 2], got 3'),
         ({'usual': (-2.0, 0.0)}, 'ki must be in [-1, 2], got -2'),
-        ({'above': 'x'}, 'above must be an array of real numbers'),
-        ({'unit': None}, 'unit must be of class str'),
+        ({'above': 'x'}, 'above must be a number'),
+        ({'unit': None}, 'unit must be a string'),
     ],
     ids=str,
 )
