@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Generator, Iterator
 from contextlib import closing, suppress
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +113,8 @@ class DamagedBag:
         channels: dict[tuple[str, str], Channel] = {}
         self._copy: dict[str, Any] = {}
         self._hashes: dict[tuple[str, str], str] = {}
+        self._times: list[tuple[int, int, str]] = []
+        """Of the first and the last message of each file, and its name."""
         for name, source in self._sources:
             yield from self._of_file(name, source, channels)
         self._compare_counts()
@@ -127,8 +130,10 @@ class DamagedBag:
                 metadata = {}
         if self.path.is_dir() and not (metadata is self._metadata and _listed(metadata)):
             self.unchecked.append(
-                'there is no valid metadata.yaml, so files that are missing cannot be noticed'
+                'there is no valid metadata.yaml, so files that are missing, or of another recording, '
+                'cannot be noticed'
             )
+            self._compare_times()
         seen, counts = self._seen, _counts_by_topic(metadata)
         count = metadata.get('message_count')
         pairs = [(count, seen.total())] if isinstance(count, int) else []
@@ -143,6 +148,15 @@ class DamagedBag:
             difference += f' ({topics})' if topics else ''
             fewer = any(number > found for number, found in pairs)
             (self.lost if fewer else self.unchecked).append(difference)
+
+    def _compare_times(self) -> None:
+        """Report files that cannot be parts of one recording, which follow one another."""
+        for (_, end, first), (start, _, second) in pairwise(sorted(self._times)):
+            if start < end:
+                self.unchecked.append(
+                    f'{second} begins before {first} ends: they may be of two recordings, or the same '
+                    'messages twice'
+                )
 
     def _compare_descriptions(self) -> None:
         """Compare metadata.yaml with the topics in the files, and with its copy there."""
@@ -242,6 +256,7 @@ class DamagedBag:
         names: dict[int, str] = {}
         faults: Counter[str] = Counter()
         budget = Budget(source.stat().st_size)
+        start, end = 2**63, -1
         with open(source, 'rb') as file:
             reader = READERS[file_kind(source)]
             for one in reader(
@@ -274,7 +289,9 @@ class DamagedBag:
                     if data is None or not 0 <= one.stamp < 2**63:
                         faults['are not CDR, are too large, or have an invalid time'] += 1
                     else:
+                        start, end = min(start, one.stamp), max(end, one.stamp)
                         yield Message(to, one.stamp, data)
+        self._times += [(start, end, name)] if end >= 0 else []
         self.lost += [f'{name}: {count} messages {what}' for what, count in faults.items()]
 
     def _channel(self, topic: Topic, channels: dict[tuple[str, str], Channel]) -> Channel | None:
