@@ -65,7 +65,7 @@ def read_robots(path: Path) -> list[RecordedRobot]:
     namespaces = _namespaces(path)
     if len(namespaces) > MAX_ROBOTS:
         raise BagError(f'{path} has {len(namespaces)} robots, at most {MAX_ROBOTS} can be shown')
-    runs, notes = {}, []
+    runs, notes = {}, list[str]()
     for namespace in namespaces:
         # The other topics of a single robot may have another namespace.
         run = read_run(path, namespace=namespace if len(namespaces) > 1 else None)
