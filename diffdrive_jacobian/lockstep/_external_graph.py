@@ -18,6 +18,8 @@ from rclpy.qos import (
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from diffdrive_jacobian.time_units import NANOSECONDS
+
 CLOCK = '/clock'
 UNKNOWN = '_NODE_NAME_UNKNOWN_'
 """Name of a node whose endpoints have been discovered before its name."""
@@ -132,7 +134,17 @@ def compatible(offered: QoSProfile, requested: QoSProfile) -> bool:
 def qos_name(profile: QoSProfile) -> str:
     """Return what decides whether a profile is compatible, in words."""
     latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-    return f'{profile.reliability.name.lower()}, {"transient local" if latched else "volatile"}'
+    words = [profile.reliability.name.lower(), 'transient local' if latched else 'volatile']
+    if profile.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC:
+        words.append('liveliness manual by topic')
+    for name, limit in (
+        ('lease', profile.liveliness_lease_duration),
+        ('deadline', profile.deadline),
+    ):
+        # 0 and infinite: there is none.
+        if 0 < limit.nanoseconds < Infinite.nanoseconds:
+            words.append(f'{name} {limit.nanoseconds / NANOSECONDS:g} s')
+    return ', '.join(words)
 
 
 def node_name(info: TopicEndpointInfo) -> str:
