@@ -48,10 +48,6 @@ class ExternalGraph:
         """Return the external subscriptions of a topic."""
         return self._external(self._node.get_subscriptions_info_by_topic(topic))
 
-    def own(self, infos: Iterable[TopicEndpointInfo]) -> list[TopicEndpointInfo]:
-        """Return the endpoints of the world."""
-        return [info for info in infos if bytes(info.endpoint_gid)[:PARTICIPANT] == self._own]
-
     def _external(self, infos: Iterable[TopicEndpointInfo]) -> list[TopicEndpointInfo]:
         return [info for info in infos if bytes(info.endpoint_gid)[:PARTICIPANT] != self._own]
 
@@ -63,14 +59,6 @@ class ExternalGraph:
             for name in names
             if name not in ('/rosout', '/parameter_events') and self.publishers(name)
         ]
-
-    def nodes(self) -> set[str]:
-        """Return the names of the external nodes that publish or are subscribed to anything."""
-        return {
-            node_name(info)
-            for name, _ in self._node.get_topic_names_and_types()
-            for info in (*self.publishers(name), *self.subscriptions(name))
-        }
 
     def subscribed_nodes(self, topic: str) -> set[str]:
         """Return the names of the external nodes that are subscribed to a topic."""

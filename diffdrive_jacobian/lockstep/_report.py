@@ -103,8 +103,8 @@ class Traffic:
             def counted(self: Publisher, msg: Any) -> None:
                 if get_ident() != thread:
                     topic = self.topic_name
-                    heard = topic not in OMITTED and bool(deliveries.readers_of(topic))
-                    note_thread(self, f'publishes {topic}', heard=heard)
+                    heard = bool(deliveries.readers_of(topic) or observers_of(topic))
+                    note_thread(self, f'publishes {topic}', heard=heard and topic not in OMITTED)
                 if (intercept := traffic.intercept) is not None and intercept(self, msg):
                     return
                 publish(self, msg)
