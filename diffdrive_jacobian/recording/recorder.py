@@ -310,7 +310,9 @@ class Recorder(Node):  # type: ignore[misc]
         if now - self._window > BURST_TIME:
             self._window, self._volume = now, 0
         self._volume += len(message.data) + OVERHEAD
-        if self._volume > BURST_VOLUME:
+        # What was repaired at the end may have been too much for the buffer again.
+        repaired = self._end is not None and now - self._last_burst < HEARTBEAT
+        if repaired or self._volume > BURST_VOLUME:
             self._last_burst = now
         if len(message.data) > LARGE:
             self._large[message.publisher] = now
