@@ -256,6 +256,18 @@ def test_a_large_last_message_cannot_be_confirmed_by_waiting(ros, executor_kind,
     assert 'cannot be confirmed' in doubt.setting.sink.left_out['possibly the end of /cmd_vel']
 
 
+def test_what_was_repaired_at_the_end_may_have_been_too_much_again(ros, executor_kind, monkeypatch):
+    doubt = Doubt(ros, monkeypatch)
+    node = doubt.setting.recorder
+    monkeypatch.setattr(recorder, 'BURST_VOLUME', 1e9)
+    node._last_burst -= 5e5
+    before = node._last_burst
+    doubt.setting.send(1)
+    doubt.end()
+    assert not node.drained()
+    assert node._last_burst > before + 4e5
+
+
 def test_a_recorder_that_was_held_at_the_end_still_waits(ros, executor_kind, monkeypatch):
     doubt = Doubt(ros, monkeypatch, ReliabilityPolicy.BEST_EFFORT)
     doubt.end()
