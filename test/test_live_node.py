@@ -191,6 +191,17 @@ def test_driving_by_hand_cancels_the_goal_first_and_stops_with_the_page(driven):
     assert len(commands) == stopped
 
 
+def test_driving_by_hand_sends_25_commands_per_second_however_often_the_page_is_asked(driven):
+    commands = driven.world.listen(Twist, 'cmd_vel')
+    driven.send(Drive('/', 0.25, 0.5))
+    begin = driven.world.elapsed
+    while driven.world.elapsed < begin + 1.0:
+        for _ in range(5):
+            driven.node.work()
+        driven.world.step(0.01)
+    assert 20 <= len(commands) <= 26
+
+
 def test_a_goal_is_refused_while_the_robot_is_driven_by_hand(driven):
     driven.send(Drive('/', 0.2, 0.0), goal(1.0, 0.0))
     driven.pass_time(0.1)

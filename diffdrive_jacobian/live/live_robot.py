@@ -29,7 +29,7 @@ from diffdrive_jacobian.live.commands import (
     SetParameter,
 )
 from diffdrive_jacobian.live.goal_progress import GoalEnd
-from diffdrive_jacobian.live.hand import PERIOD, STANDSTILL, Act, HandDriving
+from diffdrive_jacobian.live.hand import STANDSTILL, Act, HandDriving
 from diffdrive_jacobian.live.parameter_link import ParameterLink
 from diffdrive_jacobian.live.robot_state import RobotState
 from diffdrive_jacobian.live.robot_topics import RobotTopics
@@ -89,8 +89,7 @@ class LiveRobot:
         self.topics.prepare()
         self.links: dict[str, ParameterLink] = {}
         """Parameters by role."""
-        # Simulated time may be fast: then with each of its steps.
-        self.hand = HandDriving(PERIOD if polled else 0.0)
+        self.hand = HandDriving()
         # Before they are needed, so that they are discovered by then.
         self._services = {name: TriggerLink(node, self.topics.full(name)) for name in SERVICES}
         self._frame = ''
@@ -257,7 +256,12 @@ class LiveRobot:
 
     def drive(self) -> None:
         """Drive by hand, if a page does; to be called often."""
-        act = self.hand.update(time.monotonic(), self._session.is_open, self.state.goal.active)
+        act = self.hand.update(
+            time.monotonic(),
+            self._now() / NANOSECONDS,
+            self._session.is_open,
+            self.state.goal.active,
+        )
         if act is Act.PUBLISH:
             self.topics.publish_twist(self.hand.twist, self._now())
         elif act is Act.STOP:
