@@ -1,8 +1,8 @@
 """Driving by hand, with a dead-man's switch: who stops asking stops the robot.
 
-A pure state machine. The page is watched by a monotonic clock, commands are spaced by the robot's, which
-may be simulated and fast. While a goal is active, driving by hand first cancels it and begins when that is
-confirmed.
+A pure state machine. The page is watched by a monotonic clock; commands are spaced by the robot's, which
+may be simulated and fast. While a goal is active, driving by hand first cancels it and begins when that
+is confirmed.
 """
 
 from __future__ import annotations
