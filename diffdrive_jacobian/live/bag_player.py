@@ -202,9 +202,10 @@ class _Film:
         state = self._state
         # Of another package it may be missing here, or a later one.
         controller = BUILT_IN.get(str(state.controller_values.get('controller', '')))
+        values = state.controller_values
         return settings.shown(
-            {'controller': state.controller_values, 'robot': state.robot_values},
-            controller.gains if controller else (),
+            {'controller': values, 'robot': state.robot_values},
+            controller.gains if controller else settings.recorded_gains(values),
         )
 
     def strips(self) -> Mapping[str, Any]:

@@ -38,6 +38,7 @@ from diffdrive_jacobian.live.trigger_link import TriggerLink
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
 from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.ros.remote_goal import ignores_heading
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS, seconds
 
@@ -223,6 +224,12 @@ class LiveRobot:
             self._warn(f'nobody is subscribed to {self.topics.full(topic)}: is go_to_goal running?')
         else:
             self.send(goals, together=together)
+            values = state.controller_values
+            if command.theta is not None and ignores_heading(values):
+                self._warn(
+                    f'{printable(str(values["controller"]), 40)} ignores the heading of the goal: switch '
+                    'on Goal heading, or choose the control law pose'
+                )
 
     def _set(self, command: SetParameter) -> None:
         role, _, name = command.parameter.partition('/')
