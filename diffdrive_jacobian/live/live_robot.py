@@ -227,8 +227,8 @@ class LiveRobot:
             values = state.controller_values
             if command.theta is not None and ignores_heading(values):
                 self._warn(
-                    f'{printable(str(values["controller"]), 40)} ignores the heading of the goal: switch '
-                    'on Goal heading, or choose the control law pose'
+                    f'{values["controller"]} ignores the heading of the goal: switch on Goal heading, '
+                    'or choose the control law pose'
                 )
 
     def _set(self, command: SetParameter) -> None:

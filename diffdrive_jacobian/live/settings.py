@@ -96,7 +96,7 @@ def recorded_gains(values: Mapping[str, Any]) -> tuple[Gain, ...]:
 
     Their descriptions and ranges are in the package of the controller, which may be missing here.
     """
-    own = {one.name for one in specifications(GoToGoalParameters)}
+    own = specifications(GoToGoalParameters)
     found = []
     for name, value in values.items():
         if name not in own and isinstance(value, float):
