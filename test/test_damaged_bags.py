@@ -34,6 +34,8 @@ from diffdrive_jacobian.tools import plot_run, recover_run, replay_run
 
 COUNT = 10
 STORAGES = ('mcap', 'sqlite3')
+ODOMETRY_HASH = definition('nav_msgs/msg/Odometry').type_hash
+OTHER_HASH = f'RIHS01_{64 * "0"}'
 # Of each kind of consequence one: the others differ in the limits only.
 WITH_PICTURE = ('x', 1e308)
 TOOLS = {
@@ -290,6 +292,39 @@ def test_qos_that_differs_between_metadata_and_file_hides_no_messages(bags, tmp_
         assert 'recover_run' in err
     assert run(capsys, 'recover_run', bag)[0] == 0
     assert len(read_run(tmp_path / 'bag_recovered').odometry) == COUNT
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+@pytest.mark.parametrize(
+    ('old', 'new', 'said'),
+    [
+        ('"wheel_radius": 0.033', '"wheel_radius": 0.035', 'parameters of /virtual_robot'),
+        (ODOMETRY_HASH, OTHER_HASH, 'type hash of /odom'),
+    ],
+)
+def test_recover_run_compares_metadata_with_the_data_file(tmp_path, capsys, storage, old, new, said):
+    bag = make_bag(tmp_path / 'bag', storage, {'/virtual_robot': {'wheel_radius': 0.033}})
+    metadata = bag / 'metadata.yaml'
+    text = metadata.read_text()
+    assert text.count(old) == 1
+    metadata.write_text(text.replace(old, new))
+    code, out, err = run(capsys, 'recover_run', bag)
+    assert (code, err) == (0, '')
+    assert f'lost: metadata.yaml differs from the data file, from which is saved: {said}\n' in out
+    recovered = read_run(tmp_path / 'bag_recovered')
+    assert (len(recovered.odometry), recovered.notes) == (COUNT, ())
+    assert recovered.of_node('virtual_robot') == {'wheel_radius': 0.033}
+
+
+def test_messages_that_were_skipped_are_named_where_they_are_missed(tmp_path, capsys):
+    bag = make_bag(tmp_path / 'bag', 'mcap')
+    metadata = bag / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace(ODOMETRY_HASH, OTHER_HASH))
+    for tool in ('plot_run', 'replay_run'):
+        code, out, err = run(capsys, tool, bag)
+        assert (code, out) != (0, '')
+        assert 'has no odometry' in err
+        assert f'{COUNT} of {COUNT} messages on /odom were recorded with another definition' in err
 
 
 def test_many_topics_are_checked_in_linear_time(monkeypatch):

@@ -291,7 +291,7 @@ def test_a_limit_of_shrinking_is_reported():
         ({'properties': ['fast']}, "instances of Property, got 'fast'"),
         ({'properties': [SLOW, SLOW]}, 'given once'),
         ({'properties': None}, 'properties must be a list, got None'),
-        ({'time_limit': '1'}, "time_limit must be positive, got '1'"),
+        ({'time_limit': '1'}, "time_limit must be a number, got '1'"),
         ({'faults': st.just(Loss('odom'))}, r"lists of faults; it gave Loss\('odom'\)"),
         ({'worlds': 0}, 'worlds must be an integer of at least 1, got 0'),
         ({'seed': -1}, 'seed'),

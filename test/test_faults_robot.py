@@ -570,14 +570,14 @@ def test_a_fault_without_a_robot_is_reported_and_one_of_another_node_refused(loc
 @pytest.mark.parametrize(
     ('make_fault', 'told'),
     [
-        (lambda: DeadWheel('front'), "wheel must be 'left' or 'right', got 'front'"),
-        (lambda: SaturatedWheel('left', 0.0), 'max_velocity must be a number above 0, got 0.0'),
-        (lambda: ActuatorLag(-1.0), 'seconds must be a number above 0, got -1.0'),
-        (lambda: EncoderSteps(0), 'per_revolution must be an integer of at least 1, got 0'),
-        (lambda: EncoderSteps(1.5), 'per_revolution must be an integer of at least 1, got 1.5'),
-        (lambda: EncoderSteps(10**10), 'per_revolution must be at most 1000000000'),
-        (lambda: Push(math.nan), 'dx must be a finite number, got nan'),
-        (lambda: Push(noticed=1), 'noticed must be a bool, got 1'),
+        (lambda: DeadWheel('front'), "wheel must be one of 'left', 'right', got 'front'"),
+        (lambda: SaturatedWheel('left', 0.0), 'max_velocity must be positive and finite, got 0.0'),
+        (lambda: ActuatorLag(-1.0), 'seconds must be positive and finite, got -1.0'),
+        (lambda: EncoderSteps(0), 'per_revolution must be an integer from 1 to 1000000000, got 0'),
+        (lambda: EncoderSteps(1.5), 'per_revolution must be an integer from 1 to 1000000000, got 1.5'),
+        (lambda: EncoderSteps(10**10), 'from 1 to 1000000000, got 10000000000'),
+        (lambda: Push(math.nan), 'dx must be finite, got nan'),
+        (lambda: Push(noticed=1), 'noticed must be True or False, got 1'),
         (
             lambda: WrongGeometry(wheel_separation_multiplier=0.0),
             'must be between 0.01 and 100, got 0.0',

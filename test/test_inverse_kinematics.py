@@ -513,7 +513,7 @@ def test_what_a_function_raises_comes_through():
         ({'tolerance': [1e-6, 1e-6]}, r'^tolerance must be a single number, got shape \(2,\)'),
         ({'damping': 0.0}, '^damping must be positive and finite, got 0.0'),
         ({'damping': np.inf}, '^damping must be positive and finite, got inf'),
-        ({'damping': 'much'}, '^damping must be an array of real numbers, got much'),
+        ({'damping': 'much'}, "^damping must be a number, got 'much'"),
         ({'max_iterations': 0}, '^max_iterations must be an integer of at least 1, got 0'),
         ({'max_iterations': -3}, '^max_iterations must be an integer of at least 1, got -3'),
         ({'max_iterations': 10.0}, '^max_iterations must be an integer of at least 1, got 10.0'),

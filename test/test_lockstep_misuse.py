@@ -13,7 +13,7 @@ from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile
 from rclpy.task import Future
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Empty, Trigger
@@ -109,11 +109,19 @@ def test_a_message_that_does_not_reach_a_latched_subscription_is_an_error(lockst
 
 def test_a_quality_of_service_without_a_remedy_is_named(lockstep):
     planner = lockstep.add(Node('planner'))
-    often = QoSProfile(depth=1, deadline=Duration(seconds=0.1))
-    planner.create_subscription(Vector3, 'map', print, often)
-    for latched in (False, True):
-        with pytest.raises(LockstepError, match=r'/map is subscribed to by /planner .* not reach it\n'):
-            lockstep.publish('map', Vector3(), latched=latched)
+    short, manual = Duration(seconds=0.1), LivelinessPolicy.MANUAL_BY_TOPIC
+    for topic, words, policies in (
+        ('often', 'deadline 0.1 s', {'deadline': short}),
+        ('alive', 'liveliness manual by topic', {'liveliness': manual}),
+        ('leased', 'lease 0.1 s', {'liveliness_lease_duration': short}),
+    ):
+        planner.create_subscription(Vector3, topic, print, QoSProfile(depth=1, **policies))
+        for latched in (False, True):
+            with pytest.raises(
+                LockstepError,
+                match=rf'/{topic} is subscribed to by /planner .*, {words}, and .* not reach it\n',
+            ):
+                lockstep.publish(topic, Vector3(), latched=latched)
 
 
 def test_a_latched_message_waits_for_its_subscriptions(lockstep):
@@ -129,8 +137,8 @@ def test_a_latched_message_waits_for_its_subscriptions(lockstep):
 class Threaded(Node):
     """Publishes in threads of its own, also while its callback waits for one."""
 
-    def __init__(self):
-        super().__init__('threaded', start_parameter_services=False)
+    def __init__(self, name='threaded'):
+        super().__init__(name, start_parameter_services=False)
         self.publisher = self.create_publisher(Vector3, 'spectrum', 10)
         self.client = self.create_client(Empty, 'erase')
         self.create_subscription(Twist, 'twist', lambda _: self.in_thread(self.publish), 10)
@@ -141,20 +149,16 @@ class Threaded(Node):
     def call(self):
         self.client.call_async(Empty.Request())
 
-    def in_thread(self, function):
+    @staticmethod
+    def in_thread(function):
         thread = threading.Thread(target=function, name='worker')
         thread.start()
         thread.join()
 
 
 def test_what_a_node_sends_from_a_thread_of_its_own_is_an_error(lockstep):
-    node = Threaded()
-    # Before it is known whose thread it was.
-    node.in_thread(node.publish)
+    node = lockstep.add(Threaded())
     publishes = "node /threaded publishes /spectrum from a thread of its own ('worker')"
-    with pytest.raises(LockstepError, match=re.escape(publishes)):
-        lockstep.add(node)
-    lockstep.run_for(0.1)
     for use in (
         lambda: lockstep.last('spectrum'),
         lambda: lockstep.run_for(0.1),
@@ -173,6 +177,58 @@ def test_what_a_node_sends_from_a_thread_of_its_own_is_an_error(lockstep):
     node.publish()
     lockstep.settle()
     assert lockstep.last('spectrum') == Vector3()
+
+
+def test_what_a_thread_sends_before_it_destroys_the_publisher_is_an_error(lockstep):
+    node = lockstep.add(Threaded())
+
+    def last_words():
+        node.publish()
+        node.destroy_publisher(node.publisher)
+
+    node.in_thread(last_words)
+    with pytest.raises(LockstepError, match='node /threaded publishes /spectrum from a thread'):
+        lockstep.run_for(0.1)
+
+
+def test_what_a_helper_that_was_not_added_sends_from_a_thread_is_an_error(lockstep):
+    """As a node that publishes through a second node of its own."""
+    node = lockstep.add(Node('composed'))
+    helper = Threaded('helper')
+    node.create_timer(0.1, lambda: helper.in_thread(helper.publish))
+    # Nobody receives it.
+    lockstep.run_for(0.1)
+    lockstep.listen(Vector3, 'spectrum')
+    words = (
+        r"node /helper publishes /spectrum from a thread .*\('worker'\): .* add it with lockstep\.add"
+    )
+    with pytest.raises(LockstepError, match=words) as caught:
+        lockstep.run_for(0.1)
+    assert '  /spectrum: 2 from /helper, ' in str(caught.value)
+    helper.in_thread(helper.call)
+    with pytest.raises(LockstepError, match='node /helper calls or answers /erase from a thread'):
+        lockstep.settle()
+
+
+def test_a_node_may_be_created_in_a_thread(lockstep):
+    """Only what it sends after it was added counts."""
+    lockstep.listen(Vector3, 'spectrum')
+    created = []
+
+    def create():
+        node = Threaded()
+        node.declare_parameter('window', 5)
+        node.publish()
+        created.append(node)
+
+    Threaded.in_thread(create)
+    (node,) = created
+    lockstep.add(node)
+    lockstep.run_for(0.1)
+    assert lockstep.last('spectrum') == Vector3()
+    node.in_thread(node.publish)
+    with pytest.raises(LockstepError, match='node /threaded publishes /spectrum from a thread'):
+        lockstep.run_for(0.1)
 
 
 def test_threads_of_others_do_not_matter(lockstep):
@@ -289,9 +345,19 @@ def test_robot_without_such_a_parameter_is_refused(robot_at):
 
 def test_node_that_was_not_added_is_reported(lockstep):
     forgotten = Blinker('forgotten')
-    assert '  created, but not added to lockstep: /forgotten' in lockstep.report().splitlines()
+    forgotten.create_publisher(Vector3, 'words', 10).publish(Vector3())
+    report = lockstep.report().splitlines()
+    assert '  created, but not added to lockstep: /forgotten' in report
+    assert '  /words: 1 from /forgotten, last at 1 s: Vector3()' in report
     lockstep.add(forgotten)
     assert 'forgotten' not in lockstep.report().replace('from /forgotten', '')
+
+
+def test_a_guard_condition_is_refused_with_a_remedy(lockstep):
+    node = Node('guarded')
+    node.create_guard_condition(print)
+    with pytest.raises(LockstepError, match=r'/guarded has a guard condition, .* use a timer'):
+        lockstep.add(node)
 
 
 def test_arguments_that_ros_would_pass_over_are_refused(lockstep):

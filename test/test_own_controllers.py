@@ -552,8 +552,9 @@ def test_every_field_is_described():
         ({'offset': 'd'}, "offset must be '' or one of kp, kv, got 'd'"),
         ({'takes_heading': 1}, 'takes_heading must be True or False'),
         ({'advice': ()}, 'advice must be a function'),
+        ({'slope': 1.0}, 'slope must be a function'),
         ({'boundary': (1.0, '')}, 'boundary must be of class Boundary'),
-        ({'summary': None}, 'summary must be of class str'),
+        ({'summary': None}, 'summary must be a string'),
     ],
     ids=str,
 )
@@ -576,7 +577,9 @@ def test_an_invalid_controller_is_refused(changes, words):
         ({'bounds': (1.0,)}, 'bounds must have shape (..., 2)'),
         ({'usual': (1.0, 1.0)}, 'usual must be (first, last) with first < last'),
         ({'usual': (0.0, 3.0)}, 'ki must be in [-1, 2], got 3'),
-        ({'unit': None}, 'unit must be of class str'),
+        ({'usual': (-2.0, 0.0)}, 'ki must be in [-1, 2], got -2'),
+        ({'above': 'x'}, 'above must be a number'),
+        ({'unit': None}, 'unit must be a string'),
     ],
     ids=str,
 )

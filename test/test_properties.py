@@ -165,9 +165,9 @@ def test_properties_are_values(one, expression):
 @pytest.mark.parametrize(
     ('create', 'words'),
     [
-        (lambda: NeverFasterThan(-1.0, 2.0), 'v must be a number of at least 0, got -1.0'),
-        (lambda: NeverFasterThan(1.0, float('nan')), 'omega must be a number of at least 0, got nan'),
-        (lambda: NeverFasterThan('1', 2.0), "v must be a number of at least 0, got '1'"),
+        (lambda: NeverFasterThan(-1.0, 2.0), 'v must be zero or positive, got -1.0'),
+        (lambda: NeverFasterThan(1.0, float('nan')), 'omega must be zero or positive, got nan'),
+        (lambda: NeverFasterThan('1', 2.0), "v must be a number, got '1'"),
         (
             lambda: NeverFasterThan(1.0, 2.0, topic=''),
             "topic must be a string that is not empty, got ''",
@@ -180,8 +180,8 @@ def test_properties_are_values(one, expression):
         ),
         (lambda: StaysWithin(1.0, (0, 1)), 'x must be the least and the largest value, got 1.0'),
         (lambda: StaysNear([1, 2], 0.1), r'path must be a sequence of \(x, y\), got \[1, 2\]'),
-        (lambda: Settles(1.0, 0.0), 'tolerance must be a number above 0, got 0.0'),
-        (lambda: ReachesGoal(float('inf')), 'within must be a finite number of at least 0, got inf'),
+        (lambda: Settles(1.0, 0.0), 'tolerance must be positive, got 0.0'),
+        (lambda: ReachesGoal(float('inf')), 'within must be zero or positive and finite, got inf'),
     ],
 )
 def test_invalid_fields_are_refused(create, words):

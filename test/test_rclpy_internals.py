@@ -18,6 +18,7 @@ from rclpy.clock import Clock
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidParameterValueException, ParameterAlreadyDeclaredException
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode
 from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -423,6 +424,22 @@ def test_publish_is_wrapped_and_restored(ros):
         restore()
     publisher.publish(String(data='two'))
     assert published == [('/words', 'one')]
+
+
+def test_new_nodes_are_told_until_it_is_restored(ros):
+    created = []
+    restore = internals.on_new_node(created.append)
+    try:
+        nodes = [
+            Node('plain', context=ros.peer.context),
+            LifecycleNode('managed', context=ros.peer.context),
+        ]
+    finally:
+        restore()
+    nodes.append(Node('later', context=ros.peer.context))
+    assert created == nodes[:2]
+    for node in nodes:
+        node.destroy_node()
 
 
 def test_waiting_messages_are_taken_serialized_with_what_the_middleware_knows(ros):

@@ -221,9 +221,21 @@ def test_a_bag_in_parts(tmp_path, capsys, storage):
     code, out, _ = recover(capsys, bag)
     assert code == 0
     assert f'lost: run_11.{"mcap" if storage == "mcap" else "db3"}' in out
+    assert 'begins before' not in out
     found = read_bag(tmp_path / 'run_recovered')
     assert found[:110] == messages[:110]
     assert all(one in messages[110:] for one in found[110:])
+
+
+def test_a_copy_of_a_file_is_reported(tmp_path, capsys, messages):
+    """All of its messages are written twice."""
+    write_bag(tmp_path / 'run', 'mcap', messages)
+    (tmp_path / 'run' / 'metadata.yaml').unlink()
+    shutil.copy(tmp_path / 'run' / 'run.mcap', tmp_path / 'run' / 'copy.mcap')
+    code, out, _ = recover(capsys, tmp_path / 'run')
+    assert code == 0
+    assert f'{2 * len(messages)} messages' in out
+    assert 'loss cannot be excluded: run.mcap begins before copy.mcap ends' in out
 
 
 def test_a_part_that_is_missing(tmp_path, capsys, messages):

@@ -11,7 +11,9 @@ import zlib
 from contextlib import closing
 
 import pytest
-from test_recover import make_messages, read_bag, recover, write_bag, write_journal
+from test_recover import TOPICS, make_messages, read_bag, recover, write_bag, write_journal
+
+from diffdrive_jacobian.bags.bag_reader import find_damage
 
 DATA_END, FOOTER, STATISTICS = 0x0F, 0x02, 0x0B
 
@@ -124,6 +126,21 @@ def test_one_byte_is_noticed(ours, capsys, opcode, place, said):
     for what in (ours, ours / 'run.mcap'):
         _, out, err = recover(capsys, what, '-o', ours.parent / f'new{what.suffix}')
         assert f'lost: run.mcap: {said}' in out or said in err
+
+
+@pytest.mark.parametrize('topic', TOPICS)
+def test_readers_refuse_an_index_with_a_wrong_checksum(ours, topic):
+    """Another name of a topic in it would hide the messages of that topic."""
+    file = ours / 'run.mcap'
+    assert find_damage(file) == ''
+    name = struct.pack('<I', len(topic)) + topic.encode()
+
+    def rename(data):
+        assert data.count(name) == 2  # In the chunk and in the index.
+        data[data.rindex(name) + len(name) - 1] ^= 1
+
+    edit(file, rename)
+    assert 'the checksum of its summary is wrong' in find_damage(file)
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])

@@ -171,6 +171,47 @@ def test_a_damaged_page_costs_no_other(tmp_path, capsys):
     assert len(messages) > len(found) > 380
 
 
+def test_a_length_beyond_all_positions(tmp_path, capsys):
+    """Of an attachment, which is skipped, so that the length becomes a position in the file."""
+    messages = make_messages(60, 400)
+    write_bag(tmp_path / 'run', 'mcap', messages)
+    broken = cut(tmp_path / 'run', None)
+    data = bytearray((broken / 'run.mcap').read_bytes())
+    struct.pack_into('<BQ', data, data.index(messages[30][2]) - 22 - 9, 0x09, 2**64 - 1)
+    (broken / 'run.mcap').write_bytes(data)
+    code, out, _ = recover(capsys, broken)
+    assert code == 0
+    assert 'bytes of a chunk are not complete records' in out
+    assert read_bag(broken.with_name(f'{broken.name}_recovered')) == messages[:30]
+
+
+def test_the_end_of_an_sqlite_file_that_became_zeros(tmp_path, capsys):
+    messages = make_messages(400, 1000)
+    write_bag(tmp_path / 'run', 'sqlite3', messages)
+    broken = cut(tmp_path / 'run', None)
+    file = next(broken.iterdir())
+    data = file.read_bytes()
+    left, pages = 2 * len(data) // 3 // PAGE, len(data) // PAGE
+    file.write_bytes(data[: left * PAGE].ljust(len(data), b'\0'))
+    code, out, _ = recover(capsys, broken)
+    assert code == 0
+    assert f'lost: run.db3: {pages - left} of its {pages} pages are empty' in out
+    found = read_bag(broken.with_name(f'{broken.name}_recovered'))
+    assert found == messages[: len(found)]
+
+
+def test_messages_of_zeros_are_no_empty_pages(tmp_path, capsys):
+    """A black picture fills whole pages with zeros."""
+    topic = next(iter(TOPICS))
+    messages = [(topic, 1000 + index, b'\0\1\0\0' + bytes(20_000)) for index in range(10)]
+    write_bag(tmp_path / 'run', 'sqlite3', messages)
+    data = (tmp_path / 'run' / 'run.db3').read_bytes()
+    assert bytes(PAGE) in {data[at : at + PAGE] for at in range(0, len(data), PAGE)}
+    _, out, _ = recover(capsys, cut(tmp_path / 'run', None))
+    assert '10 messages' in out
+    assert 'lost: ' not in out
+
+
 @pytest.mark.parametrize('storage', STORAGES)
 def test_random_bytes_never_make_a_traceback(tmp_path, capsys, storage):
     # Bytes of a message itself may be wrong then, for neither format checks them.

@@ -351,7 +351,7 @@ def test_wide_cells_have_the_same_variance(monkeypatch):
 
 @pytest.mark.parametrize('seed', [1.5, '1', -1, 2**63, True, math.nan, [1]], ids=str)
 def test_a_seed_that_is_no_integer_or_out_of_range_is_refused(seed):
-    with pytest.raises(ValueError, match=r'^seed must be an integer from 0 to 2\^63 - 1, got '):
+    with pytest.raises(ValueError, match=r'^seed must be an integer from 0 to 9223372036854775807'):
         Drift(seed=seed)
 
 

@@ -33,7 +33,7 @@ from diffdrive_jacobian.bags.limits import (
     unpack_file,
     unpack_message,
 )
-from diffdrive_jacobian.bags.storage import PathSqlite3Reader
+from diffdrive_jacobian.bags.storage import FOOTER_END, PathSqlite3Reader, file_checksum
 from diffdrive_jacobian.bounded_yaml import TooLargeError, check_yaml, load_yaml
 from diffdrive_jacobian.text import format_size
 
@@ -113,6 +113,7 @@ class _McapReader(McapReader):
                 chunk.channel_count.update(dict.fromkeys(self.channels, 1))
 
     def read_index(self) -> None:
+        self._check_summary()
         super().read_index()
         if self.statistics is None and not all(one.message_index_offsets for one in self.chunks):
             # rosbags counts messages by these indexes, or scans a file without chunks.
@@ -136,6 +137,14 @@ class _McapReader(McapReader):
                     'its chunks overlap in time and unpack to more than '
                     f'{format_size(MAX_OVERLAP)} at once'
                 )
+
+    def _check_summary(self) -> None:
+        """Raise ReaderError if the summary, which names the topics, has a checksum and is altered."""
+        assert self.bio is not None
+        footer = self.bio.seek(-FOOTER_END.size, io.SEEK_END)
+        summary, _, checksum, _ = FOOTER_END.unpack(self.bio.read())
+        if checksum and file_checksum(self.bio, summary, footer + 16) != checksum:
+            raise ReaderError('the checksum of its summary is wrong')
 
     def messages(
         self,

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 _CHUNK_CHECKSUM = 9 + 3 * 8
 """Place of the checksum in the record of a chunk, after opcode, length, times and size."""
-_FOOTER_END = struct.Struct('<QQI8s')
+FOOTER_END = struct.Struct('<QQI8s')
 """Start of the summary and of its offsets, checksum of the summary, and the magic."""
 _DATA_END = 9 + 4
 """Size of the record that ends the data section and has its checksum."""
@@ -51,8 +51,8 @@ class CheckedMcapWriter(McapWriter):
         """Write the last chunk, the metadata and the summary, and close the file."""
         super().close(version, metadata)
         with open(self.path, 'r+b') as file:
-            footer = file.seek(-_FOOTER_END.size, 2)
-            summary, *_ = _FOOTER_END.unpack(file.read())
+            footer = file.seek(-FOOTER_END.size, 2)
+            summary, *_ = FOOTER_END.unpack(file.read())
             self._write_checksum(file, 0, summary - _DATA_END, summary - 4)
             self._write_checksum(file, summary, footer + 16, footer + 16)
 

@@ -7,19 +7,20 @@ document B's law the distance is measured from the offset point (doc/mathematics
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Annotated, Any
 
 from diffdrive_jacobian.kinematics.diff_drive import offset_point
 from diffdrive_jacobian.numerics.checks import (
-    array,
+    NotNegative,
     boolean,
+    constant,
     equal,
+    finite,
     hashable,
-    not_negative,
-    number,
-    read_only,
 )
 from diffdrive_jacobian.numerics.elementary import hypot, wrap
+from diffdrive_jacobian.numerics.fields import Checked
 from diffdrive_jacobian.numerics.formula import Number, formula
 
 
@@ -39,7 +40,7 @@ def heading_error(theta: Number, heading: Number) -> Number:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Arrival:
+class Arrival(Checked):
     """Arrival criterion. Immutable, comparable and hashable.
 
     Raises:
@@ -47,22 +48,14 @@ class Arrival:
             not a Boolean.
     """
 
-    xy_tolerance: float = 0.02
+    xy_tolerance: NotNegative = 0.02
     """Largest distance to a goal that counts as arrived (m)."""
-    yaw_tolerance: float = 0.02
+    yaw_tolerance: NotNegative = 0.02
     """Largest heading error at the goal, if the heading counts (rad)."""
-    use_heading: bool = False
+    use_heading: Annotated[bool, boolean] = False
     """Whether the heading of the last goal counts."""
-    offset: Any = 0.0
+    offset: Annotated[Any, partial(constant, check=finite)] = 0.0
     """X coordinate in the body frame of the point that is to arrive (m), a number or an array."""
-
-    def __post_init__(self) -> None:
-        """Check every value."""
-        for name in ('xy_tolerance', 'yaw_tolerance'):
-            object.__setattr__(self, name, number(name, getattr(self, name), not_negative))
-        object.__setattr__(self, 'use_heading', boolean('use_heading', self.use_heading))
-        offset = array('offset', self.offset)
-        object.__setattr__(self, 'offset', read_only(offset) if offset.ndim else float(offset))
 
     def __eq__(self, other: object) -> bool:
         """Compare every field, arrays by shape and entries."""

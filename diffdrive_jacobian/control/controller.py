@@ -18,17 +18,19 @@ import re
 import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from keyword import iskeyword
 from math import isfinite
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from diffdrive_jacobian.control.sampling import rate_warning
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import (
+    Finite,
     array,
     boolean,
     finite,
@@ -36,8 +38,8 @@ from diffdrive_jacobian.numerics.checks import (
     instance,
     number,
     numbers,
-    short,
 )
+from diffdrive_jacobian.numerics.fields import Checked, Text, optional, short
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 Law = Callable[..., tuple[Any, ...]]
@@ -54,7 +56,7 @@ class LawError(ValueError):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Gain:
+class Gain(Checked):
     """A gain of a law: a parameter of the node go_to_goal, a slider of the page, an axis of sweeps.
 
     Raises:
@@ -64,33 +66,29 @@ class Gain:
     name: str
     """Name of the parameter: a lower-case letter, then letters, digits or `_`, at most 32. Laws with a
     gain of the same name share the parameter, and must give it the same unit and bounds."""
-    default: float
-    unit: str = '1/s'
-    description: str = 'Gain'
+    default: Finite
+    unit: Text = '1/s'
+    description: Text = 'Gain'
     """What it acts on, for help texts."""
     bounds: tuple[float, float] = (-LARGEST_GAIN, LARGEST_GAIN)
     """Smallest and largest value."""
-    above: float | None = None
+    above: Annotated[float | None, optional(partial(number, check=finite))] = None
     """Lower bound that is itself not allowed, instead of the smallest value."""
-    label: str = ''
+    label: Text = ''
     """Label on the page; default: the name."""
     usual: tuple[float, float] = (math.nan, math.nan)
     """Range of the slider and of sweeps; default: from a tenth to three times the default value."""
 
     def __post_init__(self) -> None:
         """Check every field."""
+        Checked.__post_init__(self)
         if not isinstance(self.name, str) or not _GAIN.fullmatch(self.name) or iskeyword(self.name):
             raise ValueError(
                 'name of a gain must be a lower-case letter, then lower-case letters, digits or _, at '
                 f'most 32, got {short(repr(self.name))}'
             )
-        for name in ('unit', 'description', 'label'):
-            instance(name, getattr(self, name), str)
         low, high = numbers('bounds', self.bounds, 2)
         object.__setattr__(self, 'bounds', (low, high))
-        if self.above is not None:
-            object.__setattr__(self, 'above', number('above', self.above, finite))
-        object.__setattr__(self, 'default', number('default', self.default, finite))
         self.check(self.default)
         if np.isnan(self.usual).all():
             about = sorted((self.default / 10.0, 3.0 * self.default)) if self.default else [low, high]
@@ -161,7 +159,7 @@ def no_advice(gains: GainValues, limits: VelocityLimits) -> Iterable[str]:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Controller:
+class Controller(Checked):
     """A control law that drives a unicycle to a goal.
 
     The node go_to_goal, sweeps, their pictures and batches of closed loops read this object. Only `name`
@@ -173,9 +171,9 @@ class Controller:
 
     name: str
     """Name by which it is chosen: a letter, then letters, digits, `_`, `.` or `-`, at most 64."""
-    law: Law
+    law: Annotated[Law, function]
     """The law, `law(poses, goals, *gains) -> (v, omega)`."""
-    summary: str = ''
+    summary: Text = ''
     """One sentence for help texts."""
     gains: tuple[Gain, ...] = (KP, KV)
     """Gains that are passed to the law, in this order."""
@@ -184,31 +182,26 @@ class Controller:
     with `state`, shape (..., n), and with the time dt since the call before (s), at first and where the
     clock goes back 0, by keyword.
     It returns `(v, omega, state)`."""
-    takes_heading: bool = False
+    takes_heading: Annotated[bool, boolean] = False
     """Whether the law takes the heading of the goal. The robot then always turns to it at the end."""
     offset: str = ''
     """Name of the gain that is the x coordinate of the driven point in the body frame; empty: the law
     drives the axle centre."""
-    advice: Callable[[GainValues, VelocityLimits], Iterable[str]] = no_advice
+    advice: Annotated[Callable[[GainValues, VelocityLimits], Iterable[str]], function] = no_advice
     """Return warnings about gains or limits that do not suit the law."""
-    slope: Callable[[GainValues], float] | None = None
+    slope: Annotated[Callable[[GainValues], float] | None, optional(function)] = None
     """Return the largest slope of the yaw rate over the heading (1/s). The sampling rate limits it."""
-    boundary: Boundary | None = None
+    boundary: Annotated[Boundary | None, optional(partial(instance, wanted=Boundary))] = None
     """Line that is drawn in the picture of a sweep."""
 
     def __post_init__(self) -> None:
         """Check every field."""
+        Checked.__post_init__(self)
         if not isinstance(self.name, str) or not _NAME.fullmatch(self.name):
             raise ValueError(
                 "name of a controller must be a letter, then letters, digits, '_', '.' or '-', "
                 f'at most 64, got {short(repr(self.name))}'
             )
-        function('law', self.law)
-        function('advice', self.advice)
-        if self.slope is not None:
-            function('slope', self.slope)
-        instance('summary', self.summary, str)
-        boolean('takes_heading', self.takes_heading)
         if not isinstance(self.gains, tuple) or not all(isinstance(one, Gain) for one in self.gains):
             raise ValueError(f'gains must be a tuple of Gain, got {short(self.gains)}')
         names = self.gain_names
@@ -220,8 +213,6 @@ class Controller:
             )
         state = array('state', self.state, 'n') if self.state else np.zeros(0)
         object.__setattr__(self, 'state', tuple(state.tolist()))
-        if self.boundary is not None:
-            instance('boundary', self.boundary, Boundary)
 
     @property
     def gain_names(self) -> tuple[str, ...]:

@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from diffdrive_jacobian.control.controller import Controller, Law
-from diffdrive_jacobian.numerics.checks import instance, short
+from diffdrive_jacobian.numerics.checks import instance
+from diffdrive_jacobian.numerics.fields import short
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint

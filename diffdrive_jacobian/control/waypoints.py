@@ -20,8 +20,8 @@ from diffdrive_jacobian.numerics.checks import (
     number,
     numbers,
     read_only,
-    short,
 )
+from diffdrive_jacobian.numerics.fields import integer
 
 Pose: TypeAlias = NDArray[np.float64] | tuple[float, float, float]
 Law: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
@@ -53,12 +53,8 @@ class Waypoints:
         if poses.ndim != 2:
             raise ValueError(f'poses must have shape (n, 3), got {poses.shape}')
         object.__setattr__(self, 'poses', read_only(poses))
-        index = self.index
-        if isinstance(index, bool) or not isinstance(index, int | np.integer):
-            raise ValueError(f'index must be an integer, got {short(index)}')
-        if not 0 <= index < len(poses):
-            raise ValueError(f'index must be in 0 to {len(poses) - 1}, got {short(index)}')
-        object.__setattr__(self, 'index', int(index))
+        index = integer('index', self.index, 0, len(poses) - 1)
+        object.__setattr__(self, 'index', index)
         object.__setattr__(self, '_goal', tuple(self.poses[index].tolist()))
         object.__setattr__(self, 'turning', boolean('turning', self.turning))
 

@@ -18,6 +18,8 @@ from diffdrive_jacobian.exploration.scenario import Scenario, ScenarioName
 from diffdrive_jacobian.exploration.search import Search
 from diffdrive_jacobian.exploration.source import Source
 from diffdrive_jacobian.exploration.trial import Setting
+from diffdrive_jacobian.numerics.checks import number, positive_or_infinite
+from diffdrive_jacobian.numerics.fields import integer
 from diffdrive_jacobian.properties import Property
 from diffdrive_jacobian.signals import one_interrupt
 
@@ -77,11 +79,14 @@ def explore(
     setting = Setting(
         scenario=ScenarioName.of(scenario), properties=_checked_properties(properties), args=tuple(args)
     )
-    _check_number('worlds', worlds, 1)
-    _check_number('shrink_worlds', shrink_worlds, 0)
-    _check_number('seed', seed, 0)
-    if time_limit is not None and not (_is_number(time_limit) and time_limit > 0.0):
-        raise ExplorationError(f'time_limit must be positive, got {time_limit!r}')
+    try:
+        integer('worlds', worlds, 1)
+        integer('shrink_worlds', shrink_worlds, 0)
+        integer('seed', seed, 0)
+        if time_limit is not None:
+            number('time_limit', time_limit, positive_or_infinite)
+    except ValueError as error:
+        raise ExplorationError(str(error)) from None
     # A scenario may change the working directory.
     folder = None if output is None else Path(output).absolute()
     if folder is not None:
@@ -122,15 +127,6 @@ def _checked_properties(properties: Any) -> tuple[Property, ...]:
         # A test will contain it.
         Source().expression(one)
     return tuple(properties)
-
-
-def _check_number(name: str, value: object, least: int) -> None:
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
-        raise ExplorationError(f'{name} must be an integer of at least {least}, got {value!r}')
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def _case_strategy(

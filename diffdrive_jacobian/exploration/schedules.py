@@ -14,6 +14,7 @@ from diffdrive_jacobian import faults
 from diffdrive_jacobian.exploration.generation import st
 from diffdrive_jacobian.exploration.strategies import STEP, numbers, probabilities, times
 from diffdrive_jacobian.faults import Fault
+from diffdrive_jacobian.numerics.fields import integer
 
 Fields = dict[str, st.SearchStrategy[Any]]
 Kind = type[Fault] | st.SearchStrategy[Fault]
@@ -153,8 +154,7 @@ def fault_schedules(
     ):
         if isinstance(value, str):
             raise ValueError(f'{name} must be a list of names, got the string {value!r}')
-    if not (isinstance(max_faults, int) and max_faults >= 1):
-        raise ValueError(f'max_faults must be an integer of at least 1, got {max_faults!r}')
+    integer('max_faults', max_faults, 1)
     if not STEP <= duration < math.inf:
         raise ValueError(f'duration must be finite and at least {STEP:g} s, got {duration!r}')
     targets = (

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 from diffdrive_jacobian.exploration.generation import st
+from diffdrive_jacobian.numerics.fields import integer
 
 Pose = tuple[float, float, float]
 Point = tuple[float, float]
@@ -33,8 +34,7 @@ def numbers(low: float, high: float, *, decimals: int = 1) -> st.SearchStrategy[
     """
     if not (math.isfinite(low) and math.isfinite(high) and low <= high):
         raise ValueError(f'low and high must be finite and low <= high, got {low!r} and {high!r}')
-    if decimals not in range(4):
-        raise ValueError(f'decimals must be an integer from 0 to 3, got {decimals!r}')
+    integer('decimals', decimals, 0, 3)
     scale = 10**decimals
     first, last = math.ceil(low * scale - 1e-9), math.floor(high * scale + 1e-9)
     if first > last:

@@ -7,7 +7,7 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
@@ -15,6 +15,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from diffdrive_jacobian.faults.fault import Filter, TopicFault
 from diffdrive_jacobian.faults.message_fields import FieldType, MessageField
 from diffdrive_jacobian.messages import conversion
+from diffdrive_jacobian.numerics.checks import Probability
+from diffdrive_jacobian.numerics.fields import Name, one_of
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 _VALUES = {'nan': math.nan, 'inf': math.inf, '-inf': -math.inf}
@@ -52,19 +54,14 @@ class Corrupt(TopicFault):
         probability: Probability that a message is changed.
     """
 
-    field: str
-    change: str
+    field: Name
+    change: Annotated[str, one_of(*CHANGES)]
     amount: Any = 0.0
-    probability: float = 1.0
+    probability: Probability = 1.0
 
     def __post_init__(self) -> None:
-        """Check the fields."""
+        """Check the fields, and whether the amount suits the change."""
         super().__post_init__()
-        self._text('field')
-        self._number('probability', low=0.0, high=1.0)
-        if self.change not in CHANGES:
-            allowed = ', '.join(map(repr, CHANGES))
-            raise ValueError(f'Corrupt: change must be one of {allowed}, got {self.change!r}')
         amount = self.amount
         if isinstance(amount, np.generic):
             amount = amount.item()

@@ -7,16 +7,25 @@ from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields
 from typing import Any
 
+from diffdrive_jacobian.numerics.fields import Checked
+
 LONG, SHOWN = 8, 2
 """Length beyond which a message shows the beginning of a sequence only, and how many elements of it."""
 
 
 @dataclass(frozen=True, repr=False)
-class Expression:
-    """Base class of dataclasses that are printed as the expression that makes them.
+class Expression(Checked):
+    """Base class of checked dataclasses that are printed as the expression that makes them.
 
     Subclasses are decorated with `@dataclass(frozen=True, repr=False)`.
     """
+
+    def __post_init__(self) -> None:
+        """Check the fields. Errors begin with the name of the class."""
+        try:
+            super().__post_init__()
+        except ValueError as error:
+            raise ValueError(f'{type(self).__name__}: {error}') from None
 
     def __repr__(self) -> str:
         """Return the expression that makes this value."""
@@ -35,17 +44,6 @@ class Expression:
             elif value != one.default:
                 shown.append(f'{one.name}={literal(value)}')
         return f'{type(self).__name__}({", ".join(shown)})'
-
-    def _text(self, name: str, *, empty: bool = False) -> None:
-        """Check that a field is a string.
-
-        Raises:
-            ValueError: It is not, or it is empty and must not be.
-        """
-        value = getattr(self, name)
-        if not isinstance(value, str) or not (value or empty):
-            kind = 'a string' if empty else 'a string that is not empty'
-            raise ValueError(f'{type(self).__name__}: {name} must be {kind}, got {value!r}')
 
 
 def literal(value: Any) -> str:

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 from diffdrive_jacobian.faults.fault import Fault
 from diffdrive_jacobian.lockstep import Injection
+from diffdrive_jacobian.numerics.checks import Positive
+from diffdrive_jacobian.numerics.fields import Name
 from diffdrive_jacobian.time_units import nanoseconds
 
 
@@ -21,12 +23,7 @@ class NodeFault(Fault):
         node: Name of the node.
     """
 
-    node: str
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._text('node')
+    node: Name
 
 
 @dataclass(frozen=True, repr=False)
@@ -71,12 +68,7 @@ class Slow(NodeFault):
         seconds: Duration of each callback (s).
     """
 
-    seconds: float
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._number('seconds', low=0.0, above=True)
+    seconds: Positive
 
     def install(self, injection: Injection) -> None:
         """Set the duration of the callbacks."""
@@ -93,12 +85,7 @@ class TimerJitter(NodeFault):
         seconds: Longest delay (s), uniformly distributed.
     """
 
-    seconds: float
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._number('seconds', low=0.0, above=True)
+    seconds: Positive
 
     def install(self, injection: Injection) -> None:
         """Delay the ticks of the timers."""

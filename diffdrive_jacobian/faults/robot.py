@@ -12,13 +12,16 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from functools import partial
+from typing import Annotated, ClassVar
 
 from rclpy.node import Node
 
 from diffdrive_jacobian.faults.fault import Fault
 from diffdrive_jacobian.lockstep import Injection, LockstepError
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.numerics.checks import Finite, Positive, between, boolean, number
+from diffdrive_jacobian.numerics.fields import Name, integer, one_of
 from diffdrive_jacobian.simulation.actuators import Actuators
 from diffdrive_jacobian.simulation.encoders import MAX_PER_REVOLUTION
 from diffdrive_jacobian.simulation.robot import RobotModel
@@ -26,7 +29,8 @@ from diffdrive_jacobian.simulation.slip import MAX_SEED, Drift
 
 Undo = Callable[[], None]
 """Ends the effect of a fault on a robot."""
-WHEELS = ('left', 'right')
+Wheel = Annotated[str, one_of('left', 'right')]
+Multiplier = Annotated[float, partial(number, check=between(0.01, 100.0))]
 
 
 @dataclass(frozen=True, repr=False)
@@ -37,19 +41,10 @@ class RobotFault(Fault):
         robot: Name of its node.
     """
 
-    robot: str = field(default='virtual_robot', kw_only=True)
+    robot: Name = field(default='virtual_robot', kw_only=True)
 
     lasting: ClassVar[bool] = True
     """Whether the fault also applies to a robot that is created again while it lasts."""
-
-    def __post_init__(self) -> None:
-        """Check the fields.
-
-        Raises:
-            ValueError: A value is invalid.
-        """
-        super().__post_init__()
-        self._text('robot')
 
     @abstractmethod
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo | None:
@@ -81,15 +76,6 @@ class RobotFault(Fault):
 
         injection.change_node(self.robot, begin, end)
 
-    def _wheel(self, wheel: str) -> None:
-        """Check the name of a wheel.
-
-        Raises:
-            ValueError: It is another one.
-        """
-        if wheel not in WHEELS:
-            raise ValueError(f"{type(self).__name__}: wheel must be 'left' or 'right', got {wheel!r}")
-
 
 @dataclass(frozen=True, repr=False)
 class DeadWheel(RobotFault):
@@ -102,12 +88,7 @@ class DeadWheel(RobotFault):
         wheel: 'left' or 'right'.
     """
 
-    wheel: str
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._wheel(self.wheel)
+    wheel: Wheel
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
         """Stop the wheel."""
@@ -127,14 +108,8 @@ class SaturatedWheel(RobotFault):
         max_velocity: Largest speed of the wheel (rad/s).
     """
 
-    wheel: str
-    max_velocity: float
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._wheel(self.wheel)
-        self._number('max_velocity', low=0.0, above=True)
+    wheel: Wheel
+    max_velocity: Positive
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
         """Limit the wheel."""
@@ -154,12 +129,7 @@ class ActuatorLag(RobotFault):
         seconds: Time constant (s).
     """
 
-    seconds: float
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._number('seconds', low=0.0, above=True)
+    seconds: Positive
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
         """Set the lag of the motors."""
@@ -184,17 +154,7 @@ class EncoderSteps(RobotFault):
         per_revolution: Number of increments of a turn of the wheel.
     """
 
-    per_revolution: int
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._count('per_revolution')
-        if self.per_revolution > MAX_PER_REVOLUTION:
-            raise ValueError(
-                f'EncoderSteps: per_revolution must be at most {MAX_PER_REVOLUTION}, '
-                f'got {self.per_revolution}'
-            )
+    per_revolution: Annotated[int, partial(integer, low=1, high=MAX_PER_REVOLUTION)]
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
         """Set the resolution of the encoders."""
@@ -233,15 +193,9 @@ class WrongGeometry(RobotFault):
         wheel_separation_multiplier: True wheel separation [-].
     """
 
-    left_wheel_radius_multiplier: float = 1.0
-    right_wheel_radius_multiplier: float = 1.0
-    wheel_separation_multiplier: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        for name in _MULTIPLIERS:
-            self._number(name, low=0.01, high=100.0)
+    left_wheel_radius_multiplier: Multiplier = 1.0
+    right_wheel_radius_multiplier: Multiplier = 1.0
+    wheel_separation_multiplier: Multiplier = 1.0
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
         """Change the true geometry."""
@@ -270,20 +224,12 @@ class Push(RobotFault):
         noticed: Whether the odometry shows it.
     """
 
-    dx: float = 0.0
-    dy: float = 0.0
-    dtheta: float = 0.0
-    noticed: bool = False
+    dx: Finite = 0.0
+    dy: Finite = 0.0
+    dtheta: Finite = 0.0
+    noticed: Annotated[bool, boolean] = False
 
     lasting: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        for name in ('dx', 'dy', 'dtheta'):
-            self._number(name)
-        if not isinstance(self.noticed, bool):
-            raise ValueError(f'Push: noticed must be a bool, got {self.noticed!r}')
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> None:
         """Displace the robot."""

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from diffdrive_jacobian.faults.fault import Filter, TopicFault
+from diffdrive_jacobian.numerics.checks import NotNegative, Positive, Probability
+from diffdrive_jacobian.numerics.fields import Count
 from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
 
 
@@ -20,14 +22,8 @@ class Loss(TopicFault):
         burst: Number of messages in a row that are lost each time.
     """
 
-    probability: float = 1.0
-    burst: int = 1
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._number('probability', low=0.0, high=1.0)
-        self._count('burst')
+    probability: Probability = 1.0
+    burst: Count = 1
 
     def begin(self, rng: random.Random, message_type: type) -> Filter:
         """Return the filter of one subscription."""
@@ -59,17 +55,11 @@ class Delay(TopicFault):
         growth: Growth of the delay (s per s).
     """
 
-    seconds: float
-    spread: float = 0.0
-    growth: float = 0.0
+    seconds: NotNegative
+    spread: NotNegative = 0.0
+    growth: NotNegative = 0.0
 
     keeps_order: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        for name in ('seconds', 'spread', 'growth'):
-            self._number(name, low=0.0)
 
     def begin(self, rng: random.Random, message_type: type) -> Filter:
         """Return the filter of one subscription."""
@@ -92,14 +82,8 @@ class Reorder(TopicFault):
             late, but in order.
     """
 
-    probability: float
-    seconds: float
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._number('probability', low=0.0, high=1.0)
-        self._number('seconds', low=0.0, above=True)
+    probability: Probability
+    seconds: Positive
 
     def begin(self, rng: random.Random, message_type: type) -> Filter:
         """Return the filter of one subscription."""
@@ -121,16 +105,9 @@ class Duplicate(TopicFault):
         seconds: Time between two of its arrivals (s). 0: immediately after each other.
     """
 
-    probability: float = 1.0
-    copies: int = 1
-    seconds: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._number('probability', low=0.0, high=1.0)
-        self._number('seconds', low=0.0)
-        self._count('copies')
+    probability: Probability = 1.0
+    copies: Count = 1
+    seconds: NotNegative = 0.0
 
     def begin(self, rng: random.Random, message_type: type) -> Filter:
         """Return the filter of one subscription."""
@@ -152,12 +129,7 @@ class RateLimit(TopicFault):
         rate: Largest rate (Hz).
     """
 
-    rate: float
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._number('rate', low=0.0, above=True)
+    rate: Positive
 
     def begin(self, rng: random.Random, message_type: type) -> Filter:
         """Return the filter of one subscription."""

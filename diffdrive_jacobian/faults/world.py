@@ -4,12 +4,32 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 from diffdrive_jacobian.faults.fault import Fault
 from diffdrive_jacobian.faults.nodes import NodeFault
 from diffdrive_jacobian.lockstep import Injection
+from diffdrive_jacobian.numerics.checks import PositiveOrInfinite, finite, number
+from diffdrive_jacobian.numerics.fields import Name
 from diffdrive_jacobian.time_units import nanoseconds
+
+
+def _jump(name: str, value: Any) -> float:
+    """Require a number of seconds that is not zero in nanoseconds."""
+    seconds = number(name, value, finite)
+    if nanoseconds(seconds) == 0:
+        raise ValueError(f'{name} must not be zero, got {seconds!r}')
+    return seconds
+
+
+def _parameter_value(name: str, value: Any) -> Any:
+    """Require a value that a parameter of ROS can have. Returns a list as a tuple."""
+    elements = value if isinstance(value, (list, tuple)) else [value]
+    if not any(all(type(element) is kind for element in elements) for kind in (bool, int, float, str)):
+        raise ValueError(
+            f'{name} must be a bool, int, float, str, or a list of one of them, got {value!r}'
+        )
+    return tuple(value) if isinstance(value, list) else value
 
 
 @dataclass(frozen=True, repr=False)
@@ -24,14 +44,7 @@ class TimeJump(Fault):
         seconds: Length of the jump (s), negative: back.
     """
 
-    seconds: float
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._number('seconds')
-        if nanoseconds(self.seconds) == 0:
-            raise ValueError(f'TimeJump: seconds must not be zero, got {self.seconds!r}')
+    seconds: Annotated[float, _jump]
 
     def install(self, injection: Injection) -> None:
         """Schedule the jump of the clock."""
@@ -59,14 +72,8 @@ class LateService(Fault):
         seconds: Delay of each response (s); infinite: it is never sent.
     """
 
-    service: str
-    seconds: float
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._text('service')
-        self._number('seconds', low=0.0, above=True, infinite=True)
+    service: Name
+    seconds: PositiveOrInfinite
 
     def install(self, injection: Injection) -> None:
         """Delay the responses of the service."""
@@ -88,24 +95,8 @@ class ParameterChange(NodeFault):
         value: The new value: bool, int, float, str, or a list of one of them.
     """
 
-    name: str
-    value: Any
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._text('name')
-        value = self.value
-        if isinstance(value, list):
-            object.__setattr__(self, 'value', tuple(value))
-        for kind in (bool, int, float, str):
-            elements = value if isinstance(value, (list, tuple)) else [value]
-            if all(type(element) is kind for element in elements):
-                return
-        raise ValueError(
-            'ParameterChange: value must be a bool, int, float, str, or a list of one of them, '
-            f'got {value!r}'
-        )
+    name: Name
+    value: Annotated[Any, _parameter_value]
 
     def install(self, injection: Injection) -> None:
         """Schedule the change of the parameter."""

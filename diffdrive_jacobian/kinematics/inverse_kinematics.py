@@ -28,7 +28,7 @@ equations with convex constraints*, 2004.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,6 +36,7 @@ from numpy.typing import ArrayLike, NDArray
 from diffdrive_jacobian.kinematics.search import Difference, Floats, Function, Search, Task
 from diffdrive_jacobian.numerics.checks import array, floats, leading, not_negative, number, positive
 from diffdrive_jacobian.numerics.elementary import wrap
+from diffdrive_jacobian.numerics.fields import integer
 from diffdrive_jacobian.numerics.formula import Entries, Vector, formula
 
 METHODS = ('newton', 'transpose', 'levenberg_marquardt')
@@ -157,10 +158,10 @@ def solve(
         if method != 'transpose':
             raise ValueError(f'alpha is for the method transpose alone, got method {method!r}')
         alpha = number('alpha', alpha, positive)
-    _whole('max_iterations', max_iterations, 1)
-    _whole('restarts', restarts, 0)
+    integer('max_iterations', max_iterations, 1)
+    integer('restarts', restarts, 0)
     if seed is not None and not isinstance(seed, np.random.Generator):
-        _whole('seed', seed, 0)
+        integer('seed', seed, 0)
     weights = _weights(mask, m)
     task = Task(
         forward=forward,
@@ -189,12 +190,6 @@ def solve(
     fields = (found.q.T, converged, found.iterations, found.error, found.restarts, found.start)
     # [()] converts the result of a single target to a scalar.
     return IKResult._make(values.reshape((*batch, *values.shape[1:]))[()] for values in fields)
-
-
-def _whole(name: str, value: Any, least: int) -> None:
-    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not whole or value < least:
-        raise ValueError(f'{name} must be an integer of at least {least}, got {value!r}')
 
 
 def _weights(mask: ArrayLike | None, m: int) -> Floats:

@@ -14,7 +14,8 @@ Source: document A, 3.2.4, "Mobile Manipulators"; doc/mathematics.md, "Manipulat
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,8 +23,9 @@ from numpy.typing import ArrayLike, NDArray
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body, wheel_to_world_jacobian
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm, arm_forward_kinematics, arm_jacobian
-from diffdrive_jacobian.numerics.checks import array, number, positive
+from diffdrive_jacobian.numerics.checks import Positive, array, instance, numbers, read_only
 from diffdrive_jacobian.numerics.elementary import cos, product, sin
+from diffdrive_jacobian.numerics.fields import Checked
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
 
@@ -63,34 +65,27 @@ def mobile_manipulator_jacobian(
     return [[*wheels, *joints] for wheels, joints in zip(of_wheels, of_joints, strict=True)]
 
 
+def _mount(name: str, value: Any) -> NDArray[np.float64]:
+    """Require a position, shape (2,). Returns it read-only."""
+    return read_only(numbers(name, value, 2))
+
+
 @dataclass(frozen=True, eq=False)
-class MobileManipulator:
+class MobileManipulator(Checked):
     """A differential-drive base with a planar arm.
 
     Raises:
         ValueError: r or L is not positive and finite, or the mount is not `[m_x, m_y]`.
     """
 
-    r: float
+    r: Positive
     """Wheel radius (m)."""
-    L: float
+    L: Positive
     """Wheel separation (m)."""
-    arm: PlanarArm
+    arm: Annotated[PlanarArm, partial(instance, wanted=PlanarArm)]
     """Its x axis points forward."""
-    mount: Any = (0.0, 0.0)
+    mount: Annotated[Any, _mount] = (0.0, 0.0)
     """Position of the arm's base in the frame of the axle centre, `[m_x, m_y]` (m)."""
-
-    def __post_init__(self) -> None:
-        """Check every dimension."""
-        for name in ('r', 'L'):
-            object.__setattr__(self, name, number(name, getattr(self, name), positive))
-        if not isinstance(self.arm, PlanarArm):
-            raise ValueError(f'arm must be a PlanarArm, got {self.arm!r:.60}')
-        mount = array('mount', self.mount, 2).copy()
-        if mount.ndim != 1:
-            raise ValueError(f'mount must have shape (2,), got {mount.shape}')
-        mount.flags.writeable = False
-        object.__setattr__(self, 'mount', mount)
 
     def forward_kinematics(self, q: ArrayLike) -> NDArray[np.float64]:
         """Return the pose of the tip in the world.

@@ -8,21 +8,25 @@ Source: doc/mathematics.md, "Control laws".
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Annotated, Any
 
 import numpy as np
 
 from diffdrive_jacobian.numerics.checks import (
     anything,
+    constant,
     equal,
-    floats,
     hashable,
     instance,
     leading,
+    not_negative_or_infinite,
+    not_positive_or_infinite,
     positive,
-    read_only,
+    positive_or_infinite,
 )
 from diffdrive_jacobian.numerics.elementary import maximum, minimum, where
+from diffdrive_jacobian.numerics.fields import Checked
 from diffdrive_jacobian.numerics.formula import Number, formula
 
 ROUNDING = 2.0**-49
@@ -30,7 +34,7 @@ ROUNDING = 2.0**-49
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class VelocityLimits:
+class VelocityLimits(Checked):
     """Velocity limits of a differential drive; infinity means no limit. Each is a number, or an array
     for several robots that broadcasts with the commands. Immutable, comparable and hashable.
 
@@ -39,30 +43,20 @@ class VelocityLimits:
             not broadcast.
     """
 
-    min_v: Any = -np.inf
+    min_v: Annotated[Any, partial(constant, check=not_positive_or_infinite)] = -np.inf
     """Fastest reverse speed, zero or negative (m/s)."""
-    max_v: Any = np.inf
+    max_v: Annotated[Any, partial(constant, check=not_negative_or_infinite)] = np.inf
     """Fastest forward speed (m/s)."""
-    min_omega: Any = -np.inf
+    min_omega: Annotated[Any, partial(constant, check=not_positive_or_infinite)] = -np.inf
     """Fastest clockwise yaw rate, zero or negative (rad/s)."""
-    max_omega: Any = np.inf
+    max_omega: Annotated[Any, partial(constant, check=not_negative_or_infinite)] = np.inf
     """Fastest counter-clockwise yaw rate (rad/s)."""
-    max_wheel_speed: Any = np.inf
+    max_wheel_speed: Annotated[Any, partial(constant, check=positive_or_infinite)] = np.inf
     """Largest absolute speed of either wheel (rad/s)."""
 
     def __post_init__(self) -> None:
         """Check every limit."""
-        for name, limit in zip(self.names(), self.all(), strict=True):
-            value = floats(name, limit)
-            if name == 'max_wheel_speed':
-                inside, allowed = value > 0.0, 'positive'
-            elif name.startswith('min'):
-                inside, allowed = value <= 0.0, 'zero or negative'
-            else:
-                inside, allowed = value >= 0.0, 'zero or positive'
-            if not inside.all():
-                raise ValueError(f'{name} must be {allowed}, got {limit}')
-            object.__setattr__(self, name, read_only(value) if value.ndim else float(value))
+        Checked.__post_init__(self)
         leading(**{name: np.shape(limit) for name, limit in zip(self.names(), self.all(), strict=True)})
 
     def __eq__(self, other: object) -> bool:

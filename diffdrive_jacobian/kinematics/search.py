@@ -243,16 +243,16 @@ class Search:
         e, error = self.task.errors(q, which)
         q = entries_first(q, 1, 1)
         found = Outcome.of(q, error)
-        J = np.zeros((len(e), self.joints, len(which)))
+        J: Floats = np.zeros((len(e), self.joints, len(which)))
         factor = np.full(len(which), self._first_factor)
         still = _Open(which, q, e, error, J, factor)
         still = still.keep(np.isfinite(error) & (error > self.tolerance))
-        ended = np.zeros(len(still.which), dtype=np.bool_)
+        ended: Flags = np.zeros(len(still.which), dtype=np.bool_)
         self._differentiate(still, ~ended)
         for _ in range(max_iterations):
             J, JT_e = self._free(still)
             ended |= ~self._movable(still, J, JT_e)
-            again = np.zeros_like(ended)
+            again: Flags = np.zeros_like(ended)
             if ended.any():
                 again = ended & self._may_restart(still, ended, found)
                 kept = again | ~ended

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION, MAX_SPEED
+from diffdrive_jacobian.numerics.fields import Check, Checked, optional
 from diffdrive_jacobian.text import printable
 
 MAX_SIZE = 4096
@@ -29,101 +29,138 @@ class CommandError(ValueError):
     """The page sent something that is no command. The message says what is wrong."""
 
 
+def _number(low: float, high: float) -> Check:
+    def check(name: str, value: Any) -> float:
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+            raise ValueError(f'{name} must be a number in {low:g} to {high:g}, got {_short(value)}')
+        return float(value)
+
+    return check
+
+
+def _text(name: str, value: Any) -> str:
+    # Nodes cannot encode a lone surrogate, and cut a text at NUL.
+    if not isinstance(value, str) or len(value) > MAX_TEXT or not value.isprintable():
+        raise ValueError(
+            f'{name} must be a text of at most {MAX_TEXT} printable characters, got {_short(value)}'
+        )
+    return value
+
+
+def _flag(name: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError(f'{name} must be true or false, got {_short(value)}')
+    return value
+
+
+def _setting(name: str, value: Any) -> float | str | bool | None:
+    if value is None or isinstance(value, bool):
+        return value
+    return _text(name, value) if isinstance(value, str) else _number(-1e6, 1e6)(name, value)
+
+
+_angle = _number(-math.tau, math.tau)
+_Text = Annotated[str, _text]
+_Flag = Annotated[bool, _flag]
+_Position = Annotated[float, _number(-MAX_POSITION, MAX_POSITION)]
+_Velocity = Annotated[float, _number(-MAX_SPEED, MAX_SPEED)]
+
+
 @dataclass(frozen=True, slots=True)
-class SendGoal:
+class SendGoal(Checked):
     """Send a goal to a robot."""
 
-    robot: str
-    x: float
-    y: float
-    theta: float | None
+    robot: _Text
+    x: _Position
+    y: _Position
+    theta: Annotated[float | None, optional(_angle)]
     """Heading at the goal (rad). None: the direction from which the robot comes."""
-    append: bool
+    append: _Flag
     """Whether it is a further waypoint after the present goals."""
 
 
 @dataclass(frozen=True, slots=True)
-class CancelGoal:
+class CancelGoal(Checked):
     """Cancel the goal of a robot."""
 
-    robot: str
+    robot: _Text
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class Drive(Checked):
     """Drive a robot by hand. It must be repeated, otherwise the robot stops."""
 
-    robot: str
-    v: float
-    omega: float
+    robot: _Text
+    v: _Velocity
+    omega: _Velocity
 
 
 @dataclass(frozen=True, slots=True)
-class Release:
+class Release(Checked):
     """End driving by hand: the robot stops."""
 
-    robot: str
+    robot: _Text
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class Place(Checked):
     """Set the pose of a robot."""
 
-    robot: str
-    x: float
-    y: float
-    theta: float
+    robot: _Text
+    x: _Position
+    y: _Position
+    theta: Annotated[float, _angle]
 
 
 @dataclass(frozen=True, slots=True)
-class Reset:
+class Reset(Checked):
     """Reset the odometry of a robot to its initial pose."""
 
-    robot: str
+    robot: _Text
 
 
 @dataclass(frozen=True, slots=True)
-class ClearPath:
+class ClearPath(Checked):
     """Forget the path of a robot that the page draws."""
 
-    robot: str
+    robot: _Text
 
 
 @dataclass(frozen=True, slots=True)
-class SetParameter:
+class SetParameter(Checked):
     """Set a parameter of a node."""
 
-    robot: str
-    parameter: str
+    robot: _Text
+    parameter: _Text
     """Name of the parameter on the page, `ROLE/NAME`."""
-    value: float | str | bool | None
+    value: Annotated[float | str | bool | None, _setting]
     """None: no limit."""
 
 
 @dataclass(frozen=True, slots=True)
-class Pause:
+class Pause(Checked):
     """Stop or continue simulated time, or a bag."""
 
-    paused: bool
+    paused: _Flag
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class Step(Checked):
     """Advance by one time step, and pause."""
 
 
 @dataclass(frozen=True, slots=True)
-class SetSpeed:
+class SetSpeed(Checked):
     """Set the speed of simulated time, or of a bag."""
 
-    speed: float
+    speed: Annotated[float, _number(MIN_WORLD_SPEED, MAX_WORLD_SPEED)]
 
 
 @dataclass(frozen=True, slots=True)
-class Seek:
+class Seek(Checked):
     """Go to a time of the bag (s)."""
 
-    time: float
+    time: Annotated[float, _number(0.0, 1e9)]
 
 
 Command = (
@@ -142,57 +179,6 @@ Command = (
 )
 
 
-def _number(low: float, high: float) -> Callable[[str, Any], float]:
-    def read(name: str, value: Any) -> float:
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-            raise CommandError(f'{name} must be a number in {low:g} to {high:g}, got {_short(value)}')
-        return float(value)
-
-    return read
-
-
-def _text(name: str, value: Any) -> str:
-    # Nodes cannot encode a lone surrogate, and cut a text at NUL.
-    if not isinstance(value, str) or len(value) > MAX_TEXT or not value.isprintable():
-        raise CommandError(
-            f'{name} must be a text of at most {MAX_TEXT} printable characters, got {_short(value)}'
-        )
-    return value
-
-
-def _flag(name: str, value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise CommandError(f'{name} must be true or false, got {_short(value)}')
-    return value
-
-
-def _heading(name: str, value: Any) -> float | None:
-    return None if value is None else _angle(name, value)
-
-
-def _setting(name: str, value: Any) -> float | str | bool | None:
-    if value is None or isinstance(value, bool):
-        return value
-    return _text(name, value) if isinstance(value, str) else _plausible(name, value)
-
-
-_position = _number(-MAX_POSITION, MAX_POSITION)
-_angle = _number(-math.tau, math.tau)
-_velocity = _number(-MAX_SPEED, MAX_SPEED)
-_plausible = _number(-1e6, 1e6)
-_READERS: dict[str, Callable[[str, Any], Any]] = {
-    'robot': _text,
-    'x': _position,
-    'y': _position,
-    'append': _flag,
-    'v': _velocity,
-    'omega': _velocity,
-    'parameter': _text,
-    'value': _setting,
-    'paused': _flag,
-    'speed': _number(MIN_WORLD_SPEED, MAX_WORLD_SPEED),
-    'time': _number(0.0, 1e9),
-}
 _KINDS: dict[str, type[Any]] = {
     'goal': SendGoal,
     'cancel': CancelGoal,
@@ -232,14 +218,11 @@ def parse(text: str | bytes) -> Command:
         raise CommandError(
             f'{name} must have the keys {", ".join(names) or "of no value"}, got {_short(list(content))}'
         )
-    command: Command = kind(*(_reader(kind, key)(key, content[key]) for key in names))
+    try:
+        command: Command = kind(**content)
+    except ValueError as error:
+        raise CommandError(str(error)) from None
     return command
-
-
-def _reader(kind: type[Any], key: str) -> Callable[[str, Any], Any]:
-    if key == 'theta':
-        return _heading if kind is SendGoal else _angle
-    return _READERS[key]
 
 
 def _refuse_constant(name: str) -> NoReturn:

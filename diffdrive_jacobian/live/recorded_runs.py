@@ -65,14 +65,16 @@ def read_robots(path: Path) -> list[RecordedRobot]:
     namespaces = _namespaces(path)
     if len(namespaces) > MAX_ROBOTS:
         raise BagError(f'{path} has {len(namespaces)} robots, at most {MAX_ROBOTS} can be shown')
-    runs = {}
+    runs, notes = {}, list[str]()
     for namespace in namespaces:
         # The other topics of a single robot may have another namespace.
         run = read_run(path, namespace=namespace if len(namespaces) > 1 else None)
         if len(run.odometry):
             runs[namespace] = run
+        notes += run.notes
     if not runs:
-        raise BagError(f'{path} has no odometry: no message on a topic odom of {ODOMETRY}')
+        why = f'no valid message on a topic odom of {ODOMETRY}'
+        raise BagError('; '.join([f'{path} has no odometry: {why}', *notes]))
     first = min(int(run.odometry.stamps[0]) for run in runs.values())
     robots = []
     for namespace, run in runs.items():

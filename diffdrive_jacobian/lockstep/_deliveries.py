@@ -13,7 +13,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Container, Iterable
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from rclpy.context import Context
 from rclpy.node import Node
@@ -24,6 +24,19 @@ from diffdrive_jacobian.ros.rclpy_internals import message_taker, receives_info,
 
 Delivered: TypeAlias = Callable[[Node, Any, Any], None]
 """Receives the node of a subscription, the type of its messages, and a message or its bytes."""
+
+
+class SentElsewhere(NamedTuple):
+    """What a publisher, client or service has sent from another thread than that of the nodes."""
+
+    node: Node
+    """The node that has it."""
+    added: bool
+    """Whether the node was added before."""
+    what: str
+    """What it did: 'node /face publishes /cmd_vel'."""
+    thread: str
+    """Name of the thread."""
 
 
 class Deliveries:
@@ -45,8 +58,8 @@ class Deliveries:
         """Topics whose messages are not polled: they come from other processes, see `_external`."""
         self.thread = threading.get_ident()
         """The thread of the nodes."""
-        self.elsewhere: dict[Any, str] = {}
-        """Publishers, clients and services that another thread has used, with its name."""
+        self.elsewhere: dict[Any, SentElsewhere] = {}
+        """What another thread has sent last, by publisher, client or service."""
         self._readers: dict[Subscription, Reader] = {}
         self._by_topic: dict[str, list[Reader]] = {}
         self._observers: dict[str, list[Delivered]] = {}
@@ -92,10 +105,6 @@ class Deliveries:
         reader = self.new_reader(subscription, node)
         reader.owner, reader.observers = node, self.observers_of(reader.topic)
         return reader
-
-    def note_thread(self, entity: Any) -> None:
-        """Note that this thread, another one, uses a publisher, client or service."""
-        self.elsewhere[entity] = threading.current_thread().name
 
     def replace(self, nodes: Iterable[Node]) -> None:
         """Create the readers of all present subscriptions again, by `new_reader`."""

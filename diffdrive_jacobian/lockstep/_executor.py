@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import inspect
 import threading
+import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -25,7 +26,7 @@ from rclpy.timer import Timer
 
 from diffdrive_jacobian.lockstep._agenda import Agenda
 from diffdrive_jacobian.lockstep._clocks import Clocks
-from diffdrive_jacobian.lockstep._deliveries import Deliveries, is_latched
+from diffdrive_jacobian.lockstep._deliveries import Deliveries, SentElsewhere, is_latched
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._facade import Facade
 from diffdrive_jacobian.lockstep._keeper import Keeper
@@ -35,6 +36,7 @@ from diffdrive_jacobian.lockstep._timers import Timers, is_due
 from diffdrive_jacobian.ros.rclpy_internals import (
     TimerHandle,
     events_executor,
+    on_new_node,
     wrap_calls,
 )
 
@@ -80,6 +82,9 @@ class QuiescentExecutor:
         self.killed: set[Node] = set()
         """The nodes that were removed without being stopped."""
         self._restore_calls = wrap_calls(self._noting)
+        self._context = context
+        self._created: list[weakref.ref[Node]] = []
+        self._restore_nodes = on_new_node(self._note_node)
         self.clocks = Clocks()
         self.clock_pauses = 0
         """Number of faults because of which the clocks of the nodes stand."""
@@ -93,14 +98,42 @@ class QuiescentExecutor:
 
         def sent(entity: Any, *args: Any, **kwargs: Any) -> Any:
             if threading.get_ident() != deliveries.thread:
-                deliveries.note_thread(entity)
+                self.note_thread(entity, f'calls or answers {entity.service_name}')
             result = send(entity, *args, **kwargs)
             pending.append(None)
             return result
 
         return sent
 
+    def note_thread(self, entity: Any, does: str, *, heard: bool = True) -> None:
+        """Note what a publisher, client or service sends from this thread, another one.
+
+        The thread may destroy the entity afterwards.
+
+        Args:
+            entity: The publisher, client or service.
+            does: What it does: 'publishes /cmd_vel'.
+            heard: Whether it matters if the node was not added.
+        """
+        for node in self.existing:
+            if any(one is entity for one in (*node.publishers, *node.clients, *node.services)):
+                added = node in self._served
+                if added or heard:
+                    what = f'node {node.get_fully_qualified_name()} {does}'
+                    sent = SentElsewhere(node, added, what, threading.current_thread().name)
+                    self.deliveries.elsewhere[entity] = sent
+
     # --- Nodes
+
+    def _note_node(self, node: Node) -> None:
+        if node.context is self._context:
+            self._created.append(weakref.ref(node))
+
+    @property
+    def existing(self) -> list[Node]:
+        """The nodes of the context that were not destroyed, added or not."""
+        nodes = [created() for created in self._created]
+        return [node for node in nodes if node is not None and not _is_destroyed(node)]
 
     @property
     def nodes(self) -> list[Node]:
@@ -154,6 +187,7 @@ class QuiescentExecutor:
     def close(self) -> None:
         """Remove all nodes and shut down."""
         self._restore_calls()
+        self._restore_nodes()
         self.tasks.cancel()
         for served in self._served.values():
             _release(served)
@@ -343,8 +377,8 @@ class QuiescentExecutor:
         for node, served in self._served.items():
             if list(node.guards):
                 raise LockstepError(
-                    f'{node.get_fully_qualified_name()} has a guard condition, which lockstep does not '
-                    'support'
+                    f'node {node.get_fully_qualified_name()} has a guard condition, which lockstep does '
+                    'not support: any thread can trigger it, at any time; use a timer or a topic'
                 )
             for publisher in node.publishers:
                 if is_latched(publisher):

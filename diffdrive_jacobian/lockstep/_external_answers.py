@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
+from typing import Annotated, Any
 
+from diffdrive_jacobian.numerics.checks import NotNegative, number, positive
+from diffdrive_jacobian.numerics.fields import Checked, Count, Name
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 WITHIN = 5.0
 """Default of `within` (s)."""
 
 
+def _period(name: str, value: Any) -> float:
+    """Require a time of at least a nanosecond: less is zero for rcl."""
+    seconds = number(name, value, positive)
+    if seconds * NANOSECONDS < 1.0:
+        raise ValueError(f'{name} must be at least 1e-9 s, got {seconds}')
+    return seconds
+
+
+Period = Annotated[float, _period]
+
+
 @dataclass(frozen=True)
-class Answers:
+class Answers(Checked):
     """Each message on a topic is answered by messages on another one.
 
     Simulated time does not advance until the answers have been received. A message on `topic` that
@@ -28,28 +41,16 @@ class Answers:
             answered. None: all are.
     """
 
-    topic: str
-    to: str
+    topic: Name
+    to: Name
     _: KW_ONLY
-    count: int = 1
-    within: float = WITHIN
+    count: Count = 1
+    within: Period = WITHIN
     when: Callable[[], object] | None = None
-
-    def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ValueError: A value is invalid.
-        """
-        _check_name('topic', self.topic)
-        _check_name('to', self.to)
-        if not isinstance(self.count, int) or self.count < 1:
-            raise ValueError(f'count must be an integer of at least 1, got {self.count!r}')
-        _check_positive('within', self.within)
 
 
 @dataclass(frozen=True)
-class Every:
+class Every(Checked):
     """A topic is published by a timer in simulated time.
 
     Simulated time stops at each expiry of the timer until the message has been received. Any other
@@ -66,28 +67,16 @@ class Every:
         when: Called at each expiry. If it returns a false value, nothing is published. None: always.
     """
 
-    topic: str
-    period: float
+    topic: Name
+    period: Period
     _: KW_ONLY
-    created: float = 0.0
-    within: float = WITHIN
+    created: NotNegative = 0.0
+    within: Period = WITHIN
     when: Callable[[], object] | None = None
-
-    def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ValueError: A value is invalid.
-        """
-        _check_name('topic', self.topic)
-        _check_positive('period', self.period)
-        if not 0.0 <= self.created < math.inf:
-            raise ValueError(f'created must be a time of at least 0 s, got {self.created!r}')
-        _check_positive('within', self.within)
 
 
 @dataclass(frozen=True)
-class Idle:
+class Idle(Checked):
     """A node is idle when it has processed all that it received, which its parameter services show.
 
     Whenever something was sent to the node, it is asked for its parameters three times before simulated
@@ -100,32 +89,12 @@ class Idle:
         within: Longest wall time for a response (s).
     """
 
-    node: str
+    node: Name
     _: KW_ONLY
-    within: float = WITHIN
-
-    def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ValueError: A value is invalid.
-        """
-        _check_name('node', self.node)
-        _check_positive('within', self.within)
+    within: Period = WITHIN
 
 
 Expectation = Answers | Every | Idle
-
-
-def _check_name(name: str, value: object) -> None:
-    if not isinstance(value, str) or not value:
-        raise ValueError(f'{name} must be a name, got {value!r}')
-
-
-def _check_positive(name: str, value: float) -> None:
-    # Periods of less than a nanosecond are zero for rcl.
-    if not (math.isfinite(value) and value * NANOSECONDS >= 1):
-        raise ValueError(f'{name} must be a positive, finite number of seconds, got {value!r}')
 
 
 class AnswersDue:

@@ -18,6 +18,8 @@ from rclpy.qos import (
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from diffdrive_jacobian.time_units import NANOSECONDS
+
 CLOCK = '/clock'
 UNKNOWN = '_NODE_NAME_UNKNOWN_'
 """Name of a node whose endpoints have been discovered before its name."""
@@ -46,10 +48,6 @@ class ExternalGraph:
         """Return the external subscriptions of a topic."""
         return self._external(self._node.get_subscriptions_info_by_topic(topic))
 
-    def own(self, infos: Iterable[TopicEndpointInfo]) -> list[TopicEndpointInfo]:
-        """Return the endpoints of the world."""
-        return [info for info in infos if bytes(info.endpoint_gid)[:PARTICIPANT] == self._own]
-
     def _external(self, infos: Iterable[TopicEndpointInfo]) -> list[TopicEndpointInfo]:
         return [info for info in infos if bytes(info.endpoint_gid)[:PARTICIPANT] != self._own]
 
@@ -61,14 +59,6 @@ class ExternalGraph:
             for name in names
             if name not in ('/rosout', '/parameter_events') and self.publishers(name)
         ]
-
-    def nodes(self) -> set[str]:
-        """Return the names of the external nodes that publish or are subscribed to anything."""
-        return {
-            node_name(info)
-            for name, _ in self._node.get_topic_names_and_types()
-            for info in (*self.publishers(name), *self.subscriptions(name))
-        }
 
     def subscribed_nodes(self, topic: str) -> set[str]:
         """Return the names of the external nodes that are subscribed to a topic."""
@@ -132,7 +122,17 @@ def compatible(offered: QoSProfile, requested: QoSProfile) -> bool:
 def qos_name(profile: QoSProfile) -> str:
     """Return what decides whether a profile is compatible, in words."""
     latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-    return f'{profile.reliability.name.lower()}, {"transient local" if latched else "volatile"}'
+    words = [profile.reliability.name.lower(), 'transient local' if latched else 'volatile']
+    if profile.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC:
+        words.append('liveliness manual by topic')
+    for name, limit in (
+        ('lease', profile.liveliness_lease_duration),
+        ('deadline', profile.deadline),
+    ):
+        # 0 and infinite: there is none.
+        if 0 < limit.nanoseconds < Infinite.nanoseconds:
+            words.append(f'{name} {limit.nanoseconds / NANOSECONDS:g} s')
+    return ', '.join(words)
 
 
 def node_name(info: TopicEndpointInfo) -> str:

@@ -21,6 +21,8 @@ from diffdrive_jacobian.ros.runner import DISCOVERY
 
 DOMAINS = range(1, 102)
 """Domains to choose from. 0 is everybody's; those above have ports that Linux gives to clients."""
+PARTICIPANTS = 32
+"""Number of participants of a domain whose ports are looked at. Each process has one or more."""
 SHOWN_LINES = 15
 """Number of lines that an error quotes of what a process printed."""
 CLOSING = 5.0
@@ -55,10 +57,14 @@ def free_domain() -> int:
     )
 
 
-def _ports(domain: int) -> tuple[int, int]:
-    """Return the UDP ports for discovery: multicast, and unicast of the first participant."""
+def _ports(domain: int) -> list[int]:
+    """Return the UDP ports for discovery: multicast, and unicast of each participant.
+
+    All of them: with discovery on the own machine only, no process may use the first, and the process
+    of the first participant may have ended before the others.
+    """
     multicast = 7400 + 250 * domain
-    return multicast, multicast + 10
+    return [multicast, *(multicast + 10 + 2 * participant for participant in range(PARTICIPANTS))]
 
 
 def _is_free(port: int) -> bool:

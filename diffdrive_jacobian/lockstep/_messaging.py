@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -76,7 +75,7 @@ class Messaging(SimulatedTime):
                     f'{publisher.topic_name} has no subscription of type {_type_name(type(message))}\n'
                     f'{self.report()}'
                 )
-            self._check_all_served(topic, publisher.topic_name)
+            self._check_all_served(publisher.topic_name)
             self._all_served[publisher] = counts
         publisher.publish(message)
         self._settle_unless_busy()
@@ -100,43 +99,23 @@ class Messaging(SimulatedTime):
                     f'not reach it{hint}\n{self.report()}'
                 )
 
-    def _check_all_served(self, given: str, topic: str) -> None:
+    def _check_all_served(self, topic: str) -> None:
         """Check that all subscriptions of a topic are those of nodes that were added.
 
         Args:
-            given: Name of the topic, before it is remapped.
             topic: Fully qualified name of the topic.
         """
-        served = Counter(
-            node.get_fully_qualified_name()
-            for node in self._executor.nodes
-            for subscription in node.subscriptions
-            if subscription.topic_name == topic
+        nodes = self._executor.nodes
+        added = {node.get_fully_qualified_name() for node in nodes}
+        missing = sorted(
+            f'{name} (a second node of this name)' if name in added else name
+            for node in self._executor.existing
+            if node not in nodes and any(one.topic_name == topic for one in node.subscriptions)
+            for name in [node.get_fully_qualified_name()]
         )
-        # It remaps the name.
-        endpoints = self.node.get_subscriptions_info_by_topic(given)
-        # By number: two nodes can have one name, and the graph loses it when one of them is destroyed.
-        if self._external is not None:
-            endpoints = self._external.graph.own(endpoints)
-        if len(endpoints) <= served.total():
-            return
-        named = Counter(f'{end.node_namespace.rstrip("/")}/{end.node_name}' for end in endpoints)
-        added = {node.get_fully_qualified_name() for node in self._executor.nodes}
-        nodes = self.node.get_node_names_and_namespaces()
-        existing = Counter(f'{space.rstrip("/")}/{name}' for name, space in nodes)
-        # Clients of actions of a node subscribe without a subscription of the node.
-        others = set() if self._external is None else self._external.graph.nodes()
-        missing = [
-            name
-            for name in sorted(named - served)
-            if name not in others and (name not in added or existing[name] > 1)
-        ]
         if missing:
-            shown = [
-                f'{name} (a second node of this name)' if name in added else name for name in missing
-            ]
             raise LockstepError(
-                f'{topic} is subscribed to by {", ".join(shown)}: created, but not added to lockstep'
+                f'{topic} is subscribed to by {", ".join(missing)}: created, but not added to lockstep'
             )
 
     def last(self, topic: str) -> Any:

@@ -13,6 +13,7 @@ from diffdrive_jacobian.lockstep._external import External
 from diffdrive_jacobian.lockstep._external_answers import Expectation
 from diffdrive_jacobian.lockstep._external_process import ExternalProcess, free_domain
 from diffdrive_jacobian.lockstep._messaging import Messaging
+from diffdrive_jacobian.numerics.fields import integer
 from diffdrive_jacobian.ros.fastdds_profiles import open_to_others
 from diffdrive_jacobian.ros.runner import DISCOVERY, MAX_DOMAIN_ID
 
@@ -43,8 +44,7 @@ class Processes(Messaging):
             return {**isolated, DISCOVERY[0]: 'OFF'}
         if domain_id is None:
             domain_id = free_domain()
-        elif not (isinstance(domain_id, int) and 0 <= domain_id <= MAX_DOMAIN_ID):
-            raise ValueError(f'domain_id must be an integer in 0 to {MAX_DOMAIN_ID}, got {domain_id!r}')
+        domain_id = integer('domain_id', domain_id, 0, MAX_DOMAIN_ID)
         self._variables_of_others = {DISCOVERY[0]: 'LOCALHOST', 'ROS_DOMAIN_ID': str(domain_id)}
         # Read with the first participant of this process.
         open_to_others()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import count
 from typing import Any, Protocol, TypeAlias
 
@@ -87,8 +87,13 @@ class Traffic:
         self.intercept: Callable[[Publisher, Any], bool] | None = None
         """Called with each message. It returns whether it sends the message itself."""
 
-    def start(self, deliveries: Deliveries) -> None:
-        """Start counting."""
+    def start(self, deliveries: Deliveries, note_thread: Callable[..., None]) -> None:
+        """Start counting.
+
+        Args:
+            deliveries: Where the messages wait.
+            note_thread: Called in other threads, as `QuiescentExecutor.note_thread`.
+        """
         traffic, records, now, numbers = self, self._records, self._now, self._numbers
         self._deliveries = deliveries
         extend, observers_of = deliveries.pending.extend, self.observers_of
@@ -97,7 +102,9 @@ class Traffic:
         def counting(publish: Callable[..., None]) -> Callable[..., None]:
             def counted(self: Publisher, msg: Any) -> None:
                 if get_ident() != thread:
-                    deliveries.note_thread(self)
+                    topic = self.topic_name
+                    heard = bool(deliveries.readers_of(topic) or observers_of(topic))
+                    note_thread(self, f'publishes {topic}', heard=heard and topic not in OMITTED)
                 if (intercept := traffic.intercept) is not None and intercept(self, msg):
                     return
                 publish(self, msg)
@@ -180,19 +187,21 @@ class Traffic:
         if self._restore is not None:
             self._restore()
 
-    def describe(self, nodes: list[Node], world_time: int, others: Collection[str] = ()) -> str:
+    def describe(self, nodes: list[Node], existing: list[Node], world_time: int) -> str:
         """Return the last message of each publisher, and the subscribed topics without messages.
 
         Args:
             nodes: The nodes of the world.
+            existing: These, and those that were created but not added.
             world_time: Time since the start (ns).
-            others: Names of nodes in other processes.
         """
         names = {
-            publisher: node.get_fully_qualified_name() for node in nodes for publisher in node.publishers
+            publisher: node.get_fully_qualified_name()
+            for node in existing
+            for publisher in node.publishers
         }
         published = [
-            (record.topic, names.get(publisher, 'a removed node'), record)
+            (record.topic, names.get(publisher, 'a destroyed publisher'), record)
             for publisher, record in self._records.items()
             if record.topic not in OMITTED
         ] + [
@@ -216,8 +225,9 @@ class Traffic:
             f'  {topic}: no message; subscribed by {", ".join(dict.fromkeys(names))}'
             for topic, names in sorted(subscribers.items())
         ]
-        if missing := _not_served(nodes, others):
-            lines.append(f'  created, but not added to lockstep: {", ".join(missing)}')
+        # Their callbacks are not executed.
+        if missing := [node.get_fully_qualified_name() for node in existing if node not in nodes]:
+            lines.append(f'  created, but not added to lockstep: {", ".join(sorted(missing))}')
         clock, passed = self._now() / NANOSECONDS, world_time / NANOSECONDS
         title = f'last messages, at {clock:g} s of the clock, {passed:g} s after the start:'
         return '\n'.join([title, *(lines or ['  none'])])
@@ -229,13 +239,6 @@ def _subscriptions(publisher: Publisher) -> int:
         return int(publisher.get_subscription_count())
     except InvalidHandle:
         return 0
-
-
-def _not_served(nodes: list[Node], others: Collection[str]) -> list[str]:
-    """Return the names of nodes that were created but not added. Their callbacks are not executed."""
-    served = {*others, *(node.get_fully_qualified_name() for node in nodes)}
-    created = nodes[0].get_node_names_and_namespaces() if nodes else []
-    return sorted({f'{space.rstrip("/")}/{name}' for name, space in created} - served)
 
 
 def brief(message: Any) -> str:

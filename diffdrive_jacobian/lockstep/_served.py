@@ -25,9 +25,9 @@ Responded: TypeAlias = Callable[[Node, Service, Any], None]
 
 
 class Served:
-    """A node for the EventsExecutor, without timers and subscriptions."""
+    """A node for the EventsExecutor, without timers, subscriptions and guard conditions."""
 
-    timers = subscriptions = ()
+    timers = subscriptions = guards = ()
 
     def __init__(
         self,

@@ -6,15 +6,12 @@
 from __future__ import annotations
 
 import inspect
-import itertools
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
 
 from diffdrive_jacobian.lockstep._errors import LockstepError, PropertyViolation
 from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
@@ -263,18 +260,23 @@ class SimulatedTime:
             self._busy = False
 
     def _check_threads(self) -> None:
-        """Check that nodes have sent nothing from threads of their own.
+        """Check that nodes have sent nothing from threads of their own since they were added.
 
         Raises:
-            LockstepError: One has.
+            LockstepError: One has, or one that was not added has sent something to those that were.
         """
         elsewhere = self._executor.deliveries.elsewhere
-        for entity, node in itertools.product(list(elsewhere), self._executor.nodes):
-            if (sends := _sending(node, entity)) is not None:
+        while elsewhere:
+            # Other threads may add to it meanwhile.
+            _, sent = elsewhere.popitem()
+            if sent.added or sent.node not in self._executor.nodes:
+                remedy = (
+                    '' if sent.added else 'it was created, but not added: add it with lockstep.add, and '
+                )
                 raise LockstepError(
-                    f'node {node.get_fully_qualified_name()} {sends} from a thread of its own '
-                    f"('{elsewhere.pop(entity)}'): when that is done cannot be known, so it cannot run "
-                    f'in lockstep; do it in a callback, for example of a timer\n{self.report()}'
+                    f"{sent.what} from a thread of its own ('{sent.thread}'): when that is done cannot "
+                    f'be known, so it cannot run in lockstep; {remedy}do it in a callback, for example '
+                    f'of a timer\n{self.report()}'
                 )
 
     def _check_requirements(self) -> None:
@@ -291,11 +293,9 @@ class SimulatedTime:
 
     def report(self) -> str:
         """Return the last messages of all topics as text."""
-        if self._external is None:
-            return self._traffic.describe(self._executor.nodes, self.world_time)
-        lines = self._external.waiting.describe()
-        others = self._external.graph.nodes()
-        text = self._traffic.describe(self._executor.nodes, self.world_time, others)
+        executor = self._executor
+        text = self._traffic.describe(executor.nodes, executor.existing, self.world_time)
+        lines = [] if self._external is None else self._external.waiting.describe()
         return '\n  '.join([text, *lines])
 
 
@@ -310,15 +310,6 @@ def checked_nanoseconds(name: str, seconds: float) -> int:
             f'{name} must be a positive number of seconds, at most {MAX_SECONDS}, got {seconds!r}'
         )
     return round(seconds * NANOSECONDS)
-
-
-def _sending(node: Node, entity: Any) -> str | None:
-    """Return what a node does with a publisher, a client or a service; None: it is of another node."""
-    if any(one is entity for one in node.publishers):
-        return f'publishes {entity.topic_name}'
-    if any(one is entity for one in (*node.clients, *node.services)):
-        return f'calls or answers {entity.service_name}'
-    return None
 
 
 def _place(condition: Callable[[], object]) -> str:

@@ -118,7 +118,7 @@ class Lockstep(Requirements, Processes):
         except ValueError as error:
             raise LockstepError('Lockstep must be created and used in the main thread') from error
         self._closing.callback(self._guard.close)
-        self._traffic.start(self._executor.deliveries)
+        self._traffic.start(self._executor.deliveries, self._executor.note_thread)
         self._closing.callback(self._traffic.close)
         self.node = Node('lockstep', start_parameter_services=False, enable_rosout=False)
         self._executor.clocks.publisher = self.node.create_publisher(Clock, '/clock', 1)

@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable
+from functools import partial
 from numbers import Real
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from diffdrive_jacobian.numerics.fields import short
 
 MAX_NANOSECONDS = 2**63 - 1
 """Largest time of ROS clocks (ns)."""
@@ -52,6 +55,38 @@ def not_negative(name: str, value: Any) -> None:
     inside = (value >= 0.0) & (value < np.inf)
     if inside is not True and not np.all(inside):
         raise ValueError(f'{name} must be zero or positive and finite, got {_first(value, inside)}')
+
+
+def not_negative_or_infinite(name: str, value: Any) -> None:
+    """Require a number to be zero or positive. Infinity means no limit.
+
+    Raises:
+        ValueError: An entry is negative or NaN.
+    """
+    inside = value >= 0.0
+    if inside is not True and not np.all(inside):
+        raise ValueError(f'{name} must be zero or positive, got {value}')
+
+
+def between(low: float, high: float) -> Callable[[str, float], None]:
+    """Return a check that requires a single number between two limits, which are allowed."""
+
+    def check(name: str, value: float) -> None:
+        if not low <= value <= high:
+            raise ValueError(f'{name} must be between {low:g} and {high:g}, got {value}')
+
+    return check
+
+
+def not_positive_or_infinite(name: str, value: Any) -> None:
+    """Require a number to be zero or negative. Infinity means no limit.
+
+    Raises:
+        ValueError: An entry is positive or NaN.
+    """
+    inside = value <= 0.0
+    if inside is not True and not np.all(inside):
+        raise ValueError(f'{name} must be zero or negative, got {value}')
 
 
 def offset(name: str, value: Any) -> None:
@@ -144,12 +179,22 @@ def number(name: str, value: Any, check: Callable[[str, Any], None]) -> float:
         ValueError: The check fails, or the value is not a single number.
     """
     if type(value) is not float:
+        if isinstance(value, bool | np.bool_ | str | None):
+            raise ValueError(f'{name} must be a number, got {short(value, repr)}')
         result = floats(name, value)
         if result.ndim:
             raise ValueError(f'{name} must be a single number, got shape {result.shape}')
         value = float(result)
     check(name, value)
     return float(value)
+
+
+Finite = Annotated[float, partial(number, check=finite)]
+Positive = Annotated[float, partial(number, check=positive)]
+PositiveOrInfinite = Annotated[float, partial(number, check=positive_or_infinite)]
+NotNegative = Annotated[float, partial(number, check=not_negative)]
+NotNegativeOrInfinite = Annotated[float, partial(number, check=not_negative_or_infinite)]
+Probability = Annotated[float, partial(number, check=between(0.0, 1.0))]
 
 
 def array(name: str, value: Any, *trailing: int | str) -> NDArray[np.float64]:
@@ -231,7 +276,7 @@ def boolean(name: str, value: Any) -> bool:
     return bool(value)
 
 
-def instance(name: str, value: Any, wanted: type) -> None:
+def instance(name: str, value: Any, wanted: type) -> Any:
     """Require an object of a class.
 
     Raises:
@@ -239,9 +284,10 @@ def instance(name: str, value: Any, wanted: type) -> None:
     """
     if not isinstance(value, wanted):
         raise ValueError(f'{name} must be of class {wanted.__name__}, got {short(value)}')
+    return value
 
 
-def function(name: str, value: Any) -> None:
+def function(name: str, value: Any) -> Any:
     """Require a callable object.
 
     Raises:
@@ -249,6 +295,7 @@ def function(name: str, value: Any) -> None:
     """
     if not callable(value):
         raise ValueError(f'{name} must be a function, got {short(value)}')
+    return value
 
 
 def read_only(value: Any) -> NDArray[np.float64]:
@@ -256,6 +303,18 @@ def read_only(value: Any) -> NDArray[np.float64]:
     copy = np.array(value, dtype=np.float64)
     copy.setflags(write=False)
     return copy
+
+
+def constant(name: str, value: Any, check: Callable[[str, Any], None]) -> Any:
+    """Convert and check a field of an immutable object. Returns a float, or a read-only array.
+
+    Raises:
+        ValueError: The check fails, or an entry is not a number.
+    """
+    array = floats(name, value)
+    result = read_only(array) if array.ndim else float(array)
+    check(name, result)
+    return result
 
 
 def equal(first: Any, second: Any) -> bool:
@@ -291,15 +350,6 @@ def leading(**shapes: tuple[int, ...]) -> tuple[int, ...]:
         raise ValueError(
             f'{" and ".join(several)} must have leading axes that broadcast, got {shown}'
         ) from None
-
-
-def short(value: Any) -> str:
-    """Return a value as text of at most 60 characters."""
-    try:
-        got = str(value)
-    except ValueError:  # of an integer with thousands of digits
-        got = f'an object of class {type(value).__name__}'
-    return got if len(got) <= 60 else f'{got[:57]}...'
 
 
 def _first(value: Any, inside: Any) -> str:

@@ -38,6 +38,8 @@ ARROWS = 14
 """Number of headings along a path."""
 LABEL = 40
 """Length beyond which the name of a bag is shortened in the middle."""
+STILL = 1e-3
+"""Least range of a quantity over time, in its unit."""
 NUMBERED, MARKED = 12, 30
 """Numbers of goals beyond which they have no numbers, and their changes are not marked over time."""
 NOTED = 4
@@ -261,6 +263,8 @@ def _draw_over_time(
 ) -> None:
     """Draw a quantity and its limits, and for a single run its commands."""
     panel.axhline(0.0, color='#bbbbbb', lw=0.8, zorder=1)
+    # So that the rounding of a robot at rest does not fill the panel.
+    panel.update_datalim([(one.time[0], -STILL), (one.time[0], STILL)])
     command, measurement = commanded(one, quantity), measured(one, quantity)
     if not len(measurement):
         panel.plot(*command.T, color=color, ls=style, lw=1.5, drawstyle='steps-post')

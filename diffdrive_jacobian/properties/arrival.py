@@ -11,6 +11,8 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
+from diffdrive_jacobian.numerics.fields import Name
 from diffdrive_jacobian.properties._goals import Goal, Motion, read_goal
 from diffdrive_jacobian.properties._messages import FieldReader, Pose, Twist
 from diffdrive_jacobian.properties._node_time import ROUNDING, end_of_faults
@@ -39,18 +41,10 @@ class DueGoalProperty(GoalProperty):
         commands: Topic on which the controller publishes (default: 'cmd_vel').
     """
 
-    within: float
-    tolerance: float = field(default=0.05, kw_only=True)
-    status: str = field(default='goal_status', kw_only=True)
-    commands: str = field(default='cmd_vel', kw_only=True)
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._number('within', infinite=False)
-        self._number('tolerance', zero=False)
-        self._text('status')
-        self._text('commands')
+    within: NotNegative
+    tolerance: PositiveOrInfinite = field(default=0.05, kw_only=True)
+    status: Name = field(default='goal_status', kw_only=True)
+    commands: Name = field(default='cmd_vel', kw_only=True)
 
 
 @dataclass(frozen=True, repr=False)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import numbers
 from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass, field
@@ -13,6 +11,7 @@ from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.faults.expression import Expression
 from diffdrive_jacobian.lockstep import Lockstep, LockstepError
+from diffdrive_jacobian.numerics.fields import Text
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 RECENT = 5
@@ -30,15 +29,7 @@ class Property(Expression, ABC):
         namespace: Namespace of the topics, such as '/robot1' (default: that of the `Lockstep`).
     """
 
-    namespace: str = field(default='', kw_only=True)
-
-    def __post_init__(self) -> None:
-        """Check the fields.
-
-        Raises:
-            ValueError: A field is invalid.
-        """
-        self._text('namespace', empty=True)
+    namespace: Text = field(default='', kw_only=True)
 
     @abstractmethod
     def watch(self, world: Lockstep) -> Watch:
@@ -49,36 +40,6 @@ class Property(Expression, ABC):
         if not self.namespace or name.startswith('/'):
             return name
         return f'{self.namespace.rstrip("/")}/{name}'
-
-    def _number(self, name: str, *, infinite: bool = True, zero: bool = True) -> None:
-        """Check that a field is a number that is not negative, and make it a float.
-
-        Args:
-            name: Name of the field.
-            infinite: Whether it may be infinite.
-            zero: Whether it may be zero.
-
-        Raises:
-            ValueError: It is not.
-        """
-        value = getattr(self, name)
-        is_number = not isinstance(value, bool) and isinstance(value, numbers.Real)
-        valid = is_number and float(value) >= 0.0
-        if not valid or (math.isinf(value) and not infinite) or (value == 0.0 and not zero):
-            allowed = f'a{"" if infinite else " finite"} number {"of at least" if zero else "above"} 0'
-            raise ValueError(f'{type(self).__name__}: {name} must be {allowed}, got {value!r}')
-        object.__setattr__(self, name, float(value))
-
-    def _texts(self, name: str) -> None:
-        """Check that a field is a sequence of strings, and make it a tuple.
-
-        Raises:
-            ValueError: It is not.
-        """
-        value = getattr(self, name)
-        if isinstance(value, str) or not all(isinstance(one, str) and one for one in value):
-            raise ValueError(f'{type(self).__name__}: {name} must be a tuple of names, got {value!r}')
-        object.__setattr__(self, name, tuple(value))
 
 
 class Watch:

@@ -9,6 +9,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.numerics.fields import Name, Names
 from diffdrive_jacobian.properties._messages import read_twist
 from diffdrive_jacobian.properties.base import Property, Watch
 
@@ -26,16 +27,9 @@ class NoCommandAfterCancel(Property):
         goals: Topics of the goals (default: ('goal_pose', 'goals')).
     """
 
-    cancel: str = field(default='cancel_goal', kw_only=True)
-    commands: str = field(default='cmd_vel', kw_only=True)
-    goals: tuple[str, ...] = field(default=('goal_pose', 'goals'), kw_only=True)
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._text('cancel')
-        self._text('commands')
-        self._texts('goals')
+    cancel: Name = field(default='cancel_goal', kw_only=True)
+    commands: Name = field(default='cmd_vel', kw_only=True)
+    goals: Names = field(default=('goal_pose', 'goals'), kw_only=True)
 
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""

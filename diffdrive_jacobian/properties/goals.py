@@ -9,6 +9,8 @@ from typing import Any
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
+from diffdrive_jacobian.numerics.fields import Name, Names
 from diffdrive_jacobian.properties._goals import Goal, Motion, read_goal
 from diffdrive_jacobian.properties._messages import Pose, Twist
 from diffdrive_jacobian.properties._node_time import ROUNDING
@@ -26,16 +28,9 @@ class GoalProperty(Property):
         cancel: Service that cancels the goal (default: 'cancel_goal').
     """
 
-    goals: tuple[str, ...] = field(default=('goal_pose', 'goals'), kw_only=True)
-    odom: str = field(default='odom', kw_only=True)
-    cancel: str = field(default='cancel_goal', kw_only=True)
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._texts('goals')
-        self._text('odom')
-        self._text('cancel')
+    goals: Names = field(default=('goal_pose', 'goals'), kw_only=True)
+    odom: Name = field(default='odom', kw_only=True)
+    cancel: Name = field(default='cancel_goal', kw_only=True)
 
 
 @dataclass(frozen=True, repr=False)
@@ -53,16 +48,9 @@ class ReachesGoal(GoalProperty):
         yaw_tolerance: Largest difference of the heading (rad) (default: infinite, any heading).
     """
 
-    within: float
-    tolerance: float = field(default=0.05, kw_only=True)
-    yaw_tolerance: float = field(default=math.inf, kw_only=True)
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._number('within', infinite=False)
-        self._number('tolerance', zero=False)
-        self._number('yaw_tolerance', zero=False)
+    within: NotNegative
+    tolerance: PositiveOrInfinite = field(default=0.05, kw_only=True)
+    yaw_tolerance: PositiveOrInfinite = field(default=math.inf, kw_only=True)
 
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""
@@ -162,14 +150,8 @@ class Settles(GoalProperty):
         tolerance: Largest distance to the goal (m).
     """
 
-    within: float
-    tolerance: float
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._number('within', infinite=False)
-        self._number('tolerance', zero=False)
+    within: NotNegative
+    tolerance: PositiveOrInfinite
 
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""

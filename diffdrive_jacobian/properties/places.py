@@ -5,16 +5,45 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep import Lockstep
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION
+from diffdrive_jacobian.numerics.checks import NotNegativeOrInfinite
+from diffdrive_jacobian.numerics.fields import Name
 from diffdrive_jacobian.properties._goals import Motion
 from diffdrive_jacobian.properties._messages import Pose, Twist
 from diffdrive_jacobian.properties._node_time import ROUNDING
 from diffdrive_jacobian.properties.base import Property, Watch
+
+
+def _numbers(values: Any) -> tuple[float, ...]:
+    """Return numbers as a tuple, an empty one if they are none."""
+    try:
+        return tuple(float(value) for value in values)
+    except (TypeError, ValueError):
+        return ()
+
+
+def _interval(name: str, value: Any) -> tuple[float, ...]:
+    """Require a least and a largest number."""
+    limits = _numbers(value)
+    if len(limits) != 2 or not limits[0] <= limits[1]:
+        raise ValueError(f'{name} must be the least and the largest value, got {value!r}')
+    return limits
+
+
+def _corners(name: str, value: Any) -> tuple[tuple[float, ...], ...]:
+    """Require a sequence of points."""
+    corners = tuple(map(_numbers, value)) if isinstance(value, Sequence) else ()
+    if not corners or any(len(corner) != 2 for corner in corners):
+        raise ValueError(f'{name} must be a sequence of (x, y), got {value!r}')
+    return corners
+
+
+Interval = Annotated[tuple[float, float], _interval]
 
 
 @dataclass(frozen=True, repr=False)
@@ -26,12 +55,7 @@ class PlaceProperty(Property):
             robot that drifts.
     """
 
-    odom: str = field(default='odom', kw_only=True)
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._text('odom')
+    odom: Name = field(default='odom', kw_only=True)
 
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""
@@ -85,20 +109,8 @@ class StaysWithin(PlaceProperty):
         y: Least and largest y (m).
     """
 
-    x: tuple[float, float]
-    y: tuple[float, float]
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        for name in ('x', 'y'):
-            limits = _numbers(getattr(self, name))
-            if len(limits) != 2 or not limits[0] <= limits[1]:
-                got = getattr(self, name)
-                raise ValueError(
-                    f'{type(self).__name__}: {name} must be the least and the largest value, got {got!r}'
-                )
-            object.__setattr__(self, name, limits)
+    x: Interval
+    y: Interval
 
     def violation(self, pose: Pose, twist: Twist) -> str | None:
         """Return what is allowed; None: the robot is within the box."""
@@ -117,19 +129,8 @@ class StaysNear(PlaceProperty):
         distance: Largest distance to the path (m).
     """
 
-    path: tuple[tuple[float, float], ...]
-    distance: float
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._number('distance')
-        corners = tuple(map(_numbers, self.path)) if isinstance(self.path, Sequence) else ()
-        if not corners or any(len(corner) != 2 for corner in corners):
-            raise ValueError(
-                f'{type(self).__name__}: path must be a sequence of (x, y), got {self.path!r}'
-            )
-        object.__setattr__(self, 'path', corners)
+    path: Annotated[tuple[tuple[float, float], ...], _corners]
+    distance: NotNegativeOrInfinite
 
     def violation(self, pose: Pose, twist: Twist) -> str | None:
         """Return what is allowed; None: the robot is near the path."""
@@ -138,14 +139,6 @@ class StaysNear(PlaceProperty):
         if nearest <= self.distance + ROUNDING:
             return None
         return f'at most {self.distance:g} m from the path, not {nearest:.6g} m'
-
-
-def _numbers(values: Any) -> tuple[float, ...]:
-    """Return numbers as a tuple, an empty one if they are none."""
-    try:
-        return tuple(float(value) for value in values)
-    except (TypeError, ValueError):
-        return ()
 
 
 def _distance(x: float, y: float, start: tuple[float, float], end: tuple[float, float]) -> float:

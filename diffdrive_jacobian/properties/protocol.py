@@ -11,6 +11,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.numerics.fields import Name, Names
 from diffdrive_jacobian.properties._messages import FieldReader
 from diffdrive_jacobian.properties.base import Property, Watch
 
@@ -78,14 +79,8 @@ class StatusProtocol(Property):
         goals: Topics of the goals (default: ('goal_pose', 'goals')).
     """
 
-    topic: str = field(default='goal_status', kw_only=True)
-    goals: tuple[str, ...] = field(default=('goal_pose', 'goals'), kw_only=True)
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._text('topic')
-        self._texts('goals')
+    topic: Name = field(default='goal_status', kw_only=True)
+    goals: Names = field(default=('goal_pose', 'goals'), kw_only=True)
 
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.numerics.checks import NotNegative, NotNegativeOrInfinite
+from diffdrive_jacobian.numerics.fields import Name
 from diffdrive_jacobian.properties._messages import Twist, read_twist
 from diffdrive_jacobian.properties.base import Property, Watch
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -32,16 +34,9 @@ class NeverFasterThan(Property):
             'cmd_vel').
     """
 
-    v: float
-    omega: float
-    topic: str = field(default='cmd_vel', kw_only=True)
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._number('v')
-        self._number('omega')
-        self._text('topic')
+    v: NotNegativeOrInfinite
+    omega: NotNegativeOrInfinite
+    topic: Name = field(default='cmd_vel', kw_only=True)
 
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""
@@ -89,19 +84,11 @@ class AccelerationWithin(Property):
             its odometry is lost (default: True).
     """
 
-    v: float
-    omega: float
-    topic: str = field(default='cmd_vel', kw_only=True)
-    slack: float = field(default=0.1, kw_only=True)
+    v: NotNegativeOrInfinite
+    omega: NotNegativeOrInfinite
+    topic: Name = field(default='cmd_vel', kw_only=True)
+    slack: NotNegative = field(default=0.1, kw_only=True)
     stops: bool = field(default=True, kw_only=True)
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._number('v')
-        self._number('omega')
-        self._number('slack', infinite=False)
-        self._text('topic')
 
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""

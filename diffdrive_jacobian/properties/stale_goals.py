@@ -9,6 +9,7 @@ from action_msgs.msg import GoalStatus
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.numerics.fields import Name
 from diffdrive_jacobian.properties._messages import FieldReader
 from diffdrive_jacobian.properties.base import Property, Watch
 
@@ -28,12 +29,7 @@ class NoStaleGoals(Property):
         topic: Topic of type action_msgs/GoalStatus (default: 'goal_status').
     """
 
-    topic: str = field(default='goal_status', kw_only=True)
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._text('topic')
+    topic: Name = field(default='goal_status', kw_only=True)
 
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""

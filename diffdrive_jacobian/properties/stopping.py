@@ -9,6 +9,8 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.numerics.checks import NotNegative
+from diffdrive_jacobian.numerics.fields import Name, Text
 from diffdrive_jacobian.properties._messages import Twist, read_twist
 from diffdrive_jacobian.properties._node_time import ROUNDING, ReactionTime, delays
 from diffdrive_jacobian.properties.base import Property, Watch
@@ -35,18 +37,10 @@ class StopsAfterLostOdometry(Property):
         commands: Topic of type Twist or TwistStamped (default: 'cmd_vel').
     """
 
-    within: float
-    node: str = field(default='', kw_only=True)
-    odom: str = field(default='odom', kw_only=True)
-    commands: str = field(default='cmd_vel', kw_only=True)
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._number('within', infinite=False)
-        self._text('node', empty=True)
-        self._text('odom')
-        self._text('commands')
+    within: NotNegative
+    node: Text = field(default='', kw_only=True)
+    odom: Name = field(default='odom', kw_only=True)
+    commands: Name = field(default='cmd_vel', kw_only=True)
 
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""
@@ -142,21 +136,12 @@ class StopsAfterLastCommand(Property):
         omega: Largest yaw rate that counts as standing (rad/s) (default: 0.001).
     """
 
-    within: float
-    node: str = field(default='', kw_only=True)
-    odom: str = field(default='odom', kw_only=True)
-    commands: str = field(default='cmd_vel', kw_only=True)
-    v: float = field(default=0.001, kw_only=True)
-    omega: float = field(default=0.001, kw_only=True)
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        for name in ('within', 'v', 'omega'):
-            self._number(name, infinite=False)
-        self._text('node', empty=True)
-        self._text('odom')
-        self._text('commands')
+    within: NotNegative
+    node: Text = field(default='', kw_only=True)
+    odom: Name = field(default='odom', kw_only=True)
+    commands: Name = field(default='cmd_vel', kw_only=True)
+    v: NotNegative = field(default=0.001, kw_only=True)
+    omega: NotNegative = field(default=0.001, kw_only=True)
 
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""
@@ -228,14 +213,8 @@ class StopsOnShutdown(Property):
         commands: Topic of type Twist or TwistStamped (default: 'cmd_vel').
     """
 
-    node: str = field(default='', kw_only=True)
-    commands: str = field(default='cmd_vel', kw_only=True)
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        super().__post_init__()
-        self._text('node', empty=True)
-        self._text('commands')
+    node: Text = field(default='', kw_only=True)
+    commands: Name = field(default='cmd_vel', kw_only=True)
 
     def watch(self, world: Lockstep) -> Watch:
         """Begin to observe a run."""

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.bags.bag_reader import BagError
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 MAX_NUMBER = 1e6
@@ -117,6 +118,10 @@ class Run:
         lines += [f'  {len(self.fault_events)} events of faults'] * bool(self.fault_events)
         lines += [f'  {note}' for note in self.notes]
         return '\n'.join([*lines, ')'])
+
+    def lacking(self, what: str) -> BagError:
+        """Return the error that something was not found in the run, with the notes that may tell why."""
+        return BagError('; '.join([f'{self.path} has no {what}', *self.notes]))
 
     def of_node(self, name: str) -> dict[str, Any]:
         """Return the parameters of the node of that base name; {} if there is none or several.

@@ -18,7 +18,6 @@ from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
-from diffdrive_jacobian.reading.reader import BagError
 from diffdrive_jacobian.reading.run import Run, Series
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -68,9 +67,7 @@ def trace(run: Run) -> Trace:
     """
     odometry = run.odometry
     if not len(odometry):
-        raise BagError(
-            f'{run.path} has no odometry: no message on a topic odom of nav_msgs/msg/Odometry'
-        )
+        raise run.lacking('odometry: no valid message on a topic odom of nav_msgs/msg/Odometry')
     breaks = _breaks(run)
     goal, reached = _progress(run, breaks)
     x, y, theta = odometry.values[:, :3].T

@@ -116,7 +116,7 @@ def verify(
         ParameterError: The parameters are not valid parameters of the robot.
     """
     if not len(run.odometry):
-        raise BagError(f'{run.path} has no odometry: record the topic odom')
+        raise run.lacking('odometry: record the topic odom')
     if len(run.odometry) > 1 and not np.ptp(run.odometry.received):
         raise BagError(
             f'{run.path} was recorded while the clock of the recorder stood still, so that the order of '
@@ -324,7 +324,7 @@ def _commanded(run: Run, given: Mapping[str, Any] | None) -> tuple[str, str, lis
     if parameters.command_interface == 'wheels':
         source, series = 'joint_command', run.wheel_commands
     if not len(series):
-        raise BagError(f'{run.path} has no commands: record cmd_vel_out, or {source}')
+        raise run.lacking(f'commands: record cmd_vel_out, or {source}')
     delay = float(np.median(run.odometry.received - run.odometry.stamps)) / NANOSECONDS
     if abs(delay) > _MAX_DELAY:
         raise BagError(

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Generator, Iterator
 from contextlib import closing, suppress
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -111,9 +112,13 @@ class DamagedBag:
             yield from self._text(text)
         channels: dict[tuple[str, str], Channel] = {}
         self._copy: dict[str, Any] = {}
+        self._hashes: dict[tuple[str, str], str] = {}
+        self._times: list[tuple[int, int, str]] = []
+        """Of the first and the last message of each file, and its name."""
         for name, source in self._sources:
             yield from self._of_file(name, source, channels)
         self._compare_counts()
+        self._compare_descriptions()
 
     def _compare_counts(self) -> None:
         """Compare the messages that were found with metadata.yaml, or with its copy in the file."""
@@ -125,8 +130,10 @@ class DamagedBag:
                 metadata = {}
         if self.path.is_dir() and not (metadata is self._metadata and _listed(metadata)):
             self.unchecked.append(
-                'there is no valid metadata.yaml, so files that are missing cannot be noticed'
+                'there is no valid metadata.yaml, so files that are missing, or of another recording, '
+                'cannot be noticed'
             )
+            self._compare_times()
         seen, counts = self._seen, _counts_by_topic(metadata)
         count = metadata.get('message_count')
         pairs = [(count, seen.total())] if isinstance(count, int) else []
@@ -141,6 +148,31 @@ class DamagedBag:
             difference += f' ({topics})' if topics else ''
             fewer = any(number > found for number, found in pairs)
             (self.lost if fewer else self.unchecked).append(difference)
+
+    def _compare_times(self) -> None:
+        """Report files that cannot be parts of one recording, which follow one another."""
+        for (_, end, first), (start, _, second) in pairwise(sorted(self._times)):
+            if start < end:
+                self.unchecked.append(
+                    f'{second} begins before {first} ends: they may be of two recordings, or the same '
+                    'messages twice'
+                )
+
+    def _compare_descriptions(self) -> None:
+        """Compare metadata.yaml with the topics in the files, and with its copy there."""
+        described = _type_hashes(self._metadata)
+        found = _type_hashes(self._copy) | self._hashes
+        differing = [
+            f'type hash of {topic}'
+            for (topic, kind), text in described.items()
+            if found.get((topic, kind), text) != text
+        ]
+        custom = {text.key: text.value for text in _custom_data(self._metadata)}
+        copied = _custom_data(self._copy) if self._metadata else ()
+        differing += [text.key for text in copied if custom.get(text.key) != text.value]
+        if differing:
+            what = printable(', '.join(differing), 300)
+            self.lost.append(f'metadata.yaml differs from the data file, from which is saved: {what}')
 
     def _missing_file(self, name: str) -> str:
         """Describe a file that metadata.yaml lists and that cannot be read."""
@@ -224,6 +256,7 @@ class DamagedBag:
         names: dict[int, str] = {}
         faults: Counter[str] = Counter()
         budget = Budget(source.stat().st_size)
+        start, end = 2**63, -1
         with open(source, 'rb') as file:
             reader = READERS[file_kind(source)]
             for one in reader(
@@ -243,6 +276,8 @@ class DamagedBag:
                     channel = self._channel(one, channels)
                     ids[one.id] = None if channel is None else channel.id
                     names[one.id] = one.name
+                    if one.type_hash:
+                        self._hashes[one.name, one.type_name] = one.type_hash
                     if channel is not None and new:
                         yield channel
                     continue
@@ -254,7 +289,9 @@ class DamagedBag:
                     if data is None or not 0 <= one.stamp < 2**63:
                         faults['are not CDR, are too large, or have an invalid time'] += 1
                     else:
+                        start, end = min(start, one.stamp), max(end, one.stamp)
                         yield Message(to, one.stamp, data)
+        self._times += [(start, end, name)] if end >= 0 else []
         self.lost += [f'{name}: {count} messages {what}' for what, count in faults.items()]
 
     def _channel(self, topic: Topic, channels: dict[tuple[str, str], Channel]) -> Channel | None:
@@ -333,12 +370,26 @@ def _listed(metadata: dict[str, Any]) -> set[str]:
 def _counts_by_topic(metadata: dict[str, Any]) -> Counter[str]:
     """Return the numbers of messages in metadata.yaml, of the topics that it describes as it should."""
     counts: Counter[str] = Counter()
+    for described, count in _described_topics(metadata):
+        if isinstance(count, int):
+            counts[str(described.get('name'))] += count
+    return counts
+
+
+def _described_topics(metadata: dict[str, Any]) -> Iterator[tuple[dict[str, Any], Any]]:
+    """Yield the description of each topic in metadata.yaml, and its number of messages."""
     topics = metadata.get('topics_with_message_count')
     for topic in topics if isinstance(topics, list) else ():
         described = topic.get('topic_metadata') if isinstance(topic, dict) else None
-        if isinstance(described, dict) and isinstance(count := topic.get('message_count'), int):
-            counts[str(described.get('name'))] += count
-    return counts
+        if isinstance(described, dict):
+            yield described, topic.get('message_count')
+
+
+def _type_hashes(metadata: dict[str, Any]) -> dict[tuple[str, str], str]:
+    """Return the hashes of types in metadata.yaml by name and type of the topic."""
+    topics = _described_topics(metadata)
+    hashes = ((one, one.get('type_description_hash')) for one, _ in topics)
+    return {(str(one.get('name')), str(one.get('type'))): str(text) for one, text in hashes if text}
 
 
 def _custom_data(metadata: dict[str, Any]) -> Iterator[Text]:

@@ -214,7 +214,8 @@ def _walk(file: BinaryIO, size: int, note: Note) -> Iterator[tuple[int, bytes, i
         if opcode == _ATTACHMENT or (length > MAX_RECORD and end <= size):
             if opcode != _ATTACHMENT:
                 note(f'a record of {format_size(length)} is not read: it is too large')
-            file.seek(end)
+            # A damaged length may be larger than any position.
+            file.seek(min(end, size))
             continue
         waiting = [(opcode, file.read(min(length, size, MAX_RECORD)), end)]
     yield from waiting

@@ -19,6 +19,8 @@ _WIDTHS = (0, 1, 2, 3, 4, 6, 8, 8, 0, 0)  # of the serial types below 10
 _MAX_COLUMNS = 32
 _MESSAGE = [int, int, bytes]
 """Types of the columns of a message after its number: topic, time and data."""
+_LOCKS = 1 << 30
+"""Place of the page that SQLite uses for locks only."""
 _COPIES = 4
 """Largest ratio of the size of all rows to that of the file: there may be older copies of pages."""
 
@@ -38,10 +40,25 @@ class _Pages:
         self._budget = Budget(self.bytes, ratio=_COPIES)
         # Number of pages at the last commit; 0: unknown.
         self.committed = int.from_bytes(head[28:32], 'big') if head[24:28] == head[92:96] else 0
+        self._locks = _LOCKS // self.size + 1 if self.valid else 0
+        self._unused = int.from_bytes(head[36:40], 'big')
+        # Ends of chains with nothing but zeros, as of a black picture.
+        self._zero_ends: set[int] = set()
 
     def page(self, number: int) -> bytes:
         self._file.seek((number - 1) * self.size)
         return self._file.read(self.size)
+
+    def erased(self) -> int:
+        """Return the number of committed pages that hold nothing but zeros and should not.
+
+        The ends of chains are known after their rows were read. SQLite clears pages that it does not
+        use any more, and never writes the page of its locks.
+        """
+        zeros = bytes(self.size)
+        numbers = range(1, min(self.count, self.committed) + 1)
+        empty = sum(self.page(number) == zeros for number in numbers if number != self._locks)
+        return max(0, empty - len(self._zero_ends) - self._unused)
 
     def rows(self, number: int) -> Iterator[tuple[int, list[Any] | None]]:
         """Yield number and values of the rows of a table's leaf page; None: a row cannot be read."""
@@ -72,6 +89,7 @@ class _Pages:
         missing = length - len(parts[0])
         following = page[at + local : at + local + 4] if local < length else b''
         seen: set[int] = set()
+        number, more = 0, b''
         while missing > 0 and len(parts[0]) == local:
             number = int.from_bytes(following, 'big')
             if not 1 < number <= self.count or number in seen:
@@ -86,6 +104,8 @@ class _Pages:
             following = more[:4]
         if missing or any(following):
             raise ValueError(f'{length} bytes expected, {missing} are missing')
+        if number and not any(more):
+            self._zero_ends.add(number)
         return b''.join(parts)
 
 
@@ -162,5 +182,7 @@ def read_sqlite(file: BinaryIO, note: Note, doubt: Note) -> Iterator[Found]:
                 last, read = row, read + 1
     if last > read:
         note(f'{last - read} of its first {last} messages cannot be read')
+    if erased := pages.erased():
+        note(f'{erased} of its {pages.committed} pages are empty: what was in them is lost')
     if missing := max(pages.committed * pages.size - pages.bytes, pages.bytes % pages.size):
         note(f'it is cut off: {missing} bytes are missing or are not a complete page')

@@ -15,7 +15,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import redirect_stderr
-from functools import cache
+from functools import cache, wraps
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 from rcl_interfaces.msg import ParameterDescriptor
@@ -410,6 +410,29 @@ def refuse_init(context: Context, refuse: Callable[..., None]) -> None:
         refuse: The function. It receives the arguments of `Context.init`.
     """
     context.init = refuse
+
+
+def on_new_node(created: Callable[[Node], None]) -> Callable[[], None]:
+    """Call a function with each new node, when the constructor of `Node` has returned.
+
+    Relies on that of subclasses calling it. A context does not know its nodes.
+
+    Returns:
+        A function that ends it.
+    """
+    init = Node.__init__
+
+    @wraps(init)
+    def initialize(self: Node, *args: Any, **kwargs: Any) -> None:
+        init(self, *args, **kwargs)
+        created(self)
+
+    Node.__init__ = initialize
+
+    def restore() -> None:
+        Node.__init__ = init
+
+    return restore
 
 
 def wrap_calls(wrap: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Callable[[], None]:

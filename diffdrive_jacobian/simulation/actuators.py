@@ -15,7 +15,8 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
-from diffdrive_jacobian.numerics.checks import not_negative, number
+from diffdrive_jacobian.numerics.checks import NotNegative, NotNegativeOrInfinite
+from diffdrive_jacobian.numerics.fields import Checked
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 STEP = 20_000_000
@@ -46,7 +47,7 @@ class Settling(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Actuators:
+class Actuators(Checked):
     """What the wheel motors can do.
 
     The robot does not know it: unlike its velocity limits it does not keep the curvature of the path.
@@ -55,18 +56,12 @@ class Actuators:
         ValueError: A value is negative or NaN, or the lag is infinite.
     """
 
-    max_right_speed: float = math.inf
+    max_right_speed: NotNegativeOrInfinite = math.inf
     """Largest speed of the right wheel (rad/s); 0: its motor is dead, and the wheel stands still."""
-    max_left_speed: float = math.inf
+    max_left_speed: NotNegativeOrInfinite = math.inf
     """Largest speed of the left wheel (rad/s)."""
-    lag: float = 0.0
+    lag: NotNegative = 0.0
     """Time constant tau (s)."""
-
-    def __post_init__(self) -> None:
-        """Check every value."""
-        for name in ('max_right_speed', 'max_left_speed'):
-            object.__setattr__(self, name, number(name, getattr(self, name), _speed_limit))
-        object.__setattr__(self, 'lag', number('lag', self.lag, not_negative))
 
     def limited(self, speeds: Speeds) -> Speeds:
         """Return the speeds that the motors can reach."""
@@ -104,13 +99,3 @@ class Actuators:
     def _rest(self, seconds: float) -> float:
         """Return the share of a difference that is left after a time (s)."""
         return math.exp(-seconds / self.lag) if self.lag else 0.0
-
-
-def _speed_limit(name: str, value: float) -> None:
-    """Require a limit of speed. Infinity means no limit.
-
-    Raises:
-        ValueError: It is negative or NaN.
-    """
-    if not value >= 0.0:
-        raise ValueError(f'{name} must be zero or positive (rad/s), got {value}')

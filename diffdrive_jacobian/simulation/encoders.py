@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+from diffdrive_jacobian.numerics.fields import integer
 from diffdrive_jacobian.simulation.arc import arc_end
 from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -42,11 +43,7 @@ class Encoders:
         Raises:
             ValueError: `per_revolution` is not an integer from 1 to `MAX_PER_REVOLUTION`.
         """
-        if type(per_revolution) is not int or not 1 <= per_revolution <= MAX_PER_REVOLUTION:
-            raise ValueError(
-                f'per_revolution must be an integer from 1 to {MAX_PER_REVOLUTION}, '
-                f'got {per_revolution!r}'
-            )
+        per_revolution = integer('per_revolution', per_revolution, 1, MAX_PER_REVOLUTION)
         counts = _counts(robot.wheel_angles, per_revolution)
         return cls(per_revolution, robot.stamp, counts, robot.pose_tuple)
 

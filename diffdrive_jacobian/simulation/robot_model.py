@@ -4,26 +4,43 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+from typing import Annotated, Any
 
 from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel, wheel_to_body
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits, scaled_to_limits
 from diffdrive_jacobian.numerics.checks import (
+    NotNegative,
+    Positive,
     instance,
     nanoseconds,
-    not_negative,
-    number,
     numbers,
-    positive,
 )
+from diffdrive_jacobian.numerics.fields import Checked, optional
 from diffdrive_jacobian.simulation.actuators import Actuators, Speeds
 from diffdrive_jacobian.simulation.slip import Drift
 
 
+def _limits(name: str, value: Any) -> VelocityLimits:
+    """Require limits of one robot."""
+    limits: VelocityLimits = instance(name, value, VelocityLimits)
+    if not limits.alike:
+        raise ValueError(f'{name} must be numbers for one robot, got {limits}')
+    return limits
+
+
+def _timeout(name: str, value: Any) -> int:
+    """Require a duration that is not negative (ns)."""
+    timeout = nanoseconds(name, value)
+    if timeout < 0:
+        raise ValueError(f'{name} must be zero or positive (ns), got {timeout}')
+    return timeout
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
-class RobotModel:
+class RobotModel(Checked):
     """Parameters of a robot, as its controller and its odometry assume them.
 
     Raises:
@@ -32,40 +49,24 @@ class RobotModel:
             or the actuators are of another class.
     """
 
-    wheel_radius: float = 0.033
+    wheel_radius: Positive = 0.033
     """r (m)."""
-    wheel_separation: float = 0.16
+    wheel_separation: Positive = 0.16
     """L (m)."""
-    right_wheel_radius_multiplier: float = 1.0
+    right_wheel_radius_multiplier: Positive = 1.0
     """Radius of the right wheel, relative to r [-]."""
-    left_wheel_radius_multiplier: float = 1.0
+    left_wheel_radius_multiplier: Positive = 1.0
     """Radius of the left wheel, relative to r [-]."""
-    limits: VelocityLimits = field(default_factory=VelocityLimits)
+    limits: Annotated[VelocityLimits, _limits] = field(default_factory=VelocityLimits)
     """Velocity limits; without limits the robot is an ideal unicycle."""
-    command_timeout: int = 0
+    command_timeout: Annotated[int, _timeout] = 0
     """Time after which the last command is replaced by zero (ns); 0: never."""
-    wheel_travel_variance: float = 1e-5
+    wheel_travel_variance: NotNegative = 1e-5
     """k, variance of each wheel's travel per distance travelled (m)."""
-    drift: Drift | None = None
+    drift: Annotated[Drift | None, optional(partial(instance, wanted=Drift))] = None
     """In what the true motion differs from the odometry; None: in nothing."""
-    actuators: Actuators | None = None
+    actuators: Annotated[Actuators | None, optional(partial(instance, wanted=Actuators))] = None
     """In what the wheel motors differ from ideal ones; None: in nothing."""
-
-    def __post_init__(self) -> None:
-        """Check every value."""
-        for name, check in _CHECKS.items():
-            object.__setattr__(self, name, number(name, getattr(self, name), check))
-        instance('limits', self.limits, VelocityLimits)
-        if not self.limits.alike:
-            raise ValueError(f'limits must be numbers for one robot, got {self.limits}')
-        if self.drift is not None:
-            instance('drift', self.drift, Drift)
-        if self.actuators is not None:
-            instance('actuators', self.actuators, Actuators)
-        timeout = nanoseconds('command_timeout', self.command_timeout)
-        if timeout < 0:
-            raise ValueError(f'command_timeout must be zero or positive (ns), got {timeout}')
-        object.__setattr__(self, 'command_timeout', timeout)
 
     def limited(self, command: ArrayLike) -> tuple[float, float]:
         """Saturate a command `(v, omega)`, shape (2,), keeping its curvature.
@@ -123,15 +124,6 @@ class RobotModel:
         if not (math.isfinite(v) and math.isfinite(omega)):
             raise ValueError('wheel speeds must give a finite twist, but it overflows')
         return v, omega
-
-
-_CHECKS = {
-    'wheel_radius': positive,
-    'wheel_separation': positive,
-    'right_wheel_radius_multiplier': positive,
-    'left_wheel_radius_multiplier': positive,
-    'wheel_travel_variance': not_negative,
-}
 
 
 def pair(name: str, value: Any) -> tuple[float, float]:

@@ -28,14 +28,14 @@ Sources: doc/mathematics.md, "Slip"; Salmon, Moraes, Dror and Shaw, "Parallel ra
 from __future__ import annotations
 
 import math
-import operator
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any, TypeAlias
+from functools import lru_cache, partial
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 
-from diffdrive_jacobian.numerics.checks import number, positive, short
+from diffdrive_jacobian.numerics.checks import Positive
+from diffdrive_jacobian.numerics.fields import Checked, integer, optional
 from diffdrive_jacobian.simulation.arc import arc_end
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -54,7 +54,7 @@ _Slipped: TypeAlias = tuple[int, int, float, float, float, float]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Drift:
+class Drift(Checked):
     """In what the true motion differs from the odometry.
 
     Raises:
@@ -62,42 +62,14 @@ class Drift:
             finite.
     """
 
-    seed: int | None = None
+    seed: Annotated[int | None, optional(partial(integer, low=0, high=MAX_SEED))] = None
     """Seed of the random slip. None: the wheels do not slip."""
-    right_wheel_radius_multiplier: float = 1.0
+    right_wheel_radius_multiplier: Positive = 1.0
     """True radius of the right wheel, relative to the one that the odometry assumes [-]."""
-    left_wheel_radius_multiplier: float = 1.0
+    left_wheel_radius_multiplier: Positive = 1.0
     """True radius of the left wheel, relative to the one that the odometry assumes [-]."""
-    wheel_separation_multiplier: float = 1.0
+    wheel_separation_multiplier: Positive = 1.0
     """True wheel separation, relative to the one that the odometry assumes [-]."""
-
-    def __post_init__(self) -> None:
-        """Check every value."""
-        if self.seed is not None:
-            object.__setattr__(self, 'seed', _seed(self.seed))
-        for name in (
-            'right_wheel_radius_multiplier',
-            'left_wheel_radius_multiplier',
-            'wheel_separation_multiplier',
-        ):
-            object.__setattr__(self, name, number(name, getattr(self, name), positive))
-
-
-def _seed(value: Any) -> int:
-    """Return a seed as an int.
-
-    Raises:
-        ValueError: It is not an integer from 0 to `MAX_SEED`.
-    """
-    try:
-        if isinstance(value, bool | np.bool_):
-            raise TypeError
-        seed = operator.index(value)
-    except TypeError:
-        seed = -1
-    if not 0 <= seed <= MAX_SEED:
-        raise ValueError(f'seed must be an integer from 0 to 2^63 - 1, got {short(value)}')
-    return seed
 
 
 class Truth:

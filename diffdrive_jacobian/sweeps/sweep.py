@@ -9,7 +9,8 @@ import pickle
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,8 @@ from diffdrive_jacobian.control import Arrival, Controller
 from diffdrive_jacobian.control.controller import KP, Gain
 from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
-from diffdrive_jacobian.numerics.checks import array, instance, short
+from diffdrive_jacobian.numerics.checks import Positive, array, instance
+from diffdrive_jacobian.numerics.fields import Checked, Count, integer, short
 from diffdrive_jacobian.simulation import RobotModel, closed_loops
 from diffdrive_jacobian.simulation._batch import Outcomes
 from diffdrive_jacobian.simulation._block import LOST
@@ -38,7 +40,7 @@ MAX_LOOPS, MAX_SAMPLES = 1_000_000, 10_000_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Setup:
+class Setup(Checked):
     """Settings of a sweep.
 
     Raises:
@@ -51,34 +53,29 @@ class Setup:
     gains: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
     """By name, the first and the last value of a gain that is swept, or the value of one that is not. Of
     the others the first are swept over their usual range, until two are; the rest has its default."""
-    grid: int = 59
+    grid: Annotated[int, partial(integer, low=2)] = 59
     """Number of values of each gain; 59: steps of 0.1 and 0.05."""
-    starts: int = 12
+    starts: Count = 12
     """Number of start poses for each pair of gains."""
-    distance: float = 2.0
+    distance: Positive = 2.0
     """Distance of the starts from the goal (m)."""
-    rate: float = 50.0
+    rate: Positive = 50.0
     """Control rate (Hz)."""
-    duration: float = 60.0
+    duration: Positive = 60.0
     """Time after which a robot is given up (s)."""
-    tolerance: float = 0.02
+    tolerance: Positive = 0.02
     """Distance that counts as arrived (m)."""
     robot: RobotModel = field(default_factory=RobotModel)
     """The robot; its wheels and limits are used."""
 
     def __post_init__(self) -> None:
         """Check every value, and that the sweep is not too large."""
+        super().__post_init__()
         if not isinstance(self.controller, Controller) and self.controller not in CONTROLLERS:
             raise ValueError(
                 f'controller must be one of {", ".join(CONTROLLERS)}, got {self.controller!r}'
             )
         self._check_gains()
-        for name, least in (('grid', 2), ('starts', 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f'{name} must be at least {least}, got {getattr(self, name)}')
-        for name in ('distance', 'rate', 'duration', 'tolerance'):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f'{name} must be positive and finite, got {getattr(self, name):g}')
         if not self.tolerance < self.distance < LOST:
             raise ValueError(
                 f'distance must be larger than tolerance, {self.tolerance:g} m, and less than '

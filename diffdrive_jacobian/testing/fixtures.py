@@ -216,6 +216,8 @@ def lockstep(request: pytest.FixtureRequest) -> Iterator[Lockstep]:
             f'the marker lockstep takes keyword arguments only, as Lockstep does, got {marker.args!r}'
         )
     try:
+        # First, so that the error names it.
+        importlib.import_module('rclpy')
         from diffdrive_jacobian.lockstep import Lockstep
 
         with warnings.catch_warnings():

@@ -210,7 +210,7 @@ def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:
         usage=f'{PROGRAM} [options]',
         description='Sweep two gains of a control law over a grid: thousands of closed loops '
         'are simulated at once, from starts all around the goal. Time to the goal, path length and '
-        'overshoot are drawn as heat maps, with the boundary beyond which the robot spirals in, and '
+        'overshoot are drawn as heat maps, with the boundary that the controller declares, and '
         'written as CSV. Without -o and --csv both are written, as sweep_DATE-TIME.png and .csv. '
         'Existing files are not overwritten without --force. Exit code 0: done; 1: a file cannot be '
         'written; 2: wrong arguments; 130: interrupted, and nothing was written.',

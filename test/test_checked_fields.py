@@ -1,0 +1,102 @@
+"""Fields of dataclasses declare their checks in their annotations."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import Annotated, ClassVar
+
+import numpy as np
+import pytest
+
+from diffdrive_jacobian.numerics.checks import Finite, NotNegative, Positive, Probability
+from diffdrive_jacobian.numerics.fields import Checked, Count, Name, Names, Text, one_of, optional
+
+
+def even(name: str, value: int) -> int:
+    if value % 2:
+        raise ValueError(f'{name} must be even, got {value}')
+    return value
+
+
+@dataclass(frozen=True)
+class Base(Checked):
+    topic: Name
+    unit: ClassVar[str] = 'm'
+    node: Text = field(default='', kw_only=True)
+
+
+@dataclass(frozen=True)
+class Several(Base):
+    speed: Positive = 1.0
+    _: KW_ONLY
+    count: Count = 2
+    goals: Names = ('a',)
+    kind: Annotated[str, one_of('wheel', 'arm')] = 'arm'
+    pairs: Annotated[int | None, optional(even)] = None
+    share: Probability = 0.5
+    free: object = None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Slotted(Checked):
+    x: Finite = 0.0
+    y: NotNegative = 0.0
+
+
+def test_fields_are_converted():
+    value = Several('odom', np.float32(0.5), count=np.int64(3), goals=['b', 'c'], pairs=4, share=1)
+    assert value == Several('odom', 0.5, count=3, goals=('b', 'c'), pairs=4, share=1.0)
+    assert [type(one) for one in (value.speed, value.count, value.share)] == [float, int, float]
+    assert repr(Slotted(x=1)) == 'Slotted(x=1.0, y=0.0)'
+
+
+@pytest.mark.parametrize(
+    ('changes', 'message'),
+    [
+        ({'topic': ''}, "topic must be a string that is not empty, got ''"),
+        ({'topic': 3}, 'topic must be a string that is not empty, got 3'),
+        ({'node': None}, 'node must be a string, got None'),
+        ({'speed': 0}, 'speed must be positive and finite, got 0'),
+        ({'speed': '1'}, "speed must be a number, got '1'"),
+        ({'speed': True}, 'speed must be a number, got True'),
+        ({'speed': [1.0]}, r'speed must be a single number, got shape \(1,\)'),
+        ({'speed': 10**5000}, 'speed must be an array of real numbers'),
+        ({'count': 0}, 'count must be an integer of at least 1, got 0'),
+        ({'count': 1.0}, 'count must be an integer of at least 1, got 1.0'),
+        ({'count': True}, 'count must be an integer of at least 1, got True'),
+        ({'count': -(10**5000)}, 'count must be an integer of at least 1, got an object of class int'),
+        ({'goals': 'odom'}, "goals must be a tuple of names, got 'odom'"),
+        ({'goals': 3}, 'goals must be a tuple of names, got 3'),
+        ({'goals': ['odom', '']}, r"goals must be a tuple of names, got \['odom', ''\]"),
+        ({'kind': 'leg'}, "kind must be one of 'wheel', 'arm', got 'leg'"),
+        ({'pairs': 3}, 'pairs must be even, got 3'),
+        ({'share': float('nan')}, 'share must be between 0 and 1, got nan'),
+    ],
+)
+def test_invalid_fields_are_named(changes, message):
+    with pytest.raises(ValueError, match=f'^{message}'):
+        Several(**{'topic': 'odom', **changes})
+    with pytest.raises(ValueError, match=f'^{message}'):
+        replace(Several('odom'), **changes)
+
+
+def test_a_dataclass_with_slots_has_no_dictionary():
+    value = Slotted(x=1.0)
+    assert not hasattr(value, '__dict__')
+    assert pickle.loads(pickle.dumps(value)) == value
+    with pytest.raises(ValueError, match='y must be zero or positive and finite, got inf'):
+        Slotted(y=float('inf'))
+
+
+def test_a_name_for_type_checkers_declares_no_check():
+    """As of a class in a function, or of an import under TYPE_CHECKING."""
+
+    @dataclass(frozen=True)
+    class Local(Checked):
+        topic: Name
+        world: Missing  # noqa: F821
+
+    assert Local('odom', 3).world == 3
+    with pytest.raises(ValueError, match='topic must be a string'):
+        Local('', 3)
