@@ -5,6 +5,7 @@ This module imports nothing slow, so that an entry point can catch signals befor
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import threading
@@ -114,3 +115,31 @@ class Signals:
         self._count += 1
         if self._at_once:
             self._end()
+
+
+@contextmanager
+def one_interrupt() -> Iterator[None]:
+    """Raise KeyboardInterrupt only once for the SIGINTs of one request (`TOGETHER`).
+
+    What is done after the first one would be cut short by the second. Another handler than Python's own
+    remains, and so does that of a thread.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    main = threading.current_thread() is threading.main_thread()
+    if not main or before is not signal.default_int_handler:
+        yield
+        return
+    last = -math.inf
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last >= TOGETHER:
+            last = now
+            raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

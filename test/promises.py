@@ -135,7 +135,8 @@ PROMISES = (
         longer: after a burst, for late messages (doc/bags.md).""",
         """Each of the 14 programs: at a random time of its start, while it runs, flooded, with callbacks
         of 50 ms, by two signals. The time in which its main thread waits for a core does not count.
-        Before its first line only Python's own handlers are there.""",
+        Before its first line only Python's own handlers are there. `drive_to` is tried with `--no-plot`:
+        otherwise it first draws what was driven, for about 1.6 s of CPU.""",
         'ends',
         campaign('process_faults.ends'),
         50,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,11 +13,13 @@ from calibration_data import NOISE, NOMINAL, TRUE, Drive, Simulation, square, um
 
 from diffdrive_jacobian.calibration import CalibrationError, Given, Noise, calibrate, preparation
 from diffdrive_jacobian.calibration.consistency import misfit
+from diffdrive_jacobian.calibration.description import explain_undetermined
 from diffdrive_jacobian.calibration.encoder import PERIOD, densified, located
 from diffdrive_jacobian.calibration.errors import compared_distance, rms, tracks
 from diffdrive_jacobian.calibration.estimate import Estimate
 from diffdrive_jacobian.calibration.fit import fit, information
 from diffdrive_jacobian.calibration.motion import composed, increments, inverted, relative
+from diffdrive_jacobian.calibration.observability import undetermined
 from diffdrive_jacobian.calibration.preparation import overlapping, without
 from diffdrive_jacobian.kinematics.se2 import adjoint
 
@@ -412,6 +415,11 @@ def test_what_is_not_determined_is_named(commands, names):
     found = [name for name, _ in result.undetermined]
     assert len(found) == len(names)
     assert all(one.startswith(name) for one, name in zip(found, names, strict=True))
+
+
+def test_a_drive_that_determines_nothing_is_described():
+    nothing = SimpleNamespace(undetermined=undetermined(np.eye(3)))
+    assert 'does not determine any of the multipliers: drive straight' in explain_undetermined(nothing)
 
 
 # --- Bad input

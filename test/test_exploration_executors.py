@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing.spawn
 import os
 import random
@@ -18,6 +19,7 @@ import pytest
 from exploration_scenarios import crowded, deadly, follow, loaded, reading
 from hypothesis import strategies as st
 
+from diffdrive_jacobian import signals
 from diffdrive_jacobian.control import find_controller
 from diffdrive_jacobian.exploration import LocalExecutor, SerialExecutor, explore, fault_schedules
 from diffdrive_jacobian.exploration.child import call_in_child
@@ -144,6 +146,29 @@ def test_a_process_that_dies_is_a_finding(local, tmp_path, monkeypatch):
     monkeypatch.setattr(sys.modules[replay.__module__], 'run_world_afresh', lambda _: [Outcome()])
     # Not in this process.
     assert not died.replay().same_verdict
+
+
+class PressedTwice(LocalExecutor):
+    """SIGINT comes while a world is waited for, and again as the processes are ended."""
+
+    def __init__(self):
+        super().__init__(1)
+
+    def submit(self, fn, /, *args, **kwargs):
+        future = super().submit(int)
+        future.result = lambda timeout=None: signal.raise_signal(signal.SIGINT)
+        return future
+
+    def _end_children(self):
+        signal.raise_signal(signal.SIGINT)
+        super()._end_children()
+
+
+def test_two_sigint_of_one_request_end_an_exploration_once(monkeypatch):
+    monkeypatch.setattr(signals, 'TOGETHER', math.inf)
+    monkeypatch.setattr(sys.modules[explore.__module__], 'LocalExecutor', PressedTwice)
+    assert explore(follow, worlds=1).stopped == 'interrupted'
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 ENDLESS = """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -136,6 +137,27 @@ def test_curves_and_parameters_of_the_whole_bag(player):
     trail = player.session.latest()[1].trails['/']
     player.send(Seek(player.world['duration']))
     assert player.robot['travelled'] == len(trail.points)
+
+
+def test_gains_of_another_package_are_shown_as_recorded(bag, robots):
+    (robot,) = robots
+    values = {**robot.run.of_node('go_to_goal'), 'controller': 'mine', 'k1': 2.5, 'Odd.name': 1.0}
+    run = replace(robot.run, parameters={'/go_to_goal': {**values, 'k2': math.nan}})
+    player = Player(bag, [replace(robot, run=run)])
+    rows = player.session.latest()[1].fixed['settings']['/']
+    keys = {row['key']: row['value'] for row in rows}
+    assert keys['controller/k1'] == 2.5
+    assert not keys.keys() & {'controller/kp', 'controller/yaw_goal_tolerance', 'controller/k2'}
+
+
+def test_the_page_follows_changes_of_the_controller(bag, robots):
+    (robot,) = robots
+    received = int(robot.run.odometry.received[20])
+    change = (received, '/go_to_goal', {'use_goal_heading': True})
+    player = Player(bag, [replace(robot, run=replace(robot.run, parameter_events=(change,)))])
+    for index, expected in ((19, False), (20, True), (19, False)):
+        player.send(Seek(float(robot.time[index]) + 1e-6))
+        assert player.robot['use_heading'] is expected
 
 
 def test_several_robots(lockstep, tmp_path):

@@ -191,6 +191,17 @@ def test_driving_by_hand_cancels_the_goal_first_and_stops_with_the_page(driven):
     assert len(commands) == stopped
 
 
+def test_driving_by_hand_sends_25_commands_per_second_however_often_the_page_is_asked(driven):
+    commands = driven.world.listen(Twist, 'cmd_vel')
+    driven.send(Drive('/', 0.25, 0.5))
+    begin = driven.world.elapsed
+    while driven.world.elapsed < begin + 1.0:
+        for _ in range(5):
+            driven.node.work()
+        driven.world.step(0.01)
+    assert 20 <= len(commands) <= 26
+
+
 def test_a_goal_is_refused_while_the_robot_is_driven_by_hand(driven):
     driven.send(Drive('/', 0.2, 0.0), goal(1.0, 0.0))
     driven.pass_time(0.1)
@@ -371,3 +382,24 @@ def test_the_error_of_the_heading_is_shown_where_it_counts(driven):
     shown = driven.robot()
     assert shown['goal_heading_error'] == pytest.approx(2.0 - shown['pose'][2], abs=1e-4)
     assert driven.robot()['truth'] is None
+
+
+def test_a_heading_that_does_not_count_is_told(driven):
+    driven.send(goal(0.3, 0.0), goal(0.3, 0.1, 2.0))
+    driven.pass_time(0.1)
+    (text,) = driven.texts
+    assert text.startswith('go_to_goal ignores the heading of the goal')
+    driven.send(SetParameter('/', 'controller/use_goal_heading', value=True))
+    driven.until(lambda: driven.robot()['use_heading'])
+    driven.send(goal(0.3, 0.2, 2.0))
+    driven.pass_time(0.1)
+    assert driven.texts == [text]
+
+
+def test_the_distance_from_a_goal_is_shown_after_the_arrival(driven):
+    driven.send(goal(0.3, 0.0))
+    driven.until(lambda: driven.state() == 'succeeded')
+    shown = driven.robot()
+    x, y, _ = shown['pose']
+    assert shown['distance'] == pytest.approx(math.hypot(0.3 - x, y), abs=1e-5)
+    assert shown['bearing_error'] is None

@@ -36,25 +36,43 @@ def is_open(page):
 def test_driving_ends_when_the_page_is_silent():
     hand = HandDriving()
     assert hand.command(1, (0.2, 0.0), now=10.0)
-    assert hand.update(10.0, is_open, goal_active=False) is Act.PUBLISH
-    assert hand.update(10.01, is_open, goal_active=False) is Act.NOTHING
-    assert hand.update(10.0 + 0.9 * DEAD_MAN, is_open, goal_active=False) is Act.PUBLISH
-    assert hand.update(10.0 + 1.1 * DEAD_MAN, is_open, goal_active=False) is Act.STOP
+    assert hand.update(10.0, 10.0, is_open, goal_active=False) is Act.PUBLISH
+    assert hand.update(10.01, 10.01, is_open, goal_active=False) is Act.NOTHING
+    assert (
+        hand.update(10.0 + 0.9 * DEAD_MAN, 10.0 + 0.9 * DEAD_MAN, is_open, goal_active=False)
+        is Act.PUBLISH
+    )
+    assert (
+        hand.update(10.0 + 1.1 * DEAD_MAN, 10.0 + 1.1 * DEAD_MAN, is_open, goal_active=False) is Act.STOP
+    )
     assert hand.page is None
-    assert hand.update(11.0, is_open, goal_active=False) is Act.NOTHING
+    assert hand.update(11.0, 11.0, is_open, goal_active=False) is Act.NOTHING
+
+
+def test_commands_are_spaced_by_the_clock_of_the_robot():
+    """However often it is asked: it may be asked because of the last command."""
+    hand = HandDriving()
+    hand.command(1, (0.2, 0.0), now=10.0)
+    times = (5.0, 5.0, 5.03, 5.041, 5.05, 1.0, 1.03, 1.05)
+    acts = [hand.update(10.0, robot_time, is_open, goal_active=False) for robot_time in times]
+    assert [time for time, act in zip(times, acts, strict=True) if act is Act.PUBLISH] == [
+        *(5.0, 5.041),
+        # It was set back.
+        *(1.0, 1.05),
+    ]
 
 
 def test_driving_ends_at_once_with_the_page_or_its_release():
     for end in ('closed', 'released'):
         hand = HandDriving()
         hand.command(1, (0.2, 0.0), now=10.0)
-        hand.update(10.0, is_open, goal_active=False)
+        hand.update(10.0, 10.0, is_open, goal_active=False)
         if end == 'released':
             hand.release(2)
-            assert hand.update(10.05, is_open, goal_active=False) is Act.PUBLISH
+            assert hand.update(10.05, 10.05, is_open, goal_active=False) is Act.PUBLISH
             hand.release(1)
         gone = end == 'closed'
-        assert hand.update(10.06, lambda page, gone=gone: not gone, goal_active=False) is Act.STOP
+        assert hand.update(10.06, 10.06, lambda page, gone=gone: not gone, goal_active=False) is Act.STOP
 
 
 def test_one_page_drives_at_a_time():
@@ -63,17 +81,17 @@ def test_one_page_drives_at_a_time():
     assert not hand.command(2, (0.9, 0.0), now=10.1)
     assert hand.twist == (0.2, 0.0)
     hand.release(1)
-    hand.update(10.2, is_open, goal_active=False)
+    hand.update(10.2, 10.2, is_open, goal_active=False)
     assert hand.command(2, (0.9, 0.0), now=10.3)
 
 
 def test_an_active_goal_is_canceled_before_anything_is_driven():
     hand = HandDriving()
     hand.command(1, (0.2, 0.0), now=10.0)
-    assert hand.update(10.0, is_open, goal_active=True) is Act.CANCEL_GOAL
+    assert hand.update(10.0, 10.0, is_open, goal_active=True) is Act.CANCEL_GOAL
     hand.command(1, (0.2, 0.0), now=10.1)
-    assert hand.update(10.1, is_open, goal_active=True) is Act.NOTHING
-    assert hand.update(10.2, is_open, goal_active=False) is Act.PUBLISH
+    assert hand.update(10.1, 10.1, is_open, goal_active=True) is Act.NOTHING
+    assert hand.update(10.2, 10.2, is_open, goal_active=False) is Act.PUBLISH
 
 
 def test_nothing_is_driven_if_the_goal_is_not_canceled():
@@ -83,7 +101,7 @@ def test_nothing_is_driven_if_the_goal_is_not_canceled():
         now = 10.0 + 0.1 * step
         if hand.page is not None or not step:
             hand.command(1, (0.2, 0.0), now=now)
-        acts.append(hand.update(now, is_open, goal_active=True))
+        acts.append(hand.update(now, now, is_open, goal_active=True))
     assert acts[0] is Act.CANCEL_GOAL
     assert acts.index(Act.GIVE_UP) == pytest.approx(CANCEL_PATIENCE / 0.1, abs=1.1)
     assert Act.PUBLISH not in acts

@@ -290,6 +290,37 @@ def test_a_limit_holds_from_when_it_was_set(tmp_path):
     assert upper == pytest.approx(np.array([[0.0, 6.67], [1.0, 3.0], [199 / RATE, 3.0]]), abs=1e-9)
 
 
+# --- What counts for the goal
+
+
+CONTROLLER = {'controller': 'go_to_goal', 'use_goal_heading': False, 'xy_goal_tolerance': 0.05}
+
+
+@pytest.mark.parametrize('node', ['/go_to_goal', '/renamed'])
+def test_parameters_of_the_controller_count_from_when_they_were_set(tmp_path, node):
+    extra = [
+        (10.0, '/goal_pose', goal(5.0, 1.0, 1.0)),
+        (11.0, '/parameter_events', changed(node, 'use_goal_heading', value=True)),
+        (12.0, '/parameter_events', changed(node, 'controller', 'offset_point')),
+        (12.0, '/parameter_events', changed(node, 'offset', 0.3)),
+    ]
+    run = run_of(tmp_path, extra, parameters={node: CONTROLLER}, omega=0.0)
+    one = trace(run)
+    x = run.odometry.values[:, 0]
+    heading, driven = one.time >= 1.0, np.where(one.time >= 2.0, x + 0.3, x)
+    assert one.goal_heading_error == pytest.approx(np.where(heading, 1.0, np.nan), nan_ok=True)
+    assert one.distance == pytest.approx(np.hypot(5.0 - driven, 1.0))
+
+
+def test_the_tolerance_counts_from_when_it_was_set(tmp_path):
+    extra = [
+        (10.0, '/goals', goals(goal(0.5, 0.0), goal(3.0, 0.0))),
+        (10.5, '/parameter_events', changed('/go_to_goal', 'xy_goal_tolerance', 0.2)),
+    ]
+    run = run_of(tmp_path, extra, parameters={'/go_to_goal': CONTROLLER}, **STRAIGHT)
+    assert goals_of(run) == [(0.0, 0), (0.6, 1)]
+
+
 # --- Which goal counts
 
 

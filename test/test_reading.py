@@ -16,7 +16,8 @@ import pytest
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
-from rcl_interfaces.msg import Parameter, ParameterEvent, ParameterType, ParameterValue
+from rcl_interfaces.msg import ParameterEvent
+from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from ros_messages import goal, goals, joint_command, odometry, placement, stamp, twist, twist_stamped
 from ruamel.yaml import YAML
@@ -92,8 +93,9 @@ def start(x, y, theta, *, seconds):
 
 
 def changed(node, name, value):
-    value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
-    return ParameterEvent(node=node, changed_parameters=[Parameter(name=name, value=value)])
+    return ParameterEvent(
+        node=node, changed_parameters=[Parameter(name, value=value).to_parameter_msg()]
+    )
 
 
 # --- What was sent is what is read

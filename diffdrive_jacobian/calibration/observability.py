@@ -38,7 +38,7 @@ def undetermined(covariance: Array) -> list[tuple[str, str]]:
     space = directions[:, variances > UNDETERMINED**2]
     dimension = space.shape[1]
     if dimension == 3:
-        return [('none of the multipliers', f'{_STRAIGHT}, and {_TURN}')]
+        return [('any of the multipliers', f'{_STRAIGHT}, and {_TURN}')]
     found: list[tuple[str, str]] = []
     spanned = np.zeros((3, 0))
     for name, direction, remedy in COMBINATIONS:

@@ -21,6 +21,7 @@ from diffdrive_jacobian.exploration.trial import Setting
 from diffdrive_jacobian.numerics.checks import number, positive_or_infinite
 from diffdrive_jacobian.numerics.fields import integer
 from diffdrive_jacobian.properties import Property
+from diffdrive_jacobian.signals import one_interrupt
 
 
 def explore(
@@ -97,16 +98,17 @@ def explore(
         )
     used = LocalExecutor() if executor is None else executor
     complete = False
-    try:
-        search = Search(setting, strategy, seed, worlds, used, time_limit)
-        result = search.run(stop_at_first, shrink_worlds, folder)
-        complete = not result.stopped
-        if folder is not None and result.stopped != 'interrupted':
-            remove_others(folder, result.findings)
-        return result
-    finally:
-        if executor is None:
-            used.shutdown(wait=True, cancel_futures=not complete)
+    with one_interrupt():
+        try:
+            search = Search(setting, strategy, seed, worlds, used, time_limit)
+            result = search.run(stop_at_first, shrink_worlds, folder)
+            complete = not result.stopped
+            if folder is not None and result.stopped != 'interrupted':
+                remove_others(folder, result.findings)
+            return result
+        finally:
+            if executor is None:
+                used.shutdown(wait=True, cancel_futures=not complete)
 
 
 def _checked_properties(properties: Any) -> tuple[Property, ...]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -136,8 +138,8 @@ class _Film:
     def __init__(self, robot: RecordedRobot) -> None:
         self.robot, run = robot, robot.run
         self._state = RobotState(robot.name)
-        self._state.controller_values = run.of_node('go_to_goal')
-        self._state.robot_values = run.of_node('virtual_robot')
+        self._configurations = list(run.configurations())
+        self._configure(0)
         self._commands, self._wheels = robot.times(run.cmd_vel), robot.times(run.wheels)
         self._statuses = robot.run.goal_status.received
         self._truths = np.maximum.accumulate(robot.times(run.ground_truth))
@@ -155,6 +157,7 @@ class _Film:
         """Return the JSON object of the robot at a time (s)."""
         robot, run, state = self.robot, self.robot.run, self._state
         index = robot.index(time)
+        self._configure(int(run.odometry.received[index]))
         values = run.odometry.values[index]
         state.time = float(robot.time[index])
         state.pose, state.twist = values[:3], (float(values[3]), float(values[4]))
@@ -174,6 +177,13 @@ class _Film:
         assert shown is not None
         return shown
 
+    def _configure(self, received: int) -> None:
+        """Take the parameters as of a time of recording (ns)."""
+        latest = bisect_right(self._configurations, received, key=itemgetter(0)) - 1
+        _, run = self._configurations[max(latest, 0)]
+        self._state.controller_values = run.of_node('go_to_goal')
+        self._state.robot_values = run.of_node('virtual_robot')
+
     def _set_goal(self, index: int) -> None:
         run, trace, goal = self.robot.run, self.robot.trace, self._state.goal
         number = int(trace.goal[index])
@@ -192,9 +202,10 @@ class _Film:
         state = self._state
         # Of another package it may be missing here, or a later one.
         controller = BUILT_IN.get(str(state.controller_values.get('controller', '')))
+        values = state.controller_values
         return settings.shown(
-            {'controller': state.controller_values, 'robot': state.robot_values},
-            controller.gains if controller else (),
+            {'controller': values, 'robot': state.robot_values},
+            controller.gains if controller else settings.recorded_gains(values),
         )
 
     def strips(self) -> Mapping[str, Any]:

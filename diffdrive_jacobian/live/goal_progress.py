@@ -65,6 +65,11 @@ class GoalProgress:
         return None if self.goals is None or not self.active else self.goals[self.index]
 
     @property
+    def reached(self) -> NDArray[np.float64] | None:
+        """The goal at which the robot arrived, shape (3,). None: none or unknown."""
+        return None if self.goals is None or self.state is not GoalState.SUCCEEDED else self.goals[-1]
+
+    @property
     def last(self) -> bool:
         """Whether the goal that is driven to is the last one."""
         return self.goals is not None and self.index == len(self.goals) - 1

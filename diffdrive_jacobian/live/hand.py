@@ -1,18 +1,20 @@
 """Driving by hand, with a dead-man's switch: who stops asking stops the robot.
 
-A pure state machine; times are monotonic seconds. While a goal is active, driving by hand first cancels
-it and begins when that is confirmed.
+A pure state machine. The page is watched by a monotonic clock; commands are spaced by the robot's, which
+may be simulated and fast. While a goal is active, driving by hand first cancels it and begins when that
+is confirmed.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from enum import Enum, auto
 
 DEAD_MAN = 0.4
 """Time without a command of the page after which the robot stops (s)."""
 PERIOD = 0.04
-"""Time between two commands to the robot (s)."""
+"""Shortest time between two commands to the robot, by its clock (s)."""
 CANCEL_PATIENCE = 2.0
 """Longest wait until the goal is canceled (s)."""
 STANDSTILL = (0.0, 0.0)
@@ -33,18 +35,13 @@ class Act(Enum):
 class HandDriving:
     """Driving of one robot by hand."""
 
-    def __init__(self, period: float = PERIOD) -> None:
-        """Start at rest.
-
-        Args:
-            period: Shortest time between two commands (s).
-        """
-        self._period = period
+    def __init__(self) -> None:
+        """Start at rest."""
         self.page: int | None = None
         """The page that drives. None: none does."""
         self.twist = STANDSTILL
         """`(v, omega)` that is to be published (m/s, rad/s)."""
-        self._commanded = self._published = -1.0
+        self._commanded, self._published = -1.0, -math.inf
         self._canceling: float | None = None
         self._moved = self._released = False
 
@@ -53,7 +50,7 @@ class HandDriving:
         if self.page not in (None, page):
             return False
         if self.page is None:
-            self._canceling, self._moved, self._published = None, False, -1.0
+            self._canceling, self._moved, self._published = None, False, -math.inf
         self.page, self.twist, self._commanded, self._released = page, twist, now, False
         return True
 
@@ -62,11 +59,14 @@ class HandDriving:
         if self.page == page:
             self._released = True
 
-    def update(self, now: float, is_open: Callable[[int], bool], goal_active: bool) -> Act:
+    def update(
+        self, now: float, robot_time: float, is_open: Callable[[int], bool], goal_active: bool
+    ) -> Act:
         """Return what must be done now; to be called often.
 
         Args:
             now: Present time (s).
+            robot_time: The same by the robot's clock (s).
             is_open: Whether a page is connected.
             goal_active: Whether a controller drives the robot.
         """
@@ -84,7 +84,8 @@ class HandDriving:
                 return Act.GIVE_UP
             return Act.NOTHING
         self._canceling = None
-        if now - self._published < self._period:
+        # A clock that was set back must not stop the robot.
+        if 0.0 <= robot_time - self._published < PERIOD:
             return Act.NOTHING
-        self._published, self._moved = now, True
+        self._published, self._moved = robot_time, True
         return Act.PUBLISH

@@ -29,7 +29,7 @@ from diffdrive_jacobian.live.commands import (
     SetParameter,
 )
 from diffdrive_jacobian.live.goal_progress import GoalEnd
-from diffdrive_jacobian.live.hand import PERIOD, STANDSTILL, Act, HandDriving
+from diffdrive_jacobian.live.hand import STANDSTILL, Act, HandDriving
 from diffdrive_jacobian.live.parameter_link import ParameterLink
 from diffdrive_jacobian.live.robot_state import RobotState
 from diffdrive_jacobian.live.robot_topics import RobotTopics
@@ -38,6 +38,7 @@ from diffdrive_jacobian.live.trigger_link import TriggerLink
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
 from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.ros.remote_goal import ignores_heading
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS, seconds
 
@@ -89,8 +90,7 @@ class LiveRobot:
         self.topics.prepare()
         self.links: dict[str, ParameterLink] = {}
         """Parameters by role."""
-        # Simulated time may be fast: then with each of its steps.
-        self.hand = HandDriving(PERIOD if polled else 0.0)
+        self.hand = HandDriving()
         # Before they are needed, so that they are discovered by then.
         self._services = {name: TriggerLink(node, self.topics.full(name)) for name in SERVICES}
         self._frame = ''
@@ -224,6 +224,12 @@ class LiveRobot:
             self._warn(f'nobody is subscribed to {self.topics.full(topic)}: is go_to_goal running?')
         else:
             self.send(goals, together=together)
+            values = state.controller_values
+            if command.theta is not None and ignores_heading(values):
+                self._warn(
+                    f'{values["controller"]} ignores the heading of the goal: switch on Goal heading, '
+                    'or choose the control law pose'
+                )
 
     def _set(self, command: SetParameter) -> None:
         role, _, name = command.parameter.partition('/')
@@ -257,7 +263,12 @@ class LiveRobot:
 
     def drive(self) -> None:
         """Drive by hand, if a page does; to be called often."""
-        act = self.hand.update(time.monotonic(), self._session.is_open, self.state.goal.active)
+        act = self.hand.update(
+            time.monotonic(),
+            self._now() / NANOSECONDS,
+            self._session.is_open,
+            self.state.goal.active,
+        )
         if act is Act.PUBLISH:
             self.topics.publish_twist(self.hand.twist, self._now())
         elif act is Act.STOP:

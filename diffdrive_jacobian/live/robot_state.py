@@ -183,11 +183,15 @@ class RobotState:
         target = self.goal.current
         distance = bearing = heading = true_distance = None
         if target is not None:
-            distance, bearing = quantities.errors(self.pose, target, arrival.offset)
-            if self.truth is not None:
-                true_distance, _ = quantities.errors(self.truth, target, arrival.offset)
+            _, bearing = quantities.errors(self.pose, target, arrival.offset)
             if arrival.use_heading and self.goal.last:
                 heading = wrap_angle(target[2] - self.pose[2])
+        # A reached goal has a distance, but no direction.
+        target = self.goal.reached if target is None else target
+        if target is not None:
+            distance, _ = quantities.errors(self.pose, target, arrival.offset)
+            if self.truth is not None:
+                true_distance, _ = quantities.errors(self.truth, target, arrival.offset)
         command = self.command or (0.0, 0.0)
         return {
             'name': self.name,
@@ -206,7 +210,7 @@ class RobotState:
             'bearing_error': rounded(bearing),
             'goal_heading_error': rounded(heading),
             'truth': rounded(self.truth),
-            'law': self._law(target),
+            'law': self._law(self.goal.current),
             'by_hand': by_hand,
             'commanded': self.command is not None,
             'chain': quantities.chain(

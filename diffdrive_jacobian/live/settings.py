@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
 
 from diffdrive_jacobian.control import ControllerError, Gain, controller_names, find_controller
 from diffdrive_jacobian.live.quantities import rounded
+from diffdrive_jacobian.parameters.declaration import specifications
+from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.text import printable
 
 Role = Literal['controller', 'robot']
@@ -86,6 +89,20 @@ def gains(controller: str) -> tuple[Gain, ...]:
         return find_controller(controller).gains
     except ControllerError:
         return ()
+
+
+def recorded_gains(values: Mapping[str, Any]) -> tuple[Gain, ...]:
+    """Return the gains among the recorded parameters of a go_to_goal: those that are not its own.
+
+    Their descriptions and ranges are in the package of the controller, which may be missing here.
+    """
+    own = specifications(GoToGoalParameters)
+    found = []
+    for name, value in values.items():
+        if name not in own and isinstance(value, float):
+            with suppress(ValueError):
+                found.append(Gain(name=name, default=value, unit='', description='Gain, as recorded'))
+    return tuple(found)
 
 
 def offered(gains: Iterable[Gain]) -> list[Setting]:

@@ -7,7 +7,8 @@ columns are named in `run.odometry.columns`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,8 @@ COLUMNS = {
     'goal_status': ('status',),
 }
 """Columns of the values of each series of a `Run`."""
+_CONTROLLER = {'controller', 'use_goal_heading', 'xy_goal_tolerance'}
+"""Parameters by which a go_to_goal of another name is known."""
 COVARIANCES = ('xx', 'xy', 'xt', 'yy', 'yt', 'tt', 'vv', 'vw', 'ww')
 """Columns of `Run.odometry_covariances`; the first six are those of `Run.start_covariances`."""
 
@@ -121,9 +124,27 @@ class Run:
         return BagError('; '.join([f'{self.path} has no {what}', *self.notes]))
 
     def of_node(self, name: str) -> dict[str, Any]:
-        """Return the parameters of the node of that base name; {} if there is none or several."""
+        """Return the parameters of the node of that base name; {} if there is none or several.
+
+        A go_to_goal that was renamed is known by its parameters.
+        """
         found = [values for node, values in self.parameters.items() if node.split('/')[-1] == name]
+        if name == 'go_to_goal' and not found:
+            found = [values for values in self.parameters.values() if values.keys() >= _CONTROLLER]
         return found[0] if len(found) == 1 else {}
+
+    def configurations(self) -> Iterator[tuple[int, Run]]:
+        """Yield the run with the parameters of each time, and since when they are valid (ns).
+
+        Those of the beginning are valid since 0.
+        """
+        run, since = self, 0
+        yield since, run
+        for received, node, values in self.parameter_events:
+            since = max(since, received)
+            values = {**run.parameters.get(node, {}), **values}
+            run = replace(run, parameters={**run.parameters, node: values})
+            yield since, run
 
     def number_of_node(self, node: str, parameter: str, default: float) -> float:
         """Return a parameter of a node; `default` if it was not recorded or is not a finite number."""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable
 
 import numpy as np
 
-from diffdrive_jacobian.reading.run import Run, Series, number
+from diffdrive_jacobian.reading.run import Series, number
 from diffdrive_jacobian.reading.trace import Array, Indices, Mask, Trace, seconds
 
 BUCKETS = 1500
@@ -55,7 +54,10 @@ def limits(one: Trace) -> dict[str, Array]:
     (s, and m/s or rad/s), shape (2, m, 2). NaN: no limit.
     """
     rows: dict[str, list[list[list[float]]]] = {name: [] for name in _LIMITS}
-    for time, run in _configurations(one.run):
+    for since, run in one.run.configurations():
+        now = np.array([since])
+        at = seconds(run, Series(received=now, stamps=now, values=np.empty((1, 0))))
+        time = max(0.0, float(at[0])) if since else 0.0
         for name, (nodes, upper, lower) in _LIMITS.items():
             values = [run.of_node(node) for node in nodes]
             most = [number(one.get(upper)) for one in values]
@@ -68,17 +70,6 @@ def limits(one: Trace) -> dict[str, Array]:
         for name, values in rows.items()
     }
     return {**found, 'left': found['right']}
-
-
-def _configurations(run: Run) -> Iterator[tuple[float, Run]]:
-    """Yield the run with the parameters of each time, and since when they are valid (s)."""
-    yield 0.0, run
-    for received, node, values in run.parameter_events:
-        now = np.array([received])
-        time = seconds(run, Series(received=now, stamps=now, values=np.empty((1, 0))))
-        values = {**run.parameters.get(node, {}), **values}
-        run = replace(run, parameters={**run.parameters, node: values})
-        yield max(0.0, float(time[0])), run
 
 
 def _tightest(choose: Callable[[list[float]], float], bounds: list[float]) -> float:

@@ -5,7 +5,7 @@ Times are seconds since the first odometry, by its own stamps.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -56,7 +56,8 @@ def trace(run: Run) -> Trace:
     aborted (`goal_status`). Of several waypoints the next one counts from the first odometry within
     xy_goal_tolerance of go_to_goal (0.02 m if that was not recorded), as the node has it; if none is,
     though the node says that it succeeded or nothing is known of it, from the closest approach.
-    The heading of the last goal counts if the controller takes one, or by `use_goal_heading`.
+    The heading of the last goal counts if the controller takes one, or by `use_goal_heading`. All
+    parameters are those of the time, as far as their changes were recorded.
     The last goal is reached when the node reports success, or, if `goal_status` was not recorded, at
     the first odometry within the tolerance. A reached goal has no direction. Its distance continues
     until the odometry is reset, or, without `goal_status`, reset while the robot is at the goal.
@@ -74,7 +75,8 @@ def trace(run: Run) -> Trace:
     targets[goal >= 0] = run.goals.values[goal[goal >= 0]]
     dx, dy = targets[:, 0] - x, targets[:, 1] - y
     to_goal = targets[:, :2] - _driven_points(run)
-    last = [route[-1] for route in _routes(run) if heading_counts(run.of_node('go_to_goal'))]
+    last = [route[-1] for route in _routes(run)]
+    counts = _over_time(run, lambda now: heading_counts(now.of_node('go_to_goal')))
     return Trace(
         run=run,
         time=seconds(run, odometry),
@@ -82,7 +84,9 @@ def trace(run: Run) -> Trace:
         goal=goal,
         distance=np.hypot(*to_goal.T),
         bearing_error=np.where(reached, np.nan, wrap(np.arctan2(dy, dx) - theta)),
-        goal_heading_error=np.where(np.isin(goal, last), wrap(targets[:, 2] - theta), np.nan),
+        goal_heading_error=np.where(
+            np.isin(goal, last) & (counts > 0.0), wrap(targets[:, 2] - theta), np.nan
+        ),
     )
 
 
@@ -140,9 +144,18 @@ def _breaks(run: Run) -> Indices:
     return np.flatnonzero(reset) + 1
 
 
+def _over_time(run: Run, value: Callable[[Run], float]) -> Array:
+    """Return what a function of the parameters is at each odometry, shape (n,)."""
+    changes = [(since, value(now)) for since, now in run.configurations()]
+    since, values = np.array([one for one, _ in changes]), np.array([one for _, one in changes])
+    latest = np.searchsorted(since, run.odometry.received, side='right') - 1
+    return np.asarray(values[np.maximum(latest, 0)], dtype=np.float64)
+
+
 def _progress(run: Run, breaks: Indices) -> tuple[Indices, NDArray[np.bool_]]:
     """Return for each odometry which goal is driven to, -1 for none, and whether it is reached."""
-    seen, places = run.odometry.received, _driven_points(run)
+    seen = run.odometry.received
+    places = np.column_stack([_driven_points(run), _over_time(run, tolerance)])
     goal, reached = np.full(len(seen), -1), np.zeros(len(seen), dtype=bool)
     known = len(run.goal_status) > 0 or bool(run.of_node('go_to_goal'))
     routes = _routes(run)
@@ -185,12 +198,18 @@ def _progress(run: Run, breaks: Indices) -> tuple[Indices, NDArray[np.bool_]]:
 
 def _distances(run: Run, places: Array, target: int) -> Array:
     """Return the distance of each place from a goal, shape (n,) (m)."""
-    return np.asarray(np.hypot(*(places - run.goals.values[target, :2]).T), dtype=np.float64)
+    return np.asarray(np.hypot(*(places[:, :2] - run.goals.values[target, :2]).T), dtype=np.float64)
 
 
 def _within(run: Run, places: Array, target: int) -> Mask:
-    """Return for each place whether it counts as arrived at a goal, shape (n,)."""
-    return np.asarray(_distances(run, places, target) <= tolerance(run) + 1e-12)
+    """Return for each place whether it counts as arrived at a goal, shape (n,).
+
+    Args:
+        run: The run.
+        places: `[x, y, tolerance]` of each, shape (n, 3) (m).
+        target: The goal.
+    """
+    return np.asarray(_distances(run, places, target) <= places[:, 2] + 1e-12)
 
 
 def _first_within(run: Run, places: Array, target: int, begin: int, end: int) -> int | None:
@@ -238,14 +257,19 @@ def _driven_points(run: Run) -> Array:
     It is the axle centre if the controller is not built in. Its package may not be installed here, and
     reading a bag must not import it.
     """
-    poses = run.odometry.values[:, :3]
+    x, y, theta = run.odometry.values[:, :3].T
+    d = _over_time(run, _driven_offset)
+    return np.column_stack([x + d * np.cos(theta), y + d * np.sin(theta)])
+
+
+def _driven_offset(run: Run) -> float:
+    """Return how far the driven point is ahead of the axle centre (m)."""
     name = run.of_node('go_to_goal').get('controller')
     controller = BUILT_IN.get(name) if isinstance(name, str) else None
     if controller is None or not controller.offset:
-        return poses[:, :2]
+        return 0.0
     default = controller.driven_offset(controller.defaults)
-    d = run.number_of_node('go_to_goal', controller.offset, default)
-    return poses[:, :2] + d * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+    return run.number_of_node('go_to_goal', controller.offset, default)
 
 
 def _statuses(run: Run, begin: int, end: int) -> tuple[Array, NDArray[np.int64]]:
@@ -262,6 +286,6 @@ def heading_counts(parameters: Mapping[str, Any]) -> bool:
 
 
 def tolerance(run: Run) -> float:
-    """Return the distance from a goal that counts as arrived (m)."""
+    """Return the distance from a goal that counts as arrived at the beginning (m)."""
     default = GoToGoalParameters().xy_goal_tolerance
     return run.number_of_node('go_to_goal', 'xy_goal_tolerance', default)

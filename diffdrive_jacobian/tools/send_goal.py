@@ -134,7 +134,8 @@ def _end(result: GoalResult) -> str:
 def _hint(result: GoalResult) -> str:
     return {
         'aborted': " (the controller's log says why)",
-        'canceled': ' (by another process, by commands of another node, or replaced by another goal)',
+        'canceled': ' (by another process, by commands of another node, replaced by another goal, or '
+        'because the controller was shut down)',
     }.get(_end(result), '')
 
 

@@ -66,12 +66,12 @@ export class Chain {
     section.append(element('h2', {}, 'From the goal to motion'), ...Object.values(this.links).map((one) => one.node), this.note);
   }
 
-  show(robot) {
+  show(robot, recorded) {
     const { chain, law, goal } = robot, active = robot.distance !== null && goal.active;
     const target = active && goal.goals ? goal.goals[goal.index] : null;
     setText(this.goal, target
       ? `(${format(target[0], 2)}, ${format(target[1], 2)}) m   →   d = ${format(robot.distance)} m,  e = ${format(robot.bearing_error)} rad${robot.goal_heading_error === null ? '' : `, heading at the goal: Δθ = ${format(robot.goal_heading_error)} rad`}`
-      : robot.by_hand ? 'none: driven by hand' : 'none: click on the map');
+      : robot.by_hand ? 'none: driven by hand' : recorded ? 'none' : 'none: click on the map');
     this.links.goal.node.classList.toggle('idle', !target);
     const [formula, source] = LAWS[law.name] ?? ['[v, ω] = law(pose, goal)', law.name || 'not known'];
     setMath(this.links.law.formula, robot.by_hand ? 'your keys' : formula);

@@ -80,7 +80,7 @@ function showPanels() {
   byId('notes').title = model.notes.join('\n');
   setText(byId('hint'), HINTS[recorded ? 'bag' : pointer.tool]);
   byId('map').classList.toggle('grab', recorded || pointer.tool === 'move');
-  if (robot) chain.show(robot);
+  if (robot) chain.show(robot, model.recorded);
 }
 
 for (const button of byId('tools').children) {

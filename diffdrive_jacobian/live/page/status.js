@@ -13,16 +13,17 @@ const STATES = {
 };
 
 /** Return badge, its class and one sentence for a robot. */
-function described(robot) {
+function described(robot, recorded) {
   const { goal, age } = robot;
   const [badge, kind] = robot.by_hand ? ['by hand', 'hand'] : STATES[goal.state] ?? STATES.unknown;
   if (age > 1) return ['silent', 'bad', `no odometry for ${format(age, 0)} s`];
   if (robot.by_hand) return [badge, kind, 'release to stop'];
-  if (!goal.active) return [badge, kind, goal.state === 'unknown' ? 'click on the map to send one' : ''];
+  const truly = robot.true_distance === null ? '' : `, truly ${format(robot.true_distance)} m`;
+  if (goal.state === 'succeeded' && robot.distance !== null) return [badge, kind, `now ${format(robot.distance)} m from the goal${truly}`];
+  if (!goal.active) return [badge, kind, goal.state === 'unknown' && !recorded ? 'click on the map to send one' : ''];
   if (!goal.goals) return [badge, kind, 'the goal was sent before this page listened'];
   const many = goal.goals.length > 1 ? `waypoint ${goal.index + 1} of ${goal.goals.length}, ` : '';
-  const truly = robot.true_distance === null ? '' : `, truly ${format(robot.true_distance, 2)} m`;
-  return [badge, kind, `${many}${format(robot.distance, 2)} m to go${truly}`];
+  return [badge, kind, `${many}${format(robot.distance)} m to go${truly}`];
 }
 
 export function showStatus(model, open) {
@@ -35,9 +36,9 @@ export function showStatus(model, open) {
     return;
   }
   byId('status').hidden = false;
-  const [badge, kind, sentence] = described(robot);
+  const [badge, kind, sentence] = described(robot, model.recorded);
   setText(byId('state'), badge);
   byId('state').className = `badge ${kind}`;
-  setText(byId('summary'), model.recorded && !robot.goal.active ? '' : sentence);
+  setText(byId('summary'), sentence);
   byId('cancel').disabled = !robot.goal.active;
 }
