@@ -3,7 +3,7 @@
 State: pose `q = [x, y, theta]` (m, m, rad). Inputs: wheel speeds `w = [omega_R, omega_L]` (rad/s,
 positive drives forward) or the body twist `u = [v, omega]` (m/s, rad/s). Wheel radius `r` and wheel
 separation `L` in m. **The order of wheels is right, left.** Documents B and E have left, right: their
-columns are exchanged here.
+columns, and the rows of E's inverse, are exchanged here.
 
     w --J_w--> u --S(theta)--> q_dot
 

@@ -164,8 +164,8 @@ def damped_least_squares(J: Any, x_dot: Vector, damping: Number, *, weights: Vec
     """
     W_half = root(weights)
     J = J / W_half  # J W^-1/2
-    J_plus = svd(J).damped_inverse(damping)  # J^T (J J^T + lambda^2 I)^-1
-    q_dot = times(J_plus, x_dot)
+    J_damped = svd(J).damped_inverse(damping)  # J^T (J J^T + lambda^2 I)^-1
+    q_dot = times(J_damped, x_dot)
     return q_dot / W_half
 
 
@@ -189,7 +189,7 @@ def null_space_projector(J: Any, damping: Number = 0.0, *, weights: Vector = Non
     """
     W_half = root(weights)
     J = J / W_half  # J W^-1/2
-    N = svd(J).projector(damping)  # I - J^+ J
+    N = svd(J).projector(damping)  # I - J^+ J, with damping filtered
     return N * W_half / column(W_half)  # W^-1/2 N W^1/2
 
 
@@ -220,7 +220,7 @@ def redundant(
     W_half = root(weights)
     J, q_dot_0 = J / W_half, W_half * q_dot_0  # J W^-1/2 and W^1/2 q_dot_0
     values = svd(J)
-    J_plus = values.damped_inverse(damping)  # J^T (J J^T + lambda^2 I)^-1
-    N_q_dot_0 = values.projected(q_dot_0, damping)  # (I - J^+ J) q_dot_0
-    q_dot = times(J_plus, x_dot) + N_q_dot_0
+    J_damped = values.damped_inverse(damping)  # J^+, with damping J^T (J J^T + lambda^2 I)^-1
+    N_q_dot_0 = values.projected(q_dot_0, damping)  # (I - J^+ J) q_dot_0, with damping filtered
+    q_dot = times(J_damped, x_dot) + N_q_dot_0
     return q_dot / W_half

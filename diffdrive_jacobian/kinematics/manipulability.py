@@ -6,8 +6,8 @@ gradient over the inputs is `G^T gradient`.
 
 Everything broadcasts over leading axes. Wrong shapes and values that are not finite raise ValueError.
 
-Source: T. Yoshikawa, "Manipulability of robotic mechanisms", 1985, which documents A (3.2.5) and D (3)
-refer to; doc/mathematics.md, "Manipulators".
+Source: T. Yoshikawa, "Manipulability of robotic mechanisms", 1985, of which documents A (3.2.5) and D
+(3) speak without a formula; doc/mathematics.md, "Manipulators".
 """
 
 from __future__ import annotations

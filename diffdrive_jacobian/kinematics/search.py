@@ -212,9 +212,9 @@ def transpose_step(JT_e: Floats, alpha: float | Floats) -> Floats:
 
 def levenberg_marquardt_step(J: Floats, JT_e: Floats, damping: Floats) -> Floats:
     """Return `(J^T J + lambda I)^-1 J^T e` (D), with lambda of shape (k,)."""
-    JT_J = outer(J, J)
+    JT_J = outer(J, J)  # J^T J
     diagonal = np.einsum('iik->ik', JT_J)  # a view
-    diagonal += damping + REGULAR * diagonal  # J^T J + lambda I
+    diagonal += damping + REGULAR * diagonal  # + lambda I, and a little against rounding
     return np.asarray(np.linalg.solve(JT_J.transpose(2, 0, 1), JT_e.T[..., np.newaxis])[..., 0].T)
 
 
