@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
+from collections.abc import Sequence as Values
 from itertools import count
 from typing import Any, Protocol, TypeAlias
 
@@ -14,6 +15,8 @@ from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message, serialize_message
 
 from diffdrive_jacobian.lockstep._deliveries import Deliveries
+from diffdrive_jacobian.messages.fields import is_stamp, plain, walk
+from diffdrive_jacobian.messages.structure import Array, FieldType, Sequence, Structure, Text, structure
 from diffdrive_jacobian.ros.rclpy_internals import wrap_publish
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -158,7 +161,7 @@ class Traffic:
             if record.topic not in OMITTED and _subscriptions(publisher) > len(record.readers)
         )
 
-    def note_external(self, source: ExternalSource, messages: Sequence[bytes]) -> None:
+    def note_external(self, source: ExternalSource, messages: Values[bytes]) -> None:
         """Count messages from other processes on a topic.
 
         Args:
@@ -245,35 +248,38 @@ def brief(message: Any) -> str:
     """Return a message as one line with its nonzero fields."""
     if isinstance(message, bytes):
         return f'{len(message)} serialized bytes'
-    fields = ', '.join(f'{name}={value}' for name, value in _fields(message, ''))
-    return f'{type(message).__name__}({fields})'
+    kind = structure(type(message))
+    fields = (
+        (path, _shown(field, value)) for path, field, value in walk(kind, message, whole=_is_shown_whole)
+    )
+    return f'{kind.short_name}({", ".join(f"{path}={text}" for path, text in fields if text)})'
 
 
-def _fields(message: Any, prefix: str) -> Iterator[tuple[str, str]]:
-    for name in message.get_fields_and_field_types():
-        value, path = getattr(message, name), prefix + name
-        if hasattr(value, 'get_fields_and_field_types'):
-            if {'sec', 'nanosec'} == set(value.get_fields_and_field_types()):
-                if value.sec or value.nanosec:
-                    yield path, f'{value.sec + value.nanosec / NANOSECONDS:.9g} s'
-            else:
-                yield from _fields(value, f'{path}.')
-        elif isinstance(value, (str, bytes)):
-            if value:
-                yield path, repr(value)
-        elif hasattr(value, '__len__'):
-            if len(value) > MAX_CHECKED or any(not _is_zero(element) for element in value):
-                yield path, _array(value)
-        elif not _is_zero(value):
-            yield path, _scalar(value)
+def _is_shown_whole(kind: FieldType) -> bool:
+    return is_stamp(kind) or isinstance(kind, (Array, Sequence))
+
+
+def _shown(kind: FieldType, value: Any) -> str:
+    """Return the value of a field; '': it is zero, false or empty."""
+    if is_stamp(kind):
+        nonzero = value.sec or value.nanosec
+        return f'{value.sec + value.nanosec / NANOSECONDS:.9g} s' if nonzero else ''
+    match kind:
+        case Array(element=element) | Sequence(element=element):
+            zero = len(value) <= MAX_CHECKED and all(_is_zero(one) for one in value)
+            return '' if zero else _array(element, value)
+        case Text():
+            return repr(value) if value else ''
+        case _:
+            return '' if _is_zero(value) else _scalar(kind, value)
 
 
 def _is_zero(value: Any) -> bool:
     return isinstance(value, (bool, int, float)) and value == 0
 
 
-def _scalar(value: Any) -> str:
-    if hasattr(value, 'get_fields_and_field_types'):
+def _scalar(kind: FieldType, value: Any) -> str:
+    if isinstance(kind, Structure):
         return brief(value)
     if isinstance(value, float):
         # Six digits, or all of them where that is shorter: 5e-324.
@@ -281,7 +287,6 @@ def _scalar(value: Any) -> str:
     return repr(value)
 
 
-def _array(values: Any) -> str:
-    first = values[:MAX_SHOWN]
-    shown = ', '.join(map(_scalar, first.tolist() if hasattr(first, 'tolist') else first))
+def _array(element: FieldType, values: Any) -> str:
+    shown = ', '.join(_scalar(element, one) for one in plain(values[:MAX_SHOWN]))
     return f'[{shown}]' if len(values) <= MAX_SHOWN else f'[{shown}, ... {len(values)} in all]'

@@ -11,8 +11,8 @@ from rclpy.serialization import deserialize_message
 
 from diffdrive_jacobian.diagnosis.lasting import Interleaving
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader
-from diffdrive_jacobian.messages.cdr_types import LITTLE_ENDIAN
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
+from diffdrive_jacobian.messages.structure import LITTLE_ENDIAN
 from diffdrive_jacobian.messages.wire import GOALS
 from diffdrive_jacobian.ros.rclpy_internals import with_message_info
 
