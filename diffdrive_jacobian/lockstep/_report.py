@@ -261,6 +261,9 @@ def _is_shown_whole(kind: FieldType) -> bool:
 
 def _shown(kind: FieldType, value: Any) -> str:
     """Return the value of a field; '': it is zero, false or empty."""
+    if value is None:
+        # Not valid any more, see `_Record.received`.
+        return 'None'
     if is_stamp(kind):
         nonzero = value.sec or value.nanosec
         return f'{value.sec + value.nanosec / NANOSECONDS:.9g} s' if nonzero else ''

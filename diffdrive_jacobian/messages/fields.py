@@ -38,7 +38,7 @@ def walk(
     match kind:
         case _ if whole(kind):
             yield path, kind, value
-        case Structure():
+        case Structure() if value is not None:
             for name, field in kind.fields:
                 inner = f'{path}.{name}' if path else name
                 yield from walk(field, getattr(value, name), inner, whole=whole)
