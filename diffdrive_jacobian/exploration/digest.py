@@ -19,10 +19,8 @@ from diffdrive_jacobian.messages.structure import (
     Structure,
     structure,
 )
+from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.ros.rclpy_internals import wrap_publish
-
-OMITTED = ('/clock', '/rosout', '/parameter_events', '/fault_events')
-"""Topics that are not part of the hash: they do not belong to the nodes, or to their behaviour."""
 
 
 class MessageDigest:
@@ -46,7 +44,7 @@ class MessageDigest:
         def hashing(publish: Callable[..., None]) -> Callable[..., None]:
             def hashed(self: Publisher, msg: Any) -> None:
                 publish(self, msg)
-                if self.topic_name not in OMITTED:
+                if self.topic_name not in NOT_OF_ROBOTS:
                     add(self, msg)
 
             return hashed

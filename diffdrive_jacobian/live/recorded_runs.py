@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.bag_reader import BagError, base_name, messages, namespace_of, open_bag
-from diffdrive_jacobian.bags.decoding import UndecodableError, decode
-from diffdrive_jacobian.messages.conversion import MessageError, from_pose_with_covariance, from_time
+from diffdrive_jacobian.bags.known_types import known_structure
+from diffdrive_jacobian.messages.codecs import ODOMETRY
+from diffdrive_jacobian.messages.conversion import MessageError, from_covariance
 from diffdrive_jacobian.reading.reader import read_run
 from diffdrive_jacobian.reading.run import Run, Series
 from diffdrive_jacobian.reading.trace import Trace, seconds, trace
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 Array = NDArray[np.float64]
-ODOMETRY = 'nav_msgs/msg/Odometry'
 MAX_ROBOTS = 16
 """Largest number of robots that are shown."""
 
@@ -73,7 +73,7 @@ def read_robots(path: Path) -> list[RecordedRobot]:
             runs[namespace] = run
         notes += run.notes
     if not runs:
-        why = f'no valid message on a topic odom of {ODOMETRY}'
+        why = f'no valid message on a topic odom of {ODOMETRY.type_name}'
         raise BagError('; '.join([f'{path} has no odometry: {why}', *notes]))
     first = min(int(run.odometry.stamps[0]) for run in runs.values())
     robots = []
@@ -94,7 +94,7 @@ def read_robots(path: Path) -> list[RecordedRobot]:
 
 
 def _is_odometry(topic: str, kind: str) -> bool:
-    return base_name(topic) == 'odom' and kind == ODOMETRY
+    return base_name(topic) == 'odom' and kind == ODOMETRY.type_name
 
 
 def _namespaces(path: Path) -> list[str]:
@@ -118,12 +118,12 @@ def _covariances(path: Path, namespace: str, odometry: Series) -> Array:
             for one in reader.connections
             if _is_odometry(one.topic, one.msgtype) and namespace_of(one.topic) == namespace
         ]
+        read = ODOMETRY.reader(known_structure(ODOMETRY.type_name))
         for _, received, data in messages(reader, connections):
             try:
-                message = decode(data, ODOMETRY)
-                stamp = from_time(message.header.stamp)
-                _, found[received, stamp or received] = from_pose_with_covariance(message.pose)
-            except (MessageError, UndecodableError):
+                motion = read(data)
+                found[received, motion.stamp or received] = from_covariance(motion.covariance)
+            except MessageError:
                 continue
     zero = np.zeros((3, 3))
     pairs = zip(odometry.received.tolist(), odometry.stamps.tolist(), strict=True)

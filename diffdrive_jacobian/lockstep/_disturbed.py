@@ -10,12 +10,13 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 
 from diffdrive_jacobian.lockstep._errors import IneffectiveFaultsError, LockstepError
-from diffdrive_jacobian.lockstep._fault_log import TOPIC, FaultEvent, FaultLog
+from diffdrive_jacobian.lockstep._fault_log import FaultEvent, FaultLog
 from diffdrive_jacobian.lockstep._injection import Injectable, Injections, check_injectable
 from diffdrive_jacobian.lockstep._injection_base import World, full_name
 from diffdrive_jacobian.lockstep._keeper import Keeper
 from diffdrive_jacobian.lockstep._messaging import Messaging, described
 from diffdrive_jacobian.lockstep._simulated_time import MAX_SECONDS
+from diffdrive_jacobian.messages.topics import FAULT_EVENTS
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 N = TypeVar('N', bound=Node)
@@ -93,7 +94,9 @@ class Disturbed(Messaging):
         check_injectable(faults, self.world_time)
         self.settle()
         if self._injections is None:
-            self._log.publisher = self.node.create_publisher(String, TOPIC, QoSProfile(depth=1000))
+            self._log.publisher = self.node.create_publisher(
+                String, FAULT_EVENTS, QoSProfile(depth=1000)
+            )
             # Recorders subscribe.
             self.settle()
             self._injections = Injections(self._world(), self._traffic)

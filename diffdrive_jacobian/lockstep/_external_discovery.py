@@ -8,9 +8,9 @@ from rclpy.node import Node
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._external_expectations import Due
-from diffdrive_jacobian.lockstep._external_graph import CLOCK, UNKNOWN, ExternalGraph, node_name
+from diffdrive_jacobian.lockstep._external_graph import UNKNOWN, ExternalGraph, node_name
 from diffdrive_jacobian.lockstep._external_probe import Probe
-from diffdrive_jacobian.lockstep._report import OMITTED
+from diffdrive_jacobian.messages.topics import CLOCK, NOT_OF_ROBOTS
 
 UNTIMED = 2.0
 """Time for which a node that lacks nothing but the time is waited for (s)."""
@@ -31,7 +31,7 @@ class Discovery:
             for node in self._nodes
             for endpoints in (node.publishers, node.subscriptions)
             for endpoint in endpoints
-            if endpoint.topic_name not in OMITTED
+            if endpoint.topic_name not in NOT_OF_ROBOTS
         )
 
     def awaited_nodes(self, expected: Sequence[Due], probes: Sequence[Probe]) -> set[str]:

@@ -18,9 +18,9 @@ from rclpy.qos import (
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from diffdrive_jacobian.messages.topics import CLOCK, OF_EVERY_NODE
 from diffdrive_jacobian.time_units import NANOSECONDS
 
-CLOCK = '/clock'
 UNKNOWN = '_NODE_NAME_UNKNOWN_'
 """Name of a node whose endpoints have been discovered before its name."""
 PARTICIPANT = 12
@@ -54,11 +54,7 @@ class ExternalGraph:
     def published_topics(self) -> list[str]:
         """Return the topics that external nodes publish, without those of every node."""
         names = (name for name, _ in self._node.get_topic_names_and_types())
-        return [
-            name
-            for name in names
-            if name not in ('/rosout', '/parameter_events') and self.publishers(name)
-        ]
+        return [name for name in names if name not in OF_EVERY_NODE and self.publishers(name)]
 
     def subscribed_nodes(self, topic: str) -> set[str]:
         """Return the names of the external nodes that are subscribed to a topic."""

@@ -17,6 +17,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from diffdrive_jacobian.lockstep._deliveries import Deliveries
 from diffdrive_jacobian.messages.fields import is_stamp, plain, walk
 from diffdrive_jacobian.messages.structure import Array, FieldType, Sequence, Structure, Text, structure
+from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.ros.rclpy_internals import wrap_publish
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -24,8 +25,6 @@ MAX_SHOWN = 4
 """Number of elements that are shown of an array."""
 MAX_CHECKED = 100
 """Length up to which arrays of zeros are omitted. Longer ones are not searched."""
-OMITTED = ('/clock', '/fault_events', '/parameter_events', '/rosout')
-"""Topics that are not reported."""
 
 
 Published: TypeAlias = Callable[[Any, Any], None]
@@ -107,7 +106,7 @@ class Traffic:
                 if get_ident() != thread:
                     topic = self.topic_name
                     heard = bool(deliveries.readers_of(topic) or observers_of(topic))
-                    note_thread(self, f'publishes {topic}', heard=heard and topic not in OMITTED)
+                    note_thread(self, f'publishes {topic}', heard=heard and topic not in NOT_OF_ROBOTS)
                 if (intercept := traffic.intercept) is not None and intercept(self, msg):
                     return
                 publish(self, msg)
@@ -158,7 +157,7 @@ class Traffic:
         return sum(
             record.count
             for publisher, record in self._records.items()
-            if record.topic not in OMITTED and _subscriptions(publisher) > len(record.readers)
+            if record.topic not in NOT_OF_ROBOTS and _subscriptions(publisher) > len(record.readers)
         )
 
     def note_external(self, source: ExternalSource, messages: Values[bytes]) -> None:
@@ -206,7 +205,7 @@ class Traffic:
         published = [
             (record.topic, names.get(publisher, 'a destroyed publisher'), record)
             for publisher, record in self._records.items()
-            if record.topic not in OMITTED
+            if record.topic not in NOT_OF_ROBOTS
         ] + [
             (topic, 'other processes', record)
             for topic, record in self._external.items()
@@ -222,7 +221,7 @@ class Traffic:
         for node in nodes:
             for subscription in node.subscriptions:
                 topic = subscription.topic_name
-                if topic not in active and topic not in OMITTED:
+                if topic not in active and topic not in NOT_OF_ROBOTS:
                     subscribers.setdefault(topic, []).append(node.get_fully_qualified_name())
         lines += [
             f'  {topic}: no message; subscribed by {", ".join(dict.fromkeys(names))}'

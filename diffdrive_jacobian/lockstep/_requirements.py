@@ -13,8 +13,8 @@ from diffdrive_jacobian.lockstep._disturbed import Disturbed
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._injection import Injectable
 from diffdrive_jacobian.lockstep._messaging import described
-from diffdrive_jacobian.lockstep._report import OMITTED
 from diffdrive_jacobian.lockstep._requirement import Required, Requirement
+from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.ros.rclpy_internals import SERVICES_OF_RCLPY
 
 
@@ -90,7 +90,7 @@ class Requirements(Disturbed):
         for requirement, names in expected:
             # One that was violated has observed something, or its absence.
             if id(requirement) in left and self._offered.isdisjoint(names):
-                known = ', '.join(sorted(self._offered.difference(OMITTED))) or 'none'
+                known = ', '.join(sorted(self._offered.difference(NOT_OF_ROBOTS))) or 'none'
                 raise LockstepError(
                     f'{requirement} observes {" and ".join(names)}, which no node has offered; topics '
                     f'and services: {known}'

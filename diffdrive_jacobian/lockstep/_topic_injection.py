@@ -12,8 +12,8 @@ from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._fault_log import Hits
 from diffdrive_jacobian.lockstep._gated_reader import GatedReader, Stage
 from diffdrive_jacobian.lockstep._injection_base import InjectionBase, full_name
+from diffdrive_jacobian.messages.topics import CLOCK
 
-CLOCK = '/clock'
 """Topic whose messages lockstep replaces."""
 Filter = Callable[[int, bytes], Iterable[tuple[int, bytes]]]
 """Receives a world time (ns) and a message, returns messages with their delays (ns)."""

@@ -25,6 +25,7 @@ from diffdrive_jacobian.lockstep._messaging import described
 from diffdrive_jacobian.lockstep._processes import Processes
 from diffdrive_jacobian.lockstep._requirements import Requirements
 from diffdrive_jacobian.lockstep._simulated_time import checked_nanoseconds
+from diffdrive_jacobian.messages.topics import CLOCK
 from diffdrive_jacobian.ros.fastdds_profiles import withdraw
 from diffdrive_jacobian.ros.rclpy_internals import refuse_init, wrap_sleep
 from diffdrive_jacobian.ros.runner import UserError, environment, ros_context
@@ -121,7 +122,7 @@ class Lockstep(Requirements, Processes):
         self._traffic.start(self._executor.deliveries, self._executor.note_thread)
         self._closing.callback(self._traffic.close)
         self.node = Node('lockstep', start_parameter_services=False, enable_rosout=False)
-        self._executor.clocks.publisher = self.node.create_publisher(Clock, '/clock', 1)
+        self._executor.clocks.publisher = self.node.create_publisher(Clock, CLOCK, 1)
         self._executor.add(self.node)
         Lockstep._open = self
         self._publish_clock()
@@ -221,9 +222,7 @@ class Lockstep(Requirements, Processes):
 
     def _on_registered(self, node: Node) -> None:
         self._check_sim_time(node)
-        if node is not self.node and any(
-            publisher.topic_name == '/clock' for publisher in node.publishers
-        ):
+        if node is not self.node and any(publisher.topic_name == CLOCK for publisher in node.publishers):
             name = node.get_fully_qualified_name()
             raise LockstepError(f'node {name} publishes /clock, which only lockstep may do')
         self._refuse_sleep(node)

@@ -16,7 +16,7 @@ from diffdrive_jacobian.messages.structure import (
     BIG_ENDIAN,
     COUNT,
     ENCAPSULATION,
-    LITTLE_ENDIAN,
+    PLAIN,
     Array,
     FieldType,
     Number,
@@ -111,7 +111,7 @@ class Reader:
 
     def _read_new(self, data: bytes) -> tuple[Any, ...]:
         """Read a message whose layout is not known."""
-        if len(data) >= ENCAPSULATION and data[:2] not in (LITTLE_ENDIAN, BIG_ENDIAN):
+        if len(data) >= ENCAPSULATION and data[:2] not in PLAIN:
             return self._read_message(data)
         most = math.inf if self._deserialize is None else _MAX_ELEMENTS
         try:
@@ -162,7 +162,7 @@ class _Walk:
         self._missing = set(fields)
         self._whole = whole
         self._offset = ENCAPSULATION
-        self._order = '>' if data[1:2] == b'\0' else '<'
+        self._order = '>' if data[:2] == BIG_ENDIAN else '<'
         self._format = [f'{self._order}2s']
         self._formatted = 2
         self._values = 1
@@ -182,7 +182,8 @@ class _Walk:
 
     def _picker(self) -> Callable[[tuple[Any, ...]], tuple[Any, ...]]:
         picks = [self._picks[field] for field in self._fields]
-        if any(isinstance(one, list) for one in picks):
+        of_each = any(isinstance(one, list) for one in picks)
+        if of_each:
             pick: Any = _each(picks)
         else:
             # An itemgetter of one index returns no tuple.
@@ -194,7 +195,7 @@ class _Walk:
 
         # A short message has few texts, and usually the same ones as before.
         convert = _converted_before if self._offset <= _MAX_REMEMBERED else _converted
-        if texts == [0] and len(picks) > 2 and not isinstance(picks[0], list):
+        if texts == [0] and len(picks) > 2 and not of_each:
             # Such as a frame and numbers.
             text, numbers = picks[0], itemgetter(*picks[1:])
             return lambda values: (convert(values[text]), *numbers(values))

@@ -141,9 +141,9 @@ class Structure:
 FieldType: TypeAlias = Number | Text | Array | Sequence | Structure
 COUNT = Number('I')
 """The length of a string or of a sequence."""
-LITTLE_ENDIAN = b'\x00\x01'
-"""First bytes of plain CDR, version 1, little-endian."""
-BIG_ENDIAN = b'\x00\x00'
+LITTLE_ENDIAN, BIG_ENDIAN = b'\x00\x01', b'\x00\x00'
+PLAIN = (LITTLE_ENDIAN, BIG_ENDIAN)
+"""First bytes of plain CDR, version 1."""
 ENCAPSULATION = 4
 """Bytes before the first field."""
 
