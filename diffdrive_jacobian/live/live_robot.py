@@ -34,6 +34,7 @@ from diffdrive_jacobian.live.trigger_link import TriggerLink
 from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, POSE, Motion, Route, Status
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError, from_covariance
 from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.ros.remote_goal import ignores_heading
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS, seconds
@@ -100,6 +101,10 @@ class LiveRobot:
             self._on_odometry(followed['odom'], now)
         if (truth := followed['ground_truth']) is not None:
             self.state.truly_moved(seconds(truth.stamp), np.array(truth.pose), truth.twist)
+        for topic in SENSORS:
+            if topic.followed and (value := followed[topic.name]) is not None:
+                for row in topic.rows(value, self.state.wheel_names):
+                    self.state.readings.update(zip(topic.columns, row.values, strict=True))
         if (wheels := followed['joint_states']) is not None:
             try:
                 self.state.wheels = wheels.speeds(self.state.wheel_names)

@@ -40,12 +40,15 @@ class Topic:
     """Field of `Run` with its values, or ''."""
     columns: tuple[str, ...] = ()
     """Names of these values."""
+    units: tuple[str, ...] = ()
+    """Units of the columns of a sensor, which are tabulated, drawn and shown by their names. Empty: what
+    draws and shows them knows what they mean."""
     covariances: tuple[str, ...] = ()
     """Names of the values that follow them in the rows."""
     rows: Callable[[Any, Names], Iterable[Row]] = lambda value, names: ()
     """Returns the rows of a value. It raises MessageError if the value lacks what is needed."""
-    followed: str = ''
-    """What the live page calls its latest value, or ''."""
+    followed: bool = False
+    """Whether the live page looks at its latest value."""
     if_unread: str = ''
     """What to start if nobody is subscribed to it; '': nothing."""
     if_unpublished: str = ''
@@ -62,6 +65,11 @@ class Topic:
     def base_name(self) -> str:
         """The name without namespace."""
         return self.name.removeprefix('/')
+
+    @property
+    def readings(self) -> dict[str, str]:
+        """Names and units of the columns of a sensor; {}: it is none."""
+        return dict(zip(self.columns, self.units, strict=True)) if self.units else {}
 
     @property
     def readable(self) -> bool:
@@ -159,7 +167,7 @@ TOPICS = {
             columns=_POSE + _TWIST,
             covariances=_OF_POSE + _OF_TWIST,
             rows=_odometry,
-            followed='odometry',
+            followed=True,
             if_unpublished='start virtual_robot or the driver of your robot',
             if_several='their poses alternate; stop one of them, or give each robot a namespace '
             '(-r __ns:=/NAME)',
@@ -170,7 +178,7 @@ TOPICS = {
             series='ground_truth',
             columns=_POSE + _TWIST,
             rows=_motion,
-            followed='truth',
+            followed=True,
         ),
         Topic(
             name='start_pose',
@@ -222,7 +230,7 @@ TOPICS = {
             series='wheels',
             columns=_WHEELS,
             rows=_wheels,
-            followed='wheels',
+            followed=True,
         ),
         Topic(name=TRANSFORMS),
         Topic(name=PARAMETER_EVENTS, codecs=(codecs.PARAMETER_EVENT,), of_robot=False),
@@ -238,5 +246,7 @@ OF_EVERY_NODE = (PARAMETER_EVENTS, ROSOUT)
 """Topics that every node publishes."""
 NOT_OF_ROBOTS = tuple(topic.name for topic in TOPICS.values() if not topic.of_robot)
 """Topics that do not belong to the behaviour of the nodes."""
+SENSORS = [topic for topic in TOPICS.values() if topic.units]
+"""Topics whose values are tabulated, drawn and shown by their names."""
 READABLE = {topic.base_name: topic for topic in TOPICS.values() if topic.readable}
 """Topics from which a run is read, by their names without namespace."""
