@@ -24,6 +24,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.text import printable
 
 JOURNAL = '.journal'
@@ -59,7 +60,7 @@ def journal_of(bag: Path) -> Path:
     return bag.with_name(bag.name + JOURNAL)
 
 
-class JournalError(Exception):
+class JournalError(DiffdriveError):
     """A file is not a journal, or a record in it is invalid."""
 
 

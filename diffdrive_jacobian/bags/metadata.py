@@ -20,6 +20,7 @@ from diffdrive_jacobian.bags.bounded_reader import parse_bounded_qos
 from diffdrive_jacobian.bags.files import NotARegularFileError, check_regular
 from diffdrive_jacobian.bags.storage import STORAGES
 from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, TooLargeError, load_yaml
+from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.text import printable
 
 LATEST_VERSION = 9
@@ -31,7 +32,7 @@ _COMPRESSIONS = ('', 'none', 'file', 'message', 'storage')
 _INT64 = 2**63
 
 
-class DamagedError(ValueError):
+class MetadataError(DiffdriveError, ValueError):
     """A value in a bag is invalid; the message says which, what it is, and what is allowed."""
 
 
@@ -43,7 +44,7 @@ def check_metadata(source: Path | str) -> None:
 
     Raises:
         OSError: The file cannot be read.
-        DamagedError: It, or a data file that it lists, is not a regular file; or it is not YAML of
+        MetadataError: It, or a data file that it lists, is not a regular file; or it is not YAML of
             moderate size; or one of its values is invalid.
     """
     try:
@@ -51,11 +52,11 @@ def check_metadata(source: Path | str) -> None:
             check_regular(source)
         found = load_yaml(source)
     except NotARegularFileError as error:
-        raise DamagedError(str(error)) from error
+        raise MetadataError(str(error)) from error
     except TooLargeError as error:
-        raise DamagedError(f'metadata.yaml is too large: {error}') from error
+        raise MetadataError(f'metadata.yaml is too large: {error}') from error
     except YAML_ERRORS as error:
-        raise DamagedError(f'metadata.yaml is not valid YAML: {printable(error, 120)}') from error
+        raise MetadataError(f'metadata.yaml is not valid YAML: {printable(error, 120)}') from error
     whole = _mapping(found, '')
     root = _mapping(_required(whole, ROOT, ''), ROOT)
     _integer(_required(root, 'version', ''), 'version', 1, LATEST_VERSION)
@@ -95,7 +96,7 @@ def _check_data_file(path: Path) -> None:
     try:
         check_regular(path)
     except NotARegularFileError as error:
-        raise DamagedError(str(error)) from error
+        raise MetadataError(str(error)) from error
     except OSError:
         # rosbags reports a file that is missing.
         pass
@@ -123,7 +124,7 @@ def check_custom_data(custom: object) -> dict[str, str]:
     """Return custom data, {} for None.
 
     Raises:
-        DamagedError: It is not a map of texts.
+        MetadataError: It is not a map of texts.
     """
     custom = {} if custom is None else custom
     if not isinstance(custom, dict) or not all(isinstance(one, str) for one in _flat(custom)):
@@ -139,14 +140,14 @@ def parse_parameters(key: str, text: str) -> dict[str, Any]:
         text: Its value.
 
     Raises:
-        DamagedError: It is not a JSON object.
+        MetadataError: It is not a JSON object.
     """
     try:
         values = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise DamagedError(f'the {printable(key)} are not JSON: {printable(error)}') from error
+        raise MetadataError(f'the {printable(key)} are not JSON: {printable(error)}') from error
     if not isinstance(values, dict):
-        raise DamagedError(
+        raise MetadataError(
             f'the {printable(key)} must be a JSON object, got {printable(repr(text), 40)}'
         )
     return values
@@ -163,22 +164,22 @@ def check_connections(described: Iterable[Connection], stored: Iterable[Connecti
         stored: The topics of the data files. They are the same if the bag is a single file.
 
     Raises:
-        DamagedError: A topic's name or type is not text, or a topic with messages is not described.
+        MetadataError: A topic's name or type is not text, or a topic with messages is not described.
     """
     described, stored = list(described), list(stored)
     for connection in [*described, *stored]:
         for what, value in (('name', connection.topic), ('type', connection.msgtype)):
             if not isinstance(value, str) or not value:
-                raise DamagedError(f'the {what} of a topic must be text, got {printable(repr(value))}')
+                raise MetadataError(f'the {what} of a topic must be text, got {printable(repr(value))}')
         if not isinstance(connection.ext, ConnectionExtRosbag2):
-            raise DamagedError(f'{printable(connection.topic)} is not a topic of ROS 2')
+            raise MetadataError(f'{printable(connection.topic)} is not a topic of ROS 2')
     by_name = defaultdict(list)
     for connection in described:
         by_name[connection.topic, connection.msgtype].append(connection)
     for connection in stored:
         candidates = by_name[connection.topic, connection.msgtype]
         if connection.msgcount and not any(_alike(connection, one) for one in candidates):
-            raise DamagedError(
+            raise MetadataError(
                 f'metadata.yaml does not describe the topic {printable(connection.topic)} of '
                 f'{printable(connection.msgtype)} as the data file does '
                 '(name, type, type hash, QoS, serialization)'
@@ -197,12 +198,12 @@ def _alike(stored: Connection, described: Connection) -> bool:
 
 def _required(mapping: dict[str, Any], key: str, where: str) -> Any:
     if key not in mapping:
-        raise DamagedError(f'metadata.yaml lacks {f"{where}.{key}" if where else key}')
+        raise MetadataError(f'metadata.yaml lacks {f"{where}.{key}" if where else key}')
     return mapping[key]
 
 
-def _wrong(where: str, allowed: str, got: object) -> DamagedError:
-    return DamagedError(
+def _wrong(where: str, allowed: str, got: object) -> MetadataError:
+    return MetadataError(
         f'metadata.yaml: {where or "its content"} must be {allowed}, got {printable(repr(got), 40)}'
     )
 

@@ -28,6 +28,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from diffdrive_jacobian.control.sampling import rate_warning
+from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import (
     Finite,
@@ -51,7 +52,7 @@ _GAIN = re.compile(r'[a-z][a-z0-9_]{0,31}')
 LARGEST_GAIN = 100.0
 
 
-class LawError(ValueError):
+class LawError(DiffdriveError, ValueError):
     """A law raised an exception or returned something other than two finite numbers."""
 
 

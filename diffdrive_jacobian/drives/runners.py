@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
-from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.errors import DiffdriveError, UserError
 from diffdrive_jacobian.ros.runner import Runner, discovery_off, ros_context, running
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ NAME = 'drive_to'
 """Name of the node that sends the goals."""
 
 
-class DriveError(Exception):
+class DriveError(DiffdriveError):
     """A drive in simulated time was aborted. The message says why."""
 
 

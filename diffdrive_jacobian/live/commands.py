@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, NoReturn
 
+from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION, MAX_SPEED
 from diffdrive_jacobian.numerics.fields import Check, Checked, optional
 from diffdrive_jacobian.text import printable
@@ -25,7 +26,7 @@ MIN_WORLD_SPEED = 0.01
 """Smallest such speed."""
 
 
-class CommandError(ValueError):
+class CommandError(DiffdriveError, ValueError):
     """The page sent something that is no command. The message says what is wrong."""
 
 

@@ -17,6 +17,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
+from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.text import printable
 
 MAX_LENGTH = 256
@@ -24,7 +25,7 @@ MAX_LENGTH = 256
 NOT_EMPTY = f'not empty and at most {MAX_LENGTH} characters'
 
 
-class ParameterError(ValueError):
+class ParameterError(DiffdriveError, ValueError):
     """Invalid parameters. The message names the parameter, its value and its range."""
 
 

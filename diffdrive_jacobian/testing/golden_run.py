@@ -18,6 +18,7 @@ from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
 from diffdrive_jacobian.bags.qos import from_rosbags
+from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.testing.differences import Comparison, TopicDifference
 from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
@@ -29,7 +30,7 @@ MAX_TOPICS = 8
 """Number of topics with differences that are listed."""
 
 
-class GoldenRunError(AssertionError):
+class GoldenRunError(DiffdriveError, AssertionError):
     """A run differs from its golden run, or there is none."""
 
 

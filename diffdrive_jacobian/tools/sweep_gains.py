@@ -12,7 +12,7 @@ from typing import Any
 
 from diffdrive_jacobian.control import Controller, ControllerError
 from diffdrive_jacobian.control.controllers import BUILT_IN, CONTROLLERS
-from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.errors import DiffdriveError, UserError
 from diffdrive_jacobian.parameters.declaration import from_ros
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.plots import sweep_figure
@@ -26,7 +26,7 @@ from diffdrive_jacobian.tools._waiting import busy
 PROGRAM = 'sweep_gains'
 
 
-class InterruptedByUserError(Exception):
+class SweepInterruptedError(DiffdriveError):
     """A signal was caught."""
 
 
@@ -54,7 +54,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         if options.output is None and options.csv is None:
             # Other processes that started in the same second may have taken the names meanwhile.
             picture, numbers = _files(options)
-    except InterruptedByUserError:
+    except SweepInterruptedError:
         print(f'{PROGRAM}: interrupted: nothing was written', file=sys.stderr)
         return _cli.INTERRUPTED
     except (ValueError, UserError, FileExistsError) as error:
@@ -80,7 +80,7 @@ def _sweep(options: argparse.Namespace, signals: Signals) -> Sweep:
     Raises:
         ValueError: The options are invalid together.
         UserError: The parameter file is invalid.
-        InterruptedByUserError: A signal was caught.
+        SweepInterruptedError: A signal was caught.
     """
     setup = Setup(
         controller=options.controller,
@@ -129,9 +129,9 @@ def _gains(options: argparse.Namespace) -> dict[str, float | tuple[float, float]
 
 
 def _check(signals: Signals) -> None:
-    """Raise InterruptedByUserError if a signal was caught."""
+    """Raise SweepInterruptedError if a signal was caught."""
     if signals.count:
-        raise InterruptedByUserError
+        raise SweepInterruptedError
 
 
 def _robot(options: argparse.Namespace) -> RobotModel:
