@@ -22,7 +22,6 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.faults import ClockPause, Kill, Loss, TimeJump
-from diffdrive_jacobian.lockstep import Answers, Every, Idle, Lockstep, LockstepError, PropertyViolation
 from diffdrive_jacobian.lockstep import _external_process as external_process
 from diffdrive_jacobian.lockstep._external_answers import AnswersDue, TicksDue
 from diffdrive_jacobian.lockstep._external_topic import ExternalTopic
@@ -30,6 +29,7 @@ from diffdrive_jacobian.lockstep._report import Traffic
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.properties import NeverFasterThan
+from diffdrive_jacobian.testing import Answers, Every, Idle, Lockstep, LockstepError, PropertyViolation
 
 SECOND = 1_000_000_000
 SCRIPT = external_nodes.__file__

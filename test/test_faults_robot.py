@@ -29,12 +29,12 @@ from diffdrive_jacobian.faults.robot import (
 )
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.kinematics.se2 import compose, integrate, inverse, wrap_angle
-from diffdrive_jacobian.lockstep import LockstepError
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.simulation import Robot, RobotModel
 from diffdrive_jacobian.simulation.actuators import SETTLED, STEP, Actuators
 from diffdrive_jacobian.simulation.encoders import Encoders
 from diffdrive_jacobian.simulation.slip import Drift
+from diffdrive_jacobian.testing import LockstepError
 
 SECOND = 1_000_000_000
 R, L = 0.033, 0.16

@@ -10,7 +10,8 @@ from faults_nodes import Relay, Sink, Source, whats
 from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
-from diffdrive_jacobian.testing import LockstepError, faults
+from diffdrive_jacobian import faults
+from diffdrive_jacobian.testing import LockstepError
 
 INF = float('inf')
 

@@ -51,7 +51,7 @@ def in_lockstep(ros_arguments: Sequence[str] = ()) -> Iterator[LockstepRunner]:
         DriveError: A callback blocks, or simulated time cannot advance for another reason.
     """
     # Slow to import.
-    from diffdrive_jacobian.lockstep import LockstepError
+    from diffdrive_jacobian.lockstep._errors import LockstepError
     from diffdrive_jacobian.lockstep.runner import running_in_lockstep
 
     with ExitStack() as stack:

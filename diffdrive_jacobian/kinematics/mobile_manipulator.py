@@ -28,6 +28,8 @@ from diffdrive_jacobian.numerics.elementary import cos, product, sin
 from diffdrive_jacobian.numerics.fields import Checked
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
+__all__ = ['MobileManipulator', 'mobile_manipulator_jacobian']
+
 
 @formula('(),(n),(n),(2),(),() -> (3,k)')
 def mobile_manipulator_jacobian(

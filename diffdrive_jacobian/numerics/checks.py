@@ -14,6 +14,18 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.numerics.fields import short
 
+__all__ = [
+    'between',
+    'finite',
+    'not_negative',
+    'not_negative_or_infinite',
+    'not_positive_or_infinite',
+    'offset',
+    'positive',
+    'positive_or_infinite',
+    'semidefinite',
+]
+
 MAX_NANOSECONDS = 2**63 - 1
 """Largest time of ROS clocks (ns)."""
 FLOAT64 = np.dtype(np.float64)
