@@ -139,9 +139,9 @@ def test_corruption_and_faults_of_the_robot(schedule):
     ('arguments', 'words'),
     [
         ({}, 'needs topics, nodes'),
-        ({'fields': {'odom': 'x'}}, 'odom must be a list'),
+        ({'fields': {'odom': 'x'}}, "odom must be a list or tuple of names, got 'x'"),
         ({'fields': ['odom']}, r"fields must be a dict .* got \['odom'\]"),
-        ({'topics': 'odom'}, 'a list of names'),
+        ({'topics': 'odom'}, 'topics must be a list or tuple of names, got .odom'),
         ({'topics': ['odom'], 'max_faults': 0}, 'max_faults'),
         ({'topics': ['odom'], 'duration': math.inf}, 'duration'),
         ({'kinds': [faults.Loss]}, 'Loss needs topics'),

@@ -511,10 +511,10 @@ def test_a_domain_with_a_port_in_use_is_not_chosen(monkeypatch):
         ),
         (
             lambda: Answers('cmd_vel', to='odom', within=0.0),
-            'within must be positive and finite, got 0.0',
+            'within must be finite and at least 1e-09 s, got 0.0',
         ),
-        (lambda: Every('cmd_vel', math.inf), 'period must be positive and finite, got inf'),
-        (lambda: Every('cmd_vel', 1e-10), 'period must be at least 1e-9 s, got 1e-10'),
+        (lambda: Every('cmd_vel', math.inf), 'period must be finite and at least 1e-09 s, got inf'),
+        (lambda: Every('cmd_vel', 1e-10), 'period must be finite and at least 1e-09 s, got 1e-10'),
         (
             lambda: Every('cmd_vel', 0.1, created=-1.0),
             'created must be zero or positive and finite, got -1.0',

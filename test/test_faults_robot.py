@@ -580,7 +580,7 @@ def test_a_fault_without_a_robot_is_reported_and_one_of_another_node_refused(loc
         (lambda: Push(noticed=1), 'noticed must be True or False, got 1'),
         (
             lambda: WrongGeometry(wheel_separation_multiplier=0.0),
-            'must be between 0.01 and 100, got 0.0',
+            'must be in [0.01, 100], got 0.0',
         ),
         (lambda: Slip(robot=''), 'robot must be a string that is not empty'),
     ],

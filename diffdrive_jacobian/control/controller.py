@@ -36,11 +36,10 @@ from diffdrive_jacobian.numerics.checks import (
     boolean,
     finite,
     function,
-    instance,
     number,
     numbers,
 )
-from diffdrive_jacobian.numerics.fields import Checked, Text, optional, short
+from diffdrive_jacobian.numerics.fields import Checked, Text, between, instance, optional, short
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 Law = Callable[..., tuple[Any, ...]]
@@ -74,7 +73,7 @@ class Gain(Checked):
     bounds: tuple[float, float] = (-LARGEST_GAIN, LARGEST_GAIN)
     """Smallest and largest value."""
     above: Annotated[float | None, optional(partial(number, check=finite))] = None
-    """Lower bound that is itself not allowed, instead of the smallest value."""
+    """Lower bound that is itself not allowed, besides `bounds`."""
     label: Text = ''
     """Label on the page; default: the name."""
     usual: tuple[float, float] = (math.nan, math.nan)
@@ -106,10 +105,7 @@ class Gain(Checked):
 
     def check(self, value: float) -> None:
         """Raise ValueError if a value is not allowed."""
-        low, high = self.bounds
-        if not low <= value <= high or (self.above is not None and not value > self.above):
-            allowed = f'[{low:g}, ' if self.above is None else f'({self.above:g}, '
-            raise ValueError(f'{self.name} must be in {allowed}{high:g}], got {value:g}')
+        between(*self.bounds, above=self.above)(self.name, value)
 
 
 KP = Gain(

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING
 
 from diffdrive_jacobian.control.controller import Controller, Law
 from diffdrive_jacobian.errors import DiffdriveError
-from diffdrive_jacobian.numerics.checks import instance
-from diffdrive_jacobian.numerics.fields import short
+from diffdrive_jacobian.numerics.fields import instance, short
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint

@@ -16,6 +16,7 @@ from diffdrive_jacobian.calibration.description import (
     parameter_file,
 )
 from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.numerics.fields import between
 from diffdrive_jacobian.plots.calibration_figure import draw
 from diffdrive_jacobian.plots.output_files import create, new_file
 from diffdrive_jacobian.reading.calibration_data import (
@@ -162,6 +163,7 @@ def _nominal(options: argparse.Namespace, read: Sequence[WheelsAndReference]) ->
 
     Raises:
         UserError: They are unknown, or differ between the bags.
+        ValueError: They are out of range.
     """
     radius, separation = options.wheel_radius, options.wheel_separation
     if radius is None or separation is None:
@@ -180,12 +182,8 @@ def _nominal(options: argparse.Namespace, read: Sequence[WheelsAndReference]) ->
         known = recorded.pop()
         radius = known[0] if radius is None else radius
         separation = known[1] if separation is None else separation
-    for name, value, (low, high) in (
-        ('wheel radius', radius, RADIUS_BOUNDS),
-        ('wheel separation', separation, SEPARATION_BOUNDS),
-    ):
-        if not low <= value <= high:
-            raise UserError(f'the {name} must be from {low:g} to {high:g} m, got {value:g}')
+    between(*RADIUS_BOUNDS, unit='m')('the wheel radius', radius)
+    between(*SEPARATION_BOUNDS, unit='m')('the wheel separation', separation)
     return Geometry(wheel_radius=radius, wheel_separation=separation)
 
 
@@ -200,12 +198,8 @@ def _given(options: argparse.Namespace) -> Given:
     )
 
 
-def _noise(text: str) -> float:
-    """Parse a noise that squares and inverses of floats can represent."""
-    value = _cli.positive(text)
-    if not 1e-12 <= value <= 1e3:
-        raise argparse.ArgumentTypeError(f'must be from 1e-12 to 1000, got {text.strip()!r}')
-    return value
+_noise = _cli.number_that(between(1e-12, 1e3))
+"""Parses a noise that squares and inverses of floats can represent."""
 
 
 def _parser() -> _cli.Parser:

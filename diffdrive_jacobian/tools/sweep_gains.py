@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,7 +18,7 @@ from diffdrive_jacobian.plots import sweep_figure
 from diffdrive_jacobian.plots.output_files import FORMATS, create, extension, free_stem, new_file
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.simulation import RobotModel
-from diffdrive_jacobian.sweeps.sweep import Setup, Sweep, describe, sweep, table
+from diffdrive_jacobian.sweeps.sweep import MAX_LOOPS, Setup, Sweep, describe, sweep, table
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._waiting import busy
 
@@ -197,13 +196,6 @@ def _cannot_write(path: object, error: OSError) -> int:
     return _cli.FAILED
 
 
-def _whole(text: str) -> int:
-    text = text.strip()
-    if not re.fullmatch('-?[0-9]{1,9}', text):
-        raise argparse.ArgumentTypeError(f'must be a whole number below a billion, got {text!r}')
-    return int(text)
-
-
 def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
@@ -219,14 +211,14 @@ def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:
     parser.add_argument(
         '--grid',
         metavar='N',
-        type=_whole,
+        type=_cli.integer_from(2, MAX_LOOPS),
         default=usual.grid,
         help='number of values of each gain (default: %(default)s)',
     )
     parser.add_argument(
         '--starts',
         metavar='N',
-        type=_whole,
+        type=_cli.integer_from(1, MAX_LOOPS),
         default=usual.starts,
         help='number of start poses, evenly spaced around the goal, with headings in all directions '
         '(default: %(default)s)',
