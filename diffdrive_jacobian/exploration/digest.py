@@ -9,7 +9,7 @@ from typing import Any
 from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message
 
-from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.fields import is_identifier, plain, walk
 from diffdrive_jacobian.messages.structure import (
     Array,

@@ -56,6 +56,8 @@ from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import nanoseconds, seconds
 
+__all__ = ['VirtualRobot']
+
 
 class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
     """Node that subscribes to `cmd_vel` or `joint_command` and publishes `odom`, `joint_states`,
