@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import suppress
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 from rclpy.serialization import deserialize_message
@@ -13,6 +12,7 @@ from rclpy.serialization import deserialize_message
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader
 from diffdrive_jacobian.messages.codecs import POSE_IN, TWIST_IN, pose_fields, twist_fields
+from diffdrive_jacobian.messages.fields import field_value
 from diffdrive_jacobian.messages.structure import structure
 
 
@@ -61,7 +61,7 @@ class FieldReader:
     def __init__(self, fields_of: Callable[[type], tuple[str, ...]]) -> None:
         """Start without a type. `fields_of` returns the paths of the fields of a type of messages."""
         self._fields_of = fields_of
-        self._readers: dict[type, tuple[Callable[..., Any], Callable[..., Any]]] = {}
+        self._readers: dict[type, tuple[tuple[str, ...], Reader]] = {}
         self._last: tuple[type, bytes, tuple[Any, ...] | None] | None = None
 
     def read(self, message_type: type, message: Any) -> tuple[Any, ...] | None:
@@ -72,13 +72,13 @@ class FieldReader:
         if message_type not in self._readers:
             fields = self._fields_of(message_type)
             reader = Reader(message_type, fields, deserialize=deserialize_message)
-            self._readers[message_type] = reader, attrgetter(*fields)
-        from_bytes, from_object = self._readers[message_type]
+            self._readers[message_type] = fields, reader
+        fields, read = self._readers[message_type]
         if not isinstance(message, bytes):
-            return tuple(from_object(message))
+            return tuple(field_value(message, field) for field in fields)
         values: tuple[Any, ...] | None = None
         with suppress(DecodingError):
-            values = from_bytes(message)
+            values = read(message)
         self._last = message_type, message, values
         return values
 
