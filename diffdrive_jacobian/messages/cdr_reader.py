@@ -27,6 +27,7 @@ from diffdrive_jacobian.messages.structure import (
     check_plain,
     least_size,
     structure,
+    uniform_size,
 )
 
 _MAX_LAYOUTS = 16
@@ -35,8 +36,8 @@ _MAX_VALUES = 256
 """Largest number of values of a layout that is kept."""
 _MAX_ELEMENTS = 64
 """Most strings or structures in a sequence that are read one by one. For more, rclpy takes less time."""
-_MAX_WALKED = 500_000
-"""Most strings and structures in the sequences of one message. More take seconds."""
+_MAX_WALKED = 100_000
+"""Most strings and structures of one message that are visited one by one. More take seconds."""
 _MAX_REMEMBERED = 1024
 """Largest message whose texts are remembered (bytes)."""
 
@@ -254,6 +255,14 @@ class _Walk:
         if isinstance(kind, Number):
             self._numbers(kind, count, path, many=True)
             return
+        inner = f'{path}[]'
+        unit = uniform_size(kind)
+        if unit and not any(one.startswith(inner) for one in self._missing):
+            # Such as points, which are doubles without padding.
+            if count:
+                self._align(unit)
+            self._take('', count * least_size(kind))
+            return
         if count > self._most:
             raise _ManyElementsError
         self._walked += count
@@ -266,7 +275,6 @@ class _Walk:
             # Each string comes after its length.
             self._found(path, slice(first + 1, self._values, 2), is_text=True)
             return
-        inner = f'{path}[]'
         for _ in range(count):
             self._walk(kind, inner)
         self._missing.difference_update([one for one in self._missing if one.startswith(inner)])

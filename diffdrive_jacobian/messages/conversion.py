@@ -16,7 +16,7 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
     from builtin_interfaces.msg import Time
@@ -123,8 +123,8 @@ def set_pose(message: Pose, pose: NDArray[np.float64]) -> None:
     message.orientation.z, message.orientation.w = math.sin(theta / 2.0), math.cos(theta / 2.0)
 
 
-def from_covariance(covariance: Sequence[float]) -> NDArray[np.float64]:
-    """Return a covariance of x, y and yaw, shape (3, 3), from its nine entries.
+def from_covariance(covariance: ArrayLike) -> NDArray[np.float64]:
+    """Return a covariance of x, y and yaw, shape (3, 3), from its nine entries, row by row.
 
     Raises:
         MessageError: It is not finite, symmetric and positive semidefinite.

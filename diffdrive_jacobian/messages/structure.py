@@ -269,6 +269,20 @@ def check_plain(kind: FieldType) -> None:
 
 
 @cache
+def uniform_size(kind: FieldType) -> int:
+    """Return the size of each number of a value that has nothing but numbers of one size; 0: it has."""
+    match kind:
+        case Number():
+            return kind.size
+        case Array():
+            return uniform_size(kind.element) if kind.count else 0
+        case Structure() if kind.fields:
+            sizes = {uniform_size(one) for _, one in kind.fields}
+            return sizes.pop() if len(sizes) == 1 else 0
+    return 0
+
+
+@cache
 def least_size(kind: FieldType) -> int:
     """Return a lower bound of the encoded size of a value (bytes)."""
     match kind:
