@@ -171,7 +171,10 @@ def test_properties_are_values(one, expression):
             lambda: NeverFasterThan(1.0, 2.0, topic=''),
             "topic must be a string that is not empty, got ''",
         ),
-        (lambda: StatusProtocol(goals='goal_pose'), "goals must be a tuple of names, got 'goal_pose'"),
+        (
+            lambda: StatusProtocol(goals='goal_pose'),
+            "goals must be a list or tuple of names, got 'goal_pose'",
+        ),
         (lambda: StatusProtocol(namespace=1), 'namespace must be a string, got 1'),
         (
             lambda: StaysWithin((1, 0), (0, 1)),
