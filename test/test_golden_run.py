@@ -198,7 +198,7 @@ def test_the_arguments_of_check_are_checked(golden):
     run = golden(0.0)
     for tolerance in (-1.0, math.nan, math.inf):
         with pytest.raises(
-            ValueError, match=f'tolerance must be finite and not negative, got {tolerance}'
+            ValueError, match=f'tolerance must be finite and at least 0, got {tolerance}'
         ):
             run.check(tolerance=tolerance)
     for without in ('/odom', ['odom'], ['/a', 'b']):
