@@ -12,13 +12,28 @@ from typing import TYPE_CHECKING
 from diffdrive_jacobian import lazy
 
 if TYPE_CHECKING:
+    from diffdrive_jacobian.plots.derivation_figures import figure_1, figure_2, figure_3, figure_4
     from diffdrive_jacobian.plots.geometry_figure import geometry
+    from diffdrive_jacobian.plots.velocity_ellipses_figure import velocity_ellipses
 
 __all__ = [
+    'figure_1',
+    'figure_2',
+    'figure_3',
+    'figure_4',
     'geometry',
+    'velocity_ellipses',
 ]
 _PICTURES = {
     'geometry': ('geometry_figure', 'the robot from above with its symbols, and the point at d (B, E)'),
+    'figure_1': ('derivation_figures', 'figure 1 of E: the robot along the x axis'),
+    'figure_2': ('derivation_figures', 'figure 2 of E: the frames, C half way between C_1 and C_2'),
+    'figure_3': ('derivation_figures', 'figure 3 of E: a wheel that rolls, and its contact P'),
+    'figure_4': ('derivation_figures', 'figure 4 of E: the frames of the wheels on the rigid axle'),
+    'velocity_ellipses': (
+        'velocity_ellipses_figure',
+        'velocities of the axle, a line, and of points at d, a circle at L/2 (B)',
+    ),
 }
 """The pictures: the module with the function of that name, and what it draws."""
 PICTURES = {name: what for name, (_, what) in _PICTURES.items()}
