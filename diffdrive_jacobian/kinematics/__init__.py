@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         inverse_velocity,
         mobile_manipulator,
         planar_arm,
+        rigid_body,
         se2,
         spatial,
     )
@@ -33,6 +34,7 @@ __all__ = [
     'mobile_manipulator',
     'numerical_jacobian',
     'planar_arm',
+    'rigid_body',
     'se2',
     'spatial',
 ]

@@ -1,4 +1,29 @@
-"""Figures and tables of runs and sweeps, their style and their files. No ROS is needed.
+"""Pictures of the five documents, each drawn by one function; figures and tables of runs and sweeps.
 
-`run_figure.draw` draws runs, `run_table.write_csv` writes a run as CSV, `sweep_figure` draws sweeps.
+`geometry()` returns a matplotlib figure, which `plot_jacobian geometry` writes to a file. No ROS
+is needed. `run_figure.draw` draws runs, `run_table.write_csv` writes a run as CSV, `sweep_figure` draws
+sweeps.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from diffdrive_jacobian import lazy
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.plots.geometry_figure import geometry
+
+__all__ = [
+    'geometry',
+]
+_PICTURES = {
+    'geometry': ('geometry_figure', 'the robot from above with its symbols, and the point at d (B, E)'),
+}
+"""The pictures: the module with the function of that name, and what it draws."""
+PICTURES = {name: what for name, (_, what) in _PICTURES.items()}
+"""What each picture shows."""
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = lazy.attach(
+        __name__, {name: f'plots.{module}' for name, (module, _) in _PICTURES.items()}
+    )
