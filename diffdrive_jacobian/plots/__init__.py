@@ -13,16 +13,31 @@ from diffdrive_jacobian import lazy
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.plots.arm_ellipses_figure import arm_ellipses
+    from diffdrive_jacobian.plots.derivation_figures import figure_1, figure_2, figure_3, figure_4
     from diffdrive_jacobian.plots.geometry_figure import geometry
     from diffdrive_jacobian.plots.spring_figure import spring
+    from diffdrive_jacobian.plots.velocity_ellipses_figure import velocity_ellipses
 
 __all__ = [
     'arm_ellipses',
+    'figure_1',
+    'figure_2',
+    'figure_3',
+    'figure_4',
     'geometry',
     'spring',
+    'velocity_ellipses',
 ]
 _PICTURES = {
     'geometry': ('geometry_figure', 'the robot from above with its symbols, and the point at d (B, E)'),
+    'figure_1': ('derivation_figures', 'figure 1 of E: the robot along the x axis'),
+    'figure_2': ('derivation_figures', 'figure 2 of E: the frames, C half way between C_1 and C_2'),
+    'figure_3': ('derivation_figures', 'figure 3 of E: a wheel that rolls, and its contact P'),
+    'figure_4': ('derivation_figures', 'figure 4 of E: the frames of the wheels on the rigid axle'),
+    'velocity_ellipses': (
+        'velocity_ellipses_figure',
+        'velocities of the axle, a line, and of points at d, a circle at L/2 (B)',
+    ),
     'arm_ellipses': ('arm_ellipses_figure', 'velocity and force ellipses of an arm along a motion (D)'),
     'spring': ('spring_figure', 'the spring that pulls and twists an arm to its desired pose (D)'),
 }
