@@ -58,8 +58,8 @@ def shown(text):
     for at, axis in enumerate((text.axes.xaxis, text.axes.yaxis)):
         if text in axis.findobj(Text):
             low, high = sorted(axis.get_view_interval())
-            ticks = axis.get_ticklabels()
-            return text.axes.axison and (text not in ticks or low <= text.get_position()[at] <= high)
+            inside = text is axis.label or low <= text.get_position()[at] <= high
+            return text.axes.axison and inside
     return True
 
 
