@@ -42,8 +42,8 @@ def test_the_labels_of_a_picture_are_whole_and_apart(name):
         drawn = getattr(plots, name)()
         content = rendering.render(drawn, 'png')
     assert len(content) < LARGEST
-    texts = [one for one in drawn.findobj(Text) if one.get_visible() and one.get_text().strip()]
-    boxes = {one: one.get_window_extent() for one in texts if one.axes is None or shown(one)}
+    texts = {one for one in drawn.findobj(Text) if one.get_visible() and one.get_text().strip()}
+    boxes = {one: one.get_window_extent() for one in texts.difference(hidden(drawn))}
     assert boxes
     for text, box in boxes.items():
         assert drawn.bbox.x0 <= box.x0 < box.x1 <= drawn.bbox.x1, text
@@ -53,14 +53,15 @@ def test_the_labels_of_a_picture_are_whole_and_apart(name):
         assert not box.padded(-1.0).overlaps(second.padded(-1.0)), (one, other)
 
 
-def shown(text):
-    """Return whether a text is drawn: those of axes that are off, and of ticks outside, are not."""
-    for at, axis in enumerate((text.axes.xaxis, text.axes.yaxis)):
-        if text in axis.findobj(Text):
+def hidden(drawn):
+    """Return the texts of axes that are off, and of ticks outside, which are not drawn."""
+    for axes in drawn.axes:
+        for at, axis in enumerate((axes.xaxis, axes.yaxis)):
             low, high = sorted(axis.get_view_interval())
-            inside = text is axis.label or low <= text.get_position()[at] <= high
-            return text.axes.axison and inside
-    return True
+            for text in axis.findobj(Text):
+                inside = text is axis.label or low <= text.get_position()[at] <= high
+                if not (axes.axison and inside):
+                    yield text
 
 
 @pytest.mark.parametrize('name', plots.PICTURES)
