@@ -406,7 +406,10 @@ def public_page() -> str:
                 lines += [
                     f'| `{public}.{one}` | {_sentence(function)} |'
                     for one, function in sorted(vars(value).items())
-                    if getattr(function, '__module__', '') == value.__name__
+                    if (
+                        getattr(function, '__module__', '') == value.__name__
+                        or one in getattr(value, '__all__', ())
+                    )
                     and not one.startswith('_')
                     and callable(function)
                 ]

@@ -43,8 +43,8 @@ def test_the_labels_of_a_picture_are_whole_and_apart(name):
         drawn = getattr(plots, name)()
         content = rendering.render(drawn, 'png')
     assert len(content) < LARGEST
-    texts = [one for one in drawn.findobj(Text) if one.get_visible() and one.get_text().strip()]
-    boxes = {one: one.get_window_extent() for one in texts if one.axes is None or shown(one)}
+    texts = {one for one in drawn.findobj(Text) if one.get_visible() and one.get_text().strip()}
+    boxes = {one: one.get_window_extent() for one in texts.difference(hidden(drawn))}
     assert boxes
     for text, box in boxes.items():
         assert drawn.bbox.x0 <= box.x0 < box.x1 <= drawn.bbox.x1, text
@@ -54,10 +54,15 @@ def test_the_labels_of_a_picture_are_whole_and_apart(name):
         assert not box.padded(-1.0).overlaps(second.padded(-1.0)), (one, other)
 
 
-def shown(text):
-    """Return whether a text is drawn: those of axes that are off are not."""
-    axis_texts = {*text.axes.xaxis.findobj(Text), *text.axes.yaxis.findobj(Text)}
-    return text not in axis_texts or text.axes.axison
+def hidden(drawn):
+    """Return the texts of axes that are off, and of ticks outside, which are not drawn."""
+    for axes in drawn.axes:
+        for at, axis in enumerate((axes.xaxis, axes.yaxis)):
+            low, high = sorted(axis.get_view_interval())
+            for text in axis.findobj(Text):
+                inside = text is axis.label or low <= text.get_position()[at] <= high
+                if not (axes.axison and inside):
+                    yield text
 
 
 @pytest.mark.parametrize('name', plots.PICTURES)

@@ -12,16 +12,20 @@ from typing import TYPE_CHECKING
 from diffdrive_jacobian import lazy
 
 if TYPE_CHECKING:
+    from diffdrive_jacobian.plots.arm_ellipses_figure import arm_ellipses
     from diffdrive_jacobian.plots.derivation_figures import figure_1, figure_2, figure_3, figure_4
     from diffdrive_jacobian.plots.geometry_figure import geometry
+    from diffdrive_jacobian.plots.spring_figure import spring
     from diffdrive_jacobian.plots.velocity_ellipses_figure import velocity_ellipses
 
 __all__ = [
+    'arm_ellipses',
     'figure_1',
     'figure_2',
     'figure_3',
     'figure_4',
     'geometry',
+    'spring',
     'velocity_ellipses',
 ]
 _PICTURES = {
@@ -34,6 +38,8 @@ _PICTURES = {
         'velocity_ellipses_figure',
         'velocities of the axle, a line, and of points at d, a circle at L/2 (B)',
     ),
+    'arm_ellipses': ('arm_ellipses_figure', 'velocity and force ellipses of an arm along a motion (D)'),
+    'spring': ('spring_figure', 'the spring that pulls and twists an arm to its desired pose (D)'),
 }
 """The pictures: the module with the function of that name, and what it draws."""
 PICTURES = {name: what for name, (_, what) in _PICTURES.items()}
