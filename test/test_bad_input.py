@@ -56,6 +56,8 @@ FUNCTIONS = {
     diff_drive.body_to_wheel: {'v': 0.2, 'omega': 0.5, **WHEELS},
     diff_drive.wheel_to_body: {'omega_R': 2.0, 'omega_L': 3.0, **WHEELS},
     diff_drive.no_lateral_slip_constraint: {'theta': 0.5},
+    diff_drive.lie_bracket: {'theta': 0.5},
+    diff_drive.controllability_matrix: {'theta': 0.5},
     diff_drive.rolling_constraints: {'theta': 0.5, **WHEELS},
     se2.wrap_angle: {'angle': 4.0},
     se2.sinc: {'angle': 0.5},
