@@ -1,6 +1,7 @@
 """The pages of the documentation: their code blocks, how these are run, and what is generated in them.
 
     python test/pages.py parameters            write the parameter tables of doc/nodes.md
+    python test/pages.py bodies [PAGE ...]     write the bodies of functions into pages
     python test/pages.py outputs [PAGE ...]    run pages and write the outputs that they quote
     python test/pages.py public                write doc/public.md
 
@@ -20,20 +21,25 @@ a block say what differs:
     <!-- output: part -->                its lines are in what the block before printed, in this order
     <!-- output: part, exact -->         the same, with equal numbers (also without `part`)
 
-Numbers in other outputs may differ.
+Numbers in other outputs may differ. Before a `py` block, which is not run:
+
+    <!-- body: PACKAGE.MODULE.FUNCTION -->   a function of the package, without its docstring
 """
 
 from __future__ import annotations
 
+import ast
 import importlib
 import inspect
 import os
+import pkgutil
 import re
 import signal
 import subprocess
 import sys
 import sysconfig
 import tempfile
+import textwrap
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass, fields
@@ -340,6 +346,32 @@ def with_parameter_tables(text: str) -> str:
     return text
 
 
+# --- Bodies of functions
+
+BODY = re.compile(r'(<!-- body: ([\w.]+) -->\n+```py\n)(.*?)(^```$)', re.MULTILINE | re.DOTALL)
+
+
+def body(name: str) -> str:
+    """Return the source of a function or method, without decorators and docstring.
+
+    Args:
+        name: Its full name, `PACKAGE.MODULE.FUNCTION` or `PACKAGE.MODULE.CLASS.METHOD`.
+    """
+    source = textwrap.dedent(inspect.getsource(pkgutil.resolve_name(name)))
+    (function,) = ast.parse(source).body
+    assert isinstance(function, ast.FunctionDef), f'{name} is no function'
+    lines = source.splitlines(keepends=True)
+    first = function.body[0]
+    if ast.get_docstring(function) is not None:
+        del lines[first.lineno - 1 : first.end_lineno]
+    return ''.join(lines[function.lineno - 1 :])
+
+
+def with_bodies(text: str) -> str:
+    """Return a page with its bodies of functions as they should be."""
+    return BODY.sub(lambda match: match[1] + body(match[2]) + match[4], text)
+
+
 # --- Public names
 
 PUBLIC = (
@@ -396,6 +428,8 @@ def main(what: str, names: list[str]) -> None:
         new = text
         if what == 'parameters':
             new = with_parameter_tables(text)
+        elif what == 'bodies':
+            new = with_bodies(text)
         else:
             with tempfile.TemporaryDirectory() as directory:
                 for block, printed in reversed(run_page(text, Path(directory))):
@@ -410,6 +444,7 @@ if __name__ == '__main__':
     if sys.argv[1:] == ['public']:
         PAGES.get('doc/public.md', ROOT / 'doc' / 'public.md').write_text(public_page())
         sys.exit()
-    if sys.argv[1:2] not in (['parameters'], ['outputs']) or not {*sys.argv[2:]} <= {*PAGES}:
+    written = sys.argv[1:2] in (['parameters'], ['bodies'], ['outputs'])
+    if not written or not {*sys.argv[2:]} <= {*PAGES}:
         sys.exit(__doc__)
     main(sys.argv[1], sys.argv[2:])

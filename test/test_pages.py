@@ -147,6 +147,33 @@ def library():
     return names
 
 
+# --- Bodies of functions
+
+
+@pytest.mark.parametrize('name', [name for name, text in TEXTS.items() if '<!-- body' in text])
+def test_bodies_of_functions_are_as_in_the_source(name):
+    text = TEXTS[name]
+    assert text.count('<!-- body') == len(pages.BODY.findall(text)), 'a comment without its py block'
+    assert text == pages.with_bodies(text), 'python test/pages.py bodies writes them'
+
+
+def test_a_body_is_the_function_without_decorators_and_docstring():
+    place, stale = '<!-- body: diffdrive_jacobian.{} -->\n```py\n', 'of yesterday\n'
+    contact = place.format('kinematics.contact.wheel_contact_position')
+    method = place.format('kinematics.planar_arm.PlanarArm.integrate')
+    old = f'{contact}{stale}```\n\ntext\n\n{method}```\n'
+    new = pages.with_bodies(old)
+    position = """\
+def wheel_contact_position(x: Number, phi: Number, r: Number) -> Entries:
+    return [x + r * sin(phi), r + r * cos(phi), 0.0]
+"""
+    assert new.startswith(f'{contact}{position}```\n\ntext\n\n{method}def ')
+    assert stale not in new
+    assert pages.with_bodies(new) == new
+    with pytest.raises(AttributeError):
+        pages.body('diffdrive_jacobian.kinematics.contact.removed')
+
+
 # --- Nodes and tools
 
 
