@@ -376,7 +376,7 @@ def with_bodies(text: str) -> str:
 
 PUBLIC = (
     *('control', 'kinematics', 'simulation', 'sweeps', 'calibration'),
-    *('reading', 'recovery', 'replay', 'drives', 'testing', 'faults', 'properties'),
+    *('reading', 'plots', 'recovery', 'replay', 'drives', 'testing', 'faults', 'properties'),
 )
 """Packages whose `__all__` is public."""
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
         inverse_velocity,
         mobile_manipulator,
         planar_arm,
+        rigid_body,
         se2,
     )
     from diffdrive_jacobian.kinematics.mobile_manipulator import MobileManipulator
@@ -28,6 +29,7 @@ __all__ = [
     'inverse_velocity',
     'mobile_manipulator',
     'planar_arm',
+    'rigid_body',
     'se2',
 ]
 if not TYPE_CHECKING:

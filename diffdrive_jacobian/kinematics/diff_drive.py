@@ -241,6 +241,55 @@ def wheel_to_body(omega_R: Number, omega_L: Number, r: Number, L: Number) -> tup
     return v, omega
 
 
+@formula('(3),() -> (2,2)', L=positive)
+def wheel_centres(pose: Vector, L: Number) -> Rows:
+    """Return the positions of the centres of both wheels (E). The middle between them is the pose's.
+
+    They are `L/2` to the right and to the left of it, along `e_l = [sin, -cos]` and against it.
+
+    Args:
+        pose: `[x, y, theta]`, shape (..., 3).
+        L: Wheel separation, shape (...) (m).
+
+    Returns:
+        `[[x_R, y_R], [x_L, y_L]]`, shape (..., 2, 2) (m). Document E has them as `C_2` and `C_1`.
+
+    Raises:
+        ValueError: L is not positive and finite, or the pose is not finite.
+    """
+    x, y, theta = pose
+    return [
+        [x + L / 2.0 * sin(theta), y - L / 2.0 * cos(theta)],
+        [x - L / 2.0 * sin(theta), y + L / 2.0 * cos(theta)],
+    ]
+
+
+@formula('(),(3),() -> (2,2)', L=positive)
+def wheel_centre_velocities(theta: Number, q_dot: Vector, L: Number) -> Rows:
+    """Return the velocities of the centres of both wheels, `v_C + theta_dot k × CC_i` (E).
+
+    Their mean is the velocity of the axle centre C. Of wheels that roll without slip they are
+    `r omega_R e_f` and `r omega_L e_f`, along `e_f = [cos, sin]`.
+
+    Args:
+        theta: Headings, shape (...) (rad).
+        q_dot: `[x_dot, y_dot, theta_dot]` of the robot in the world, shape (..., 3) (m/s, m/s, rad/s).
+        L: Wheel separation, shape (...) (m).
+
+    Returns:
+        Velocities in the world, the right wheel's first, shape (..., 2, 2) (m/s).
+
+    Raises:
+        ValueError: L is not positive and finite, or theta or q_dot is not finite.
+    """
+    x_dot, y_dot, theta_dot = q_dot
+    turning = L / 2.0 * theta_dot
+    return [
+        [x_dot + turning * cos(theta), y_dot + turning * sin(theta)],
+        [x_dot - turning * cos(theta), y_dot - turning * sin(theta)],
+    ]
+
+
 @formula('() -> (1,3)')
 def no_lateral_slip_constraint(theta: Number) -> Rows:
     """Return the row `A(q) = [sin, -cos, 0]` with `A(q) q_dot = 0`, no lateral slip (A, E).

@@ -188,6 +188,25 @@ def homogeneous(pose: Vector) -> Rows:
     ]
 
 
+@formula('(3) -> (4,4)')
+def homogeneous_3d(pose: Vector) -> Rows:
+    """Return the homogeneous transform `H_B^W` of a pose in space, where z is up (document B).
+
+    Args:
+        pose: `[x, y, theta]`, shape (..., 3).
+
+    Returns:
+        Transforms, shape (..., 4, 4): they map `[x, y, z, 1]` in B to W.
+    """
+    x, y, theta = pose
+    return [
+        [cos(theta), -sin(theta), 0.0, x],
+        [sin(theta), cos(theta), 0.0, y],
+        [0.0, 0.0, 1.0, 0.0],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+
+
 @formula('(3),(2),() -> (3)')
 def integrate(pose: Vector, twist: Vector, dt: Number) -> Entries:
     """Return the pose after a constant twist of a unicycle, the exact arc `q * Exp(u dt)`.
