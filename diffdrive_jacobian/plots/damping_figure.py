@@ -55,7 +55,7 @@ def _draw_workspace(
     q = np.stack(np.meshgrid(around, bend), axis=-1)
     tip, factor = arm.forward_kinematics(q), _damping(arm, q, threshold, maximum)
     # Where there is no damping there is no shade.
-    levels = np.linspace(0.0, maximum, LEVELS) + [1e-6 * maximum, *[0.0] * (LEVELS - 1)]
+    levels = [1e-6 * maximum, *np.linspace(0.0, maximum, LEVELS)[1:]]
     shade = axes.contourf(tip[..., 0], tip[..., 1], factor, levels, cmap='Greys', vmax=1.5 * maximum)
     scale = drawing.colorbar(shade, ax=axes, shrink=0.8, aspect=30, pad=0.02)
     scale.set_label(r'damping $\lambda$ [m]')
@@ -90,7 +90,7 @@ def _draw_over_bend(
     with np.errstate(divide='ignore'):
         bound = SPEED / (2.0 * factor)
     speeds.semilogy(degrees, bound, color=GREY, ls=':', label=r'$|\dot x| / 2\lambda$', **style)
-    speeds.set(ylim=(0.05, 50.0), ylabel=r'$|\dot q|$ [rad/s]')
+    speeds.set(ylim=(0.05, 50.0), yticks=[0.1, 1.0, 10.0], ylabel=r'$|\dot q|$ [rad/s]')
     speeds.set_title(f'desired: {SPEED:g} m/s away from the base')
     speeds.legend(loc='upper center')
     speeds.tick_params(labelbottom=False)

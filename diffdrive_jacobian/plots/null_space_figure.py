@@ -92,7 +92,7 @@ def _draw_around(axes: Axes, without: Tracking, avoiding: Tracking) -> None:
     _draw_arm(axes, avoiding.q[-1], color=BLUE)
     axes.plot(*OBSTACLE, 'X', color=INK, ms=10.0, zorder=5)
     sketch.label(axes, 'obstacle', OBSTACLE, (-4.0, 14.0))
-    axes.set(title='tip on a line, past an obstacle', xlabel='x [m]', ylabel='y [m]')
+    axes.set(title='past an obstacle', xlabel='x [m]', ylabel='y [m]')
     axes.set_aspect('equal', adjustable='datalim')
 
 
