@@ -16,8 +16,8 @@ from diffdrive_jacobian.plots import rendering, style
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.plot_jacobian import main
 
-LARGEST = 80_000
-"""Size of a picture that pages can show (bytes)."""
+LARGEST = 100_000
+"""Size of a picture (bytes)."""
 ROOT = Path(__file__).parents[1]
 
 
