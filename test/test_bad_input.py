@@ -60,6 +60,8 @@ FUNCTIONS = {
     diff_drive.wheel_centres: {'pose': POSE, 'L': 0.16},
     diff_drive.wheel_centre_velocities: {'theta': 0.5, 'q_dot': POSE, 'L': 0.16},
     diff_drive.no_lateral_slip_constraint: {'theta': 0.5},
+    diff_drive.lie_bracket: {'theta': 0.5},
+    diff_drive.controllability_matrix: {'theta': 0.5},
     diff_drive.rolling_constraints: {'theta': 0.5, **WHEELS},
     rigid_body.point_velocity: {'v': POSE, 'omega': POSE, 'offset': POSE},
     se2.wrap_angle: {'angle': 4.0},

@@ -192,6 +192,15 @@ def joint_limit(rng):
     return iv.joint_limit_gradient(q, lower, upper)[:, np.newaxis], numeric
 
 
+def clearance(rng, links):
+    # Not folded, and obstacles beside elbows and tip: no joint moves the base.
+    arm, q = PlanarArm(rng.uniform(0.3, 1.0, links)), rng.uniform(-0.8, 0.8, (COUNT, links))
+    beside = rng.uniform(-0.1, 0.1, (COUNT, 2))
+    obstacle = arm.joint_positions(q)[range(COUNT), rng.integers(1, links + 1, COUNT)] + beside
+    numeric = differences(lambda q: arm.clearance(q, obstacle[:, np.newaxis])[..., np.newaxis], q)
+    return arm.clearance_gradient(q, obstacle)[:, np.newaxis], numeric
+
+
 CASES = [
     ('diff_drive.unicycle_jacobian', unicycle, {}),
     ('diff_drive.wheel_to_body_jacobian', wheel_to_body, {}),
@@ -233,6 +242,7 @@ CASES = [
     ('manipulability.manipulability_gradient', manipulability, {'links': 3, 'heading': False}),
     ('manipulability.manipulability_gradient', manipulability, {'links': 4, 'heading': True}),
     ('joint_limits.joint_limit_gradient', joint_limit, {}),
+    ('planar_arm.PlanarArm.clearance_gradient', clearance, {'links': 3}),
 ]
 
 

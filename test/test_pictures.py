@@ -7,6 +7,7 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from matplotlib.text import Text
 
@@ -15,8 +16,8 @@ from diffdrive_jacobian.plots import rendering, style
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.plot_jacobian import main
 
-LARGEST = 80_000
-"""Size of a picture that pages can show (bytes)."""
+LARGEST = 100_000
+"""Size of a picture (bytes)."""
 ROOT = Path(__file__).parents[1]
 
 
@@ -72,6 +73,30 @@ def test_a_picture_does_not_depend_on_the_style_of_the_user(name):
         strange = getattr(plots, name)()
     with style.styled():
         assert rendering.render(strange, 'png') == rendering.render(getattr(plots, name)(), 'png')
+
+
+def test_the_ellipses_are_a_line_at_the_axle_and_a_circle_at_half_the_wheel_separation():
+    from matplotlib.patches import Polygon
+
+    (axes,) = plots.velocity_ellipses(r=0.05, L=0.4).axes
+    shapes = [one for one in axes.patches if isinstance(one, Polygon) and len(one.get_xy()) > 100]
+    boxes = [one.get_extents().transformed(axes.transData.inverted()) for one in shapes[1:]]
+    np.testing.assert_allclose([box.x0 + box.width / 2 for box in boxes], [0, 0.1, 0.2, 0.4], atol=1e-9)
+    ratios = [box.height / box.width for box in boxes]  # 2 d / L
+    np.testing.assert_allclose(ratios, [0.0, 0.5, 1.0, 2.0], atol=1e-3)
+
+
+def test_the_axle_centre_is_half_way_between_the_wheel_centres_and_faces_forward():
+    (axes,) = plots.figure_2(L=0.3).axes
+    points = [one.get_xydata()[0] for one in axes.lines if one.get_marker() == 'o']
+    C_1, C_2, C = points
+    np.testing.assert_allclose((C_1 + C_2) / 2.0, C)
+    assert np.linalg.norm(C_1 - C_2) == pytest.approx(0.3)
+    arrows = [one for one in axes.texts if one.arrow_patch is not None]
+    from_C = [np.subtract(one.xy, one.xyann) for one in arrows if np.allclose(one.xyann, C)]
+    assert len(from_C) == 4  # the heading, v_C, e_f, e_l
+    along = [vector @ (C_1 - C_2) / np.linalg.norm(vector) / 0.3 for vector in from_C]
+    np.testing.assert_allclose(along, [0.0, 0.0, 0.0, -1.0], atol=1e-12)
 
 
 def test_every_picture_is_public_and_in_the_documentation(folder, capsys):

@@ -172,6 +172,21 @@ def test_manipulability_of_a_nearly_stretched_arm_keeps_its_digits():
     np.testing.assert_allclose(w, 0.7 * 0.4 * np.sin(q[:, 1]), rtol=1e-12, atol=1e-15)
 
 
+def test_clearance_is_the_distance_of_the_nearest_of_many_points_of_the_arm():
+    arm, rng = PlanarArm([0.5, 0.4, 0.3]), np.random.default_rng(6)
+    q, obstacle = rng.uniform(-4.0, 4.0, (200, 3)), rng.uniform(-1.5, 1.5, (200, 2))
+    joints, part = arm.joint_positions(q)[:, :, np.newaxis], np.linspace(0.0, 1.0, 1001)[:, np.newaxis]
+    points = (joints[:, :-1] + part * (joints[:, 1:] - joints[:, :-1])).reshape(200, -1, 2)
+    nearest = norm(points - obstacle[:, np.newaxis]).min(axis=-1)
+    clearance = arm.clearance(q, obstacle)
+    assert np.all(clearance <= nearest)
+    close(clearance, nearest, 1e-3)
+    # By hand: beside the second link of an arm like an L, at 0.1 m from its middle.
+    assert np.isclose(arm.clearance([0.0, np.pi / 2.0, 0.0], [0.6, 0.2]), 0.1)
+    close(arm.clearance_gradient([0.0, np.pi / 2.0, 0.0], [0.6, 0.2]), [0.2, 0.2, 0.0])
+    assert not arm.clearance_gradient([0.0, 0.0, 0.0], [0.3, 0.0]).any()  # it touches the first link
+
+
 def test_an_arm_keeps_its_lengths():
     given = np.array([0.3, 0.2])
     arm = PlanarArm(given)
@@ -350,6 +365,8 @@ BAD = [
     ('inverse_velocity is for .* 2 links', lambda x: LONG.inverse_velocity([0.0] * 3, x), [[0, 1]]),
     ('x_dot must', lambda x: ARM.inverse_velocity([0.0, 1.0], x), [[1.0] * 3, [NAN, 0.0], 'ab']),
     ('q and x_dot must .* broadcast', lambda q: ARM.inverse_velocity(q, ONES[2]), [np.ones((3, 2))]),
+    ('obstacle must', lambda o: ARM.clearance([0.0] * 2, o), [1.0, [1.0] * 3, [NAN, 0.0], 'ab']),
+    ('obstacle must', lambda o: ARM.clearance_gradient([0.0] * 2, o), [1.0, [1.0] * 3, [NAN, 0.0]]),
     ('wrench must', lambda w: ARM.joint_torques([0.0] * 2, w), [1.0, [1.0], [0.0] * 4, [NAN, 0.0]]),
     ('q and wrench must .* broadcast', lambda q: ARM.joint_torques(q, ONES[2]), [np.ones((3, 2))]),
     ('q_dot must', lambda q_dot: ARM.integrate([0.0] * 2, q_dot, 1.0), [[0.0], [NAN, 0.0]]),

@@ -25,6 +25,9 @@ from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, f
 def unicycle_jacobian(theta: Number) -> Rows:
     """Map the body twist to the velocity in the world: `q_dot = S(theta) u` (A(4)-(7)).
 
+    S is the mobile robot's analog of the manipulator's Jacobian J(q), and has no singularities: its
+    columns are orthogonal for every heading.
+
     Args:
         theta: Headings, shape (...) (rad).
 
@@ -41,6 +44,8 @@ def unicycle_jacobian(theta: Number) -> Rows:
 @formula('(),() -> (2,2)', r=positive, L=positive)
 def wheel_to_body_jacobian(r: Number, L: Number) -> Rows:
     """Map wheel speeds to the body twist: `u = J_w w`, `J_w = [[r/2, r/2], [r/L, -r/L]]` (A(8), E).
+
+    A constant of the robot: unlike a manipulator's Jacobian it does not depend on the configuration.
 
     Args:
         r: Wheel radius, shape (...) (m).
@@ -293,9 +298,48 @@ def no_lateral_slip_constraint(theta: Number) -> Rows:
         theta: Headings, shape (...) (rad).
 
     Returns:
-        The constraint, shape (..., 1, 3). Its null space is the range of S(theta).
+        The constraint, shape (..., 1, 3). Its null space is the range of S(theta). In the body frame
+        it is `[0, -1, 0]` for every heading.
     """
     return [[sin(theta), -cos(theta), 0.0]]
+
+
+@formula('() -> (3)')
+def lie_bracket(theta: Number) -> Entries:
+    """Return the Lie bracket of the columns of S(theta): `[g_1, g_2] = [sin, -cos, 0]` (A, 3.2.2).
+
+    `[g_1, g_2] = dg_2/dq g_1 - dg_1/dq g_2`. It is the direction that `no_lateral_slip_constraint`
+    forbids. Driving `a` forward, turning by `b`, driving back and turning back moves the robot by
+    `a b [g_1, g_2]`, to second order.
+
+    Args:
+        theta: Headings, shape (...) (rad).
+
+    Returns:
+        The bracket, shape (..., 3).
+    """
+    # dg_2/dq is zero, and dg_1/dq g_2 is the derivative of g_1 = [cos, sin, 0] by theta.
+    return [sin(theta), -cos(theta), 0.0]
+
+
+@formula('() -> (3,3)')
+def controllability_matrix(theta: Number) -> Rows:
+    """Return the columns `g_1, g_2, [g_1, g_2]`, of which g_1 and g_2 are those of S(theta) (A, 3.2.2).
+
+    Its rank is 3 for every heading, so a unicycle reaches every pose (the Lie algebra rank condition).
+
+    Source: W.-L. Chow, "Über Systeme von linearen partiellen Differentialgleichungen erster Ordnung",
+    1939; doc/mathematics.md, "Controllability".
+
+    Args:
+        theta: Headings, shape (...) (rad).
+
+    Returns:
+        The matrix, shape (..., 3, 3). Its determinant is 1.
+    """
+    S = unicycle_jacobian.formula(theta)
+    bracket = lie_bracket.formula(theta)
+    return [[*row, entry] for row, entry in zip(S, bracket, strict=True)]
 
 
 @formula('(),(),() -> (3,3),(3,2)', r=positive, L=positive)

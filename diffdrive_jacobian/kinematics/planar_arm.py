@@ -1,4 +1,4 @@
-"""A planar arm of n revolute joints: positions, Jacobians, singularities, torques.
+"""A planar arm of n revolute joints: positions, Jacobians, singularities, clearance, torques.
 
 State: joint angles `q = [q_1, ..., q_n]` (rad), each counted from the link before it; the first from
 the x axis of the arm's base. Task: the tip's position x, y (m) and heading (rad), the sum of the angles.
@@ -14,14 +14,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import accumulate, product
-from math import pi
+from math import inf, pi
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics.singular_values import EPS, refuse_singular
 from diffdrive_jacobian.numerics.checks import array, positive
-from diffdrive_jacobian.numerics.elementary import atan2, cos, maximum, minimum, sin, sqrt, wrap
+from diffdrive_jacobian.numerics.elementary import (
+    atan2,
+    cos,
+    hypot,
+    maximum,
+    minimum,
+    sin,
+    sqrt,
+    where,
+    wrap,
+)
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
 
@@ -41,6 +51,32 @@ def arm_jacobian(lengths: Vector, q: Vector) -> Rows:
         [-sum(y[i:]) for i in range(len(q))],
         [sum(x[i:]) for i in range(len(q))],
     ]
+
+
+@formula('(n),(n),(2) -> (n)')
+def arm_up_to_nearest_point(lengths: Vector, q: Vector, obstacle: Vector) -> Entries:
+    """Return the lengths of the links of an arm that ends at its nearest point to an obstacle.
+
+    The link with that point is shortened, the links beyond it have the length 0. So the forward
+    kinematics and the Jacobian of this arm are those of the nearest point.
+
+    Args:
+        lengths: Lengths of the links, shape (..., n) (m).
+        q: Joint angles, shape (..., n) (rad).
+        obstacle: A point in the frame of the arm, shape (..., 2) (m).
+    """
+    x, y = arm_links(lengths, q)
+    nearest: Entries = list(lengths)
+    distance: Number = inf
+    for i, length in enumerate(lengths):
+        # From the joint to the obstacle, and the foot of its perpendicular, as a part of the link.
+        to_x, to_y = obstacle[0] - sum(x[:i]), obstacle[1] - sum(y[:i])
+        part = minimum(maximum((to_x * x[i] + to_y * y[i]) / length**2, 0.0), 1.0)
+        to_link = hypot(to_x - part * x[i], to_y - part * y[i])
+        up_to = [*lengths[:i], part * length, *[0.0] * (len(q) - i - 1)]
+        nearest = [where(to_link < distance, *pair) for pair in zip(up_to, nearest, strict=True)]
+        distance = minimum(distance, to_link)
+    return nearest
 
 
 def arm_links(lengths: Vector, q: Vector) -> tuple[list[Number], list[Number]]:
@@ -199,6 +235,37 @@ class PlanarArm:
         self._need_two('inverse_velocity')
         return _inverse_velocity(self.lengths, q, x_dot)
 
+    def clearance(self, q: ArrayLike, obstacle: ArrayLike) -> NDArray[np.float64]:
+        """Return the distance of the arm from an obstacle, a point, to the nearest point of its links.
+
+        Args:
+            q: Joint angles, shape (..., n) (rad).
+            obstacle: A point in the frame of the arm, shape (..., 2) (m).
+
+        Returns:
+            The distance, shape (...) (m).
+        """
+        return np.asarray(_clearance(self.lengths, q, obstacle))
+
+    def clearance_gradient(self, q: ArrayLike, obstacle: ArrayLike) -> NDArray[np.float64]:
+        """Return the gradient of `clearance`: a motion away from an obstacle (A, 3.2.5).
+
+        It is `J^T n`, with the Jacobian J of the nearest point and the unit vector n from the obstacle
+        to it. Where the nearest point changes to another link, it jumps. As a secondary task:
+        `redundant(J, x_dot, k * arm.clearance_gradient(q, obstacle))`, k > 0.
+
+        Source: A. A. Maciejewski, C. A. Klein, "Obstacle avoidance for kinematically redundant
+        manipulators in dynamically varying environments", 1985.
+
+        Args:
+            q: Joint angles, shape (..., n) (rad).
+            obstacle: A point in the frame of the arm, shape (..., 2) (m).
+
+        Returns:
+            The gradients, shape (..., n) (m/rad). 0 where the arm touches the obstacle.
+        """
+        return _clearance_gradient(self.lengths, q, obstacle)
+
     def joint_torques(self, q: ArrayLike, wrench: ArrayLike) -> NDArray[np.float64]:
         """Return the joint torques of a wrench at the tip: `tau = J^T W` (D, 6).
 
@@ -269,6 +336,24 @@ def _inverse_velocity(lengths: Vector, q: Vector, x_dot: Vector) -> Entries:
     refuse_singular(determinant, abs(determinant) <= blur * lengths[0] * lengths[1])
     v_x, v_y = x_dot
     return [(d * v_x - b * v_y) / determinant, (a * v_y - c * v_x) / determinant]
+
+
+@formula('(n),(n),(2) -> ()')
+def _clearance(lengths: Vector, q: Vector, obstacle: Vector) -> Number:
+    nearest = arm_up_to_nearest_point.formula(lengths, q, obstacle)
+    x, y, _ = arm_forward_kinematics.formula(nearest, q)
+    return hypot(x - obstacle[0], y - obstacle[1])
+
+
+@formula('(n),(n),(2) -> (n)')
+def _clearance_gradient(lengths: Vector, q: Vector, obstacle: Vector) -> Entries:
+    nearest = arm_up_to_nearest_point.formula(lengths, q, obstacle)
+    x, y, _ = arm_forward_kinematics.formula(nearest, q)
+    J_x, J_y = arm_jacobian.formula(nearest, q)
+    away_x, away_y = x - obstacle[0], y - obstacle[1]
+    distance = hypot(away_x, away_y)
+    distance = where(distance > 0.0, distance, 1.0)
+    return [(J_xi * away_x + J_yi * away_y) / distance for J_xi, J_yi in zip(J_x, J_y, strict=True)]
 
 
 @formula('(n),(n),(m) -> (n)')
