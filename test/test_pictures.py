@@ -7,6 +7,7 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from matplotlib.text import Text
 
@@ -42,8 +43,8 @@ def test_the_labels_of_a_picture_are_whole_and_apart(name):
         drawn = getattr(plots, name)()
         content = rendering.render(drawn, 'png')
     assert len(content) < LARGEST
-    texts = [one for one in drawn.findobj(Text) if one.get_visible() and one.get_text().strip()]
-    boxes = {one: one.get_window_extent() for one in texts if one.axes is None or shown(one)}
+    texts = {one for one in drawn.findobj(Text) if one.get_visible() and one.get_text().strip()}
+    boxes = {one: one.get_window_extent() for one in texts.difference(hidden(drawn))}
     assert boxes
     for text, box in boxes.items():
         assert drawn.bbox.x0 <= box.x0 < box.x1 <= drawn.bbox.x1, text
@@ -53,10 +54,15 @@ def test_the_labels_of_a_picture_are_whole_and_apart(name):
         assert not box.padded(-1.0).overlaps(second.padded(-1.0)), (one, other)
 
 
-def shown(text):
-    """Return whether a text is drawn: those of axes that are off are not."""
-    axis_texts = {*text.axes.xaxis.findobj(Text), *text.axes.yaxis.findobj(Text)}
-    return text not in axis_texts or text.axes.axison
+def hidden(drawn):
+    """Return the texts of axes that are off, and of ticks outside, which are not drawn."""
+    for axes in drawn.axes:
+        for at, axis in enumerate((axes.xaxis, axes.yaxis)):
+            low, high = sorted(axis.get_view_interval())
+            for text in axis.findobj(Text):
+                inside = text is axis.label or low <= text.get_position()[at] <= high
+                if not (axes.axison and inside):
+                    yield text
 
 
 @pytest.mark.parametrize('name', plots.PICTURES)
@@ -67,6 +73,30 @@ def test_a_picture_does_not_depend_on_the_style_of_the_user(name):
         strange = getattr(plots, name)()
     with style.styled():
         assert rendering.render(strange, 'png') == rendering.render(getattr(plots, name)(), 'png')
+
+
+def test_the_ellipses_are_a_line_at_the_axle_and_a_circle_at_half_the_wheel_separation():
+    from matplotlib.patches import Polygon
+
+    (axes,) = plots.velocity_ellipses(r=0.05, L=0.4).axes
+    shapes = [one for one in axes.patches if isinstance(one, Polygon) and len(one.get_xy()) > 100]
+    boxes = [one.get_extents().transformed(axes.transData.inverted()) for one in shapes[1:]]
+    np.testing.assert_allclose([box.x0 + box.width / 2 for box in boxes], [0, 0.1, 0.2, 0.4], atol=1e-9)
+    ratios = [box.height / box.width for box in boxes]  # 2 d / L
+    np.testing.assert_allclose(ratios, [0.0, 0.5, 1.0, 2.0], atol=1e-3)
+
+
+def test_the_axle_centre_is_half_way_between_the_wheel_centres_and_faces_forward():
+    (axes,) = plots.figure_2(L=0.3).axes
+    points = [one.get_xydata()[0] for one in axes.lines if one.get_marker() == 'o']
+    C_1, C_2, C = points
+    np.testing.assert_allclose((C_1 + C_2) / 2.0, C)
+    assert np.linalg.norm(C_1 - C_2) == pytest.approx(0.3)
+    arrows = [one for one in axes.texts if one.arrow_patch is not None]
+    from_C = [np.subtract(one.xy, one.xyann) for one in arrows if np.allclose(one.xyann, C)]
+    assert len(from_C) == 4  # the heading, v_C, e_f, e_l
+    along = [vector @ (C_1 - C_2) / np.linalg.norm(vector) / 0.3 for vector in from_C]
+    np.testing.assert_allclose(along, [0.0, 0.0, 0.0, -1.0], atol=1e-12)
 
 
 def test_every_picture_is_public_and_in_the_documentation(folder, capsys):

@@ -17,6 +17,7 @@ from diffdrive_jacobian.kinematics import (
     diff_drive,
     inverse_kinematics,
     inverse_velocity,
+    spatial,
 )
 
 WHEELS = {'r': 0.033, 'L': 0.16}
@@ -27,6 +28,7 @@ WIDE = PlanarArm([0.5, 0.4, 0.3]).jacobian([0.1, 0.2, 0.3])
 LIMITS = VelocityLimits(min_v=-0.1, max_v=0.22, min_omega=-2.0, max_omega=2.0, max_wheel_speed=10.0)
 RANGE = {'q': Q, 'lower': (-3.0, -2.0), 'upper': (2.0, 2.5)}
 LAW = {'state': POSE, 'goal': GOAL}
+HERE, THERE = np.eye(4), np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
 OPTIONS = {'limits', 'h', 'jacobian', 'tasks'}
 """Arguments that are not numbers, or that are in every call the same."""
 
@@ -47,6 +49,7 @@ CALLS = [
     (diff_drive.rolling_constraints, {'theta': 0.5, **WHEELS}),
     (contact.wheel_contact_position, {'x': 0.1, 'phi': 0.5, 'r': 0.033}),
     (contact.wheel_contact_jacobian, {'phi': 0.5, 'r': 0.033}),
+    (spatial.spatial_displacement, {'T': HERE, 'T_desired': THERE}),
     (contact.rolling_direction, {'r': 0.033}),
     (inverse_velocity.adjugate_inverse, {'J': J}),
     (inverse_velocity.pseudoinverse, {'J': WIDE}),
@@ -55,6 +58,11 @@ CALLS = [
     (inverse_velocity.null_space_projector, {'J': WIDE, 'damping': 0.1}),
     (inverse_velocity.redundant, {'J': WIDE, 'x_dot': X_DOT, 'q_dot_0': POSE, 'damping': 0.0}),
     (inverse_velocity.manipulability, {'J': WIDE}),
+    (inverse_velocity.velocity_ellipsoid, {'J': WIDE}),
+    (inverse_velocity.force_ellipsoid, {'J': WIDE}),
+    (inverse_velocity.smallest_singular_value, {'J': WIDE}),
+    (inverse_velocity.condition_number, {'J': WIDE}),
+    (inverse_velocity.masked_task, {'J': WIDE, 'x_dot': X_DOT, 'mask': (1.0, 0.5)}),
     (inverse_velocity.manipulability_gradient, {'jacobian': ARM.jacobian, 'q': Q}),
     (inverse_velocity.joint_limit_cost, RANGE),
     (inverse_velocity.joint_limit_gradient, RANGE),
@@ -66,6 +74,7 @@ CALLS = [
     (ARM.jacobian, {'q': Q}),
     (ARM.determinant, {'q': Q}),
     (ARM.singular_configurations, {'q_1': 0.5}),
+    (ARM.inverse_kinematics, {'position': (1.0, 0.5)}),
     (ARM.inverse_velocity, {'q': Q, 'x_dot': X_DOT}),
     (ARM.clearance, {'q': Q, 'obstacle': GOAL}),
     (ARM.clearance_gradient, {'q': Q, 'obstacle': GOAL}),
@@ -136,7 +145,7 @@ def outcome(call, arguments):
 
 def test_every_public_function_is_called_here():
     called = {call.__name__ for call, _ in CALLS}
-    for module in (contact, diff_drive, inverse_kinematics, inverse_velocity):
+    for module in (contact, diff_drive, inverse_kinematics, inverse_velocity, spatial):
         for name, value in vars(module).items():
             own = inspect.isfunction(value) and value.__module__.startswith('diffdrive_jacobian')
             listed = name in getattr(module, '__all__', ()) or value in vars(module).values()

@@ -10,13 +10,16 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.kinematics import (
         contact,
         diff_drive,
+        differentiation,
         inverse_kinematics,
         inverse_velocity,
         mobile_manipulator,
         planar_arm,
         rigid_body,
         se2,
+        spatial,
     )
+    from diffdrive_jacobian.kinematics.differentiation import numerical_jacobian
     from diffdrive_jacobian.kinematics.mobile_manipulator import MobileManipulator
     from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 
@@ -25,12 +28,15 @@ __all__ = [
     'PlanarArm',
     'contact',
     'diff_drive',
+    'differentiation',
     'inverse_kinematics',
     'inverse_velocity',
     'mobile_manipulator',
+    'numerical_jacobian',
     'planar_arm',
     'rigid_body',
     'se2',
+    'spatial',
 ]
 if not TYPE_CHECKING:
     # Nodes, which need few of them, start faster than with all.
@@ -40,5 +46,6 @@ if not TYPE_CHECKING:
         | {
             'MobileManipulator': 'kinematics.mobile_manipulator',
             'PlanarArm': 'kinematics.planar_arm',
+            'numerical_jacobian': 'kinematics.differentiation',
         },
     )

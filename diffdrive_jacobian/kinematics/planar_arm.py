@@ -13,7 +13,7 @@ doc/mathematics.md, "Manipulators".
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, product
 from math import inf, pi
 
 import numpy as np
@@ -21,7 +21,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics.singular_values import EPS, refuse_singular
 from diffdrive_jacobian.numerics.checks import array, positive
-from diffdrive_jacobian.numerics.elementary import cos, hypot, maximum, minimum, sin, where, wrap
+from diffdrive_jacobian.numerics.elementary import (
+    atan2,
+    cos,
+    hypot,
+    maximum,
+    minimum,
+    sin,
+    sqrt,
+    where,
+    wrap,
+)
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
 
@@ -158,19 +168,55 @@ class PlanarArm:
         return np.asarray(_determinant(self.lengths, q))
 
     def singular_configurations(self, q_1: ArrayLike = 0.0) -> NDArray[np.float64]:
-        """Return the singular configurations of two links: stretched, q_2 = 0, and folded, q_2 = pi (A).
+        """Return the configurations in which the position is singular: all links on one line (A, D).
+
+        There the tip cannot move along that line. Two links are stretched, q_2 = 0, or folded, q_2 = pi.
 
         Args:
             q_1: Angle of the first joint, which does not matter, shape (...) (rad).
 
         Returns:
-            `[[q_1, 0], [q_1, pi]]`, shape (..., 2, 2) (rad).
+            `[q_1, q_2, ..., q_n]` with each of q_2 to q_n 0 or pi, shape (..., 2^(n - 1), n) (rad), the
+            stretched arm first. For two links `[[q_1, 0], [q_1, pi]]`.
+        """
+        q_1 = array('q_1', q_1)
+        others = list(product((0.0, pi), repeat=self.joints - 1))
+        q = np.empty((*q_1.shape, len(others), self.joints))
+        q[..., 0], q[..., 1:] = q_1[..., np.newaxis], others
+        return q
+
+    def inverse_kinematics(self, position: ArrayLike) -> NDArray[np.float64]:
+        """Return both explicit solutions of two links: elbow down and elbow up (D, 6).
+
+        `cos(q_2) = (x^2 + y^2 - l_1^2 - l_2^2) / (2 l_1 l_2)` by the law of cosines, and
+        `q_1 = atan2(y, x) - atan2(l_2 sin(q_2), l_1 + l_2 cos(q_2))`. Other arms, and headings, need
+        `inverse_kinematics.solve`.
+
+        Args:
+            position: Position of the tip, shape (..., 2) (m).
+
+        Returns:
+            `[down, up]`, shape (..., 2, 2) (rad). The first has q_2 from 0 to pi: seen along the line to
+            the tip, the elbow is on the right, below a tip straight ahead. The second has q_2 from -pi
+            to 0. They are the same where the arm is stretched or folded. For a tip on the base, which
+            any q_1 reaches, q_1 is 0.
 
         Raises:
-            ValueError: The arm has not two links.
+            ValueError: The arm has not two links, or a position is out of reach: its distance from the
+                base must be from `|l_1 - l_2|` to `l_1 + l_2`.
         """
-        self._need_two('singular_configurations')
-        return _singular_configurations(q_1)
+        self._need_two('inverse_kinematics')
+        position = array('position', position, 2)
+        distance = np.hypot(position[..., 0], position[..., 1])
+        least, most = abs(self.lengths[0] - self.lengths[1]), self.lengths.sum()
+        rounding = 4.0 * EPS * most
+        beyond = (distance < least - rounding) | (distance > most + rounding)
+        if beyond.any():
+            raise ValueError(
+                f'position must be from {least:g} to {most:g} m away from the base, '
+                f'got {position[beyond][0].tolist()}'
+            )
+        return _inverse_kinematics(self.lengths, position)
 
     def inverse_velocity(self, q: ArrayLike, x_dot: ArrayLike) -> NDArray[np.float64]:
         """Return joint velocities of two links for a velocity of the tip, by the adjugate (A, 3.2.1).
@@ -267,11 +313,17 @@ def _determinant(lengths: Vector, q: Vector) -> Number:
     return l_1 * l_2 * sin(q_2)
 
 
-@formula('() -> (2,2)')
-def _singular_configurations(q_1: Number) -> Rows:
+@formula('(2),(2) -> (2,2)')
+def _inverse_kinematics(lengths: Vector, position: Vector) -> Rows:
+    (l_1, l_2), (x, y) = lengths, position
+    c_2 = (x * x + y * y - l_1 * l_1 - l_2 * l_2) / (2.0 * l_1 * l_2)
+    c_2 = maximum(minimum(c_2, 1.0), -1.0)  # only rounding is cut off
+    s_2 = sqrt(1.0 - c_2 * c_2)
+    bearing, inner = atan2(y, x), atan2(l_2 * s_2, l_1 + l_2 * c_2)
+    q_2 = atan2(s_2, c_2)
     return [
-        [q_1, 0.0],
-        [q_1, pi],
+        [wrap(bearing - inner), q_2],
+        [wrap(bearing + inner), -q_2],
     ]
 
 

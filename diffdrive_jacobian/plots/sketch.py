@@ -218,6 +218,11 @@ def robot(axes: Axes, pose: ArrayLike, r: float, L: float) -> None:
         L: Wheel separation.
     """
     outline(axes, placed(L * BODY, pose), fc=FILL, ec=GREY)
+    wheels(axes, pose, r, L)
+
+
+def wheels(axes: Axes, pose: ArrayLike, r: float, L: float) -> None:
+    """Draw the wheels of a robot from above with their axle. Arguments as for `robot`."""
     line(axes, *placed([[0.0, -L / 2.0], [0.0, L / 2.0]], pose), lw=2.0, color=GREY)
     half = TYRE * L / 2.0
     for side in (-L / 2.0, L / 2.0):
