@@ -289,6 +289,25 @@ def test_d_the_transpose_and_the_least_squares_steps_reduce_the_error():
         assert error(step) < error(np.zeros(3))
 
 
+def test_d_slip_the_stiffness_of_the_spring_belongs_before_the_transpose():
+    # Its step 4 prints 1/B J^T Delta for Q = J^T W, W = gamma Delta and q_dot = Q/B.
+    arm, q, target = PlanarArm([0.5, 0.4, 0.3]), np.array([0.3, 0.8, -0.5]), np.array([0.7, 0.7, 0.1])
+    gamma, B, dt = 2.0, 4.0, 1e-6
+    J = arm.jacobian(q, heading=True)
+
+    def energy(q):
+        delta = target - arm.forward_kinematics(q)
+        return 0.5 * gamma * delta @ delta
+
+    delta = target - arm.forward_kinematics(q)
+    Q = arm.joint_torques(q, gamma * delta)
+    q_dot = gamma / B * J.T @ delta
+    close(q_dot, Q / B)
+    # Friction consumes what the spring gives, without a rest.
+    rate = (energy(q + q_dot * dt) - energy(q - q_dot * dt)) / (2.0 * dt)
+    close(rate, -B * q_dot @ q_dot, 1e-8)
+
+
 # --- E: derivation of the differential drive; wheel 1 is the left one, 2 the right
 
 

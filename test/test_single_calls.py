@@ -17,6 +17,7 @@ from diffdrive_jacobian.kinematics import (
     diff_drive,
     inverse_kinematics,
     inverse_velocity,
+    rigid_body,
     spatial,
 )
 
@@ -43,12 +44,15 @@ CALLS = [
     (diff_drive.offset_point_jacobian, {'theta': 0.5, **WHEELS, 'd': -0.1}),
     (diff_drive.body_to_wheel, {'v': 0.2, 'omega': 0.5, **WHEELS}),
     (diff_drive.wheel_to_body, {'omega_R': 2.0, 'omega_L': 3.0, **WHEELS}),
+    (diff_drive.wheel_centres, {'pose': POSE, 'L': 0.16}),
+    (diff_drive.wheel_centre_velocities, {'theta': 0.5, 'q_dot': POSE, 'L': 0.16}),
     (diff_drive.no_lateral_slip_constraint, {'theta': 0.5}),
     (diff_drive.lie_bracket, {'theta': 0.5}),
     (diff_drive.controllability_matrix, {'theta': 0.5}),
     (diff_drive.rolling_constraints, {'theta': 0.5, **WHEELS}),
     (contact.wheel_contact_position, {'x': 0.1, 'phi': 0.5, 'r': 0.033}),
     (contact.wheel_contact_jacobian, {'phi': 0.5, 'r': 0.033}),
+    (rigid_body.point_velocity, {'v': POSE, 'omega': POSE, 'offset': (0.0, 0.1, 0.2)}),
     (spatial.spatial_displacement, {'T': HERE, 'T_desired': THERE}),
     (contact.rolling_direction, {'r': 0.033}),
     (inverse_velocity.adjugate_inverse, {'J': J}),
@@ -145,7 +149,7 @@ def outcome(call, arguments):
 
 def test_every_public_function_is_called_here():
     called = {call.__name__ for call, _ in CALLS}
-    for module in (contact, diff_drive, inverse_kinematics, inverse_velocity, spatial):
+    for module in (contact, diff_drive, inverse_kinematics, inverse_velocity, rigid_body, spatial):
         for name, value in vars(module).items():
             own = inspect.isfunction(value) and value.__module__.startswith('diffdrive_jacobian')
             listed = name in getattr(module, '__all__', ()) or value in vars(module).values()
