@@ -43,7 +43,7 @@ def test_saturated_actuators_do_not_follow():
     line = StraightLine(np.stack([x, [-0.4, -0.4]], axis=-1), np.stack([x, [0.4, 0.4]], axis=-1), 0.1)
     q0 = solve(lambda q: arm.forward_kinematics(q)[..., :2], arm.jacobian, line.start, [-2.0, 2.0]).q
     limits = np.array([np.inf, 1.0])[:, np.newaxis, np.newaxis] * np.ones(2)
-    run = track_line(arm, np.stack([q0, q0]), line, settling=4.0, max_velocity=limits)
+    run = track_line(arm, np.stack([q0, q0]), line, rate=50.0, settling=2.0, max_velocity=limits)
     fastest, largest, last = np.abs(run.q_dot).max(axis=(0, -1)), run.error.max(axis=0), run.error[-1]
     assert fastest[0, 0] > 1.2
     assert fastest[0, 1] > 20.0
@@ -51,7 +51,7 @@ def test_saturated_actuators_do_not_follow():
     assert largest[0, 0] < 1e-4 < 9e-3 < largest[1, 0]  # beside the hole: late
     assert last[1, 0] < 1e-4
     assert last[1, 1] > 0.4  # through it: stuck
-    run = track_line(arm, q0, line, settling=4.0, threshold=0.1, maximum_damping=0.05)
+    run = track_line(arm, q0, line, rate=50.0, settling=2.0, threshold=0.1, maximum_damping=0.05)
     assert np.abs(run.q_dot).max() < 0.2 / (2.0 * 0.05)  # the line's speed, and as much by feedback
     assert run.error.max(axis=0)[0] < 2e-3
     assert run.error[-1].max() < 1e-4
