@@ -43,6 +43,8 @@ CALLS = [
     (diff_drive.offset_point_jacobian, {'theta': 0.5, **WHEELS, 'd': -0.1}),
     (diff_drive.body_to_wheel, {'v': 0.2, 'omega': 0.5, **WHEELS}),
     (diff_drive.wheel_to_body, {'omega_R': 2.0, 'omega_L': 3.0, **WHEELS}),
+    (diff_drive.wheel_centres, {'pose': POSE, 'L': 0.16}),
+    (diff_drive.wheel_centre_velocities, {'theta': 0.5, 'q_dot': POSE, 'L': 0.16}),
     (diff_drive.no_lateral_slip_constraint, {'theta': 0.5}),
     (diff_drive.lie_bracket, {'theta': 0.5}),
     (diff_drive.controllability_matrix, {'theta': 0.5}),
