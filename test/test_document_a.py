@@ -11,9 +11,10 @@ import inspect
 import numpy as np
 
 from diffdrive_jacobian.control import StraightLine, go_to_goal
-from diffdrive_jacobian.kinematics import PlanarArm, diff_drive, se2
+from diffdrive_jacobian.kinematics import diff_drive, se2
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
 from diffdrive_jacobian.kinematics.inverse_kinematics import solve
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 from diffdrive_jacobian.plots import null_space_figure, parking_figure
 from diffdrive_jacobian.simulation import track_line
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from diffdrive_jacobian.faults.fault import Fault
-from diffdrive_jacobian.lockstep import Injection
+from diffdrive_jacobian.lockstep._injection import Injection
 from diffdrive_jacobian.numerics.checks import Positive
 from diffdrive_jacobian.numerics.fields import Name
 from diffdrive_jacobian.time_units import nanoseconds

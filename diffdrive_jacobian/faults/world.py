@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from diffdrive_jacobian.faults.fault import Fault
 from diffdrive_jacobian.faults.nodes import NodeFault
-from diffdrive_jacobian.lockstep import Injection
+from diffdrive_jacobian.lockstep._injection import Injection
 from diffdrive_jacobian.numerics.checks import PositiveOrInfinite, finite, number
 from diffdrive_jacobian.numerics.fields import Name
 from diffdrive_jacobian.time_units import nanoseconds

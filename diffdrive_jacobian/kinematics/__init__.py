@@ -19,20 +19,14 @@ if TYPE_CHECKING:
         se2,
         spatial,
     )
-    from diffdrive_jacobian.kinematics.differentiation import numerical_jacobian
-    from diffdrive_jacobian.kinematics.mobile_manipulator import MobileManipulator
-    from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 
 __all__ = [
-    'MobileManipulator',
-    'PlanarArm',
     'contact',
     'diff_drive',
     'differentiation',
     'inverse_kinematics',
     'inverse_velocity',
     'mobile_manipulator',
-    'numerical_jacobian',
     'planar_arm',
     'rigid_body',
     'se2',
@@ -40,12 +34,4 @@ __all__ = [
 ]
 if not TYPE_CHECKING:
     # Nodes, which need few of them, start faster than with all.
-    __getattr__, __dir__ = lazy.attach(
-        __name__,
-        {name: f'kinematics.{name}' for name in __all__}
-        | {
-            'MobileManipulator': 'kinematics.mobile_manipulator',
-            'PlanarArm': 'kinematics.planar_arm',
-            'numerical_jacobian': 'kinematics.differentiation',
-        },
-    )
+    __getattr__, __dir__ = lazy.attach(__name__, {name: f'kinematics.{name}' for name in __all__})

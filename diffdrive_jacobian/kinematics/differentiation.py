@@ -17,6 +17,8 @@ from numpy.typing import ArrayLike
 from diffdrive_jacobian.numerics.checks import array
 from diffdrive_jacobian.numerics.formula import Array
 
+__all__ = ['numerical_jacobian']
+
 STEP = float(np.finfo(np.float64).eps) ** (1.0 / 3.0)
 """Step of central differences, at which rounding and truncation errors are of the same size."""
 

@@ -34,6 +34,8 @@ from diffdrive_jacobian.numerics.elementary import (
 )
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
+__all__ = ['PlanarArm', 'arm_forward_kinematics', 'arm_jacobian']
+
 
 @formula('(n),(n) -> (3)')
 def arm_forward_kinematics(lengths: Vector, q: Vector) -> Entries:

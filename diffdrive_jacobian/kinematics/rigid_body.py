@@ -14,6 +14,8 @@ from __future__ import annotations
 
 from diffdrive_jacobian.numerics.formula import Entries, Vector, formula
 
+__all__ = ['point_velocity']
+
 
 @formula('(3),(3),(3) -> (3)')
 def point_velocity(v: Vector, omega: Vector, offset: Vector) -> Entries:

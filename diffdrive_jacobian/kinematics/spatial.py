@@ -17,6 +17,8 @@ from diffdrive_jacobian.kinematics.singular_values import product, times, transp
 from diffdrive_jacobian.numerics.checks import finite
 from diffdrive_jacobian.numerics.formula import Array, formula
 
+__all__ = ['spatial_displacement']
+
 ROUNDING = 1e-6
 """Largest deviation of `R^T R` from the identity in the norm of Frobenius."""
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.plots.velocity_ellipses_figure import velocity_ellipses
 
 __all__ = [
+    'PICTURES',
     'arm_ellipses',
     'damping',
     'figure_1',
@@ -33,7 +34,10 @@ __all__ = [
     'lie_bracket',
     'null_space',
     'parking',
+    'run_figure',
+    'run_table',
     'spring',
+    'sweep_figure',
     'velocity_ellipses',
 ]
 _PICTURES = {

@@ -19,7 +19,7 @@ from diffdrive_jacobian.faults import (
     TimeJump,
     TimerJitter,
 )
-from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 ROUNDING = 1e-9
