@@ -9,13 +9,14 @@ import ast
 import inspect
 
 import numpy as np
+import pytest
 
 from diffdrive_jacobian.control import StraightLine, go_to_goal
 from diffdrive_jacobian.kinematics import diff_drive, se2
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
 from diffdrive_jacobian.kinematics.inverse_kinematics import solve
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
-from diffdrive_jacobian.plots import null_space_figure, parking_figure
+from diffdrive_jacobian.plots import null_space_figure, parking, parking_figure
 from diffdrive_jacobian.simulation import track_line
 
 HEADINGS = np.linspace(-np.pi, np.pi, 101)
@@ -100,6 +101,18 @@ def test_the_parking_robot_gets_sideways_without_ever_driving_sideways():
     moved = np.diff(poses, axis=0)
     middle = se2.wrap_angle(poses[:-1, 2] + moved[:, 2] / 2.0)
     close(diff_drive.no_lateral_slip_constraint(middle) @ moved[..., np.newaxis], 0.0)
+
+
+def test_the_picture_of_parking_leaves_out_where_the_robot_stands_or_only_turns():
+    poses = parking_figure.parked()
+    texts = [text.get_text() for text in parking(np.repeat(poses, 2, axis=0)).axes[0].texts]
+    assert texts == [text.get_text() for text in parking().axes[0].texts]
+    turned = poses[-1] + [[0.0, 0.0, 0.5], [0.0, 0.0, 1.0]]
+    more = [text.get_text() for text in parking(np.concatenate([poses, turned])).axes[0].texts]
+    assert more == texts
+    for bad in (poses[:1], poses[[0, 0]], poses[0], [poses], poses[:, :2], poses * np.nan):
+        with pytest.raises(ValueError, match=r'^poses must'):
+            parking(bad)
 
 
 def test_the_pseudo_inverse_of_s_stands_still_where_the_law_turns():

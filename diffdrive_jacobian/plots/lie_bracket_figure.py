@@ -18,18 +18,16 @@ if TYPE_CHECKING:
 
 R, L = 0.033, 0.16
 """Wheel radius and separation of the robot that is drawn (m)."""
+A, B = 0.5, 0.8
+"""Distance forward and back (m), angle turned and turned back (rad)."""
 OBLIQUE = np.array([[1.0, 0.0], [0.5, 0.35], [0.0, 0.55]])
 """Where a metre along x, a metre along y and a radian are in the drawing of the poses."""
 EDGES = ('1 forward', '2 turn', '3 back', '4 turn back')
 
 
 @picture
-def lie_bracket(a: float = 0.5, b: float = 0.8) -> Figure:
+def lie_bracket() -> Figure:
     """Draw the parallelogram of the Lie bracket: from above, over the poses, and as it gets smaller.
-
-    Args:
-        a: Distance that is driven forward and back (m).
-        b: Angle that is turned and turned back (rad).
 
     Raises:
         ModuleNotFoundError: matplotlib is not installed.
@@ -38,8 +36,8 @@ def lie_bracket(a: float = 0.5, b: float = 0.8) -> Figure:
 
     drawing = Figure(figsize=(9.0, 3.2), layout='constrained')
     above, poses, order = drawing.subplots(1, 3, width_ratios=[1.2, 1.2, 1.0])
-    corners = parallelogram(a, b)
-    _draw_from_above(above, corners, a, b)
+    corners = parallelogram(A, B)
+    _draw_from_above(above, corners)
     _draw_poses(poses, corners)
     _draw_order(order)
     return drawing
@@ -60,7 +58,7 @@ def parallelogram(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
     return np.array(corners)
 
 
-def _draw_from_above(axes: Axes, corners: NDArray[np.float64], a: float, b: float) -> None:
+def _draw_from_above(axes: Axes, corners: NDArray[np.float64]) -> None:
     """Draw the way of the robot, and the robot at its start and at its end."""
     start, ahead, turned, back, end = corners
     sketch.robot(axes, start, R, L)
@@ -73,7 +71,7 @@ def _draw_from_above(axes: Axes, corners: NDArray[np.float64], a: float, b: floa
     sketch.angle(axes, back[:2], 0.11, back[2], end[2], '4', color=BLUE)
     sketch.arrow(axes, start[:2], (end - start)[:2], color=RED, lw=2.4, zorder=6)
     sketch.label(axes, 'gap', (start + end)[:2] / 2.0, (18.0, 0.0), color=RED)
-    bracket = a * b * diff_drive.lie_bracket(0.0)[:2]
+    bracket = A * B * diff_drive.lie_bracket(0.0)[:2]
     sketch.arrow(axes, start[:2], bracket, lw=1.2, ls=DASHED)
     sketch.label(axes, '$ab\\,[g_1, g_2]$', bracket, (-4.0, -10.0), fontsize=9.5)
     axes.set(title='from above', xlabel='x [m]', ylabel='y [m]')

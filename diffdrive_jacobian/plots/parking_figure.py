@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diffdrive_jacobian.kinematics import se2
+from diffdrive_jacobian.numerics.checks import array
 from diffdrive_jacobian.plots import sketch
 from diffdrive_jacobian.plots.sketch import BLUE, DASHED, GREY, RED
 from diffdrive_jacobian.plots.style import picture
@@ -28,6 +29,8 @@ MOTIONS = (
     ((-0.1, -0.1 / RADIUS), TURN * RADIUS / 0.1),
 )
 """The motions: twist (m/s, rad/s) and duration (s)."""
+STANDING = 1e-9
+"""Largest change of a pose that is no motion (m, rad)."""
 OUTLINES = 24
 """How many outlines of the moving robot are drawn."""
 PARKED = ((0.29, 0.55), (-0.37, -0.08))
@@ -40,12 +43,13 @@ def parking(poses: ArrayLike | None = None) -> Figure:
 
     Args:
         poses: Poses of the robot that parks, shape (n, 3) (m, m, rad), for example from the odometry of
-            `virtual_robot`. None: those of the exact motion.
+            `virtual_robot` without drift. None: those of the exact motion.
 
     Raises:
         ModuleNotFoundError: matplotlib is not installed.
+        ValueError: Poses are not finite, have another shape, or do not differ.
     """
-    driven = parked() if poses is None else np.asarray(poses, dtype=np.float64)
+    driven = _driven(parked() if poses is None else array('poses', poses, 'n', 3))
     drawing, axes = sketch.canvas(7.2, (-0.4, 0.62), (-0.13, 0.4))
     for left, right in PARKED:
         box = [[left, -0.09], [right, -0.09], [right, 0.09], [left, 0.09]]
@@ -55,8 +59,10 @@ def parking(poses: ArrayLike | None = None) -> Figure:
         sketch.outline(axes, sketch.placed(L * sketch.BODY, pose), ec='#cccccc', lw=0.6)
     for pose in (driven[0], driven[-1]):
         sketch.robot(axes, pose, R, L)
-    for number, (first, last) in enumerate(pairwise(places), 1):
-        part = driven[first : last + 1, :2]
+    parts = [driven[first : last + 1, :2] for first, last in pairwise(places)]
+    # In place there is nothing to draw.
+    parts = [part for part in parts if np.max(np.ptp(part, axis=0)) > STANDING]
+    for number, part in enumerate(parts, 1):
         sketch.line(axes, *part[:-1], color=BLUE, lw=2.0)
         sketch.arrow(axes, part[-2], part[-1] - part[-2], color=BLUE, lw=2.0, mutation_scale=16.0)
         middle = len(part) // 2
@@ -79,6 +85,14 @@ def parked(samples: int = 100) -> NDArray[np.float64]:
         times = np.linspace(0.0, duration, samples + 1)[1:]
         poses += [*se2.integrate(poses[-1], twist, times)]
     return np.array(poses)
+
+
+def _driven(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the poses without those at which the robot stands."""
+    moves = np.max(np.abs(np.diff(poses, axis=0)), axis=-1) > STANDING
+    if poses.ndim != 2 or not moves.any():
+        raise ValueError(f'poses must have shape (n, 3) and differ, got shape {poses.shape}')
+    return np.asarray(poses[np.concatenate([[True], moves])])
 
 
 def _places(poses: NDArray[np.float64]) -> list[int]:

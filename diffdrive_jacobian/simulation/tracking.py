@@ -165,7 +165,7 @@ def track_line(
         np.arange(steps + 1) / rate,
         np.array(track),
         np.array(velocities) if steps else np.empty((0, *shape[:-1], inputs)),
-        np.array(errors),
+        np.array([np.broadcast_to(error, shape[:-1]) for error in errors]),
     )
 
 
