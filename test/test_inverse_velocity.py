@@ -11,14 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from diffdrive_jacobian.kinematics import (
-    PlanarArm,
-    diff_drive,
-    joint_limits,
-    manipulability,
-    task_priority,
-)
+from diffdrive_jacobian.kinematics import diff_drive, joint_limits, manipulability, task_priority
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 
 EPS = np.finfo(float).eps
 SVD = 300.0 * EPS  # LAPACK stops when what is left beside the singular values is below some 90 eps.

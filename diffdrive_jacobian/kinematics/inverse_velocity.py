@@ -41,6 +41,7 @@ from diffdrive_jacobian.kinematics.joint_limits import (
     limit_velocity,
 )
 from diffdrive_jacobian.kinematics.manipulability import (
+    Ellipsoid,
     condition_number,
     force_ellipsoid,
     manipulability,
@@ -66,6 +67,7 @@ from diffdrive_jacobian.numerics.formula import Array, Number, Rows, Vector, for
 __all__ = [
     'CUTOFF',
     'FILTER',
+    'Ellipsoid',
     'adjugate_inverse',
     'condition_number',
     'damped_least_squares',
