@@ -27,7 +27,9 @@ TOOLS = sorted(
     for one in entry_points(group='console_scripts')
     if one.value.startswith('diffdrive_jacobian.')
 )
-WITHOUT_ROS = ('calibrate_run', 'plot_run', 'recover_run', 'sweep_gains', 'verify_run')
+WITHOUT_ROS = (
+    *('calibrate_run', 'plot_jacobian', 'plot_run', 'recover_run', 'sweep_gains', 'verify_run'),
+)
 BAG = Path(__file__).parent / 'bags' / 'turtlebot3_fake_sqlite'
 """Recorded with ros2 bag record."""
 READ = """
