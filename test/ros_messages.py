@@ -11,7 +11,7 @@ from nav_msgs.msg import Goals, Odometry
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
-from diffdrive_jacobian.messages.codecs import ODOMETRY
+from diffdrive_jacobian.messages.codecs import ODOMETRY, POSE_WITH_COVARIANCE
 from diffdrive_jacobian.messages.conversion import from_time, set_pose
 
 PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
@@ -72,8 +72,9 @@ def twists(messages):
     return [(one.linear.x, one.angular.z) for one in bare]
 
 
-def pose_of(odometry):
-    return np.array(ODOMETRY.of(odometry).pose)
+def pose_of(message):
+    codec = ODOMETRY if isinstance(message, Odometry) else POSE_WITH_COVARIANCE
+    return np.array(codec.of(message).pose)
 
 
 def covariance_of(odometry):

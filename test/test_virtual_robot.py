@@ -23,7 +23,6 @@ from ros_messages import (
 
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
-from diffdrive_jacobian.messages.codecs import POSE_WITH_COVARIANCE
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.testing import Lockstep
 
@@ -185,7 +184,7 @@ def reproduce(applied, starts, instant):
         (start for start in starts if time_of(start) <= instant),
         key=lambda start: time_of(start),
     )
-    pose, now = np.array(POSE_WITH_COVARIANCE.of(begin).pose), time_of(begin)
+    pose, now = pose_of(begin), time_of(begin)
     driven = (0.0, 0.0)
     for at, command in zip(instants(applied), twists(applied), strict=True):
         if at > instant:
