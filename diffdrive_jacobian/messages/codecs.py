@@ -23,7 +23,6 @@ from diffdrive_jacobian.messages.conversion import (
     from_time,
     from_twist,
 )
-from diffdrive_jacobian.messages.fields import field_value
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 V = TypeVar('V')
@@ -66,14 +65,6 @@ class Codec(Generic[V]):
     """Returns these numbers of a value."""
     header: Codec[Any] | None = None
     """What is read and checked before the rest, which may be long."""
-
-    def of(self, message: Any) -> V:
-        """Return the value in a message object.
-
-        Raises:
-            MessageError: It is invalid.
-        """
-        return self.value(*(field_value(message, field) for field in self.fields))
 
     def reader(
         self, kind: Any, deserialize: Callable[[bytes, Any], Any] | None = None
