@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
-
-from rclpy.node import Node
-from rclpy.publisher import Publisher
+from contextlib import AbstractContextManager
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
-from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
-from diffdrive_jacobian.lockstep._external_answers import WITHIN
 from diffdrive_jacobian.lockstep._external_probe import Probe
 from diffdrive_jacobian.lockstep._external_process import ExternalProcess
+from diffdrive_jacobian.lockstep._scheduler import Scheduler
 
 CLOCK_PERIOD = 0.1
 """Period at which the time is published again, because a message may be lost (s)."""
@@ -28,8 +24,7 @@ class Waiting:
 
     def __init__(
         self,
-        node: Node,
-        executor: QuiescentExecutor,
+        scheduler: Scheduler,
         watched: Callable[[], AbstractContextManager[None]],
         report: Callable[[], str],
         awaited: Callable[[ExternalProcess], bool],
@@ -37,14 +32,12 @@ class Waiting:
         """Start without processes.
 
         Args:
-            node: Node of the world.
-            executor: Executes its nodes.
+            scheduler: Executes the nodes of the world.
             watched: Returns a context in which callbacks may be executed.
             report: Returns the last messages of all topics, and the states of the processes, as text.
             awaited: Returns whether anything is awaited from a process.
         """
-        self._node = node
-        self._executor = executor
+        self._scheduler = scheduler
         self._watched = watched
         self._report = report
         self._awaited = awaited
@@ -70,23 +63,9 @@ class Waiting:
             if now - repeated > CLOCK_PERIOD:
                 repeated = now
                 self.check_processes()
-                self._executor.clocks.publish()
+                self._scheduler.clocks.publish()
             self.serve()
             time.sleep(NAP if now - begin < CLOCK_PERIOD else SLOW_NAP)
-
-    def for_subscription(self, publisher: Publisher) -> None:
-        """Wait until a publisher has a subscription. If none comes, return after a while."""
-        with suppress(LockstepError):
-            self.until(publisher.get_subscription_count, WITHIN, str)
-
-    def for_service(self, name: str) -> None:
-        """Wait until a service is discovered. If none is, return after a while."""
-
-        def discovered() -> bool:
-            return any(name == other for other, _ in self._node.get_service_names_and_types())
-
-        with suppress(LockstepError):
-            self.until(discovered, WITHIN, str)
 
     def ask(self, probe: Probe, rounds: int) -> None:
         """Send requests to a node, each after the response to the one before.
@@ -100,7 +79,7 @@ class Waiting:
     def serve(self) -> None:
         """Process requests and responses. Messages wait until everything has been received."""
         with self._watched():
-            self._executor.serve()
+            self._scheduler.serve()
 
     def check_processes(self) -> None:
         """Check that no process has failed.
