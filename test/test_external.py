@@ -23,12 +23,12 @@ from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.faults import ClockPause, Kill, Loss, TimeJump
 from diffdrive_jacobian.lockstep import Answers, Every, Idle, Lockstep, LockstepError, PropertyViolation
-from diffdrive_jacobian.lockstep import _external_process as external_process
 from diffdrive_jacobian.lockstep._clock import Agenda, Clocks
-from diffdrive_jacobian.lockstep._external_answers import AnswersDue, TicksDue
-from diffdrive_jacobian.lockstep._external_topic import ExternalTopic
 from diffdrive_jacobian.lockstep._gate import Gates
 from diffdrive_jacobian.lockstep._links import Links
+from diffdrive_jacobian.lockstep.external import process as external_process
+from diffdrive_jacobian.lockstep.external.expectations import AnswersDue, TicksDue
+from diffdrive_jacobian.lockstep.external.topic import ExternalTopic
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.properties import NeverFasterThan

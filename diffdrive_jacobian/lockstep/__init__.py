@@ -4,10 +4,10 @@ from diffdrive_jacobian.lockstep import Lockstep, LockstepError
 """
 
 from diffdrive_jacobian.lockstep._errors import IneffectiveFaultsError, LockstepError, PropertyViolation
-from diffdrive_jacobian.lockstep._external_answers import Answers, Every, Idle
-from diffdrive_jacobian.lockstep._external_process import ExternalProcess
 from diffdrive_jacobian.lockstep._fault_log import FaultEvent
 from diffdrive_jacobian.lockstep._injection import Injection
+from diffdrive_jacobian.lockstep.external.expectations import Answers, Every, Idle
+from diffdrive_jacobian.lockstep.external.process import ExternalProcess
 from diffdrive_jacobian.lockstep.world import Lockstep
 
 __all__ = [

@@ -9,11 +9,11 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 
 from diffdrive_jacobian.lockstep._errors import IneffectiveFaultsError, LockstepError
-from diffdrive_jacobian.lockstep._external import Isolated
 from diffdrive_jacobian.lockstep._fault_log import MAX_REPORTED, TOPIC, FaultEvent, FaultLog
 from diffdrive_jacobian.lockstep._injection import Fault, Injection, World
 from diffdrive_jacobian.lockstep._nodes import Nodes
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
+from diffdrive_jacobian.lockstep.external.others import Isolated
 from diffdrive_jacobian.time_units import NANOSECONDS, in_seconds
 
 

@@ -64,7 +64,7 @@ class Links:
         self.pending: deque[Link | None] = deque()
         """One entry for each message and link. None: a request or a response of a service."""
         self.held: set[str] = set()
-        """Topics whose messages are not polled: they come from other processes, see `_external`."""
+        """Topics whose messages are not polled: they come from other processes, see `external`."""
         self.thread = threading.get_ident()
         """The thread of the nodes."""
         self.elsewhere: dict[Any, SentElsewhere] = {}

@@ -9,12 +9,12 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from diffdrive_jacobian.lockstep._errors import LockstepError, described
-from diffdrive_jacobian.lockstep._external import Isolated
-from diffdrive_jacobian.lockstep._external_graph import compatible, node_name, qos_name
 from diffdrive_jacobian.lockstep._link import is_latched
 from diffdrive_jacobian.lockstep._nodes import Nodes
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.lockstep._simulated_time import SimulatedTime
+from diffdrive_jacobian.lockstep.external.graph import compatible, node_name, qos_name
+from diffdrive_jacobian.lockstep.external.others import Isolated
 from diffdrive_jacobian.ros.rclpy_internals import SERVICES_OF_RCLPY
 
 LISTENING_DEPTH = 1000

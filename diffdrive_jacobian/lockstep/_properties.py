@@ -12,11 +12,11 @@ from rclpy.node import Node
 from rclpy.service import Service
 
 from diffdrive_jacobian.lockstep._errors import LockstepError, PropertyViolation, described
-from diffdrive_jacobian.lockstep._external import Isolated
 from diffdrive_jacobian.lockstep._link import Delivered, Published
 from diffdrive_jacobian.lockstep._nodes import Nodes
 from diffdrive_jacobian.lockstep._report import OMITTED
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
+from diffdrive_jacobian.lockstep.external.others import Isolated
 from diffdrive_jacobian.ros.rclpy_internals import SERVICES_OF_RCLPY
 from diffdrive_jacobian.time_units import NANOSECONDS
 

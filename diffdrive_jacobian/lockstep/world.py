@@ -6,7 +6,7 @@ so a run is as fast as the machine. Its results are the same each time, bit for 
 
 A world consists of its nodes (`_nodes`), the links between them (`_links`), and a scheduler, which
 executes one callback after the other (`_scheduler`) while time advances (`_simulated_time`). There may
-be faults (`_faults`), properties (`_properties`) and nodes in other processes (`_external`).
+be faults (`_faults`), properties (`_properties`) and nodes in other processes (`external`).
 """
 
 from __future__ import annotations
@@ -22,9 +22,6 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep._errors import InitializedError, LockstepError, described
-from diffdrive_jacobian.lockstep._external import External, Isolated, variables
-from diffdrive_jacobian.lockstep._external_answers import Expectation
-from diffdrive_jacobian.lockstep._external_process import ExternalProcess
 from diffdrive_jacobian.lockstep._fault_log import FaultEvent
 from diffdrive_jacobian.lockstep._faults import Faults
 from diffdrive_jacobian.lockstep._guard import Guard
@@ -35,6 +32,9 @@ from diffdrive_jacobian.lockstep._properties import Properties, Property
 from diffdrive_jacobian.lockstep._report import describe
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.lockstep._simulated_time import CONNECTION, SimulatedTime, checked_nanoseconds
+from diffdrive_jacobian.lockstep.external.expectations import Expectation
+from diffdrive_jacobian.lockstep.external.others import External, Isolated, variables
+from diffdrive_jacobian.lockstep.external.process import ExternalProcess
 from diffdrive_jacobian.ros.fastdds_profiles import withdraw
 from diffdrive_jacobian.ros.rclpy_internals import refuse_init
 from diffdrive_jacobian.ros.runner import DISCOVERY, UserError, environment, ros_context

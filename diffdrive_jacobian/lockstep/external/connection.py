@@ -9,15 +9,12 @@ from contextlib import AbstractContextManager, suppress
 from rclpy.node import Node
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
-from diffdrive_jacobian.lockstep._external_answers import Expectation, Idle
-from diffdrive_jacobian.lockstep._external_discovery import UNTIMED, Discovery
-from diffdrive_jacobian.lockstep._external_expectations import Due, Expectations
-from diffdrive_jacobian.lockstep._external_graph import ExternalGraph
-from diffdrive_jacobian.lockstep._external_probe import ROUNDS, Probe, Repeated
-from diffdrive_jacobian.lockstep._external_process import ExternalProcess, end_all
-from diffdrive_jacobian.lockstep._external_topic import ExternalTopic
-from diffdrive_jacobian.lockstep._external_waiting import Waiting
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
+from diffdrive_jacobian.lockstep.external.expectations import Due, Expectation, Expectations
+from diffdrive_jacobian.lockstep.external.graph import UNTIMED, Discovery, ExternalGraph
+from diffdrive_jacobian.lockstep.external.process import ExternalProcess, end_all
+from diffdrive_jacobian.lockstep.external.topic import ExternalTopic
+from diffdrive_jacobian.lockstep.external.waiting import ROUNDS, Probe, Repeated, Waiting
 from diffdrive_jacobian.ros.rclpy_internals import wait_for_message
 
 DISCOVERY_PERIOD = 0.01
@@ -208,7 +205,7 @@ class Connection:
         """
         services = {name for name, _ in self._node.get_service_names_and_types()}
         nodes = self._discovery().awaited_nodes(*self._awaited())
-        probes = [Probe(self._node, Idle(name, within=timeout)) for name in sorted(nodes)]
+        probes = [Probe(self._node, name, timeout) for name in sorted(nodes)]
         try:
             known = [probe for probe in probes if probe.service in services]
             for probe in known:

@@ -17,14 +17,13 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
-from diffdrive_jacobian.lockstep._external_answers import WITHIN, Expectation
-from diffdrive_jacobian.lockstep._external_connection import Connection
-from diffdrive_jacobian.lockstep._external_expectations import Due
-from diffdrive_jacobian.lockstep._external_probe import ROUNDS
-from diffdrive_jacobian.lockstep._external_process import ExternalProcess, free_domain
-from diffdrive_jacobian.lockstep._external_topic import ExternalTopic
 from diffdrive_jacobian.lockstep._link import Link
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
+from diffdrive_jacobian.lockstep.external.connection import Connection
+from diffdrive_jacobian.lockstep.external.expectations import WITHIN, Due, Expectation
+from diffdrive_jacobian.lockstep.external.process import ExternalProcess, free_domain
+from diffdrive_jacobian.lockstep.external.topic import ExternalTopic
+from diffdrive_jacobian.lockstep.external.waiting import ROUNDS
 from diffdrive_jacobian.numerics.fields import integer
 from diffdrive_jacobian.ros.fastdds_profiles import open_to_others
 from diffdrive_jacobian.ros.rclpy_internals import wait_for_message
