@@ -162,6 +162,7 @@ class Links:
             if publisher in node.publishers:
                 source.owner = node
                 source.stages += self._stages_of(source)
+                return
 
     def _divert(self, publisher: Publisher, source: Source, message: Any) -> bool:
         """Let a message pass the gate and the stages of its sender.
