@@ -22,6 +22,7 @@ from ruamel.yaml.events import (
     ScalarEvent,
 )
 
+from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.text import format_size
 
 MAX_SIZE = 2_000_000
@@ -37,7 +38,7 @@ YAML_ERRORS = (YAMLError, ValueError, RecursionError, OverflowError)
 """What `load_yaml` raises. `TooLargeError` is a ValueError."""
 
 
-class TooLargeError(ValueError):
+class TooLargeError(DiffdriveError, ValueError):
     """A file asks for more memory or time than is allowed; the message gives the limit."""
 
 

@@ -1,5 +1,17 @@
-"""Errors of the layer above rclpy that tools without ROS raise, too."""
+"""The base class of the errors of this package, and the error of those who start its programs."""
+
+from __future__ import annotations
+
+__all__ = ['DiffdriveError', 'UserError']
 
 
-class UserError(Exception):
-    """A mistake of the user who started the process; the message names it."""
+class DiffdriveError(Exception):
+    """Base class of all errors of this package.
+
+    Some are a ValueError, an OSError or another builtin error, too. An invalid argument of a function is
+    a plain ValueError, as in NumPy.
+    """
+
+
+class UserError(DiffdriveError):
+    """An argument, a parameter or the environment of a program is invalid; the message names it."""

@@ -22,7 +22,7 @@ from defective_controllers import CONTROLLERS, DEFECTIVE
 from hypothesis import strategies as st
 
 from diffdrive_jacobian import faults
-from diffdrive_jacobian.exploration import explore, fault_schedules, numbers, points, poses
+from diffdrive_jacobian.testing import explore, fault_schedules, numbers, points, poses
 
 RIGHT = 'no defect'
 SHRINK_WORLDS = 200

@@ -16,6 +16,7 @@ from process_faults.outcome import Outcome
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
+from diffdrive_jacobian import faults
 from diffdrive_jacobian.lockstep.runner import LockstepRunner
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
@@ -32,7 +33,7 @@ from diffdrive_jacobian.properties import (
 )
 from diffdrive_jacobian.ros.remote_goal import ANSWER_PATIENCE, Result, send_goal_in
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.testing import explore, fault_schedules, faults, goals, poses, times
+from diffdrive_jacobian.testing import explore, fault_schedules, goals, poses, times
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 DISTURBED = 4.0

@@ -38,10 +38,12 @@ import time
 from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from pathlib import Path
+from types import ModuleType
 
 import forked
 from domains import domain_id
 
+import diffdrive_jacobian
 from diffdrive_jacobian.parameters.declaration import NodeParameters, specifications
 from diffdrive_jacobian.parameters.nodes import (
     GoToGoalParameters,
@@ -342,11 +344,17 @@ def with_parameter_tables(text: str) -> str:
 
 # --- Public names
 
-PUBLIC = (
-    *('control', 'kinematics', 'simulation', 'sweeps', 'calibration'),
-    *('reading', 'recovery', 'replay', 'drives', 'testing', 'faults', 'properties'),
-)
-"""Packages whose `__all__` is public."""
+
+def public_names(package: ModuleType = diffdrive_jacobian, prefix: str = '') -> dict[str, object]:
+    """Return the public objects by their path in this package, those in public modules included."""
+    found = {}
+    for name in package.__all__:
+        if not hasattr(package, name):
+            importlib.import_module(f'{package.__name__}.{name}')
+        value = found[f'{prefix}{name}'] = getattr(package, name)
+        if inspect.ismodule(value):
+            found |= public_names(value, f'{prefix}{name}.')
+    return found
 
 
 def public_page() -> str:
@@ -354,28 +362,19 @@ def public_page() -> str:
     lines = [
         '# Public names',
         '',
-        'What a program may import, with the first sentence of its docstring. Each name is in the',
-        '`__all__` of its package, from which it is imported. Type checkers refuse others. Everything',
-        'else may change without notice. Public are also the nodes, `nodes.virtual_robot.VirtualRobot`,',
-        '`nodes.go_to_goal.GoToGoal` and `nodes.wheel_bridge.WheelBridge`, and the decorator of',
-        'equations, `numerics.formula.formula` ([design](design.md)).',
+        'What a program may import, with the first sentence of its docstring. Each object has one',
+        'public path, as on this page. Packages and modules list these names in `__all__`. Everything',
+        'else is internal and may change without notice. All errors derive from',
+        '`errors.DiffdriveError`.',
         '',
         'Written by `python test/pages.py public`.',
     ]
-    for name in PUBLIC:
-        package = importlib.import_module(f'diffdrive_jacobian.{name}')
-        lines += ['', f'## {name}', '', _sentence(package), '', '| name | |', '|---|---|']
-        for public in sorted(package.__all__):
-            value = getattr(package, public)
-            lines.append(f'| `{public}` | {_sentence(value)} |')
-            if inspect.ismodule(value) and value.__name__.startswith(f'{package.__name__}.'):
-                lines += [
-                    f'| `{public}.{one}` | {_sentence(function)} |'
-                    for one, function in sorted(vars(value).items())
-                    if getattr(function, '__module__', '') == value.__name__
-                    and not one.startswith('_')
-                    and callable(function)
-                ]
+    for path, value in public_names().items():
+        package, _, name = path.partition('.')
+        if not name:
+            lines += ['', f'## {package}', '', _sentence(value), '', '| name | |', '|---|---|']
+        else:
+            lines.append(f'| `{name}` | {_sentence(value)} |')
     return '\n'.join([*lines, ''])
 
 

@@ -257,7 +257,7 @@ def test_wheels_that_are_given_are_not_looked_for():
         (['--wheels-topic', '/mocap/pose'], ['must be of type sensor_msgs/msg/JointState']),
         (['--wheels', 'left', 'right'], ["no joint 'left'", JOINTS[0]]),
         (['--wheels', JOINTS[0], JOINTS[0]], ['both wheels', JOINTS[0]]),
-        (['--wheel-radius', '50'], ['wheel radius must be from 0.001 to 10 m']),
+        (['--wheel-radius', '50'], ['wheel radius must be in [0.001, 10] m, got 50.0']),
         (['-o', 'found.txt'], ['must end in .yaml']),
         (['-o', 'nowhere/found.yaml'], ['nowhere']),
     ],
@@ -273,7 +273,7 @@ def test_wrong_arguments(written, folder, capsys, arguments, words):
     ('arguments', 'word'),
     [
         (['--wheel-radius', '-1'], 'must be positive'),
-        (['--heading-noise', 'nan'], 'must be a finite number'),
+        (['--heading-noise', 'nan'], 'must be finite, got nan'),
         (['--yaw-offset', '90'], 'must be in radians'),
         (['-p', 'kp:=1'], 'takes no ROS arguments'),
         (['--lever-arm', '1'], 'expected 2 arguments'),

@@ -3,14 +3,30 @@
 from __future__ import annotations
 
 import pickle
+import re
 from dataclasses import KW_ONLY, dataclass, field, replace
+from functools import partial
 from typing import Annotated, ClassVar
 
 import numpy as np
 import pytest
 
 from diffdrive_jacobian.numerics.checks import Finite, NotNegative, Positive, Probability
-from diffdrive_jacobian.numerics.fields import Checked, Count, Name, Names, Text, one_of, optional
+from diffdrive_jacobian.numerics.fields import (
+    Checked,
+    Count,
+    Name,
+    Names,
+    Text,
+    between,
+    boolean,
+    instance,
+    interval,
+    mapping,
+    one_of,
+    optional,
+    sequence,
+)
 
 
 def even(name: str, value: int) -> int:
@@ -66,12 +82,12 @@ def test_fields_are_converted():
         ({'count': 1.0}, 'count must be an integer of at least 1, got 1.0'),
         ({'count': True}, 'count must be an integer of at least 1, got True'),
         ({'count': -(10**5000)}, 'count must be an integer of at least 1, got an object of class int'),
-        ({'goals': 'odom'}, "goals must be a tuple of names, got 'odom'"),
-        ({'goals': 3}, 'goals must be a tuple of names, got 3'),
-        ({'goals': ['odom', '']}, r"goals must be a tuple of names, got \['odom', ''\]"),
+        ({'goals': 'odom'}, "goals must be a list or tuple of names, got 'odom'"),
+        ({'goals': 3}, 'goals must be a list or tuple of names, got 3'),
+        ({'goals': ['odom', '']}, r"goals must be a list or tuple of names, got \['odom', ''\]"),
         ({'kind': 'leg'}, "kind must be one of 'wheel', 'arm', got 'leg'"),
         ({'pairs': 3}, 'pairs must be even, got 3'),
-        ({'share': float('nan')}, 'share must be between 0 and 1, got nan'),
+        ({'share': float('nan')}, r'share must be in \[0, 1\], got nan'),
     ],
 )
 def test_invalid_fields_are_named(changes, message):
@@ -100,3 +116,39 @@ def test_a_name_for_type_checkers_declares_no_check():
     assert Local('odom', 3).world == 3
     with pytest.raises(ValueError, match='topic must be a string'):
         Local('', 3)
+
+
+@pytest.mark.parametrize(
+    ('check', 'valid', 'invalid', 'message'),
+    [
+        (between(0.0, 1.0), (0, 1.0, np.float32(0.5)), -0.1, 'x must be in [0, 1], got -0.1'),
+        (between(0.0, 1.0), (), float('nan'), 'x must be in [0, 1], got nan'),
+        (between(0.0, 1.0), (), True, 'x must be a number, got True'),
+        (between(0.0, 1.0), (), '1', "x must be a number, got '1'"),
+        (between(0.0, 1.0, unit='m'), (), 2, 'x must be in [0, 1] m, got 2'),
+        (between(0.0, 1.0, above=0.0), (1e-300, 1), 0.0, 'x must be in (0, 1], got 0.0'),
+        (between(0.1), (0.1, 1e300), float('inf'), 'x must be finite and at least 0.1, got inf'),
+        (between(0, 9, above=3), (4,), 3, 'x must be in (3, 9], got 3'),
+        (boolean, (True, False), 1, 'x must be True or False, got 1'),
+        (mapping, ({},), [], 'x must be a map, got []'),
+        (sequence, ([],), {}, 'x must be a list, got {}'),
+        (one_of(), (), 'a', "x must be one of (none), got 'a'"),
+        (partial(instance, wanted=int), (1,), 'a', "x must be of class int, got 'a'"),
+    ],
+)
+def test_checks_that_need_no_numpy(check, valid, invalid, message):
+    for value in valid:
+        assert check('x', value) == value
+    with pytest.raises(ValueError, match=f'^{re.escape(message)}'):
+        check('x', invalid)
+
+
+def test_integers_that_are_no_floats_are_refused():
+    for check in (between(0.0), between(0.0, 9.0)):
+        with pytest.raises(ValueError, match='got an object of class int'):
+            check('x', 10**5000)
+
+
+def test_ranges_in_words_keep_integers():
+    assert interval(0, 2**63 - 1) == 'in [0, 9223372036854775807]'
+    assert interval(-1e6, 1e6) == 'in [-1e+06, 1e+06]'

@@ -24,7 +24,7 @@ from diffdrive_jacobian.bags import metadata
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, JournalWriter, Message, Text, journal_of
 from diffdrive_jacobian.bags.message_definitions import definition
-from diffdrive_jacobian.bags.metadata import DamagedError, check_connections, check_metadata
+from diffdrive_jacobian.bags.metadata import MetadataError, check_connections, check_metadata
 from diffdrive_jacobian.plots.run_figure import LABELS, draw
 from diffdrive_jacobian.reading.reader import read_run
 from diffdrive_jacobian.reading.time_series import commanded, limits, measured
@@ -184,7 +184,7 @@ def test_a_damaged_value_is_named(bags, tmp_path, key, change):
         # Only the data file tells that it is wrong.
         check_metadata((bag / 'metadata.yaml').read_text())
         return
-    with pytest.raises(DamagedError, match=f'metadata.yaml.*{key}'):
+    with pytest.raises(MetadataError, match=f'metadata.yaml.*{key}'):
         check_metadata((bag / 'metadata.yaml').read_text())
 
 
@@ -344,7 +344,7 @@ def test_many_topics_are_checked_in_linear_time(monkeypatch):
     ]
     check_connections(topics, topics)
     assert compared == len(topics)
-    with pytest.raises(DamagedError, match='does not describe the topic /t0 '):
+    with pytest.raises(MetadataError, match='does not describe the topic /t0 '):
         check_connections(topics[1:], topics)
 
 
@@ -355,7 +355,7 @@ def rename_all(content, key, value):
 
 @pytest.mark.parametrize('text', ['', '[1, 2', '\0', 'x', '[[' * 1500, '{a: ' * 1500, '- ' * 1500])
 def test_metadata_that_is_no_map_or_too_deep_is_damage(text):
-    with pytest.raises(DamagedError, match=r'metadata\.yaml'):
+    with pytest.raises(MetadataError, match=r'metadata\.yaml'):
         check_metadata(text)
 
 

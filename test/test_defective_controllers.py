@@ -10,8 +10,7 @@ from defect_scenario import PROPERTIES, drive
 from defective_controllers import DEFECTIVE
 
 from diffdrive_jacobian.faults import Duplicate, Hang, Loss, TimeJump
-from diffdrive_jacobian.properties import PropertyViolation
-from diffdrive_jacobian.testing import Lockstep
+from diffdrive_jacobian.testing import Lockstep, PropertyViolation
 
 GOAL = (0.0, (0.0, 0.0))
 ONE_METRE = (1.0, 0.0, 0.0)

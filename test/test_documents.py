@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from diffdrive_jacobian.control import go_to_goal
-from diffdrive_jacobian.kinematics import PlanarArm, contact, se2
+from diffdrive_jacobian.kinematics import contact, se2
 from diffdrive_jacobian.kinematics import diff_drive as dd
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 
 HEADINGS = np.linspace(-np.pi, np.pi, 25)
 r, l, d, psi = 0.033, 0.16, 0.1, 0.7  # noqa: E741 - the documents' letters

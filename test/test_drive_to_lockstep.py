@@ -212,7 +212,7 @@ def test_a_bug_keeps_the_recording(tmp_path, monkeypatch):
     [
         (['--open'], '--lockstep and --open exclude each other'),
         (['--controller', 'pid'], "'go_to_goal', 'offset_point', 'pose'"),
-        (['--heading', 'nan'], 'argument --heading: must be a finite number'),
+        (['--heading', 'nan'], 'argument --heading: must be finite, got nan'),
         (['--ros-args', '-p', 'wheel_radius:=-1.0'], "parameter 'wheel_radius' must be in [0.001, 10]"),
         (['--ros-args', '--no-such-option'], 'ROS arguments: '),
     ],

@@ -17,17 +17,17 @@ from exploration_scenarios import changing, divide, follow, identified, moving
 from hypothesis import strategies as st
 
 from diffdrive_jacobian.bags.bag_reader import open_bag
-from diffdrive_jacobian.exploration import (
+from diffdrive_jacobian.exploration import search
+from diffdrive_jacobian.exploration.result import described_replay
+from diffdrive_jacobian.faults import Delay, Loss
+from diffdrive_jacobian.properties import AccelerationWithin, NeverFasterThan
+from diffdrive_jacobian.testing import (
     ExplorationError,
     SerialExecutor,
     explore,
     fault_schedules,
     numbers,
-    search,
 )
-from diffdrive_jacobian.exploration.result import described_replay
-from diffdrive_jacobian.faults import Delay, Loss
-from diffdrive_jacobian.properties import AccelerationWithin, NeverFasterThan
 
 SLOW = NeverFasterThan(0.75, 1.0)
 LOSSES = fault_schedules(['speed'], kinds=[Loss, Delay], max_faults=2, duration=1.2)

@@ -21,7 +21,6 @@ from hypothesis import strategies as st
 
 from diffdrive_jacobian import signals
 from diffdrive_jacobian.control import find_controller
-from diffdrive_jacobian.exploration import LocalExecutor, SerialExecutor, explore, fault_schedules
 from diffdrive_jacobian.exploration.child import call_in_child
 from diffdrive_jacobian.exploration.errors import ExplorationError
 from diffdrive_jacobian.exploration.replay import replay
@@ -29,6 +28,7 @@ from diffdrive_jacobian.exploration.trial import Outcome
 from diffdrive_jacobian.faults import Loss
 from diffdrive_jacobian.properties import NeverFasterThan
 from diffdrive_jacobian.sweeps import Setup, Sweep, sweep
+from diffdrive_jacobian.testing import LocalExecutor, SerialExecutor, explore, fault_schedules
 
 LOSSES = fault_schedules(['speed'], kinds=[Loss], duration=1.2)
 SETUP = Setup(grid=5, starts=3, rate=20.0)

@@ -11,19 +11,20 @@ import pytest
 from exploration_scenarios import Follower, Sensor, follow, robot
 from hypothesis import strategies as st
 
-from diffdrive_jacobian.exploration import (
+from diffdrive_jacobian.exploration.child import _picklable
+from diffdrive_jacobian.exploration.worker import result_of
+from diffdrive_jacobian.faults import Hang, Loss
+from diffdrive_jacobian.plots import run_figure
+from diffdrive_jacobian.plots.fault_marks import VIOLATION
+from diffdrive_jacobian.properties import NeverFasterThan, Property, StaysNear, Watch
+from diffdrive_jacobian.testing import (
     ExplorationError,
+    Lockstep,
+    PropertyViolation,
     SerialExecutor,
     explore,
     fault_schedules,
 )
-from diffdrive_jacobian.exploration.child import _picklable
-from diffdrive_jacobian.exploration.worker import result_of
-from diffdrive_jacobian.faults import Hang, Loss
-from diffdrive_jacobian.lockstep import Lockstep, PropertyViolation
-from diffdrive_jacobian.plots import run_figure
-from diffdrive_jacobian.plots.fault_marks import VIOLATION
-from diffdrive_jacobian.properties import NeverFasterThan, Property, StaysNear, Watch
 
 
 def serial(scenario, properties=(), **arguments):

@@ -14,7 +14,12 @@ from hypothesis import find, given, settings
 from hypothesis import strategies as st
 
 from diffdrive_jacobian import faults
-from diffdrive_jacobian.exploration import (
+from diffdrive_jacobian.exploration.generation import generate, shrink, trials
+from diffdrive_jacobian.exploration.scenario import ScenarioName
+from diffdrive_jacobian.exploration.source import Source
+from diffdrive_jacobian.exploration.trial import Trial
+from diffdrive_jacobian.exploration.versions import differences, versions
+from diffdrive_jacobian.testing import (
     ExplorationError,
     angles,
     fault_schedules,
@@ -27,11 +32,6 @@ from diffdrive_jacobian.exploration import (
     times,
     waypoints,
 )
-from diffdrive_jacobian.exploration.generation import generate, shrink, trials
-from diffdrive_jacobian.exploration.scenario import ScenarioName
-from diffdrive_jacobian.exploration.source import Source
-from diffdrive_jacobian.exploration.trial import Trial
-from diffdrive_jacobian.exploration.versions import differences, versions
 
 FEW = settings(max_examples=40, database=None, derandomize=True)
 SHRINK = settings(max_examples=100, database=None, derandomize=True)
@@ -139,9 +139,9 @@ def test_corruption_and_faults_of_the_robot(schedule):
     ('arguments', 'words'),
     [
         ({}, 'needs topics, nodes'),
-        ({'fields': {'odom': 'x'}}, 'odom must be a list'),
+        ({'fields': {'odom': 'x'}}, "odom must be a list or tuple of names, got 'x'"),
         ({'fields': ['odom']}, r"fields must be a dict .* got \['odom'\]"),
-        ({'topics': 'odom'}, 'a list of names'),
+        ({'topics': 'odom'}, 'topics must be a list or tuple of names, got .odom'),
         ({'topics': ['odom'], 'max_faults': 0}, 'max_faults'),
         ({'topics': ['odom'], 'duration': math.inf}, 'duration'),
         ({'kinds': [faults.Loss]}, 'Loss needs topics'),

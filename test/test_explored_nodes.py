@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 from explored_nodes import SCENARIOS, properties
 
-from diffdrive_jacobian.exploration import SerialExecutor
+from diffdrive_jacobian import faults
 from diffdrive_jacobian.exploration.digest import MessageDigest
-from diffdrive_jacobian.lockstep import Lockstep
-from diffdrive_jacobian.testing import explore, faults
+from diffdrive_jacobian.testing import Lockstep, SerialExecutor, explore
 
 
 @pytest.mark.parametrize('seed', range(3))

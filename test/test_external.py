@@ -22,7 +22,6 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.faults import ClockPause, Kill, Loss, TimeJump
-from diffdrive_jacobian.lockstep import Answers, Every, Idle, Lockstep, LockstepError, PropertyViolation
 from diffdrive_jacobian.lockstep._clock import Agenda, Clocks
 from diffdrive_jacobian.lockstep._gate import Gates
 from diffdrive_jacobian.lockstep._links import Links
@@ -32,6 +31,7 @@ from diffdrive_jacobian.lockstep.external.topic import ExternalTopic
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.properties import NeverFasterThan
+from diffdrive_jacobian.testing import Answers, Every, Idle, Lockstep, LockstepError, PropertyViolation
 
 SECOND = 1_000_000_000
 SCRIPT = external_nodes.__file__
@@ -513,10 +513,10 @@ def test_a_domain_with_a_port_in_use_is_not_chosen(monkeypatch):
         ),
         (
             lambda: Answers('cmd_vel', to='odom', within=0.0),
-            'within must be positive and finite, got 0.0',
+            'within must be finite and at least 1e-09 s, got 0.0',
         ),
-        (lambda: Every('cmd_vel', math.inf), 'period must be positive and finite, got inf'),
-        (lambda: Every('cmd_vel', 1e-10), 'period must be at least 1e-9 s, got 1e-10'),
+        (lambda: Every('cmd_vel', math.inf), 'period must be finite and at least 1e-09 s, got inf'),
+        (lambda: Every('cmd_vel', 1e-10), 'period must be finite and at least 1e-09 s, got 1e-10'),
         (
             lambda: Every('cmd_vel', 0.1, created=-1.0),
             'created must be zero or positive and finite, got -1.0',

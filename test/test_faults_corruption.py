@@ -298,7 +298,7 @@ def test_a_type_without_fields():
         ({'change': 'set', 'amount': math.inf}, "a bool or a str (for others there are 'nan', 'inf'"),
         ({'change': 'set', 'amount': None}, 'a bool or a str'),
         ({'change': 'nan', 'amount': 2.0}, "amount must not be given with change 'nan', got 2.0"),
-        ({'change': 'nan', 'probability': 1.5}, 'probability must be between 0 and 1, got 1.5'),
+        ({'change': 'nan', 'probability': 1.5}, 'probability must be in [0, 1], got 1.5'),
         ({'change': 'nan', 'field': ''}, 'field must be a string'),
         ({'change': 'nan', 'topic': 3}, 'topic must be a string'),
         ({'change': 'nan', 'start': -1.0}, 'start must be'),

@@ -29,12 +29,12 @@ from diffdrive_jacobian.faults.robot import (
 )
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.kinematics.se2 import compose, integrate, inverse, wrap_angle
-from diffdrive_jacobian.lockstep import LockstepError
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.simulation import Robot, RobotModel
 from diffdrive_jacobian.simulation.actuators import SETTLED, STEP, Actuators
 from diffdrive_jacobian.simulation.encoders import Encoders
 from diffdrive_jacobian.simulation.slip import Drift
+from diffdrive_jacobian.testing import LockstepError
 
 SECOND = 1_000_000_000
 R, L = 0.033, 0.16
@@ -580,7 +580,7 @@ def test_a_fault_without_a_robot_is_reported_and_one_of_another_node_refused(loc
         (lambda: Push(noticed=1), 'noticed must be True or False, got 1'),
         (
             lambda: WrongGeometry(wheel_separation_multiplier=0.0),
-            'must be between 0.01 and 100, got 0.0',
+            'must be in [0.01, 100], got 0.0',
         ),
         (lambda: Slip(robot=''), 'robot must be a string that is not empty'),
     ],

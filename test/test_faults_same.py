@@ -15,10 +15,11 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
+from diffdrive_jacobian import faults
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.testing import Lockstep, faults
+from diffdrive_jacobian.testing import Lockstep
 
 TOPICS = {
     'odom': Odometry,

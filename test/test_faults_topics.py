@@ -10,8 +10,9 @@ from faults_nodes import LATCHED, Sink, Source, play, whats
 from rclpy.node import Node
 from std_msgs.msg import Int64, String
 
+from diffdrive_jacobian import faults
 from diffdrive_jacobian.bags.bag_reader import open_bag
-from diffdrive_jacobian.testing import Lockstep, LockstepError, faults
+from diffdrive_jacobian.testing import Lockstep, LockstepError
 
 IN_TIME = [(number, 100.0 * number) for number in range(1, 11)]
 

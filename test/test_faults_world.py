@@ -10,9 +10,10 @@ from faults_nodes import Relay, Sink, Source, whats
 from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
+from diffdrive_jacobian import faults
 from diffdrive_jacobian.properties import end_of_faults
 from diffdrive_jacobian.properties._node_time import delays
-from diffdrive_jacobian.testing import LockstepError, faults
+from diffdrive_jacobian.testing import LockstepError
 
 INF = float('inf')
 
@@ -207,7 +208,7 @@ def test_the_expression_of_a_fault_is_short():
     [
         (lambda: faults.Loss(''), "topic must be a string that is not empty, got ''"),
         (lambda: faults.Loss('a', node=3), 'node must be a string, got 3'),
-        (lambda: faults.Loss('a', probability=1.5), 'probability must be between 0 and 1, got 1.5'),
+        (lambda: faults.Loss('a', probability=1.5), r'probability must be in \[0, 1\], got 1.5'),
         (lambda: faults.Loss('a', probability='x'), "probability must be a number, got 'x'"),
         (lambda: faults.Loss('a', burst=0), 'burst must be an integer of at least 1, got 0'),
         (lambda: faults.Loss('a', burst=True), 'burst must be an integer of at least 1, got True'),

@@ -136,7 +136,7 @@ def test_a_message_type_that_was_imported_before_its_fields_are_checked_is_repor
 
 
 WORLDS = """
-    from diffdrive_jacobian.testing import faults
+    from diffdrive_jacobian import faults
 
     def test_two_robots(lockstep, robot_at):
         robot_at(1.0, -2.0, 0.5, namespace='one', linear__x__max_velocity=0.2)
@@ -319,7 +319,8 @@ def test_a_failure_reports_the_last_messages_once(run, monkeypatch):
 
 REQUIRED = """
     from dataclasses import dataclass
-    from diffdrive_jacobian.testing import properties
+    from diffdrive_jacobian import properties
+    from diffdrive_jacobian.testing import PropertyViolation
 
     @dataclass(frozen=True, repr=False)
     class Ends(properties.Property):
@@ -335,7 +336,7 @@ REQUIRED = """
 
     def test_is_finished_by_hand(lockstep):
         lockstep.require(Ends())
-        with pytest.raises(properties.PropertyViolation, match='it never ends'):
+        with pytest.raises(PropertyViolation, match='it never ends'):
             lockstep.finish()
 
     def test_is_closed_by_hand(lockstep):

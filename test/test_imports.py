@@ -34,7 +34,7 @@ DOORS = {
     '__init__': (),
     'text': (),
     'time_units': (),
-    'bounded_yaml': ('text',),
+    'bounded_yaml': ('errors', 'text'),
     'errors': (),
     'lazy': (),
     'signals': (),

@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 from diffdrive_jacobian import kinematics
-from diffdrive_jacobian.kinematics import MobileManipulator, PlanarArm, contact, diff_drive, se2
+from diffdrive_jacobian.kinematics import contact, diff_drive, se2
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
-from diffdrive_jacobian.kinematics.mobile_manipulator import mobile_manipulator_jacobian
-from diffdrive_jacobian.kinematics.planar_arm import arm_forward_kinematics, arm_jacobian
+from diffdrive_jacobian.kinematics.mobile_manipulator import (
+    MobileManipulator,
+    mobile_manipulator_jacobian,
+)
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm, arm_forward_kinematics, arm_jacobian
 
 COUNT = 1000
 STEP = 1e-5

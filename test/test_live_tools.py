@@ -105,11 +105,11 @@ def test_drive_to_live_in_real_time(world):
 @pytest.mark.parametrize(
     ('tool', 'arguments', 'message'),
     [
-        (watch_run, ['--port', '0'], 'must be a whole number in 1 to 65535'),
-        (watch_run, ['--port', '99999'], 'must be a whole number'),
+        (watch_run, ['--port', '0'], 'must be an integer from 1 to 65535, got 0'),
+        (watch_run, ['--port', '99999'], 'must be an integer from 1 to 65535, got 99999'),
         (watch_run, ['--rate', '2'], '--rate needs a BAG'),
         (watch_run, ['bag', '--rate', '-2'], 'must be positive'),
-        (watch_run, ['bag', '--rate', '1e9'], 'must be in 0.01 to 1000'),
+        (watch_run, ['bag', '--rate', '1e9'], 'must be in [0.01, 1000], got 1000000000.0'),
         (watch_run, ['bag', '--ros-args', '-p', 'x:=1'], 'a BAG needs no ROS arguments'),
         (drive_to, [], 'X Y (only --live needs no goal)'),
         (drive_to, ['1', '1', '--no-browser'], 'are options of --live'),

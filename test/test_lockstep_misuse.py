@@ -26,7 +26,7 @@ from diffdrive_jacobian.testing import Lockstep, LockstepError
 def test_times_that_cannot_be_are_refused(lockstep, seconds):
     for advance in (lockstep.run_for, lockstep.step):
         with pytest.raises(
-            ValueError, match=f'must be a positive number of seconds, .*, got {re.escape(str(seconds))}'
+            ValueError, match=rf'must be in \[1e-09, 2147483647\] s, got {re.escape(str(seconds))}'
         ):
             advance(seconds)
     with pytest.raises(ValueError, match='timeout must be'):
@@ -47,7 +47,7 @@ def test_invalid_use_is_refused(lockstep):
         Lockstep()
     lockstep.close()
     for wrong in ({'start': 0.0}, {'start': -1.0}, {'patience': 0.0}):
-        with pytest.raises(ValueError, match='positive number'):
+        with pytest.raises(ValueError, match=r'must be in \[1e-09, 2147483647\] s'):
             Lockstep(**wrong)
     with pytest.raises(LockstepError, match='ROS arguments'):
         Lockstep(['--ros-args', '--no-such-option'])

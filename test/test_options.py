@@ -184,8 +184,8 @@ def robots(tmp_path_factory):
     from recorded import LockstepRecording
     from ros_messages import twist
 
-    from diffdrive_jacobian.lockstep import Lockstep
     from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+    from diffdrive_jacobian.testing import Lockstep
 
     path = tmp_path_factory.mktemp('bags') / 'two'
     with Lockstep() as world:

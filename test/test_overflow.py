@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from diffdrive_jacobian.control import resolved_rate
-from diffdrive_jacobian.kinematics import PlanarArm
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 from diffdrive_jacobian.simulation import track_line
 
 pytestmark = pytest.mark.filterwarnings('error')

@@ -7,9 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from diffdrive_jacobian.kinematics import MobileManipulator, PlanarArm, contact, se2
+from diffdrive_jacobian.kinematics import contact, se2
 from diffdrive_jacobian.kinematics import diff_drive as dd
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
+from diffdrive_jacobian.kinematics.mobile_manipulator import MobileManipulator
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 
 R, L = 0.033, 0.16  # document A's robot
 BATCH = (4, 5)

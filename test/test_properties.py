@@ -19,7 +19,6 @@ from diffdrive_jacobian.properties import (
     NoCommandAfterCancel,
     NoStaleGoals,
     PoseFinite,
-    PropertyViolation,
     ReachesGoal,
     Settles,
     StatusProtocol,
@@ -29,7 +28,7 @@ from diffdrive_jacobian.properties import (
     StopsAfterLostOdometry,
     StopsOnShutdown,
 )
-from diffdrive_jacobian.testing import LockstepError
+from diffdrive_jacobian.testing import LockstepError, PropertyViolation
 
 
 @pytest.fixture

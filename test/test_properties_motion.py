@@ -24,14 +24,12 @@ from diffdrive_jacobian.faults import (
     Loss,
     TimeJump,
 )
-from diffdrive_jacobian.lockstep import LockstepError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.properties import (
     ArrivesOnceFaultsEnd,
     KeepsDriving,
     NeverFasterThan,
     PoseFinite,
-    PropertyViolation,
     ReachesGoal,
     Settles,
     StaysNear,
@@ -41,6 +39,7 @@ from diffdrive_jacobian.properties import (
     StopsOnShutdown,
     end_of_faults,
 )
+from diffdrive_jacobian.testing import LockstepError, PropertyViolation
 
 # --- Stopping
 

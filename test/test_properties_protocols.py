@@ -16,10 +16,9 @@ from diffdrive_jacobian.properties import (
     NeverFasterThan,
     NoCommandAfterCancel,
     NoStaleGoals,
-    PropertyViolation,
     StatusProtocol,
 )
-from diffdrive_jacobian.testing import LockstepError
+from diffdrive_jacobian.testing import LockstepError, PropertyViolation
 
 
 @pytest.fixture

@@ -9,13 +9,14 @@ import pytest
 
 from diffdrive_jacobian.control import resolved_rate
 from diffdrive_jacobian.control.resolved_rate import StraightLine
-from diffdrive_jacobian.kinematics import MobileManipulator, PlanarArm
 from diffdrive_jacobian.kinematics.inverse_velocity import (
     joint_limit_cost,
     joint_limit_gradient,
     manipulability,
     manipulability_gradient,
 )
+from diffdrive_jacobian.kinematics.mobile_manipulator import MobileManipulator
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 from diffdrive_jacobian.simulation import track_line
 
 ARM = PlanarArm([1.0, 0.8])

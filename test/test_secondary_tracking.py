@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from diffdrive_jacobian.control import StraightLine, resolved_rate
-from diffdrive_jacobian.kinematics import MobileManipulator, PlanarArm
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
+from diffdrive_jacobian.kinematics.mobile_manipulator import MobileManipulator
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 from diffdrive_jacobian.simulation import track_line
 
 ARM = PlanarArm([0.6, 0.5, 0.4])

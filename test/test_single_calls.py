@@ -10,14 +10,9 @@ import pytest
 
 from diffdrive_jacobian import control
 from diffdrive_jacobian.control import Arrival, StraightLine, VelocityLimits, Waypoints
-from diffdrive_jacobian.kinematics import (
-    MobileManipulator,
-    PlanarArm,
-    contact,
-    diff_drive,
-    inverse_kinematics,
-    inverse_velocity,
-)
+from diffdrive_jacobian.kinematics import contact, diff_drive, inverse_kinematics, inverse_velocity
+from diffdrive_jacobian.kinematics.mobile_manipulator import MobileManipulator
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 
 WHEELS = {'r': 0.033, 'L': 0.16}
 POSE, GOAL, X_DOT = (0.3, -0.2, 1.0), (1.0, 2.0), (0.1, -0.2)

@@ -485,27 +485,27 @@ def test_it_says_which_gains_are_the_fastest():
         (('--kp', '3', '2'), 'kp must be MIN MAX with MIN < MAX, got (3.0, 2.0)'),
         (('--kp', '2', '2'), 'kp must be MIN MAX with MIN < MAX, got (2.0, 2.0)'),
         (('--kp', '2', '2.0000000001'), 'kp must have 59 different values'),
-        (('--kp', 'nan', '2'), "--kp: must be a finite number, got 'nan'"),
-        (('--kv', '1', 'inf'), "--kv: must be a finite number, got 'inf'"),
+        (('--kp', 'nan', '2'), '--kp: must be finite, got nan'),
+        (('--kv', '1', 'inf'), '--kv: must be finite, got inf'),
         (('--kp', '1'), 'two gains must be swept, got ranges of none'),
-        (('--grid', '1'), 'grid must be an integer of at least 2, got 1'),
-        (('--grid', '2.5'), "--grid: must be a whole number below a billion, got '2.5'"),
-        (('--grid', '٣'), "--grid: must be a whole number below a billion, got '٣'"),
-        (('--grid', '-'), "--grid: must be a whole number below a billion, got '-'"),
+        (('--grid', '1'), '--grid: must be an integer from 2 to 1000000, got 1'),
+        (('--grid', '2.5'), "--grid: must be an integer from 2 to 1000000, got '2.5'"),
+        (('--grid', '٣'), "--grid: must be an integer from 2 to 1000000, got '٣'"),
+        (('--grid', '-'), "--grid: must be an integer from 2 to 1000000, got '-'"),
         (('--grid', '1000'), 'grid 1000 with 12 starts gives 12000000 closed loops; at most 1000000'),
-        (('--grid', '9' * 99), '--grid: must be a whole number'),
-        (('--starts', '0'), 'starts must be an integer of at least 1, got 0'),
-        (('--starts', '-3'), 'starts must be an integer of at least 1, got -3'),
+        (('--grid', '9' * 99), '--grid: must be an integer from 2 to 1000000, got 9999'),
+        (('--starts', '0'), '--starts: must be an integer from 1 to 1000000, got 0'),
+        (('--starts', '-3'), '--starts: must be an integer from 1 to 1000000, got -3'),
         (('--duration', '1e9'), 'which may take an hour; choose a smaller grid'),
         (('--duration', '1e300', '--rate', '1e300'), 'which may take an hour'),
-        (('--duration', '0'), "--duration: must be positive, got '0'"),
-        (('--rate', '-50'), "--rate: must be positive, got '-50'"),
+        (('--duration', '0'), '--duration: must be positive and finite, got 0.0'),
+        (('--rate', '-50'), '--rate: must be positive and finite, got -50.0'),
         (('--distance', '0.01'), 'distance must be larger than tolerance, 0.02 m, and less than'),
         (('--distance', '1e6'), 'distance must be larger than tolerance'),
         (('--tolerance', '0'), '--tolerance: must be in [1e-06, 100], got 0.0'),
         (('--controller', 'other'), "controller must be one of 'go_to_goal', 'offset_point', 'pose'"),
         (('--controller', 'offset_point', '--kp', '1', '2'), 'unrecognized arguments: --kp'),
-        (('--max-velocity', '0'), "--max-velocity: must be positive, got '0'"),
+        (('--max-velocity', '0'), '--max-velocity: must be positive and finite, got 0.0'),
         (('--max-velocity', '2000'), "'linear.x.max_velocity' must be in [0, 1000]"),
         (('--max-yaw-rate', '1e-9'), 'limits must be at least 1e-06, got 1e-09'),
         (('--params-file', 'nowhere.yaml'), "no such file: 'nowhere.yaml'"),
@@ -541,7 +541,7 @@ def test_a_setup_checks_itself():
     for changes in ({'rate': math.nan}, {'duration': -1.0}, {'tolerance': math.inf}):
         with pytest.raises(ValueError, match=f'{next(iter(changes))} must be positive and finite'):
             Setup(**changes)
-    with pytest.raises(ValueError, match='controller must be one of go_to_goal, offset_point, pose'):
+    with pytest.raises(ValueError, match="controller must be one of 'go_to_goal', 'offset_point'"):
         Setup(controller='other')
     with pytest.raises(ValueError, match="gains must be of kv, offset, those of 'offset_point'"):
         Setup(controller='offset_point', gains={'kp': 1.0})

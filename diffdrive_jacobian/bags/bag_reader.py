@@ -16,17 +16,18 @@ from diffdrive_jacobian.bags.bounded_reader import BoundedReader
 from diffdrive_jacobian.bags.files import is_recoverable
 from diffdrive_jacobian.bags.journal import PARAMETERS, journal_of
 from diffdrive_jacobian.bags.metadata import (
-    DamagedError,
+    MetadataError,
     check_connections,
     check_custom_data,
     check_metadata,
     parse_parameters,
 )
 from diffdrive_jacobian.bounded_yaml import TooLargeError
+from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 
 
-class BagError(Exception):
+class BagError(DiffdriveError):
     """A bag cannot be read, or lacks what is needed; the message says which and what.
 
     The message is safe to print, although names in it may come from the bag.
@@ -37,7 +38,7 @@ class BagError(Exception):
         super().__init__(printable(message, PATH_LIMIT))
 
 
-class ReadingInterruptedError(Exception):
+class ReadingInterruptedError(DiffdriveError):
     """The user does not want the result any more."""
 
 
@@ -92,7 +93,7 @@ def open_bag(path: Path) -> Iterator[Reader]:
         reader.open()
     except TooLargeError as error:
         raise BagError(f'{printable(path, PATH_LIMIT)} cannot be read: {error}') from error
-    except DamagedError as error:
+    except MetadataError as error:
         raise DamagedBagError(path, str(error)) from error
     except Exception as error:  # whatever the parsers of a damaged file raise
         raise DamagedBagError(path, f'it cannot be read: {printable(repr(error), 200)}') from error
@@ -115,7 +116,7 @@ def _check_open(path: Path, reader: Reader) -> None:
     try:
         check_custom_data(reader.storage.metadata.custom)
         check_connections(reader.connections, stored_connections(reader))
-    except DamagedError as error:
+    except MetadataError as error:
         raise DamagedBagError(path, str(error)) from error
 
 
@@ -143,7 +144,7 @@ def recorded_parameters(reader: Reader) -> dict[str, dict[str, Any]]:
             for key, text in entries
             if key.startswith(PARAMETERS)
         }
-    except DamagedError as error:
+    except MetadataError as error:
         raise DamagedBagError(Path(str(reader.path)), str(error)) from error
 
 

@@ -20,6 +20,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from diffdrive_jacobian.bags.message_definitions import Definition, UnknownTypeError
+from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.text import printable
 
 GOALS = 'nav_msgs/msg/Goals'
@@ -45,7 +46,7 @@ _SMALL = 1 << 20
 """Size up to which messages are decoded without counting (bytes)."""
 
 
-class UndecodableError(ValueError):
+class UndecodableError(DiffdriveError, ValueError):
     """A recorded message is not a valid message of its type."""
 
 

@@ -7,6 +7,7 @@ import stat
 from pathlib import Path
 
 from diffdrive_jacobian.bags.journal import JOURNAL, MAGIC, journal_of
+from diffdrive_jacobian.errors import DiffdriveError
 
 MCAP_MAGIC = b'\x89MCAP0\r\n'
 SQLITE_MAGIC = b'SQLite format 3\0'
@@ -16,11 +17,11 @@ _KINDS = {'.mcap': 'mcap', '.db3': 'sqlite3', JOURNAL: 'journal'}
 _MAGICS = {MCAP_MAGIC: 'mcap', SQLITE_MAGIC: 'sqlite3', MAGIC: 'journal'}
 
 
-class NotARegularFileError(OSError):
+class NotARegularFileError(DiffdriveError, OSError):
     """A path exists but is not a regular file."""
 
 
-class NotABagError(Exception):
+class NotABagError(DiffdriveError):
     """A path holds nothing of a bag."""
 
 

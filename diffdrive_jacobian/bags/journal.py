@@ -21,9 +21,12 @@ import zlib
 from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.numerics.fields import Check, integer, sequence, short, text
 from diffdrive_jacobian.text import printable
 
 JOURNAL = '.journal'
@@ -43,14 +46,30 @@ BLOCK = 8 << 20
 OVERHEAD = 250
 """Approximate memory of a record without its payload (bytes)."""
 _SURROGATE = re.compile('[\ud800-\udfff]')
-_TEXT_FIELDS: dict[str, type] = {'key': str, 'value': str}
-_CHANNEL_FIELDS: dict[str, type] = {
-    'id': int,
-    'topic': str,
-    'type_name': str,
-    'definition': str,
-    'type_hash': str,
-    'qos': list,
+
+
+def _unicode(name: str, value: Any) -> str:
+    found: str = text(name, value)
+    if _SURROGATE.search(found):
+        raise ValueError(f'{name} must be valid Unicode, got {short(found, repr)}')
+    return found
+
+
+def _profiles(name: str, value: Any) -> tuple[dict[str, Any], ...]:
+    for profile in sequence(name, value):
+        if not isinstance(profile, dict) or not all(type(one) is int for one in profile.values()):
+            raise ValueError(f'{name} must hold maps of integers, got {short(profile, repr)}')
+    return tuple(value)
+
+
+_TEXT_FIELDS: dict[str, Check] = {'key': _unicode, 'value': _unicode}
+_CHANNEL_FIELDS: dict[str, Check] = {
+    'id': partial(integer, low=0, high=2**16 - 1),
+    'topic': _unicode,
+    'type_name': _unicode,
+    'definition': _unicode,
+    'type_hash': _unicode,
+    'qos': _profiles,
 }
 
 
@@ -59,7 +78,7 @@ def journal_of(bag: Path) -> Path:
     return bag.with_name(bag.name + JOURNAL)
 
 
-class JournalError(Exception):
+class JournalError(DiffdriveError):
     """A file is not a journal, or a record in it is invalid."""
 
 
@@ -305,29 +324,18 @@ def _parsed(kind: bytes, payload: bytes) -> Record:
         raise JournalError(f'its content is not JSON: {printable(error)}') from error
     if kind == _TEXT:
         return Text(**_fields(content, _TEXT_FIELDS))
-    fields = _fields(content, _CHANNEL_FIELDS)
-    if not 0 <= fields['id'] < 2**16:
-        raise JournalError(f'id must be from 0 to {2**16 - 1}, got {printable(fields["id"])}')
-    for profile in fields['qos']:
-        if not isinstance(profile, dict) or not all(type(one) is int for one in profile.values()):
-            raise JournalError(f'qos must hold maps of integers, got {printable(repr(profile), 40)}')
-    return Channel(**{**fields, 'qos': tuple(fields['qos'])})
+    return Channel(**_fields(content, _CHANNEL_FIELDS))
 
 
-def _fields(content: object, types: dict[str, type]) -> dict[str, Any]:
+def _fields(content: object, checks: dict[str, Check]) -> dict[str, Any]:
     """Return a JSON object after a check of its fields.
 
     Raises:
-        JournalError: It has other fields, or fields of other types.
+        JournalError: It has other fields, or a field is invalid.
     """
-    if not isinstance(content, dict) or content.keys() != types.keys():
-        got = printable(repr(content), 40)
-        raise JournalError(f'it must have the fields {", ".join(types)}, got {got}')
-    for name, kind in types.items():
-        value = content[name]
-        if type(value) is not kind:
-            got = printable(repr(value), 40)
-            raise JournalError(f'{name} must be of type {kind.__name__}, got {got}')
-        if isinstance(value, str) and _SURROGATE.search(value):
-            raise JournalError(f'{name} must be valid Unicode, got {printable(repr(value), 40)}')
-    return content
+    if not isinstance(content, dict) or content.keys() != checks.keys():
+        raise JournalError(f'it must have the fields {", ".join(checks)}, got {short(content, repr)}')
+    try:
+        return {name: check(name, content[name]) for name, check in checks.items()}
+    except ValueError as error:
+        raise JournalError(str(error)) from error

@@ -18,6 +18,7 @@ from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
+from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.text import printable
 
 DELIMITER = '=' * 80
@@ -28,7 +29,7 @@ _FIELD = re.compile(r'^\s*([A-Za-z]\w*(?:/[A-Za-z]\w*)?)(?:<=\d+)?(?:\[[^]]*\])?
 _PRIMITIVE = re.compile(r'bool|byte|char|float(32|64)|u?int(8|16|32|64)|w?string')
 
 
-class UnknownTypeError(Exception):
+class UnknownTypeError(DiffdriveError):
     """No installed package defines a message type."""
 
 

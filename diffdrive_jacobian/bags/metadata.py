@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,17 @@ from diffdrive_jacobian.bags.bounded_reader import parse_bounded_qos
 from diffdrive_jacobian.bags.files import NotARegularFileError, check_regular
 from diffdrive_jacobian.bags.storage import STORAGES
 from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, TooLargeError, load_yaml
+from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.numerics.fields import (
+    integer,
+    mapping,
+    nonempty,
+    one_of,
+    optional,
+    sequence,
+    short,
+    text,
+)
 from diffdrive_jacobian.text import printable
 
 LATEST_VERSION = 9
@@ -31,7 +43,7 @@ _COMPRESSIONS = ('', 'none', 'file', 'message', 'storage')
 _INT64 = 2**63
 
 
-class DamagedError(ValueError):
+class MetadataError(DiffdriveError, ValueError):
     """A value in a bag is invalid; the message says which, what it is, and what is allowed."""
 
 
@@ -43,7 +55,7 @@ def check_metadata(source: Path | str) -> None:
 
     Raises:
         OSError: The file cannot be read.
-        DamagedError: It, or a data file that it lists, is not a regular file; or it is not YAML of
+        MetadataError: It, or a data file that it lists, is not a regular file; or it is not YAML of
             moderate size; or one of its values is invalid.
     """
     try:
@@ -51,103 +63,126 @@ def check_metadata(source: Path | str) -> None:
             check_regular(source)
         found = load_yaml(source)
     except NotARegularFileError as error:
-        raise DamagedError(str(error)) from error
+        raise MetadataError(str(error)) from error
     except TooLargeError as error:
-        raise DamagedError(f'metadata.yaml is too large: {error}') from error
+        raise MetadataError(f'metadata.yaml is too large: {error}') from error
     except YAML_ERRORS as error:
-        raise DamagedError(f'metadata.yaml is not valid YAML: {printable(error, 120)}') from error
-    whole = _mapping(found, '')
-    root = _mapping(_required(whole, ROOT, ''), ROOT)
-    _integer(_required(root, 'version', ''), 'version', 1, LATEST_VERSION)
-    _choice(_required(root, 'storage_identifier', ''), 'storage_identifier', sorted(STORAGES))
-    paths = _sequence(_required(root, 'relative_file_paths', ''), 'relative_file_paths')
+        raise MetadataError(f'metadata.yaml is not valid YAML: {printable(error, 120)}') from error
+    with _reported():
+        _check_content(found, source.parent if isinstance(source, Path) else None)
+
+
+def _check_content(found: object, folder: Path | None) -> None:
+    """Check the content of metadata.yaml, and the data files in a folder; None: they are not checked.
+
+    Raises:
+        ValueError: A value is invalid.
+    """
+    root = mapping(ROOT, _required(mapping('its content', found), ROOT))
+    integer('version', _required(root, 'version'), 1, LATEST_VERSION)
+    one_of(*sorted(STORAGES))('storage_identifier', _required(root, 'storage_identifier'))
+    paths = sequence('relative_file_paths', _required(root, 'relative_file_paths'))
     names: set[str] = set()
     for index, path in enumerate(paths):
         where = f'relative_file_paths[{index}]'
-        if not _string(path, where) or '\0' in path:
-            raise _wrong(where, 'the name of a file', path)
+        if '\0' in nonempty(where, path):
+            raise ValueError(f'{where} must be the name of a file, got {short(path, repr)}')
         # rosbags reads, and unpacks, a file as often as it is listed.
         if Path(path).name in names:
-            raise _wrong(where, 'a file that is not listed before', path)
+            raise ValueError(
+                f'{where} must be a file that is not listed before, got {short(path, repr)}'
+            )
         names.add(Path(path).name)
-        if isinstance(source, Path):
-            _check_data_file(source.parent / Path(path).name)
-    count = _integer(_required(root, 'message_count', ''), 'message_count', 0, _INT64 - 1)
+        if folder is not None:
+            _check_data_file(folder / Path(path).name)
+    count = integer('message_count', _required(root, 'message_count'), 0, _INT64 - 1)
     for key, name in (('duration', 'nanoseconds'), ('starting_time', 'nanoseconds_since_epoch')):
-        value = _required(_mapping(_required(root, key, ''), key), name, key)
+        value = _required(mapping(key, _required(root, key)), name, key)
         # Writers differ for a bag without messages.
-        _integer(value, f'{key}.{name}', 0 if count else -_INT64, _INT64 - 1)
-    topics = _sequence(_required(root, 'topics_with_message_count', ''), 'topics_with_message_count')
+        integer(f'{key}.{name}', value, 0 if count else -_INT64, _INT64 - 1)
+    topics = sequence('topics_with_message_count', _required(root, 'topics_with_message_count'))
     for index, topic in enumerate(topics):
-        _check_topic(_mapping(topic, f'topics_with_message_count[{index}]'), index)
+        where = f'topics_with_message_count[{index}]'
+        _check_topic(mapping(where, topic), where)
     if 'compression_mode' in root:
-        mode = _string(root['compression_mode'], 'compression_mode')
-        _choice(mode.lower(), 'compression_mode', _COMPRESSIONS)
+        mode = text('compression_mode', root['compression_mode'])
+        one_of(*_COMPRESSIONS)('compression_mode', mode.lower())
     for key in ('compression_format', 'ros_distro'):
-        if root.get(key) is not None:
-            _string(root[key], key)
-    for index, file in enumerate(_sequence(root.get('files', []), 'files')):
-        _mapping(file, f'files[{index}]')
+        optional(text)(key, root.get(key))
+    for index, file in enumerate(sequence('files', root.get('files', []))):
+        mapping(f'files[{index}]', file)
     check_custom_data(root.get('custom_data'))
+
+
+@contextmanager
+def _reported() -> Iterator[None]:
+    """Raise a MetadataError where a check fails."""
+    try:
+        yield
+    except MetadataError:
+        raise
+    except ValueError as error:
+        raise MetadataError(f'metadata.yaml: {error}') from error
 
 
 def _check_data_file(path: Path) -> None:
     try:
         check_regular(path)
     except NotARegularFileError as error:
-        raise DamagedError(str(error)) from error
+        raise MetadataError(str(error)) from error
     except OSError:
         # rosbags reports a file that is missing.
         pass
 
 
-def _check_topic(topic: dict[str, Any], index: int) -> None:
-    where = f'topics_with_message_count[{index}]'
-    count = _required(topic, 'message_count', where)
-    _integer(count, f'{where}.message_count', 0, _INT64 - 1)
+def _check_topic(topic: dict[str, Any], where: str) -> None:
+    integer(f'{where}.message_count', _required(topic, 'message_count', where), 0, _INT64 - 1)
+    described = _required(topic, 'topic_metadata', where)
     where += '.topic_metadata'
-    described = _mapping(_required(topic, 'topic_metadata', where[: -len('.topic_metadata')]), where)
+    mapping(where, described)
     for key in ('name', 'type', 'serialization_format'):
-        if not _string(_required(described, key, where), f'{where}.{key}'):
-            raise _wrong(f'{where}.{key}', 'text that is not empty', '')
-    _choice(described['serialization_format'], f'{where}.serialization_format', ['cdr'])
-    _string(described.get('type_description_hash', ''), f'{where}.type_description_hash')
+        nonempty(f'{where}.{key}', _required(described, key, where))
+    one_of('cdr')(f'{where}.serialization_format', described['serialization_format'])
+    text(f'{where}.type_description_hash', described.get('type_description_hash', ''))
+    profiles = described.get('offered_qos_profiles', [])
     try:
-        parse_bounded_qos(described.get('offered_qos_profiles', []))
+        parse_bounded_qos(profiles)
     except (*INVALID, RecursionError) as error:
-        key = f'{where}.offered_qos_profiles'
-        raise _wrong(key, 'a list of QoS profiles', described['offered_qos_profiles']) from error
+        raise ValueError(
+            f'{where}.offered_qos_profiles must be a list of QoS profiles, got {short(profiles, repr)}'
+        ) from error
 
 
 def check_custom_data(custom: object) -> dict[str, str]:
     """Return custom data, {} for None.
 
     Raises:
-        DamagedError: It is not a map of texts.
+        MetadataError: It is not a map of texts.
     """
-    custom = {} if custom is None else custom
-    if not isinstance(custom, dict) or not all(isinstance(one, str) for one in _flat(custom)):
-        raise _wrong('custom_data', 'a map of texts', custom)
-    return custom
+    with _reported():
+        entries: dict[str, str] = mapping('custom_data', {} if custom is None else custom)
+        for entry in (*entries.keys(), *entries.values()):
+            text('each key and value of custom_data', entry)
+    return entries
 
 
-def parse_parameters(key: str, text: str) -> dict[str, Any]:
+def parse_parameters(key: str, content: str) -> dict[str, Any]:
     """Return the parameters of a node from an entry of the custom data.
 
     Args:
         key: The entry's key.
-        text: Its value.
+        content: Its value.
 
     Raises:
-        DamagedError: It is not a JSON object.
+        MetadataError: It is not a JSON object.
     """
     try:
-        values = json.loads(text)
+        values = json.loads(content)
     except (ValueError, RecursionError) as error:
-        raise DamagedError(f'the {printable(key)} are not JSON: {printable(error)}') from error
+        raise MetadataError(f'the {printable(key)} are not JSON: {printable(error)}') from error
     if not isinstance(values, dict):
-        raise DamagedError(
-            f'the {printable(key)} must be a JSON object, got {printable(repr(text), 40)}'
+        raise MetadataError(
+            f'the {printable(key)} must be a JSON object, got {printable(repr(content), 40)}'
         )
     return values
 
@@ -163,22 +198,24 @@ def check_connections(described: Iterable[Connection], stored: Iterable[Connecti
         stored: The topics of the data files. They are the same if the bag is a single file.
 
     Raises:
-        DamagedError: A topic's name or type is not text, or a topic with messages is not described.
+        MetadataError: A topic's name or type is not text, or a topic with messages is not described.
     """
     described, stored = list(described), list(stored)
     for connection in [*described, *stored]:
         for what, value in (('name', connection.topic), ('type', connection.msgtype)):
-            if not isinstance(value, str) or not value:
-                raise DamagedError(f'the {what} of a topic must be text, got {printable(repr(value))}')
+            try:
+                nonempty(f'the {what} of a topic', value)
+            except ValueError as error:
+                raise MetadataError(str(error)) from error
         if not isinstance(connection.ext, ConnectionExtRosbag2):
-            raise DamagedError(f'{printable(connection.topic)} is not a topic of ROS 2')
+            raise MetadataError(f'{printable(connection.topic)} is not a topic of ROS 2')
     by_name = defaultdict(list)
     for connection in described:
         by_name[connection.topic, connection.msgtype].append(connection)
     for connection in stored:
         candidates = by_name[connection.topic, connection.msgtype]
         if connection.msgcount and not any(_alike(connection, one) for one in candidates):
-            raise DamagedError(
+            raise MetadataError(
                 f'metadata.yaml does not describe the topic {printable(connection.topic)} of '
                 f'{printable(connection.msgtype)} as the data file does '
                 '(name, type, type hash, QoS, serialization)'
@@ -192,49 +229,7 @@ def _alike(stored: Connection, described: Connection) -> bool:
     return not stored.digest or not described.digest or stored.digest == described.digest
 
 
-# --- Checks of single values
-
-
-def _required(mapping: dict[str, Any], key: str, where: str) -> Any:
-    if key not in mapping:
-        raise DamagedError(f'metadata.yaml lacks {f"{where}.{key}" if where else key}')
-    return mapping[key]
-
-
-def _wrong(where: str, allowed: str, got: object) -> DamagedError:
-    return DamagedError(
-        f'metadata.yaml: {where or "its content"} must be {allowed}, got {printable(repr(got), 40)}'
-    )
-
-
-def _mapping(value: object, where: str) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise _wrong(where, 'a map', value)
-    return value
-
-
-def _sequence(value: object, where: str) -> list[Any]:
-    if not isinstance(value, list):
-        raise _wrong(where, 'a list', value)
-    return value
-
-
-def _string(value: object, where: str) -> str:
-    if not isinstance(value, str):
-        raise _wrong(where, 'text', value)
-    return value
-
-
-def _choice(value: object, where: str, choices: Sequence[str]) -> None:
-    if value not in choices:
-        raise _wrong(where, f'one of {", ".join(repr(one) for one in choices)}', value)
-
-
-def _integer(value: object, where: str, low: int, high: int) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-        raise _wrong(where, f'an integer from {low} to {high}', value)
-    return value
-
-
-def _flat(mapping: dict[Any, Any]) -> list[Any]:
-    return [*mapping.keys(), *mapping.values()]
+def _required(found: dict[str, Any], key: str, where: str = '') -> Any:
+    if key not in found:
+        raise MetadataError(f'metadata.yaml lacks {f"{where}.{key}" if where else key}')
+    return found[key]

@@ -7,10 +7,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.errors import DiffdriveError
+
 Array = NDArray[np.float64]
 
 
-class CalibrationError(Exception):
+class CalibrationError(DiffdriveError):
     """The recordings do not determine the parameters, or contradict the model; the message says why."""
 
 

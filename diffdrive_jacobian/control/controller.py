@@ -28,6 +28,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from diffdrive_jacobian.control.sampling import rate_warning
+from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import (
     Finite,
@@ -35,11 +36,10 @@ from diffdrive_jacobian.numerics.checks import (
     boolean,
     finite,
     function,
-    instance,
     number,
     numbers,
 )
-from diffdrive_jacobian.numerics.fields import Checked, Text, optional, short
+from diffdrive_jacobian.numerics.fields import Checked, Text, between, instance, optional, short
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 Law = Callable[..., tuple[Any, ...]]
@@ -51,7 +51,7 @@ _GAIN = re.compile(r'[a-z][a-z0-9_]{0,31}')
 LARGEST_GAIN = 100.0
 
 
-class LawError(ValueError):
+class LawError(DiffdriveError, ValueError):
     """A law raised an exception or returned something other than two finite numbers."""
 
 
@@ -73,7 +73,7 @@ class Gain(Checked):
     bounds: tuple[float, float] = (-LARGEST_GAIN, LARGEST_GAIN)
     """Smallest and largest value."""
     above: Annotated[float | None, optional(partial(number, check=finite))] = None
-    """Lower bound that is itself not allowed, instead of the smallest value."""
+    """Lower bound that is itself not allowed, besides `bounds`."""
     label: Text = ''
     """Label on the page; default: the name."""
     usual: tuple[float, float] = (math.nan, math.nan)
@@ -105,10 +105,7 @@ class Gain(Checked):
 
     def check(self, value: float) -> None:
         """Raise ValueError if a value is not allowed."""
-        low, high = self.bounds
-        if not low <= value <= high or (self.above is not None and not value > self.above):
-            allowed = f'[{low:g}, ' if self.above is None else f'({self.above:g}, '
-            raise ValueError(f'{self.name} must be in {allowed}{high:g}], got {value:g}')
+        between(*self.bounds, above=self.above)(self.name, value)
 
 
 KP = Gain(

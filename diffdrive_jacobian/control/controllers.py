@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from diffdrive_jacobian.control.controller import Controller, Law
-from diffdrive_jacobian.numerics.checks import instance
-from diffdrive_jacobian.numerics.fields import short
+from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.numerics.fields import instance, short
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -27,7 +27,7 @@ GROUP = 'diffdrive_jacobian.controllers'
 """Entry-point group of the controllers of other packages."""
 
 
-class ControllerError(ValueError):
+class ControllerError(DiffdriveError, ValueError):
     """There is no such controller, or it cannot be loaded."""
 
 

@@ -16,12 +16,11 @@ from diffdrive_jacobian.numerics.checks import (
     boolean,
     finite,
     function,
-    instance,
     number,
     numbers,
     read_only,
 )
-from diffdrive_jacobian.numerics.fields import integer
+from diffdrive_jacobian.numerics.fields import instance, integer
 
 Pose: TypeAlias = NDArray[np.float64] | tuple[float, float, float]
 Law: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
-from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.errors import DiffdriveError, UserError
 from diffdrive_jacobian.ros.runner import Runner, discovery_off, ros_context, running
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ NAME = 'drive_to'
 """Name of the node that sends the goals."""
 
 
-class DriveError(Exception):
+class DriveError(DiffdriveError):
     """A drive in simulated time was aborted. The message says why."""
 
 
@@ -51,7 +51,7 @@ def in_lockstep(ros_arguments: Sequence[str] = ()) -> Iterator[LockstepRunner]:
         DriveError: A callback blocks, or simulated time cannot advance for another reason.
     """
     # Slow to import.
-    from diffdrive_jacobian.lockstep import LockstepError
+    from diffdrive_jacobian.lockstep._errors import LockstepError
     from diffdrive_jacobian.lockstep.runner import running_in_lockstep
 
     with ExitStack() as stack:

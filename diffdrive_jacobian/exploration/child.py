@@ -18,6 +18,7 @@ import threading
 from contextlib import suppress
 from typing import IO, Any
 
+from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.text import error_text
 
 serving = False
@@ -33,7 +34,7 @@ class Children(set['ChildProcess']):
     """Whether no more may be started."""
 
 
-class ChildDiedError(Exception):
+class ChildDiedError(DiffdriveError):
     """The process ended without an answer; the message says how."""
 
 

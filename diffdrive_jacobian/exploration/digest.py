@@ -11,7 +11,7 @@ from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message
 from unique_identifier_msgs.msg import UUID
 
-from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.ros.rclpy_internals import wrap_publish
 
 OMITTED = ('/clock', '/rosout', '/parameter_events', '/fault_events')

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from diffdrive_jacobian.errors import DiffdriveError
 
-class ExplorationError(Exception):
+
+class ExplorationError(DiffdriveError):
     """An exploration cannot be done; the message says why, and what to change."""

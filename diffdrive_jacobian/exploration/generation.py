@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.exploration.errors import ExplorationError
 from diffdrive_jacobian.exploration.trial import Trial
 
@@ -97,11 +98,11 @@ def shrink(
             raise StopShrinking from error
         if failed:
             smallest[:] = [trial]
-            raise _FoundError
+            raise _TrialFailedError
 
     try:
         _run(strategy, seed, block, count, [Phase.generate, Phase.shrink], check)
-    except (_FoundError, StopShrinking):
+    except (_TrialFailedError, StopShrinking):
         if errors:
             raise errors[0] from None
         # Hypothesis ends with the smallest one.
@@ -114,7 +115,7 @@ class StopShrinking(BaseException):
     """Ends shrinking. Not an Exception, which Hypothesis would take for a failure."""
 
 
-class _FoundError(Exception):
+class _TrialFailedError(DiffdriveError):
     """A trial fails."""
 
 

@@ -11,7 +11,8 @@ from diffdrive_jacobian.exploration.digest import MessageDigest
 from diffdrive_jacobian.exploration.result import described_replay
 from diffdrive_jacobian.exploration.trial import of_exception, seconds
 from diffdrive_jacobian.exploration.versions import differences, versions
-from diffdrive_jacobian.lockstep import Lockstep, PropertyViolation
+from diffdrive_jacobian.lockstep._errors import PropertyViolation
+from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.text import printable_lines
 
 

@@ -14,7 +14,8 @@ from diffdrive_jacobian import faults
 from diffdrive_jacobian.exploration.generation import st
 from diffdrive_jacobian.exploration.strategies import STEP, numbers, probabilities, times
 from diffdrive_jacobian.faults import Fault
-from diffdrive_jacobian.numerics.fields import integer
+from diffdrive_jacobian.numerics.fields import between, integer
+from diffdrive_jacobian.numerics.fields import names as check_names
 
 Fields = dict[str, st.SearchStrategy[Any]]
 Kind = type[Fault] | st.SearchStrategy[Fault]
@@ -152,11 +153,9 @@ def fault_schedules(
         ('robots', robots),
         *(fields or {}).items(),
     ):
-        if isinstance(value, str):
-            raise ValueError(f'{name} must be a list of names, got the string {value!r}')
+        check_names(name, value)
     integer('max_faults', max_faults, 1)
-    if not STEP <= duration < math.inf:
-        raise ValueError(f'duration must be finite and at least {STEP:g} s, got {duration!r}')
+    between(STEP, unit='s')('duration', duration)
     targets = (
         (TOPIC_KINDS, 'topic', topics),
         (NODE_KINDS, 'node', nodes),

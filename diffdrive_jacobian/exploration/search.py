@@ -24,7 +24,7 @@ from diffdrive_jacobian.exploration.result import Exploration, Finding
 from diffdrive_jacobian.exploration.shrinking import Fails, key_of
 from diffdrive_jacobian.exploration.trial import Outcome, Setting, Trial, Violation
 from diffdrive_jacobian.exploration.worker import (
-    NotEndedError,
+    TaskNotEnded,
     packed,
     result_of,
     run_world_afresh,
@@ -98,7 +98,7 @@ class Search:
         except KeyboardInterrupt:
             self._stopped = 'interrupted'
             findings += self._not_shrunk(findings, output)
-        except NotEndedError:
+        except TaskNotEnded:
             self._stopped = (
                 f'time limit of {self._limit:g} s; a world still ran {GRACE:g} s later: does its '
                 'scenario end?'

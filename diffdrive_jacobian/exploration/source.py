@@ -85,8 +85,10 @@ class Source:
 
 
 def _public(module: str, name: str) -> str:
-    """Return the package of a module of this package if it has the name, too."""
+    """Return the package of a module of this package if the name is public there."""
     package = '.'.join(module.split('.')[:2])
-    if module.startswith('diffdrive_jacobian.') and hasattr(sys.modules.get(package), name):
+    if module.startswith('diffdrive_jacobian.') and name in getattr(
+        sys.modules.get(package), '__all__', ()
+    ):
         return package
     return module

@@ -16,12 +16,8 @@ import diffdrive_jacobian
 from diffdrive_jacobian.exploration.digest import MessageDigest
 from diffdrive_jacobian.exploration.scenario import ScenarioName
 from diffdrive_jacobian.faults import Fault
-from diffdrive_jacobian.lockstep import (
-    IneffectiveFaultsError,
-    Lockstep,
-    LockstepError,
-    PropertyViolation,
-)
+from diffdrive_jacobian.lockstep._errors import IneffectiveFaultsError, LockstepError, PropertyViolation
+from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.properties import Property, Watch
 from diffdrive_jacobian.text import error_text, printable_lines
 from diffdrive_jacobian.time_units import NANOSECONDS

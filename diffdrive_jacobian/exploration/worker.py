@@ -93,7 +93,7 @@ def run_worlds_here(data: bytes) -> list[Outcome]:
     return [run(setting, trial, only=only, digest=digest) for trial in trials]
 
 
-class NotEndedError(BaseException):
+class TaskNotEnded(BaseException):
     """A task still runs. Not an Exception, which Hypothesis would take for a failure."""
 
 
@@ -106,7 +106,7 @@ def result_of(future: Future[list[Outcome]], timeout: float | None) -> list[Outc
 
     Raises:
         ExplorationError: The executor failed, or a fault or a property is invalid.
-        NotEndedError: The task still runs after `timeout`.
+        TaskNotEnded: The task still runs after `timeout`.
     """
     try:
         return future.result(timeout)
@@ -114,7 +114,7 @@ def result_of(future: Future[list[Outcome]], timeout: float | None) -> list[Outc
         raise
     except Exception as error:
         if isinstance(error, FutureTimeoutError) and not future.done():
-            raise NotEndedError from None
+            raise TaskNotEnded from None
         raise ExplorationError(
             f'a world could not be run: {type(error).__name__}: {error_text(error)}'
         ) from error

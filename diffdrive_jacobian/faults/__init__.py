@@ -1,6 +1,6 @@
 """Faults that a `Lockstep` injects: of topics, nodes, the world around them, and the robot.
 
-With `from diffdrive_jacobian.testing import faults`, a test calls
+With `from diffdrive_jacobian import faults`, a test calls
 `lockstep.inject(faults.Loss('odom', probability=0.5, start=2.0, duration=1.0))`.
 """
 
@@ -19,7 +19,8 @@ from diffdrive_jacobian.faults.robot import (
 )
 from diffdrive_jacobian.faults.topics import Delay, Duplicate, Loss, RateLimit, Reorder, Stale
 from diffdrive_jacobian.faults.world import ClockPause, LateService, ParameterChange, TimeJump
-from diffdrive_jacobian.lockstep import FaultEvent
+from diffdrive_jacobian.lockstep._fault_log import FaultEvent
+from diffdrive_jacobian.lockstep._injection import Injection
 
 __all__ = [
     'ActuatorLag',
@@ -33,6 +34,7 @@ __all__ = [
     'FaultEvent',
     'Filter',
     'Hang',
+    'Injection',
     'Kill',
     'LateService',
     'Loss',

@@ -2,7 +2,7 @@
 
 A fault is a value: a frozen dataclass that can be compared, pickled and printed as the Python expression
 that makes it. `Lockstep.inject` lets it happen. How it happens is in `install`, which uses what the
-world offers to every fault (`lockstep._injection.Injection`).
+world offers to every fault (`Injection`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import ClassVar
 from rclpy.node import Node
 
 from diffdrive_jacobian.faults.expression import Expression
-from diffdrive_jacobian.lockstep import Injection
+from diffdrive_jacobian.lockstep._injection import Injection
 from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
 from diffdrive_jacobian.numerics.fields import Name, Text
 

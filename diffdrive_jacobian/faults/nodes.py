@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from rclpy.node import Node
 
 from diffdrive_jacobian.faults.fault import Fault, Undo
-from diffdrive_jacobian.lockstep import Injection, LockstepError
+from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._injection import Injection
 from diffdrive_jacobian.numerics.checks import Positive
 from diffdrive_jacobian.numerics.fields import Name
 from diffdrive_jacobian.time_units import nanoseconds

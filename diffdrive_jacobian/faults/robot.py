@@ -18,7 +18,8 @@ from typing import Annotated, ClassVar
 from rclpy.node import Node
 
 from diffdrive_jacobian.faults.fault import Fault, Undo
-from diffdrive_jacobian.lockstep import Injection, LockstepError
+from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._injection import Injection
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.numerics.checks import Finite, Positive, between, boolean, number
 from diffdrive_jacobian.numerics.fields import Name, integer, one_of

@@ -14,7 +14,8 @@ from rclpy.parameter import Parameter
 
 from diffdrive_jacobian.faults.fault import Fault, Undo
 from diffdrive_jacobian.faults.nodes import NodeFault
-from diffdrive_jacobian.lockstep import Injection, LockstepError
+from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._injection import Injection
 from diffdrive_jacobian.numerics.checks import PositiveOrInfinite, finite, number
 from diffdrive_jacobian.numerics.fields import Name
 from diffdrive_jacobian.ros.rclpy_internals import PARAMETERS_OF_RCLPY, declared_parameters

@@ -16,12 +16,8 @@ if TYPE_CHECKING:
         planar_arm,
         se2,
     )
-    from diffdrive_jacobian.kinematics.mobile_manipulator import MobileManipulator
-    from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 
 __all__ = [
-    'MobileManipulator',
-    'PlanarArm',
     'contact',
     'diff_drive',
     'inverse_kinematics',
@@ -32,11 +28,4 @@ __all__ = [
 ]
 if not TYPE_CHECKING:
     # Nodes, which need few of them, start faster than with all.
-    __getattr__, __dir__ = lazy.attach(
-        __name__,
-        {name: f'kinematics.{name}' for name in __all__}
-        | {
-            'MobileManipulator': 'kinematics.mobile_manipulator',
-            'PlanarArm': 'kinematics.planar_arm',
-        },
-    )
+    __getattr__, __dir__ = lazy.attach(__name__, {name: f'kinematics.{name}' for name in __all__})

@@ -20,6 +20,8 @@ from diffdrive_jacobian.numerics.checks import positive
 from diffdrive_jacobian.numerics.elementary import cos, sin
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, formula
 
+__all__ = ['rolling_direction', 'wheel_contact_jacobian', 'wheel_contact_position']
+
 AT_GROUND = pi
 """The angle phi of the point that touches the ground (rad)."""
 

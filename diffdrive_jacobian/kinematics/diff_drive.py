@@ -20,6 +20,21 @@ from diffdrive_jacobian.numerics.checks import offset, positive
 from diffdrive_jacobian.numerics.elementary import cos, product, sin
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
+__all__ = [
+    'body_to_wheel',
+    'body_to_wheel_jacobian',
+    'no_lateral_slip_constraint',
+    'offset_point',
+    'offset_point_jacobian',
+    'rolling_constraints',
+    'single_wheel_jacobian',
+    'unicycle_jacobian',
+    'wheel_to_body',
+    'wheel_to_body_jacobian',
+    'wheel_to_position_jacobian',
+    'wheel_to_world_jacobian',
+]
+
 
 @formula('() -> (3,2)')
 def unicycle_jacobian(theta: Number) -> Rows:

@@ -39,6 +39,8 @@ from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.numerics.fields import integer
 from diffdrive_jacobian.numerics.formula import Entries, Vector, formula
 
+__all__ = ['METHODS', 'IKResult', 'pose_difference', 'solve']
+
 METHODS = ('newton', 'transpose', 'levenberg_marquardt')
 
 

@@ -23,10 +23,12 @@ from numpy.typing import ArrayLike, NDArray
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics.diff_drive import wheel_to_body, wheel_to_world_jacobian
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm, arm_forward_kinematics, arm_jacobian
-from diffdrive_jacobian.numerics.checks import Positive, array, instance, numbers, read_only
+from diffdrive_jacobian.numerics.checks import Positive, array, numbers, read_only
 from diffdrive_jacobian.numerics.elementary import cos, product, sin
-from diffdrive_jacobian.numerics.fields import Checked
+from diffdrive_jacobian.numerics.fields import Checked, instance
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
+
+__all__ = ['MobileManipulator', 'mobile_manipulator_jacobian']
 
 
 @formula('(),(n),(n),(2),(),() -> (3,k)')

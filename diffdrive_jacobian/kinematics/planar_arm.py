@@ -24,6 +24,8 @@ from diffdrive_jacobian.numerics.checks import array, positive
 from diffdrive_jacobian.numerics.elementary import cos, maximum, sin, wrap
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
+__all__ = ['PlanarArm', 'arm_forward_kinematics', 'arm_jacobian']
+
 
 @formula('(n),(n) -> (3)')
 def arm_forward_kinematics(lengths: Vector, q: Vector) -> Entries:

@@ -18,7 +18,6 @@ from diffdrive_jacobian.numerics.checks import (
     constant,
     equal,
     hashable,
-    instance,
     leading,
     not_negative_or_infinite,
     not_positive_or_infinite,
@@ -26,7 +25,7 @@ from diffdrive_jacobian.numerics.checks import (
     positive_or_infinite,
 )
 from diffdrive_jacobian.numerics.elementary import maximum, minimum, where
-from diffdrive_jacobian.numerics.fields import Checked
+from diffdrive_jacobian.numerics.fields import Checked, instance
 from diffdrive_jacobian.numerics.formula import Number, formula
 
 ROUNDING = 2.0**-49

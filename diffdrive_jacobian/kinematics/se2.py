@@ -16,6 +16,20 @@ from diffdrive_jacobian.numerics import elementary
 from diffdrive_jacobian.numerics.elementary import cos, sin, sinc_defect, wrap
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
+__all__ = [
+    'adjoint',
+    'compose',
+    'exp',
+    'homogeneous',
+    'integrate',
+    'inverse',
+    'left_jacobian',
+    'log',
+    'right_jacobian',
+    'sinc',
+    'wrap_angle',
+]
+
 
 @formula('() -> ()')
 def wrap_angle(angle: Number) -> Number:

@@ -2,4 +2,6 @@
 
 The server runs in a thread of its own and listens on 127.0.0.1 only. Nodes store their latest state in a
 `Session`, and take the commands of the page from it.
+
+Internal: may change without notice.
 """

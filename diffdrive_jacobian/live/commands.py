@@ -11,9 +11,9 @@ import math
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, NoReturn
 
+from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION, MAX_SPEED
-from diffdrive_jacobian.numerics.fields import Check, Checked, optional
-from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.numerics.fields import Checked, between, boolean, optional, short
 
 MAX_SIZE = 4096
 """Largest size of a command (bytes)."""
@@ -25,45 +25,30 @@ MIN_WORLD_SPEED = 0.01
 """Smallest such speed."""
 
 
-class CommandError(ValueError):
+class CommandError(DiffdriveError, ValueError):
     """The page sent something that is no command. The message says what is wrong."""
-
-
-def _number(low: float, high: float) -> Check:
-    def check(name: str, value: Any) -> float:
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-            raise ValueError(f'{name} must be a number in {low:g} to {high:g}, got {_short(value)}')
-        return float(value)
-
-    return check
 
 
 def _text(name: str, value: Any) -> str:
     # Nodes cannot encode a lone surrogate, and cut a text at NUL.
     if not isinstance(value, str) or len(value) > MAX_TEXT or not value.isprintable():
         raise ValueError(
-            f'{name} must be a text of at most {MAX_TEXT} printable characters, got {_short(value)}'
+            f'{name} must be a text of at most {MAX_TEXT} printable characters, got {short(value, repr)}'
         )
-    return value
-
-
-def _flag(name: str, value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise ValueError(f'{name} must be true or false, got {_short(value)}')
     return value
 
 
 def _setting(name: str, value: Any) -> float | str | bool | None:
     if value is None or isinstance(value, bool):
         return value
-    return _text(name, value) if isinstance(value, str) else _number(-1e6, 1e6)(name, value)
+    return _text(name, value) if isinstance(value, str) else between(-1e6, 1e6)(name, value)
 
 
-_angle = _number(-math.tau, math.tau)
+_angle = between(-math.tau, math.tau, unit='rad')
 _Text = Annotated[str, _text]
-_Flag = Annotated[bool, _flag]
-_Position = Annotated[float, _number(-MAX_POSITION, MAX_POSITION)]
-_Velocity = Annotated[float, _number(-MAX_SPEED, MAX_SPEED)]
+_Flag = Annotated[bool, boolean]
+_Position = Annotated[float, between(-MAX_POSITION, MAX_POSITION, unit='m')]
+_Velocity = Annotated[float, between(-MAX_SPEED, MAX_SPEED)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,14 +138,14 @@ class Step(Checked):
 class SetSpeed(Checked):
     """Set the speed of simulated time, or of a bag."""
 
-    speed: Annotated[float, _number(MIN_WORLD_SPEED, MAX_WORLD_SPEED)]
+    speed: Annotated[float, between(MIN_WORLD_SPEED, MAX_WORLD_SPEED)]
 
 
 @dataclass(frozen=True, slots=True)
 class Seek(Checked):
     """Go to a time of the bag (s)."""
 
-    time: Annotated[float, _number(0.0, 1e9)]
+    time: Annotated[float, between(0.0, 1e9, unit='s')]
 
 
 Command = (
@@ -206,18 +191,17 @@ def parse(text: str | bytes) -> Command:
     try:
         content = json.loads(text, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
-        raise CommandError(f'a command must be JSON, got {_short(text)}') from error
+        raise CommandError(f'a command must be JSON, got {short(text, repr)}') from error
     if not isinstance(content, dict):
-        raise CommandError(f'a command must be a JSON object, got {_short(content)}')
+        raise CommandError(f'a command must be a JSON object, got {short(content, repr)}')
     name = content.pop('do', None)
     kind = _KINDS.get(name) if isinstance(name, str) else None
     if kind is None:
-        raise CommandError(f'do must be one of {", ".join(_KINDS)}, got {_short(name)}')
+        raise CommandError(f'do must be one of {", ".join(_KINDS)}, got {short(name, repr)}')
     names = [field.name for field in fields(kind)]
     if sorted(content) != sorted(names):
-        raise CommandError(
-            f'{name} must have the keys {", ".join(names) or "of no value"}, got {_short(list(content))}'
-        )
+        keys = ', '.join(names) or 'of no value'
+        raise CommandError(f'{name} must have the keys {keys}, got {short(list(content), repr)}')
     try:
         command: Command = kind(**content)
     except ValueError as error:
@@ -227,9 +211,3 @@ def parse(text: str | bytes) -> Command:
 
 def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f'{name} is no JSON')
-
-
-def _short(value: object) -> str:
-    """Return the beginning of an untrusted value."""
-    text = repr(value) if not isinstance(value, int) or abs(value) < 1e15 else 'a huge number'
-    return printable(text if len(text) <= 60 else f'{text[:60]}...')

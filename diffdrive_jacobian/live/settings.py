@@ -10,6 +10,7 @@ from functools import lru_cache
 from typing import Any, Literal
 
 from diffdrive_jacobian.control import ControllerError, Gain, controller_names, find_controller
+from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.parameters.declaration import specifications
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
@@ -20,7 +21,7 @@ MAX_CHOICES = 32
 """Largest number of controllers that are offered."""
 
 
-class SettingError(ValueError):
+class SettingError(DiffdriveError, ValueError):
     """The page wants to set what it cannot."""
 
 

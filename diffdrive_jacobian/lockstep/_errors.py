@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from diffdrive_jacobian.errors import DiffdriveError
 
-class LockstepError(Exception):
+
+class LockstepError(DiffdriveError):
     """A condition was not met in time, simulated time could not advance, or lockstep was misused.
 
     The first line of the message describes the error. The last messages of all topics may follow.

@@ -18,6 +18,7 @@ from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._guard import Guard, Stuck
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.lockstep.external.others import Isolated
+from diffdrive_jacobian.numerics.fields import between
 from diffdrive_jacobian.ros.rclpy_internals import RCLError
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -244,11 +245,7 @@ def checked_nanoseconds(name: str, seconds: float) -> int:
     Raises:
         ValueError: It is not positive or does not fit into a stamp. `name` is its name in the message.
     """
-    if not (seconds <= MAX_SECONDS and round(seconds * NANOSECONDS) > 0):
-        raise ValueError(
-            f'{name} must be a positive number of seconds, at most {MAX_SECONDS}, got {seconds!r}'
-        )
-    return round(seconds * NANOSECONDS)
+    return round(between(1e-9, MAX_SECONDS, unit='s')(name, seconds) * NANOSECONDS)
 
 
 def _place(condition: Callable[[], object]) -> str:

@@ -433,7 +433,7 @@ class Lockstep:
         of a fault depend on `seed` and the fault alone, not on other faults, unless they are equal.
 
         Args:
-            faults: The faults, see `diffdrive_jacobian.testing.faults`.
+            faults: The faults, see `diffdrive_jacobian.faults`.
             seed: Seed of their random numbers.
 
         Raises:

@@ -1,1 +1,4 @@
-"""Checked conversion between ROS messages and numbers. Imports no ROS."""
+"""Checked conversion between ROS messages and numbers. Imports no ROS.
+
+Internal: may change without notice.
+"""

@@ -10,6 +10,7 @@ from functools import lru_cache
 from operator import itemgetter
 from typing import Any, NamedTuple
 
+from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.messages.cdr_fields import check_readable, field_value
 from diffdrive_jacobian.messages.cdr_types import (
     COUNT,
@@ -40,7 +41,7 @@ class DecodingError(MessageError):
     """Bytes that are not a message of the type."""
 
 
-class _ManyElementsError(Exception):
+class _ManyElementsError(DiffdriveError):
     """A sequence has more than _MAX_ELEMENTS strings or structures."""
 
 

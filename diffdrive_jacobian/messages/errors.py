@@ -1,5 +1,9 @@
 """Errors of messages."""
 
+from __future__ import annotations
 
-class MessageError(ValueError):
+from diffdrive_jacobian.errors import DiffdriveError
+
+
+class MessageError(DiffdriveError, ValueError):
     """A message with invalid content."""

@@ -28,6 +28,8 @@ from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import nanoseconds
 
+__all__ = ['GoToGoal']
+
 RATE_PERIODS = 10
 """Number of periods of the odometry from which its rate is measured."""
 SLOW_TURN = 60.0

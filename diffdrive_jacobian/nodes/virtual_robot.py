@@ -45,6 +45,8 @@ from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import nanoseconds, seconds
 
+__all__ = ['VirtualRobot']
+
 Command: TypeAlias = tuple[tuple[float, float], int]
 """Twist `(v, omega)` (m/s, rad/s) and stamp (ns; 0: none)."""
 

@@ -20,6 +20,8 @@ from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.time_units import nanoseconds
 
+__all__ = ['WheelBridge']
+
 
 class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
     """Node that subscribes to `cmd_vel` and publishes `joint_command`.

@@ -1,8 +1,10 @@
-"""Checks of arguments. Errors name the argument, its value and the values allowed."""
+"""Checks of arguments. Errors name the argument, its value and the values allowed.
+
+Those that need no NumPy are in `fields`.
+"""
 
 from __future__ import annotations
 
-import math
 import operator
 from collections.abc import Callable
 from functools import partial
@@ -12,113 +14,36 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.numerics.fields import short
+from diffdrive_jacobian.numerics import fields
+from diffdrive_jacobian.numerics.fields import (
+    between,
+    finite,
+    not_negative,
+    not_negative_or_infinite,
+    not_positive_or_infinite,
+    offset,
+    positive,
+    positive_or_infinite,
+    short,
+)
+
+__all__ = [
+    'between',
+    'finite',
+    'not_negative',
+    'not_negative_or_infinite',
+    'not_positive_or_infinite',
+    'offset',
+    'positive',
+    'positive_or_infinite',
+    'semidefinite',
+]
 
 MAX_NANOSECONDS = 2**63 - 1
 """Largest time of ROS clocks (ns)."""
 FLOAT64 = np.dtype(np.float64)
 ROUNDING = 1e-8
 """Tolerance on symmetry and semidefiniteness of a covariance, relative to its largest entry."""
-FEW = 64
-"""Size up to which an array is checked as floats, because that is faster."""
-
-
-def positive(name: str, value: Any) -> None:
-    """Require a length to be positive and finite.
-
-    Raises:
-        ValueError: An entry is zero, negative, infinite or NaN.
-    """
-    # A float needs the first test only. This runs for every message.
-    inside = (value > 0.0) & (value < np.inf)
-    if inside is not True and not np.all(inside):
-        raise ValueError(f'{name} must be positive and finite, got {_first(value, inside)}')
-
-
-def positive_or_infinite(name: str, value: Any) -> None:
-    """Require a number to be positive. Infinity means no limit.
-
-    Raises:
-        ValueError: An entry is zero, negative or NaN.
-    """
-    inside = value > 0.0
-    if inside is not True and not np.all(inside):
-        raise ValueError(f'{name} must be positive, got {value}')
-
-
-def not_negative(name: str, value: Any) -> None:
-    """Require a number to be zero or positive, and finite.
-
-    Raises:
-        ValueError: An entry is negative, infinite or NaN.
-    """
-    inside = (value >= 0.0) & (value < np.inf)
-    if inside is not True and not np.all(inside):
-        raise ValueError(f'{name} must be zero or positive and finite, got {_first(value, inside)}')
-
-
-def not_negative_or_infinite(name: str, value: Any) -> None:
-    """Require a number to be zero or positive. Infinity means no limit.
-
-    Raises:
-        ValueError: An entry is negative or NaN.
-    """
-    inside = value >= 0.0
-    if inside is not True and not np.all(inside):
-        raise ValueError(f'{name} must be zero or positive, got {value}')
-
-
-def between(low: float, high: float) -> Callable[[str, float], None]:
-    """Return a check that requires a single number between two limits, which are allowed."""
-
-    def check(name: str, value: float) -> None:
-        if not low <= value <= high:
-            raise ValueError(f'{name} must be between {low:g} and {high:g}, got {value}')
-
-    return check
-
-
-def not_positive_or_infinite(name: str, value: Any) -> None:
-    """Require a number to be zero or negative. Infinity means no limit.
-
-    Raises:
-        ValueError: An entry is positive or NaN.
-    """
-    inside = value <= 0.0
-    if inside is not True and not np.all(inside):
-        raise ValueError(f'{name} must be zero or negative, got {value}')
-
-
-def offset(name: str, value: Any) -> None:
-    """Require a control point off the axle.
-
-    Raises:
-        ValueError: An entry is zero, infinite or NaN.
-    """
-    inside = (value != 0.0) & (abs(value) < np.inf)
-    if inside is not True and not np.all(inside):
-        raise ValueError(
-            f'{name} must be finite and not 0, because the Jacobian of the axle centre has rank 1; '
-            f'got {_first(value, inside)}'
-        )
-
-
-def finite(name: str, value: Any) -> None:
-    """Require finite numbers.
-
-    Raises:
-        ValueError: An entry is infinite or NaN.
-    """
-    if type(value) is float:
-        if not math.isfinite(value):
-            raise ValueError(f'{name} must be finite, got {value}')
-        return
-    # A finite sum has finite terms. Of a few numbers it is several times as fast as np.isfinite.
-    if value.size <= FEW and math.isfinite(sum(value.ravel().tolist())):
-        return
-    inside = np.isfinite(value)
-    if not inside.all():
-        raise ValueError(f'{name} must be finite, got {_first(value, inside)}')
 
 
 def semidefinite(name: str, value: NDArray[np.float64]) -> None:
@@ -271,20 +196,7 @@ def boolean(name: str, value: Any) -> bool:
     Raises:
         ValueError: The value is not a Boolean.
     """
-    if not isinstance(value, bool | np.bool_):
-        raise ValueError(f'{name} must be True or False, got {short(value)}')
-    return bool(value)
-
-
-def instance(name: str, value: Any, wanted: type) -> Any:
-    """Require an object of a class.
-
-    Raises:
-        ValueError: The value is of another class.
-    """
-    if not isinstance(value, wanted):
-        raise ValueError(f'{name} must be of class {wanted.__name__}, got {short(value)}')
-    return value
+    return fields.boolean(name, bool(value) if isinstance(value, np.bool_) else value)
 
 
 def function(name: str, value: Any) -> Any:
@@ -350,11 +262,3 @@ def leading(**shapes: tuple[int, ...]) -> tuple[int, ...]:
         raise ValueError(
             f'{" and ".join(several)} must have leading axes that broadcast, got {shown}'
         ) from None
-
-
-def _first(value: Any, inside: Any) -> str:
-    """Return the first invalid entry and its index, for an error message."""
-    if np.ndim(value) == 0:
-        return f'{value}'
-    index = tuple(int(i) for i in np.argwhere(~np.asarray(inside))[0])
-    return f'{np.asarray(value)[index]} at index {index if len(index) > 1 else index[0]}'

@@ -34,6 +34,8 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.numerics.checks import FLOAT64, finite, leading, shaped
 
+__all__ = ['formula']
+
 Array: TypeAlias = NDArray[np.float64]
 Number: TypeAlias = Any
 """A float, or an array with one entry for each robot of a batch."""

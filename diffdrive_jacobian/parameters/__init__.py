@@ -1,1 +1,4 @@
-"""Parameters of the nodes as validated dataclasses. Imports no ROS."""
+"""Parameters of the nodes as validated dataclasses. Imports no ROS.
+
+Internal: may change without notice.
+"""

@@ -17,6 +17,8 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
+from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.numerics import fields
 from diffdrive_jacobian.text import printable
 
 MAX_LENGTH = 256
@@ -24,7 +26,7 @@ MAX_LENGTH = 256
 NOT_EMPTY = f'not empty and at most {MAX_LENGTH} characters'
 
 
-class ParameterError(ValueError):
+class ParameterError(DiffdriveError, ValueError):
     """Invalid parameters. The message names the parameter, its value and its range."""
 
 
@@ -47,11 +49,9 @@ class Specification:
         """The values allowed, in words."""
         words = []
         if self.choices:
-            words.append('one of ' + ', '.join(repr(choice) for choice in self.choices))
-        if self.above is not None and self.high is not None:
-            words.append(f'in ({_bound(self.above)}, {_bound(self.high)}]')
-        elif self.low is not None and self.high is not None:
-            words.append(f'in [{_bound(self.low)}, {_bound(self.high)}]')
+            words.append(fields.choices(self.choices))
+        if self.low is not None and self.high is not None:
+            words.append(fields.interval(self.low, self.high, self.above))
         if self.nan_is_none:
             words.append('or .nan for none')
         return ' '.join(words)
@@ -64,15 +64,9 @@ class Specification:
             return 0 < len(value) <= MAX_LENGTH
         if isinstance(value, float) and math.isnan(value):
             return self.nan_is_none
-        return (
-            (self.low is None or value >= self.low)
-            and (self.high is None or value <= self.high)
-            and (self.above is None or value > self.above)
-        )
-
-
-def _bound(value: float) -> str:
-    return str(value) if isinstance(value, int) else f'{value:g}'
+        if self.low is None or self.high is None:
+            return True
+        return fields.inside(value, self.low, self.high, self.above)
 
 
 def parameter(
@@ -94,18 +88,18 @@ def parameter(
         description: One sentence with the unit in brackets.
         name: ROS name, if it differs from the name of the field (`linear.x.max_velocity`).
         bounds: Smallest and largest value allowed.
-        above: Lower bound that is itself not allowed. Replaces the smallest value of `bounds`.
+        above: Lower bound that is itself not allowed, besides `bounds`.
         choices: The strings allowed.
         constraint: Text for the descriptor instead of the list of choices, where these are searched for.
         nan_is_none: Whether NaN is allowed and means "none". Ranges of ROS reject NaN, so the descriptor
             of such a parameter has no range.
         read_only: Whether the parameter cannot change while the node runs.
     """
-    low, high = bounds if bounds else (None, None)
+    low, high = bounds or ((None, None) if above is None else (-math.inf, math.inf))
     specification = Specification(
         name=name,
         description=description,
-        low=None if above is not None else low,
+        low=low,
         high=high,
         above=above,
         choices=choices,

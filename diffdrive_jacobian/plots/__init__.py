@@ -2,3 +2,5 @@
 
 `run_figure.draw` draws runs, `run_table.write_csv` writes a run as CSV, `sweep_figure` draws sweeps.
 """
+
+__all__ = ['run_figure', 'run_table', 'sweep_figure']

@@ -27,6 +27,8 @@ from diffdrive_jacobian.reading.run import Run
 from diffdrive_jacobian.reading.time_series import commanded, limits, line, measured
 from diffdrive_jacobian.reading.trace import Array, Trace, tolerance, trace
 
+__all__ = ['draw', 'figure']
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure

@@ -15,6 +15,8 @@ from diffdrive_jacobian.reading.run import Run, Series
 from diffdrive_jacobian.reading.trace import Trace, seconds, trace
 from diffdrive_jacobian.time_units import NANOSECONDS
 
+__all__ = ['COLUMNS', 'table', 'write_csv']
+
 COLUMNS = (
     *('time_s', 'x_m', 'y_m', 'theta_rad', 'v_mps', 'omega_radps'),
     *('distance_m', 'bearing_error_rad', 'v_command_mps', 'omega_command_radps'),

@@ -14,6 +14,8 @@ from diffdrive_jacobian.control.controller import KP, KV, Gain
 from diffdrive_jacobian.plots.rendering import render
 from diffdrive_jacobian.plots.style import styled
 
+__all__ = ['draw', 'figure']
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure

@@ -1,17 +1,17 @@
 """Properties that must hold in a run of a `Lockstep`, at each time step.
 
     from diffdrive_jacobian.properties import NeverFasterThan, StatusProtocol
+    from diffdrive_jacobian.testing import Lockstep
 
     with Lockstep() as world:
         world.require(NeverFasterThan(0.5, 2.0), StatusProtocol())
         ...
         world.finish()
 
-A violation is raised as a PropertyViolation by the method that advanced time. For properties of your
-own, derive from `Property` and `Watch`.
+A violation is raised as a `testing.PropertyViolation` by the method that advanced time. For properties
+of your own, derive from `Property` and `Watch`.
 """
 
-from diffdrive_jacobian.lockstep import PropertyViolation
 from diffdrive_jacobian.properties._node_time import end_of_faults
 from diffdrive_jacobian.properties.arrival import ArrivesOnceFaultsEnd, KeepsDriving
 from diffdrive_jacobian.properties.base import Property, Watch
@@ -36,7 +36,6 @@ __all__ = [
     'NoStaleGoals',
     'PoseFinite',
     'Property',
-    'PropertyViolation',
     'ReachesGoal',
     'Settles',
     'StatusProtocol',

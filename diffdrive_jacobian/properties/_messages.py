@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from rclpy.serialization import deserialize_message
 
-from diffdrive_jacobian.lockstep import LockstepError
+from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader
 
 _TWISTS = {

@@ -7,7 +7,7 @@ from typing import Any
 
 from rclpy.node import Node
 
-from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 ROUNDING = 1e-9

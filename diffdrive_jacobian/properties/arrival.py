@@ -10,7 +10,7 @@ from action_msgs.msg import GoalStatus
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
 from diffdrive_jacobian.numerics.fields import Name
 from diffdrive_jacobian.properties._goals import Goal, Motion, read_goal

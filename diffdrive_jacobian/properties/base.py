@@ -10,7 +10,8 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.faults.expression import Expression
-from diffdrive_jacobian.lockstep import Lockstep, LockstepError
+from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.numerics.fields import Text
 from diffdrive_jacobian.time_units import NANOSECONDS
 

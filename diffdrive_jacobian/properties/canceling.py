@@ -8,7 +8,7 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.numerics.fields import Name, Names
 from diffdrive_jacobian.properties._messages import read_twist
 from diffdrive_jacobian.properties.base import Property, Watch

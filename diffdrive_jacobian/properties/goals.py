@@ -8,7 +8,7 @@ from typing import Any
 
 from rclpy.publisher import Publisher
 
-from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
 from diffdrive_jacobian.numerics.fields import Name, Names
 from diffdrive_jacobian.properties._goals import Goal, Motion, read_goal

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from rclpy.publisher import Publisher
 
-from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION
 from diffdrive_jacobian.numerics.checks import NotNegativeOrInfinite
 from diffdrive_jacobian.numerics.fields import Name

@@ -10,7 +10,7 @@ from action_msgs.msg import GoalStatus
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.numerics.fields import Name, Names
 from diffdrive_jacobian.properties._messages import FieldReader
 from diffdrive_jacobian.properties.base import Property, Watch

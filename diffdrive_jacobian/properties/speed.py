@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from rclpy.publisher import Publisher
 
-from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.numerics.checks import NotNegative, NotNegativeOrInfinite
 from diffdrive_jacobian.numerics.fields import Name
 from diffdrive_jacobian.properties._messages import Twist, read_twist

@@ -8,7 +8,7 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.numerics.checks import NotNegative
 from diffdrive_jacobian.numerics.fields import Name, Text
 from diffdrive_jacobian.properties._messages import Twist, read_twist

@@ -39,6 +39,8 @@ from diffdrive_jacobian.reading.calibration_samples import (
 )
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 
+__all__ = ['WheelsAndReference', 'read_wheels_and_reference']
+
 MISSING = 'are missing in the bag'
 WHEELS, REFERENCE = 'joint_states', 'ground_truth'
 

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 
 from diffdrive_jacobian.bags.journal import OVERHEAD, JournalWriter, Message, Record
+from diffdrive_jacobian.errors import DiffdriveError
 
 FLUSH_PERIOD = 0.1
 """Period at which records are handed to the operating system (s)."""
@@ -18,7 +19,7 @@ EARLY = 4 << 20
 """Waiting records of this size are written before the period is over (bytes)."""
 
 
-class JournalGoneError(OSError):
+class JournalGoneError(DiffdriveError, OSError):
     """The journal was removed, renamed or replaced while it was being written."""
 
 

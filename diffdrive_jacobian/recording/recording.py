@@ -25,6 +25,7 @@ from diffdrive_jacobian.bags.journal import (
     read_journal,
 )
 from diffdrive_jacobian.bags.limits import MAX_MESSAGE
+from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.plots.output_files import names_by_time
 from diffdrive_jacobian.recording.journal_thread import CAPACITY, JournalThread
 from diffdrive_jacobian.text import printable
@@ -36,7 +37,7 @@ MAX_LEFT_OUT = 100
 """Largest number of topics that were left out and are named."""
 
 
-class RecordingError(Exception):
+class RecordingError(DiffdriveError):
     """A recording is not complete. The message says why, and where the recorded messages are."""
 
     def __init__(self, message: str, summary: Summary | None = None) -> None:

@@ -36,7 +36,7 @@ from diffdrive_jacobian.bags.journal import (
 )
 from diffdrive_jacobian.bags.limits import UNPACK_ERRORS, Budget, unpack_file, unpack_message
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError
-from diffdrive_jacobian.bags.metadata import DamagedError, parse_parameters
+from diffdrive_jacobian.bags.metadata import MetadataError, parse_parameters
 from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, TooLargeError, load_yaml
 from diffdrive_jacobian.recovery.salvage_mcap import Topic, read_mcap
 from diffdrive_jacobian.recovery.salvage_sqlite import read_sqlite
@@ -243,7 +243,7 @@ class DamagedBag:
         try:
             if text.key.startswith(PARAMETERS):
                 parse_parameters(text.key, text.value)
-        except DamagedError as error:
+        except MetadataError as error:
             if (loss := f'{error}: left out') not in self.lost:
                 self.lost.append(loss)
             return

@@ -24,6 +24,7 @@ from diffdrive_jacobian.bags.journal import (
     is_being_written,
     journal_of,
 )
+from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.recovery.damaged_bag import DamagedBag
 from diffdrive_jacobian.recovery.decoding_check import DecodingCheck
 from diffdrive_jacobian.text import printable
@@ -32,7 +33,7 @@ RECOVERED = '_recovered'
 """Ends the name of a recovered bag."""
 
 
-class NothingToSaveError(Exception):
+class NothingToSaveError(DiffdriveError):
     """There is nothing to recover; the arguments are the reason and what could not be read."""
 
 
@@ -40,7 +41,7 @@ class UncheckedError(NothingToSaveError):
     """Nothing is missing as far as could be checked; the arguments are that, and what could not be."""
 
 
-class RecoveryInterruptedError(Exception):
+class RecoveryInterruptedError(DiffdriveError):
     """The recovery was interrupted; no bag was written."""
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 
+from diffdrive_jacobian.numerics.fields import between
+
 _BITS = 4
 """Bits of a delay, after the leading one, that a bin of the histogram keeps."""
 
@@ -37,8 +39,7 @@ class Lateness:
         Raises:
             ValueError: `percent` is not in [0, 100].
         """
-        if not 0.0 <= percent <= 100.0:
-            raise ValueError(f'percent must be in [0, 100], got {percent}')
+        between(0.0, 100.0)('percent', percent)
         if not self.count:
             return math.nan
         rank = max(math.ceil(percent / 100.0 * self.count), 1)

@@ -1,1 +1,4 @@
-"""Common code of the nodes: base class, parameters, runner, watchdog, adapter to rclpy."""
+"""Common code of the nodes: base class, parameters, runner, watchdog, adapter to rclpy.
+
+Internal: may change without notice.
+"""

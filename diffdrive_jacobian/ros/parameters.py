@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from itertools import pairwise
@@ -52,7 +53,7 @@ def descriptor(specification: Specification, default: Any) -> ParameterDescripto
         additional_constraints=f'must be {constraint}' if constraint else '',
     )
     low = specification.low if specification.above is None else specification.above
-    if low is None or specification.high is None or specification.nan_is_none:
+    if low is None or specification.high in (None, math.inf) or specification.nan_is_none:
         return result
     if isinstance(default, float):
         result.floating_point_range = [

@@ -16,11 +16,11 @@ from diffdrive_jacobian.numerics.checks import (
     array,
     floats,
     function,
-    instance,
     leading,
     number,
     positive,
 )
+from diffdrive_jacobian.numerics.fields import instance
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -31,13 +31,13 @@ from numpy.typing import ArrayLike, NDArray
 from diffdrive_jacobian.kinematics.se2 import compose
 from diffdrive_jacobian.numerics.checks import (
     MAX_NANOSECONDS,
-    instance,
     nanoseconds,
     number,
     numbers,
     positive,
     read_only,
 )
+from diffdrive_jacobian.numerics.fields import instance
 from diffdrive_jacobian.simulation._uncertainty import Uncertainty
 from diffdrive_jacobian.simulation.actuators import Settling, Speeds
 from diffdrive_jacobian.simulation.arc import arc_end

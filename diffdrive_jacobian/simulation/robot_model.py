@@ -14,11 +14,10 @@ from diffdrive_jacobian.kinematics.saturation import VelocityLimits, scaled_to_l
 from diffdrive_jacobian.numerics.checks import (
     NotNegative,
     Positive,
-    instance,
     nanoseconds,
     numbers,
 )
-from diffdrive_jacobian.numerics.fields import Checked, optional
+from diffdrive_jacobian.numerics.fields import Checked, instance, optional
 from diffdrive_jacobian.simulation.actuators import Actuators, Speeds
 from diffdrive_jacobian.simulation.slip import Drift
 

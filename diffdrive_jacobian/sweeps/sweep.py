@@ -19,8 +19,8 @@ from diffdrive_jacobian.control import Arrival, Controller
 from diffdrive_jacobian.control.controller import KP, Gain
 from diffdrive_jacobian.control.controllers import CONTROLLERS
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
-from diffdrive_jacobian.numerics.checks import Positive, array, instance
-from diffdrive_jacobian.numerics.fields import Checked, Count, integer, short
+from diffdrive_jacobian.numerics.checks import Positive, array
+from diffdrive_jacobian.numerics.fields import Checked, Count, choices, instance, integer, short
 from diffdrive_jacobian.simulation import RobotModel, closed_loops
 from diffdrive_jacobian.simulation._batch import Outcomes
 from diffdrive_jacobian.simulation._block import LOST
@@ -72,8 +72,11 @@ class Setup(Checked):
         """Check every value, and that the sweep is not too large."""
         super().__post_init__()
         if not isinstance(self.controller, Controller) and self.controller not in CONTROLLERS:
+            raise ValueError(f'controller must be {choices(CONTROLLERS)}, got {self.controller!r}')
+        if self.loops > MAX_LOOPS:
             raise ValueError(
-                f'controller must be one of {", ".join(CONTROLLERS)}, got {self.controller!r}'
+                f'grid {self.grid} with {self.starts} starts gives {self.loops} closed loops; at most '
+                f'{MAX_LOOPS} are possible, because they need up to a gigabyte of memory'
             )
         self._check_gains()
         if not self.tolerance < self.distance < LOST:
@@ -84,11 +87,6 @@ class Setup(Checked):
         small = [limit for limit in self.robot.limits.all() if 0.0 < abs(limit) < MIN_LIMIT]
         if small:
             raise ValueError(f'limits must be at least {MIN_LIMIT:g}, got {abs(small[0]):g}')
-        if self.loops > MAX_LOOPS:
-            raise ValueError(
-                f'grid {self.grid} with {self.starts} starts gives {self.loops} closed loops; at most '
-                f'{MAX_LOOPS} are possible, because they need up to a gigabyte of memory'
-            )
         if self.loops * self.duration * self.rate > MAX_SAMPLES:
             raise ValueError(
                 f'{self.loops} closed loops of {self.duration:g} s at {self.rate:g} Hz have more than '

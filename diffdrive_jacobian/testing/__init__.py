@@ -2,13 +2,13 @@
 
 Names of this package, which are imported on first use:
 
-- `Lockstep`, `LockstepError`, `PropertyViolation`: as in the package `lockstep`.
-- `Answers`, `Every`, `Idle`: what nodes in other processes send, as in the package `lockstep`.
-- `faults`: the package of the faults that a `Lockstep` injects.
-- `properties`: the package of the properties that a `Lockstep` requires.
-- `explore`, `fault_schedules`, `poses`, ...: all names of the package `exploration`, most of which need
-  Hypothesis.
+- `Lockstep` and its errors.
+- `Answers`, `Every`, `Idle`: what nodes in other processes send.
+- `explore`, `fault_schedules`, `poses`, ...: exploring worlds, most of which needs Hypothesis.
 - `RecordedRun`, `GoldenRun`: types of the fixtures `recorded_run` and `golden_run`.
+
+Faults that a `Lockstep` injects are in the package `faults`, properties that it requires in
+`properties`.
 
 pytest loads the plugin in every project, so this module imports neither rclpy nor NumPy by itself.
 """
@@ -20,36 +20,31 @@ from typing import TYPE_CHECKING
 from diffdrive_jacobian import lazy
 
 if TYPE_CHECKING:
-    from diffdrive_jacobian import faults, properties
-    from diffdrive_jacobian.exploration import (
-        Exploration,
-        ExplorationError,
-        Finding,
-        LocalExecutor,
-        Replay,
-        SerialExecutor,
+    from diffdrive_jacobian.exploration.errors import ExplorationError
+    from diffdrive_jacobian.exploration.executors import LocalExecutor, SerialExecutor
+    from diffdrive_jacobian.exploration.exploring import explore
+    from diffdrive_jacobian.exploration.reproduction import reproducing
+    from diffdrive_jacobian.exploration.result import Exploration, Finding, Replay
+    from diffdrive_jacobian.exploration.scenario import scenario_from
+    from diffdrive_jacobian.exploration.schedules import fault_schedules
+    from diffdrive_jacobian.exploration.strategies import (
         angles,
-        explore,
-        fault_schedules,
         gains,
         goals,
         numbers,
         points,
         poses,
         probabilities,
-        reproducing,
-        scenario_from,
         times,
         waypoints,
     )
-    from diffdrive_jacobian.lockstep import (
-        Answers,
-        Every,
-        Idle,
-        Lockstep,
+    from diffdrive_jacobian.lockstep._errors import (
+        IneffectiveFaultsError,
         LockstepError,
         PropertyViolation,
     )
+    from diffdrive_jacobian.lockstep.external.expectations import Answers, Every, Idle
+    from diffdrive_jacobian.lockstep.world import Lockstep
     from diffdrive_jacobian.testing.golden_run import GoldenRun
     from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
@@ -61,6 +56,7 @@ __all__ = [
     'Finding',
     'GoldenRun',
     'Idle',
+    'IneffectiveFaultsError',
     'LocalExecutor',
     'Lockstep',
     'LockstepError',
@@ -71,36 +67,38 @@ __all__ = [
     'angles',
     'explore',
     'fault_schedules',
-    'faults',
     'gains',
     'goals',
     'numbers',
     'points',
     'poses',
     'probabilities',
-    'properties',
     'reproducing',
     'scenario_from',
     'times',
     'waypoints',
 ]
 
-_LOCKSTEP = ('Answers', 'Every', 'Idle', 'Lockstep', 'LockstepError', 'PropertyViolation')
-_EXPLORATION = tuple(
-    name
-    for name in __all__
-    if name not in (*_LOCKSTEP, 'GoldenRun', 'RecordedRun', 'faults', 'properties')
-)
+_MODULES = {
+    'exploration.errors': ('ExplorationError',),
+    'exploration.executors': ('LocalExecutor', 'SerialExecutor'),
+    'exploration.exploring': ('explore',),
+    'exploration.reproduction': ('reproducing',),
+    'exploration.result': ('Exploration', 'Finding', 'Replay'),
+    'exploration.scenario': ('scenario_from',),
+    'exploration.schedules': ('fault_schedules',),
+    'exploration.strategies': (
+        *('angles', 'gains', 'goals', 'numbers', 'points', 'poses', 'probabilities', 'times'),
+        'waypoints',
+    ),
+    'lockstep._errors': ('IneffectiveFaultsError', 'LockstepError', 'PropertyViolation'),
+    'lockstep.external.expectations': ('Answers', 'Every', 'Idle'),
+    'lockstep.world': ('Lockstep',),
+    'testing.golden_run': ('GoldenRun',),
+    'testing.recorded_run': ('RecordedRun',),
+}
 
 if not TYPE_CHECKING:
     __getattr__, __dir__ = lazy.attach(
-        __name__,
-        {
-            'GoldenRun': 'testing.golden_run',
-            'RecordedRun': 'testing.recorded_run',
-            'faults': 'faults',
-            'properties': 'properties',
-            **dict.fromkeys(_LOCKSTEP, 'lockstep'),
-            **dict.fromkeys(_EXPLORATION, 'exploration'),
-        },
+        __name__, {name: module for module, names in _MODULES.items() for name in names}
     )

@@ -24,7 +24,7 @@ import pytest
 from diffdrive_jacobian.testing.artifacts import artifact_name, name_beside_the_file
 
 if TYPE_CHECKING:
-    from diffdrive_jacobian.lockstep import Lockstep
+    from diffdrive_jacobian.lockstep.world import Lockstep
     from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
     from diffdrive_jacobian.testing.golden_run import GoldenRun
     from diffdrive_jacobian.testing.recorded_run import RecordedRun
@@ -125,7 +125,8 @@ def pytest_runtest_call(item: pytest.Item) -> None:
     world, golden = _argument(item, 'lockstep'), _argument(item, 'golden_run')
     if world is None:
         return
-    from diffdrive_jacobian.lockstep import Lockstep, LockstepError
+    from diffdrive_jacobian.lockstep._errors import LockstepError
+    from diffdrive_jacobian.lockstep.world import Lockstep
     from diffdrive_jacobian.recording.recording import RecordingError
     from diffdrive_jacobian.testing.golden_run import GoldenRun, GoldenRunError
 
@@ -156,7 +157,8 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
         report.user_properties.append((WRITTEN, str(golden.path)))
     if not report.failed or world is None:
         return
-    from diffdrive_jacobian.lockstep import Lockstep, LockstepError
+    from diffdrive_jacobian.lockstep._errors import LockstepError
+    from diffdrive_jacobian.lockstep.world import Lockstep
     from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
     contained = call.excinfo is not None and call.excinfo.errisinstance(LockstepError)
@@ -218,7 +220,7 @@ def lockstep(request: pytest.FixtureRequest) -> Iterator[Lockstep]:
     try:
         # First, so that the error names it.
         importlib.import_module('rclpy')
-        from diffdrive_jacobian.lockstep import Lockstep
+        from diffdrive_jacobian.lockstep.world import Lockstep
 
         with warnings.catch_warnings():
             # Of lark. rclpy imports it with the first message type, within the test.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 from collections import defaultdict
 from collections.abc import Callable, Collection
@@ -18,6 +17,8 @@ from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
 from diffdrive_jacobian.bags.qos import from_rosbags
+from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.numerics.fields import between
 from diffdrive_jacobian.testing.differences import Comparison, TopicDifference
 from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
@@ -29,7 +30,7 @@ MAX_TOPICS = 8
 """Number of topics with differences that are listed."""
 
 
-class GoldenRunError(AssertionError):
+class GoldenRunError(DiffdriveError, AssertionError):
     """A run differs from its golden run, or there is none."""
 
 
@@ -81,8 +82,7 @@ class GoldenRun:
         """
         __tracebackhide__ = True
         self.checked = True
-        if not (math.isfinite(tolerance) and tolerance >= 0.0):
-            raise ValueError(f'tolerance must be finite and not negative, got {tolerance!r}')
+        between(0.0)('tolerance', tolerance)
         if isinstance(without, str) or any(not topic.startswith('/') for topic in without):
             raise ValueError(f"without must be names of topics such as '/odom', got {without!r}")
         bag = self._run.finish()

@@ -6,7 +6,7 @@ from typing import Any
 
 from rclpy.parameter import Parameter
 
-from diffdrive_jacobian.lockstep import Lockstep
+from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.parameters.declaration import specifications
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters

@@ -7,17 +7,22 @@ import math
 import os
 import re
 import sys
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, TypeVar
 
 from diffdrive_jacobian import __version__
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION
+from diffdrive_jacobian.numerics import fields
+from diffdrive_jacobian.numerics.fields import Check, between, finite, inside, integer, one_of
 from diffdrive_jacobian.parameters.configurations import configurations
 from diffdrive_jacobian.parameters.declaration import (
     NodeParameters,
     ParameterError,
     specifications,
 )
+
+T = TypeVar('T')
 
 DONE, FAILED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
 """Exit codes: done, not done, wrong arguments, interrupted by a signal."""
@@ -127,21 +132,53 @@ def _is_number(text: str) -> bool:
 def number(text: str) -> float:
     """Parse a finite number."""
     text = text.strip()
-    if not _is_number(text) or not math.isfinite(float(text)):
+    if not _is_number(text):
         hint = f' ({ROS_HINT})' if ':=' in text else ''
-        raise argparse.ArgumentTypeError(f'must be a finite number, got {text!r}{hint}')
-    return float(text)
+        raise argparse.ArgumentTypeError(f'must be a number, got {text!r}{hint}')
+    return _checked(finite, float(text))
+
+
+def number_that(check: Check) -> Callable[[str], float]:
+    """Return a type of arguments: the finite numbers that a check accepts."""
+    return lambda text: _checked(check, number(text))
+
+
+def integer_from(low: int, high: float = math.inf) -> Callable[[str], int]:
+    """Return a type of arguments: integers from `low` to `high`."""
+    check = partial(integer, low=low, high=high)
+    # Python reads more as an integer than people write on a command line.
+
+    def parse(text: str) -> int:
+        text = text.strip()
+        # Python reads more as an integer than people write on a command line.
+        value = int(text) if re.fullmatch('-?[0-9]{1,99}', text) else text
+        return int(_checked(check, value))
+
+    return parse
+
+
+def _checked(check: Check, value: T) -> T:
+    """Return a value that a check accepts; argparse puts the name of the argument before the message."""
+    try:
+        check('', value)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error).strip()) from None
+    return value
 
 
 def angle(text: str) -> float:
     """Parse an angle (rad). More than one turn is rejected: it is probably in degrees."""
     value = number(text)
-    if abs(value) > math.tau:
-        raise argparse.ArgumentTypeError(
-            f'must be in radians, from -2 pi to 2 pi, got {text.strip()!r} '
-            f'({value:g} degrees are {math.radians(value):.6g} rad)'
-        )
+    if not inside(value, -math.tau, math.tau):
+        raise argparse.ArgumentTypeError(_not_in_radians(value))
     return value
+
+
+def _not_in_radians(value: float) -> str:
+    return (
+        f"must be in radians, from -2 pi to 2 pi, got '{value:g}' "
+        f'({value:g} degrees are {math.radians(value):.6g} rad)'
+    )
 
 
 def add_heading(parser: argparse.ArgumentParser, text: str) -> None:
@@ -163,14 +200,11 @@ def given_heading(parser: argparse.ArgumentParser, options: argparse.Namespace) 
             parser.error('--degrees needs --heading, whose unit it changes')
         return None
     if options.degrees:
-        if abs(value) > 360.0:
+        if not inside(value, -360.0, 360.0):
             parser.error(f"argument --heading: must be from -360 to 360 degrees, got '{value:g}'")
         return math.radians(value)
-    if abs(value) > math.tau:
-        parser.error(
-            f"argument --heading: must be in radians, from -2 pi to 2 pi, got '{value:g}' "
-            f'({value:g} degrees are {math.radians(value):.6g} rad); --degrees accepts them'
-        )
+    if not inside(value, -math.tau, math.tau):
+        parser.error(f'argument --heading: {_not_in_radians(value)}; --degrees accepts them')
     return value
 
 
@@ -242,29 +276,12 @@ def bag_folder(text: str) -> str:
 _FILE_ENDINGS = ('.png', '.svg', '.pdf', '.jpg', '.jpeg', '.csv', '.txt', '.yaml', '.yml')
 
 
-def coordinate(text: str) -> float:
-    """Parse a coordinate of a goal (m)."""
-    value = number(text)
-    if abs(value) > MAX_POSITION:
-        raise argparse.ArgumentTypeError(
-            f'must be within {MAX_POSITION:g} m of the origin, got {text.strip()!r}'
-        )
-    return value
-
-
-def positive(text: str) -> float:
-    """Parse a positive finite number."""
-    value = number(text)
-    if value <= 0.0:
-        raise argparse.ArgumentTypeError(f'must be positive, got {text.strip()!r}')
-    return value
-
-
-def count(text: str) -> int:
-    """Parse a whole number of at least one."""
-    if not (text.isascii() and text.isdigit()) or int(text) < 1:
-        raise argparse.ArgumentTypeError(f'must be a whole number of at least 1, got {text!r}')
-    return int(text)
+coordinate = number_that(between(-MAX_POSITION, MAX_POSITION, unit='m'))
+"""Parses a coordinate of a goal (m)."""
+positive = number_that(fields.positive)
+"""Parses a positive finite number."""
+count = integer_from(1)
+"""Parses an integer of at least one."""
 
 
 def add_wait_matching(parser: argparse.ArgumentParser, what: str, default: str) -> None:
@@ -331,11 +348,7 @@ def add_params_file(
 def _configuration(name: str) -> str:
     """Return the path of the installed parameter file of a robot."""
     installed = configurations()
-    if name not in installed:
-        raise argparse.ArgumentTypeError(
-            f'must be one of {", ".join(installed) or "none, no file is installed"}, got {name!r}'
-        )
-    return str(installed[name])
+    return str(installed[_checked(one_of(*installed), name)])
 
 
 def add_namespace(parser: argparse.ArgumentParser) -> None:

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.tools import _cli
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.live.server import LiveServer
@@ -32,19 +33,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--port',
         metavar='PORT',
-        type=_port,
+        type=_cli.integer_from(1, MAX_PORT),
         default=0,
         help='TCP port of the page (default: any free one)',
     )
     parser.add_argument(
         '--no-browser', action='store_true', help='only print the address, do not open a browser'
     )
-
-
-def _port(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and 1 <= int(text) <= MAX_PORT):
-        raise argparse.ArgumentTypeError(f'must be a whole number in 1 to {MAX_PORT}, got {text!r}')
-    return int(text)
 
 
 def announcing(

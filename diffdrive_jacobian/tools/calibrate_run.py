@@ -15,6 +15,8 @@ from diffdrive_jacobian.calibration.description import (
     explain_undetermined,
     parameter_file,
 )
+from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.numerics.fields import between
 from diffdrive_jacobian.plots.calibration_figure import draw
 from diffdrive_jacobian.plots.output_files import create, new_file
 from diffdrive_jacobian.reading.calibration_data import (
@@ -31,10 +33,6 @@ RADIUS_BOUNDS, SEPARATION_BOUNDS = (1e-3, 10.0), (1e-3, 100.0)
 """Nominal dimensions that the nodes accept (m)."""
 
 
-class UsageError(Exception):
-    """An argument is invalid; the message names it."""
-
-
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool and return its exit code."""
     own, ros = _cli.split_arguments(arguments)
@@ -43,7 +41,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     try:
         bags = [Path(bag) for bag in options.bags]
         if len({bag.resolve() for bag in bags}) < len(bags):
-            raise UsageError(f'each bag can be given once, got {" ".join(map(str, bags))}')
+            raise UserError(f'each bag can be given once, got {" ".join(map(str, bags))}')
         output, picture = _outputs(options, bags)
         read: list[WheelsAndReference] = []
         for bag in bags:
@@ -63,7 +61,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         nominal = _nominal(options, read)
     except ReadingInterruptedError:
         return _interrupted()
-    except (BagError, UsageError, ValueError, OSError) as error:
+    except (BagError, UserError, ValueError, OSError) as error:
         return _cli.complain(PROGRAM, printable(error, PATH_LIMIT))
     try:
         result = calibrate([one.recording for one in read], nominal, _given(options))
@@ -164,31 +162,28 @@ def _nominal(options: argparse.Namespace, read: Sequence[WheelsAndReference]) ->
     """Return the nominal dimensions, of the options or of the parameters in the bags.
 
     Raises:
-        UsageError: They are unknown, or differ between the bags.
+        UserError: They are unknown, or differ between the bags.
+        ValueError: They are out of range.
     """
     radius, separation = options.wheel_radius, options.wheel_separation
     if radius is None or separation is None:
         recorded = {one.dimensions for one in read if one.dimensions is not None}
         if len(recorded) > 1:
             listed = ', '.join(f'{r:g} and {s:g} m' for r, s in sorted(recorded))
-            raise UsageError(
+            raise UserError(
                 f'the bags have several wheel radii and separations, {listed}: choose with '
                 '--wheel-radius and --wheel-separation'
             )
         if not recorded:
-            raise UsageError(
+            raise UserError(
                 'the bag has no parameters wheel_radius and wheel_separation of a node: both must be '
                 'given with --wheel-radius and --wheel-separation'
             )
         known = recorded.pop()
         radius = known[0] if radius is None else radius
         separation = known[1] if separation is None else separation
-    for name, value, (low, high) in (
-        ('wheel radius', radius, RADIUS_BOUNDS),
-        ('wheel separation', separation, SEPARATION_BOUNDS),
-    ):
-        if not low <= value <= high:
-            raise UsageError(f'the {name} must be from {low:g} to {high:g} m, got {value:g}')
+    between(*RADIUS_BOUNDS, unit='m')('the wheel radius', radius)
+    between(*SEPARATION_BOUNDS, unit='m')('the wheel separation', separation)
     return Geometry(wheel_radius=radius, wheel_separation=separation)
 
 
@@ -203,12 +198,8 @@ def _given(options: argparse.Namespace) -> Given:
     )
 
 
-def _noise(text: str) -> float:
-    """Parse a noise that squares and inverses of floats can represent."""
-    value = _cli.positive(text)
-    if not 1e-12 <= value <= 1e3:
-        raise argparse.ArgumentTypeError(f'must be from 1e-12 to 1000, got {text.strip()!r}')
-    return value
+_noise = _cli.number_that(between(1e-12, 1e3))
+"""Parses a noise that squares and inverses of floats can represent."""
 
 
 def _parser() -> _cli.Parser:

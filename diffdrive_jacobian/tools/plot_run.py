@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
+from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.plots.output_files import FORMATS, NOT_OVERWRITTEN, check_directory
 from diffdrive_jacobian.plots.run_figure import draw, names
 from diffdrive_jacobian.plots.run_table import DECIMALS, write_csv
@@ -39,20 +40,16 @@ TOPICS = (
 """Topics whose name in the bag can be given by --topic."""
 
 
-class UsageError(Exception):
-    """An argument is invalid; the message names it."""
-
-
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool and return its exit code."""
     options = _parser().parse_args(arguments)
     bags = [Path(bag) for bag in options.bags]
     try:
         if len({bag.resolve() for bag in bags}) < len(bags):
-            raise UsageError(f'each bag can be given once, got {" ".join(map(str, bags))}')
+            raise UserError(f'each bag can be given once, got {" ".join(map(str, bags))}')
         given = [name for name, _ in options.topics]
         if repeated := [name for name in given if given.count(name) > 1]:
-            raise UsageError(f'--topic can be given once for each name, got {repeated[0]} again')
+            raise UserError(f'--topic can be given once for each name, got {repeated[0]} again')
         picture = _picture(options, bags)
         tables = [] if options.csv is None else _tables(options, bags)
         # A bag that does not exist is reported when it is read.
@@ -82,7 +79,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         return _write(runs, picture, tables, signals, replace=options.force)
     except ReadingInterruptedError:
         return _interrupted()
-    except (BagError, UsageError) as error:
+    except (BagError, UserError) as error:
         return _cli.complain(PROGRAM, printable(error, PATH_LIMIT))
     except ModuleNotFoundError as error:
         if (error.name or '').split('.')[0] != 'matplotlib':
@@ -145,7 +142,7 @@ def _picture(options: argparse.Namespace, bags: Sequence[Path]) -> Path:
     """Return the path of the picture, which by default is beside the first bag.
 
     Raises:
-        UsageError: It exists, is a directory, or has another ending than a picture.
+        UserError: It exists, is a directory, or has another ending than a picture.
     """
     output = options.output
     name = '_and_'.join(bag.resolve().name for bag in bags)
@@ -153,11 +150,11 @@ def _picture(options: argparse.Namespace, bags: Sequence[Path]) -> Path:
         name += options.namespace.replace('/', '_')
     path = bags[0].resolve().parent / f'{name}.png' if output is None else Path(output)
     if output is not None and (output.endswith('/') or path.is_dir()):
-        raise UsageError(
+        raise UserError(
             f'the picture must be a file (.{", .".join(FORMATS)}), got a directory: {output!r}'
         )
     if path.suffix.lower().removeprefix('.') not in FORMATS:
-        raise UsageError(f'the picture must end in .{", .".join(FORMATS)}, got {output!r}')
+        raise UserError(f'the picture must end in .{", .".join(FORMATS)}, got {output!r}')
     return _checked(path, replace=options.force)
 
 
@@ -165,29 +162,29 @@ def _tables(options: argparse.Namespace, bags: Sequence[Path]) -> list[Path]:
     """Return the paths of the CSV files, one for each run.
 
     Raises:
-        UsageError: One of them exists, or `output` is neither a CSV file nor a directory.
+        UserError: One of them exists, or `output` is neither a CSV file nor a directory.
     """
     output = options.csv
     path = Path(output)
     if path.is_dir() or output.endswith('/') or not path.suffix:
         if path.exists() and not path.is_dir():
-            raise UsageError(f'{path} exists already; a CSV file ends in .csv')
+            raise UserError(f'{path} exists already; a CSV file ends in .csv')
         labels = (name.replace('/', '_') for name in names(bags))
         return [_checked(path / f'{label}.csv', replace=options.force) for label in labels]
     if path.suffix.lower() != '.csv':
-        raise UsageError(
+        raise UserError(
             f'--csv must be a file that ends in .csv or a directory, got {output!r} (a directory exists '
             'already, has a name without an ending, or is given with / at its end)'
         )
     if len(bags) > 1:
-        raise UsageError(f'--csv must be a directory for {len(bags)} runs, got {output!r}')
+        raise UserError(f'--csv must be a directory for {len(bags)} runs, got {output!r}')
     return [_checked(path, replace=options.force)]
 
 
 def _checked(path: Path, *, replace: bool) -> Path:
     """Return a path, unless something is there that is not to be replaced."""
     if (path.exists() or path.is_symlink()) and not (replace and path.is_file()):
-        raise UsageError(f'{path} exists already; {NOT_OVERWRITTEN}')
+        raise UserError(f'{path} exists already; {NOT_OVERWRITTEN}')
     return path
 
 

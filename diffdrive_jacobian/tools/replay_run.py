@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.numerics.fields import not_negative
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli
@@ -152,13 +153,6 @@ def _remapping(text: str) -> tuple[str, str]:
     return old, new
 
 
-def _not_negative(text: str) -> float:
-    value = _cli.number(text)
-    if value < 0.0:
-        raise argparse.ArgumentTypeError(f'must not be negative, got {text.strip()!r}')
-    return value
-
-
 def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
@@ -186,7 +180,7 @@ def _parser() -> _cli.Parser:
     parser.add_argument(
         '--start-offset',
         metavar='SECONDS',
-        type=_not_negative,
+        type=_cli.number_that(not_negative),
         default=0.0,
         help='start this long after the beginning of the bag (s) (default: 0.0)',
     )
@@ -221,7 +215,7 @@ def _parser() -> _cli.Parser:
     )
     parser.add_argument(
         '--wait-for-all-acked',
-        type=_not_negative,
+        type=_cli.number_that(not_negative),
         metavar='MS',
         help='at the end wait up to this time (ms) until all reliable subscriptions have acknowledged '
         'all messages, 0: no limit; exit code 1 if they have not (default: do not wait)',

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,21 +11,21 @@ from typing import Any
 
 from diffdrive_jacobian.control import Controller, ControllerError
 from diffdrive_jacobian.control.controllers import BUILT_IN, CONTROLLERS
-from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.errors import DiffdriveError, UserError
 from diffdrive_jacobian.parameters.declaration import from_ros
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.plots import sweep_figure
 from diffdrive_jacobian.plots.output_files import FORMATS, create, extension, free_stem, new_file
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.simulation import RobotModel
-from diffdrive_jacobian.sweeps.sweep import Setup, Sweep, describe, sweep, table
+from diffdrive_jacobian.sweeps.sweep import MAX_LOOPS, Setup, Sweep, describe, sweep, table
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._waiting import busy
 
 PROGRAM = 'sweep_gains'
 
 
-class InterruptedByUserError(Exception):
+class SweepInterruptedError(DiffdriveError):
     """A signal was caught."""
 
 
@@ -54,7 +53,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         if options.output is None and options.csv is None:
             # Other processes that started in the same second may have taken the names meanwhile.
             picture, numbers = _files(options)
-    except InterruptedByUserError:
+    except SweepInterruptedError:
         print(f'{PROGRAM}: interrupted: nothing was written', file=sys.stderr)
         return _cli.INTERRUPTED
     except (ValueError, UserError, FileExistsError) as error:
@@ -80,7 +79,7 @@ def _sweep(options: argparse.Namespace, signals: Signals) -> Sweep:
     Raises:
         ValueError: The options are invalid together.
         UserError: The parameter file is invalid.
-        InterruptedByUserError: A signal was caught.
+        SweepInterruptedError: A signal was caught.
     """
     setup = Setup(
         controller=options.controller,
@@ -129,9 +128,9 @@ def _gains(options: argparse.Namespace) -> dict[str, float | tuple[float, float]
 
 
 def _check(signals: Signals) -> None:
-    """Raise InterruptedByUserError if a signal was caught."""
+    """Raise SweepInterruptedError if a signal was caught."""
     if signals.count:
-        raise InterruptedByUserError
+        raise SweepInterruptedError
 
 
 def _robot(options: argparse.Namespace) -> RobotModel:
@@ -197,13 +196,6 @@ def _cannot_write(path: object, error: OSError) -> int:
     return _cli.FAILED
 
 
-def _whole(text: str) -> int:
-    text = text.strip()
-    if not re.fullmatch('-?[0-9]{1,9}', text):
-        raise argparse.ArgumentTypeError(f'must be a whole number below a billion, got {text!r}')
-    return int(text)
-
-
 def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
@@ -219,14 +211,14 @@ def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:
     parser.add_argument(
         '--grid',
         metavar='N',
-        type=_whole,
+        type=_cli.integer_from(2, MAX_LOOPS),
         default=usual.grid,
         help='number of values of each gain (default: %(default)s)',
     )
     parser.add_argument(
         '--starts',
         metavar='N',
-        type=_whole,
+        type=_cli.integer_from(1, MAX_LOOPS),
         default=usual.starts,
         help='number of start poses, evenly spaced around the goal, with headings in all directions '
         '(default: %(default)s)',

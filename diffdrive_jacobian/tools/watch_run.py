@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.numerics.fields import between
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli, _live
 from diffdrive_jacobian.tools._startup import long_lived
@@ -68,12 +69,7 @@ def _nodes(options: argparse.Namespace, ros: Sequence[str], signals: Signals) ->
 def _rate(text: str) -> float:
     from diffdrive_jacobian.live.commands import MAX_WORLD_SPEED, MIN_WORLD_SPEED
 
-    value = _cli.positive(text)
-    if not MIN_WORLD_SPEED <= value <= MAX_WORLD_SPEED:
-        raise argparse.ArgumentTypeError(
-            f'must be in {MIN_WORLD_SPEED:g} to {MAX_WORLD_SPEED:g}, got {text.strip()!r}'
-        )
-    return value
+    return _cli.number_that(between(MIN_WORLD_SPEED, MAX_WORLD_SPEED))(text)
 
 
 def _parser() -> _cli.Parser:

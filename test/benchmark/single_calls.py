@@ -22,9 +22,11 @@ from table import Goal, Row, interleave
 
 from diffdrive_jacobian import control
 from diffdrive_jacobian.control import Arrival, StraightLine, VelocityLimits, Waypoints
-from diffdrive_jacobian.kinematics import MobileManipulator, PlanarArm, contact, diff_drive
+from diffdrive_jacobian.kinematics import contact, diff_drive
 from diffdrive_jacobian.kinematics import inverse_kinematics as ik
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
+from diffdrive_jacobian.kinematics.mobile_manipulator import MobileManipulator
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 
 MOST = 3.0
 """Times as long as by hand that a single call may take."""

@@ -4,29 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import KW_ONLY, dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 from rclpy.node import Node
 
 from diffdrive_jacobian.lockstep.external.process import ExternalProcess
 from diffdrive_jacobian.lockstep.external.waiting import Probe
-from diffdrive_jacobian.numerics.checks import NotNegative, number, positive
-from diffdrive_jacobian.numerics.fields import Checked, Count, Name
+from diffdrive_jacobian.numerics.checks import NotNegative
+from diffdrive_jacobian.numerics.fields import Checked, Count, Name, between
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 WITHIN = 5.0
 """Default of `within` (s)."""
 
 
-def _period(name: str, value: Any) -> float:
-    """Require a time of at least a nanosecond: less is zero for rcl."""
-    seconds = number(name, value, positive)
-    if seconds * NANOSECONDS < 1.0:
-        raise ValueError(f'{name} must be at least 1e-9 s, got {seconds}')
-    return seconds
-
-
-Period = Annotated[float, _period]
+# Less than a nanosecond is zero for rcl.
+Period = Annotated[float, between(1e-9, unit='s')]
 
 
 @dataclass(frozen=True)
