@@ -199,7 +199,7 @@ class Link:
         taken = self.take(self.message_type, self.raw)
         if taken is None:
             return False
-        self.call(taken)
+        self.arrive(taken)
         return True
 
     def accept(self) -> None:
@@ -207,17 +207,18 @@ class Link:
         if not self.stages:
             self.deliver()
         elif (taken := self._take_next(self.message_type, True)) is not None:
-            late = partial(self._arrive_late, taken[1])
+            late = partial(self._pass_late, taken[1])
             pass_on(self.stages, taken[0], self._agenda, late, late)
 
-    def call(self, taken: Taken) -> None:
-        """Let the receiver process a message, at once or when its gate opens."""
+    def arrive(self, taken: Taken) -> None:
+        """Let a message pass the gate of the receiver, at once or later."""
         if self._gate.free:
             self._hand_over(taken)
         else:
             self._gate.enter(self, self.topic, partial(self._hand_over, taken), self.depth)
 
     def _hand_over(self, taken: Taken) -> None:
+        """Let the receiver process a message."""
         if self.observers:
             for observer in self.observers:
                 observer(self.owner, self.message_type, taken[0])
@@ -230,18 +231,18 @@ class Link:
             if taken is None:
                 return None
             data, info = taken
-            late = partial(self._arrive_late, info)
-            pass_on(self.stages, data, self._agenda, partial(self._arrive, info), late)
+            late = partial(self._pass_late, info)
+            pass_on(self.stages, data, self._agenda, partial(self._pass, info), late)
             # The message itself has its entry among those that wait.
             self._pending.extendleft([self] * (len(ready) - 1))
         return ready.popleft()
 
-    def _arrive(self, info: dict[str, Any], data: bytes) -> None:
+    def _pass(self, info: dict[str, Any], data: bytes) -> None:
         message = data if self.raw else deserialize_message(data, self.message_type)
         self._ready.append((message, info))
 
-    def _arrive_late(self, info: dict[str, Any], data: bytes) -> None:
-        self._arrive(info, data)
+    def _pass_late(self, info: dict[str, Any], data: bytes) -> None:
+        self._pass(info, data)
         self._pending.append(self)
 
     def close(self) -> None:

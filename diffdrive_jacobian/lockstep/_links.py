@@ -292,7 +292,7 @@ class Links:
             # As `deliver`, without a call for each.
             taken = link.take(link.message_type, link.raw)
             if taken is not None:
-                link.call(taken)
+                link.arrive(taken)
                 found = True
         return found
 

@@ -36,7 +36,6 @@ class SimulatedTime:
         guard: Guard,
         *,
         check_open: Callable[[], None],
-        check: Callable[[], None],
         discovered: Callable[[], None],
         report: Callable[[], str],
     ) -> None:
@@ -46,18 +45,19 @@ class SimulatedTime:
             scheduler: Executes the nodes.
             guard: Notices callbacks that block.
             check_open: Raises an error if time cannot advance any more.
-            check: Called at each simulated time, when all callbacks have been executed.
             discovered: Called when topics of other processes may have been discovered.
             report: Returns the last messages of all topics as text.
         """
         self._scheduler = scheduler
         self._clocks, self._agenda = scheduler.clocks, scheduler.agenda
         self._guard = guard
-        self._check_open, self._check = check_open, check
+        self._check_open = check_open
         self._discovered, self._report = discovered, report
         self._until_next: int | None = None
         self.others = Isolated()
         """Nodes in other processes."""
+        self.check: Callable[[], None] = lambda: None
+        """Called at each simulated time, when all callbacks have been executed."""
         self.busy = False
         """Whether callbacks are being executed."""
 
@@ -68,7 +68,7 @@ class SimulatedTime:
         with self.watched():
             self._until_next = self._scheduler.settle()
         self._await_others()
-        self._check()
+        self.check()
 
     def settle_unless_busy(self) -> None:
         """Settle, except within a callback, after which it happens anyway."""
@@ -158,7 +158,7 @@ class SimulatedTime:
         with self.watched():
             self._until_next = self._scheduler.advance()
         self._await_others()
-        self._check()
+        self.check()
 
     # --- Nodes in other processes
 
@@ -175,7 +175,6 @@ class SimulatedTime:
 
     def connect(self, timeout: float = CONNECTION) -> None:
         """Wait until other processes are discovered, as `Lockstep.connect`."""
-        checked_nanoseconds('timeout', timeout)
         self._check_open()
         others = self.others
         if self.busy or others.connected():

@@ -143,7 +143,6 @@ class Lockstep:
             scheduler,
             guard,
             check_open=self._check_open,
-            check=self._check_properties,
             discovered=self._on_discovery,
             report=self.report,
         )
@@ -158,6 +157,7 @@ class Lockstep:
         self._messaging = Messaging(scheduler, self._nodes, self._time, self.report)
         self._faults = Faults(scheduler, self._nodes, others, self.settle)
         self._properties = Properties(scheduler, self._nodes, others, self.report)
+        self._time.check = self._properties.check
         Lockstep._open = self
         self._time.arrive()
 
@@ -496,10 +496,6 @@ class Lockstep:
         self._properties.finish()
         self.check_faults()
 
-    def _check_properties(self) -> None:
-        __tracebackhide__ = True
-        self._properties.check()
-
     def expect(self, *names: str) -> None:
         """Expect that some node has a publisher of one of these topics, or one of these services.
 
@@ -601,6 +597,7 @@ class Lockstep:
             LockstepError: Nodes are not discovered in time, or a process has ended.
         """
         __tracebackhide__ = True
+        checked_nanoseconds('timeout', timeout)
         self._time.connect(timeout)
 
     def _on_discovery(self) -> None:
