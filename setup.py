@@ -16,6 +16,7 @@ COMMANDS = [
     'replay_run',
     'verify_run',
     'watch_run',
+    'plot_jacobian',
     'plot_run',
     'sweep_gains',
     'doctor',

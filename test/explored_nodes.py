@@ -19,6 +19,7 @@ from std_srvs.srv import Trigger
 from diffdrive_jacobian import faults
 from diffdrive_jacobian.lockstep.runner import LockstepRunner
 from diffdrive_jacobian.messages import conversion as messages
+from diffdrive_jacobian.messages.codecs import ODOMETRY
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
@@ -142,7 +143,7 @@ def chain(world, case):
     # Whatever has happened, the next goal is reached.
     for name in NODES:
         world.find(name)
-    pose = messages.from_pose(world.last('odom').pose.pose)
+    pose = np.array(ODOMETRY.of(world.last('odom')).pose)
     assert all(map(math.isfinite, pose)), pose
     x, y, theta = map(float, pose)
     goal = x + 0.2 * math.cos(theta + 1.0), y + 0.2 * math.sin(theta + 1.0), 0.0

@@ -1,8 +1,10 @@
 """The pages of the documentation: their code blocks, how these are run, and what is generated in them.
 
     python test/pages.py parameters            write the parameter tables of doc/nodes.md
+    python test/pages.py bodies [PAGE ...]     write the bodies of functions into pages
     python test/pages.py outputs [PAGE ...]    run pages and write the outputs that they quote
     python test/pages.py public                write doc/public.md
+    python test/pages.py pictures              draw the pictures of plot_jacobian that pages show
 
 A page is run from top to bottom in one empty directory. A `python` block is a program and a `bash` block
 a script. Programs of this package, `pytest` and `python` run in forks, see `forked`. `python3` is a new
@@ -20,20 +22,26 @@ a block say what differs:
     <!-- output: part -->                its lines are in what the block before printed, in this order
     <!-- output: part, exact -->         the same, with equal numbers (also without `part`)
 
-Numbers in other outputs may differ.
+Numbers in other outputs may differ. Before a `py` block, which is not run:
+
+    <!-- body: PACKAGE.MODULE.FUNCTION -->   a function of the package, without its docstring
 """
 
 from __future__ import annotations
 
+import ast
 import importlib
 import inspect
+import io
 import os
+import pkgutil
 import re
 import signal
 import subprocess
 import sys
 import sysconfig
 import tempfile
+import textwrap
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass, fields
@@ -342,6 +350,32 @@ def with_parameter_tables(text: str) -> str:
     return text
 
 
+# --- Bodies of functions
+
+BODY = re.compile(r'(<!-- body: ([\w.]+) -->\n+```py\n)(.*?)(^```$)', re.MULTILINE | re.DOTALL)
+
+
+def body(name: str) -> str:
+    """Return the source of a function or method, without decorators and docstring.
+
+    Args:
+        name: Its full name, `PACKAGE.MODULE.FUNCTION` or `PACKAGE.MODULE.CLASS.METHOD`.
+    """
+    source = textwrap.dedent(inspect.getsource(pkgutil.resolve_name(name)))
+    (function,) = ast.parse(source).body
+    assert isinstance(function, ast.FunctionDef), f'{name} is no function'
+    lines = source.splitlines(keepends=True)
+    first = function.body[0]
+    if ast.get_docstring(function) is not None:
+        del lines[first.lineno - 1 : first.end_lineno]
+    return ''.join(lines[function.lineno - 1 :])
+
+
+def with_bodies(text: str) -> str:
+    """Return a page with its bodies of functions as they should be."""
+    return BODY.sub(lambda match: match[1] + body(match[2]) + match[4], text)
+
+
 # --- Public names
 
 
@@ -387,6 +421,30 @@ def _sentence(value: object) -> str:
     return (found[0] if found else text).rstrip(':').replace('|', '\\|')
 
 
+# --- Pictures
+
+
+def write_pictures() -> None:
+    """Draw the pictures of `plot_jacobian` that pages show, with a palette, a third of the size."""
+    from PIL import Image
+
+    from diffdrive_jacobian import plots
+    from diffdrive_jacobian.plots.rendering import render
+    from diffdrive_jacobian.plots.style import styled
+
+    shown = {
+        Path(link)
+        for path in PAGES.values()
+        for link in re.findall(r'!\[.*?\]\((.*?)\)', path.read_text())
+    }
+    for name in plots.PICTURES:
+        if (file := Path('../resource/pictures') / f'{name}.png') in shown:
+            with styled():
+                content = render(getattr(plots, name)(), 'png')
+            picture = Image.open(io.BytesIO(content)).convert('RGB').quantize(dither=Image.Dither.NONE)
+            picture.save(ROOT / 'doc' / file, optimize=True)
+
+
 def main(what: str, names: list[str]) -> None:
     """Write what is generated into the pages."""
     for name in names or PAGES:
@@ -395,6 +453,8 @@ def main(what: str, names: list[str]) -> None:
         new = text
         if what == 'parameters':
             new = with_parameter_tables(text)
+        elif what == 'bodies':
+            new = with_bodies(text)
         else:
             with tempfile.TemporaryDirectory() as directory:
                 for block, printed in reversed(run_page(text, Path(directory))):
@@ -409,6 +469,10 @@ if __name__ == '__main__':
     if sys.argv[1:] == ['public']:
         PAGES.get('doc/public.md', ROOT / 'doc' / 'public.md').write_text(public_page())
         sys.exit()
-    if sys.argv[1:2] not in (['parameters'], ['outputs']) or not {*sys.argv[2:]} <= {*PAGES}:
+    if sys.argv[1:] == ['pictures']:
+        write_pictures()
+        sys.exit()
+    written = sys.argv[1:2] in (['parameters'], ['bodies'], ['outputs'])
+    if not written or not {*sys.argv[2:]} <= {*PAGES}:
         sys.exit(__doc__)
     main(sys.argv[1], sys.argv[2:])

@@ -133,7 +133,7 @@ PROMISES = (
         """Every program exits within 1 s of SIGINT, SIGTERM or SIGHUP, with the documented exit code,
         and without a traceback or temporary files. Nodes publish a last zero. Only record_run may wait
         longer: after a burst, for late messages (doc/bags.md).""",
-        """Each of the 14 programs: at a random time of its start, while it runs, flooded, with callbacks
+        """Each program: at a random time of its start, while it runs, flooded, with callbacks
         of 50 ms, by two signals. The time in which its main thread waits for a core does not count.
         Before its first line only Python's own handlers are there. `drive_to` is tried with `--no-plot`:
         otherwise it first draws what was driven, for about 1.6 s of CPU.""",

@@ -11,7 +11,8 @@ from nav_msgs.msg import Goals, Odometry
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
-from diffdrive_jacobian.messages.conversion import from_pose, from_time, set_pose
+from diffdrive_jacobian.messages.codecs import ODOMETRY, POSE_WITH_COVARIANCE
+from diffdrive_jacobian.messages.conversion import from_time, set_pose
 
 PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 WHEELS = ['left_wheel_joint', 'right_wheel_joint']
@@ -58,7 +59,12 @@ def pose_message(pose):
 
 
 def instants(messages):
-    return [from_time(one.header.stamp) for one in messages]
+    return [time_of(one) for one in messages]
+
+
+def time_of(message):
+    """Return the stamp of a message (ns)."""
+    return from_time(message.header.stamp.sec, message.header.stamp.nanosec)
 
 
 def twists(messages):
@@ -66,8 +72,9 @@ def twists(messages):
     return [(one.linear.x, one.angular.z) for one in bare]
 
 
-def pose_of(odometry):
-    return from_pose(odometry.pose.pose)
+def pose_of(message):
+    codec = ODOMETRY if isinstance(message, Odometry) else POSE_WITH_COVARIANCE
+    return np.array(codec.of(message).pose)
 
 
 def covariance_of(odometry):

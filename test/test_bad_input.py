@@ -1,5 +1,6 @@
-"""Every public function and class of control, simulation, diff_drive and se2, given invalid arguments: a
-ValueError that names the argument, or a finite result, and the same for one robot and for a batch."""
+"""Every public function and class of control, simulation, diff_drive, rigid_body and se2, given invalid
+arguments: a ValueError that names the argument, or a finite result, and the same for one robot and for
+a batch."""
 
 from __future__ import annotations
 
@@ -12,8 +13,9 @@ import pytest
 
 from diffdrive_jacobian import control, simulation
 from diffdrive_jacobian.control import Arrival, StraightLine, VelocityLimits, Waypoints
-from diffdrive_jacobian.kinematics import diff_drive, se2
+from diffdrive_jacobian.kinematics import diff_drive, rigid_body, se2
 from diffdrive_jacobian.simulation import Drift, Robot, RobotModel, odometry_noise
+from diffdrive_jacobian.simulation.closed_loop import Outcomes
 
 POSE, TWIST, GOAL = (0.3, -0.2, 1.0), (0.2, 0.5), (1.0, 2.0)
 WHEELS = {'r': 0.033, 'L': 0.16}
@@ -55,8 +57,13 @@ FUNCTIONS = {
     diff_drive.offset_point_jacobian: {'theta': 0.5, **WHEELS, 'd': 0.1},
     diff_drive.body_to_wheel: {'v': 0.2, 'omega': 0.5, **WHEELS},
     diff_drive.wheel_to_body: {'omega_R': 2.0, 'omega_L': 3.0, **WHEELS},
+    diff_drive.wheel_centres: {'pose': POSE, 'L': 0.16},
+    diff_drive.wheel_centre_velocities: {'theta': 0.5, 'q_dot': POSE, 'L': 0.16},
     diff_drive.no_lateral_slip_constraint: {'theta': 0.5},
+    diff_drive.lie_bracket: {'theta': 0.5},
+    diff_drive.controllability_matrix: {'theta': 0.5},
     diff_drive.rolling_constraints: {'theta': 0.5, **WHEELS},
+    rigid_body.point_velocity: {'v': POSE, 'omega': POSE, 'offset': POSE},
     se2.wrap_angle: {'angle': 4.0},
     se2.sinc: {'angle': 0.5},
     se2.exp: {'twist': POSE},
@@ -64,6 +71,7 @@ FUNCTIONS = {
     se2.compose: {'first': POSE, 'second': POSE},
     se2.inverse: {'pose': POSE},
     se2.homogeneous: {'pose': POSE},
+    se2.homogeneous_3d: {'pose': POSE},
     se2.adjoint: {'pose': POSE},
     se2.left_jacobian: {'twist': POSE},
     se2.right_jacobian: {'twist': POSE},
@@ -160,7 +168,7 @@ def spoiled(valid, value):
 
 def numbers(result):
     """Yield every number of a result; NaN is allowed as the time of a robot that has not arrived."""
-    if isinstance(result, simulation.closed_loop.Outcomes):
+    if isinstance(result, Outcomes):
         assert np.all(np.isnan(result.time) == ~result.arrived)
         result = result._replace(time=np.nan_to_num(result.time))
     if isinstance(result, VelocityLimits):
@@ -189,7 +197,7 @@ def assert_named_or_finite(call, name, value):
 def test_every_public_function_is_called_here():
     called = {name_of(call).split('.')[0] for call in CALLS}
     public = {*control.__all__, *simulation.__all__} - ELSEWHERE
-    for module in (diff_drive, se2):
+    for module in (diff_drive, rigid_body, se2):
         public |= {
             name
             for name, value in vars(module).items()

@@ -20,6 +20,7 @@ from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
+from diffdrive_jacobian.nodes import go_to_goal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.parameters.declaration import ParameterError
@@ -193,7 +194,7 @@ def test_goals_with_too_many_poses_are_refused_unread(controller, monkeypatch, c
     controller.at(0, 0)
     message = goals(*[goal(1, 0)] * (MAX_WAYPOINTS + 1), stamp=2)
     with monkeypatch.context() as patched:
-        patched.setattr(serialization, 'deserialize_message', None)
+        patched.setattr(go_to_goal, '_read_goals', None)
         controller.send(message)
     words = f'goals must contain at most {MAX_WAYPOINTS} poses, got {MAX_WAYPOINTS + 1}'
     assert words in capfd.readouterr().err
@@ -209,13 +210,12 @@ def test_header_of_goals_is_read_without_the_poses(frame, count):
     message = goals(*[goal(1, 0, frame='x')] * count, frame=frame)
     message.header.stamp = stamp(-5_000_000_123)
     assert serialization.goals_header(serialize_message(message)) == (message.header.stamp, count)
-    assert serialization.deserialized(serialize_message(message), Goals) == message
 
 
 def big_endian_goals(count):
-    """Serialize that many poses of zeros, without frames, in the byte order that only rclpy reads."""
+    """Serialize that many poses of zeros, without frames, in an encapsulation that only rclpy reads."""
     header = struct.pack('>iII', 2, 0, 1) + bytes(4)
-    return b'\0\0\0\0' + header + struct.pack('>I', count) + bytes(72 * count)
+    return b'\0\2\0\0' + header + struct.pack('>I', count) + bytes(72 * count)
 
 
 def test_long_goals_in_another_byte_order_are_not_converted(lockstep, monkeypatch, capfd):
@@ -223,7 +223,7 @@ def test_long_goals_in_another_byte_order_are_not_converted(lockstep, monkeypatc
     controller = Controller(lockstep)
     publisher = lockstep.node.create_publisher(Goals, 'goals', 10)
     with monkeypatch.context() as patched:
-        patched.setattr(serialization, '_read_goals', None)
+        patched.setattr(serialization, '_read_header', None)
         publisher.publish(big_endian_goals(MAX_WAYPOINTS + 1000))
         lockstep.settle()
     assert 'goals dropped: a Goals message must have at most 200000 bytes' in capfd.readouterr().err
@@ -235,8 +235,6 @@ def test_goals_that_are_cut_off_are_no_goals(length):
     data = serialize_message(goals(goal(1, 0)))[:length]
     with pytest.raises(MessageError, match='it is not a Goals message'):
         serialization.goals_header(data)
-    with pytest.raises(MessageError, match='it is not a Goals message'):
-        serialization.deserialized(data, Goals)
 
 
 @pytest.mark.parametrize(
@@ -266,10 +264,8 @@ def test_bytes_that_are_no_goals_are_dropped(lockstep, controller, data):
 @pytest.mark.parametrize('sec', [-1, -5, -(2**31)])
 @pytest.mark.parametrize('nanosec', [0, 999_999_999, 1_000_000_000, 2**32 - 1])
 def test_stamps_before_time_began_are_invalid(sec, nanosec):
-    time = stamp(0)
-    time.sec, time.nanosec = sec, nanosec
     with pytest.raises(MessageError, match=f'got sec {sec}, nanosec {nanosec}'):
-        messages.from_time(time)
+        messages.from_time(sec, nanosec)
 
 
 @pytest.mark.parametrize(

@@ -12,12 +12,11 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 import diffdrive_jacobian
-from diffdrive_jacobian.messages import conversion, wire
-from diffdrive_jacobian.ros.serialization import reader
+from diffdrive_jacobian.messages.codecs import JOINT_STATE, WHEEL_ARRAY, WheelArray, Wheels
 
 PACKAGE = Path(diffdrive_jacobian.__file__).parent
-FIELDS = {'sec', 'nanosec', 'velocity', 'position', 'data'}
-"""Fields of stamps, of joint states and of arrays of wheel speeds."""
+FIELDS = {'sec', 'nanosec'}
+"""Fields of stamps."""
 MESSAGES = {'stamp', 'clock', 'message', '_message', '_states'}
 """Names of messages and of fields that have these fields."""
 
@@ -40,7 +39,7 @@ def writers():
 
 def test_only_the_conversion_writes_stamps_and_wheels():
     found = set(writers())
-    assert {path for path, _ in found} == {'messages/conversion.py', 'messages/wire.py'}
+    assert {path for path, _ in found} == {'messages/conversion.py'}
     assert {field for _, field in found} == FIELDS
 
 
@@ -54,18 +53,15 @@ def test_no_module_assigns_a_stamp_of_its_own_making():
 
 @pytest.mark.parametrize('angles', [None, (0.5, -0.5)])
 def test_wheels_are_left_right_in_messages_and_right_left_in_the_library(angles):
-    state, time, speeds = JointState(name=['left', 'right']), 1_500_000_000, (3.0, 2.0)
-    if angles is None:
-        data = wire.joint_command_writer(state)(time, speeds)
-    else:
-        data = wire.joint_state_writer(state)(time, speeds, angles)
+    names, time, speeds = ('left', 'right'), 1_500_000_000, (3.0, 2.0)
+    template = JointState(name=[*names], velocity=[0.0, 0.0])
+    if angles is not None:
+        template.position = [0.0, 0.0]
+    data = JOINT_STATE.writer(template)(Wheels.of(time, names, speeds, angles))
     state = deserialize_message(data, JointState)
-    data = wire.wheel_array_writer(Float64MultiArray())(time, speeds)
+    data = WHEEL_ARRAY.writer(Float64MultiArray(data=[0.0, 0.0]))(WheelArray.of(speeds))
     array = deserialize_message(data, Float64MultiArray)
     assert list(state.velocity) == list(array.data) == [2.0, 3.0]
     assert list(state.position) == ([] if angles is None else [-0.5, 0.5])
     assert (state.header.stamp.sec, state.header.stamp.nanosec) == (1, 500_000_000)
-    assert conversion.from_joint_state(state, ('left', 'right')) == speeds
-    assert reader(JointState, wire.JOINT_STATE)(
-        wire.joint_command_writer(JointState(name=['left', 'right']))(time, speeds)
-    ) == (1, 500_000_000, ('left', 'right'), (2.0, 3.0))
+    assert JOINT_STATE.of(state).speeds(names) == WHEEL_ARRAY.of(array).speeds(names) == speeds

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from diffdrive_jacobian.control import go_to_goal
 from diffdrive_jacobian.kinematics import diff_drive as dd
-from diffdrive_jacobian.kinematics import se2
+from diffdrive_jacobian.kinematics import rigid_body, se2
 
 R, L = 0.033, 0.16  # document A's robot
 deterministic = settings(deadline=None, derandomize=True)
@@ -110,6 +110,51 @@ def test_rolling_of_both_wheels_is_the_chain(theta, r, L, omega_R, omega_L):
     close(centres, r * wheels, 100.0 * r)
 
 
+# --- The centres of the wheels
+
+
+@deterministic
+@given(headings, dimensions, dimensions, speeds, speeds)
+def test_the_wheel_centres_roll_forward_and_the_axle_centre_is_half_way(theta, r, L, omega_R, omega_L):
+    pose = np.array([3.0, -2.0, theta])
+    right, left = dd.wheel_centres(pose, L)
+    close((right + left) / 2.0, pose[:2], L)
+    e_f, e_l = dd.unicycle_jacobian(theta)[:2, 0], dd.no_lateral_slip_constraint(theta)[0, :2]
+    close(right - left, L * e_l, 10.0 + L)
+    q_dot = dd.wheel_to_world_jacobian(theta, r, L) @ [omega_R, omega_L]
+    velocities = dd.wheel_centre_velocities(theta, q_dot, L)
+    close(velocities @ e_f, [r * omega_R, r * omega_L], 1e3 * r)
+    close(velocities @ e_l, [0.0, 0.0], 1e3 * r)
+    close(velocities.mean(axis=0), q_dot[:2], 1e3 * r)
+
+
+@deterministic
+@given(headings, dimensions, st.tuples(speeds, speeds, speeds))
+def test_the_velocities_of_the_wheel_centres_are_those_of_a_rigid_body(theta, L, q_dot):
+    """Also of a robot that slips: by differences of the centres, and from one wheel to the other."""
+    pose, theta_dot = np.array([0.5, 1.0, theta]), q_dot[2]
+    velocities = dd.wheel_centre_velocities(theta, q_dot, L)
+    ahead, behind = (dd.wheel_centres(pose + sign * 1e-6 * np.array(q_dot), L) for sign in (1, -1))
+    np.testing.assert_allclose(velocities, (ahead - behind) / 2e-6, rtol=1e-5, atol=1e-5 * (1.0 + L))
+    (right, left), (v_R, v_L) = dd.wheel_centres(pose, L), velocities
+    from_left = rigid_body.point_velocity([*v_L, 0.0], [0.0, 0.0, theta_dot], [*(right - left), 0.0])
+    close(from_left, [*v_R, 0.0], 1e3 * (1.0 + L))
+
+
+vectors = st.tuples(speeds, speeds, speeds)
+
+
+@deterministic
+@given(vectors, vectors, vectors, vectors)
+def test_the_velocity_of_a_point_of_a_rigid_body(v, omega, first, second):
+    close(rigid_body.point_velocity(v, omega, first), v + np.cross(omega, first), 1e5)
+    # From P to Q and on to R is from P to R; the distance of two points does not change.
+    at_first = rigid_body.point_velocity(v, omega, first)
+    at_second = rigid_body.point_velocity(at_first, omega, second)
+    close(at_second, rigid_body.point_velocity(v, omega, np.add(first, second)), 1e5)
+    close((at_second - at_first) @ second, 0.0, 1e7)
+
+
 # --- The documents' numbers
 
 
@@ -147,6 +192,8 @@ def test_every_function_broadcasts_over_leading_axes():
         (dd.wheel_to_body_jacobian, (r, L)),
         (dd.body_to_wheel_jacobian, (r, L)),
         (dd.wheel_to_world_jacobian, (theta, r, L)),
+        (lambda *args: dd.wheel_centres(np.stack(np.broadcast_arrays(*args), -1), 0.16), (theta, r, L)),
+        (lambda theta, L: dd.wheel_centre_velocities(theta, [1.0, 2.0, 3.0], L), (theta, L)),
         (lambda *args: dd.rolling_constraints(*args)[0], (theta, r, L)),
         (lambda *args: dd.rolling_constraints(*args)[1], (theta, r, L)),
         (lambda *args: np.stack(dd.body_to_wheel(*args), -1), (first, second, r, L)),

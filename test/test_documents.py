@@ -14,6 +14,7 @@ from diffdrive_jacobian.kinematics import contact, se2
 from diffdrive_jacobian.kinematics import diff_drive as dd
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
+from diffdrive_jacobian.kinematics.rigid_body import point_velocity
 
 HEADINGS = np.linspace(-np.pi, np.pi, 25)
 r, l, d, psi = 0.033, 0.16, 0.1, 0.7  # noqa: E741 - the documents' letters
@@ -98,6 +99,13 @@ def test_b_new_jacobian_of_the_offset_point():
     # "Can we invert this new Jacobian? Yes!", for every psi; the order of columns turns the sign.
     close(np.linalg.det(dd.offset_point_jacobian(HEADINGS, r, l, d)), -d * r**2 / l)
     assert np.linalg.det(J) > 0.0
+
+
+def test_b_velocities_of_the_offset_point_are_an_ellipse():
+    for at, semi_axes in ((d, (r / 2**0.5, 2**0.5 * d * r / l)), (l / 2, (r / 2**0.5, r / 2**0.5))):
+        found = np.linalg.svd(dd.offset_point_jacobian(psi, r, l, at), compute_uv=False)
+        close(found, sorted(semi_axes, reverse=True))
+    close(np.linalg.svd(dd.wheel_to_position_jacobian(psi, r, l), compute_uv=False), [r / 2**0.5, 0.0])
 
 
 def test_b_slip_the_left_wheel_moves_the_offset_point_to_the_right():
@@ -282,6 +290,25 @@ def test_d_the_transpose_and_the_least_squares_steps_reduce_the_error():
         assert error(step) < error(np.zeros(3))
 
 
+def test_d_slip_the_stiffness_of_the_spring_belongs_before_the_transpose():
+    # Its step 4 prints 1/B J^T Delta for Q = J^T W, W = gamma Delta and q_dot = Q/B.
+    arm, q, target = PlanarArm([0.5, 0.4, 0.3]), np.array([0.3, 0.8, -0.5]), np.array([0.7, 0.7, 0.1])
+    gamma, B, dt = 2.0, 4.0, 1e-6
+    J = arm.jacobian(q, heading=True)
+
+    def energy(q):
+        delta = target - arm.forward_kinematics(q)
+        return 0.5 * gamma * delta @ delta
+
+    delta = target - arm.forward_kinematics(q)
+    Q = arm.joint_torques(q, gamma * delta)
+    q_dot = gamma / B * J.T @ delta
+    close(q_dot, Q / B)
+    # Friction consumes what the spring gives, without a rest.
+    rate = (energy(q + q_dot * dt) - energy(q - q_dot * dt)) / (2.0 * dt)
+    close(rate, -B * q_dot @ q_dot, 1e-8)
+
+
 # --- E: derivation of the differential drive; wheel 1 is the left one, 2 the right
 
 
@@ -293,6 +320,21 @@ def test_e_rolling_and_no_slip_of_both_wheels_are_the_forward_kinematics():
     v_x, theta_dot = r * omega_1 / 2.0 + r * omega_2 / 2.0, (r * omega_2 - r * omega_1) / l
     close(A_w @ [omega_2, omega_1], [0.0, r * omega_2, r * omega_1])
     close(np.linalg.solve(A_q, A_w @ [omega_2, omega_1]), [v_x * c, v_x * s, theta_dot])
+
+
+def test_e_theta_dot_by_the_rigid_axle_and_by_superposition_about_o():
+    omega_1, omega_2 = LEFT_RIGHT
+    theta_dot = (r * omega_2 - r * omega_1) / l
+    for phi_dot in LEFT_RIGHT:  # v_C = 0 + phi_dot j x r k
+        close(point_velocity([0, 0, 0], [0, phi_dot, 0], [0, 0, r]), [r * phi_dot, 0.0, 0.0])
+    right = point_velocity([r * omega_1, 0, 0], [0, 0, theta_dot], [0, -l, 0])
+    close(right, [r * omega_2, 0.0, 0.0])
+    # About O at rest, first by wheel 1, then by wheel 2: each turn moves the other wheel backward.
+    theta_1_dot, theta_2_dot = -2 * r * omega_1 / l, 2 * r * omega_2 / l
+    v_1 = point_velocity([0, 0, 0], [0, 0, theta_1_dot], [0, l / 2, 0])
+    v_2 = point_velocity([0, 0, 0], [0, 0, theta_2_dot], [0, -l / 2, 0])
+    close([v_1, v_2], [[r * omega_1, 0.0, 0.0], [r * omega_2, 0.0, 0.0]])
+    close((theta_1_dot + theta_2_dot) / 2, theta_dot)
 
 
 def test_e_forward_and_inverse_jacobian():

@@ -16,12 +16,11 @@ from nav_msgs.msg import Odometry, Path
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, ParameterValue
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
-from ros_messages import goal, odometry
+from ros_messages import goal, odometry, time_of
 from sensor_msgs.msg import BatteryState, Image, JointState, LaserScan
 from std_msgs.msg import Bool, Byte, Empty, Int8, Int64, String, UInt8
 
 from diffdrive_jacobian.faults.corruption import CHANGES, Corrupt
-from diffdrive_jacobian.messages.conversion import from_time
 
 SECOND = 1_000_000_000
 
@@ -335,7 +334,7 @@ def test_a_receiver_gets_the_wrong_value_and_the_others_the_right_one(lockstep, 
     assert {one.pose.pose.position.x for one in fine} == {0.0}
     received = {(one.pose.pose.position.x, one.header.frame_id) for one in wrong}
     assert received == {(0.0, 'odom'), (7.0, 'odom'), (7.0, 'map'), (0.0, 'map')}
-    times = [from_time(one.header.stamp) - SECOND for one in wrong if one.pose.pose.position.x]
+    times = [time_of(one) - SECOND for one in wrong if one.pose.pose.position.x]
     assert (min(times), max(times)) == (100_000_000, 180_000_000)
     events = [event.what for event in lockstep.fault_events]
     assert any('changed' in event and '/odom to /receiver' in event for event in events)

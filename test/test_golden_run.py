@@ -62,7 +62,7 @@ def test_the_first_field_that_differs_is_named():
     assert first(late, PoseStamped()) == 'header.stamp.nanosec is 1, golden 0'
     assert first(String(data='a\n'), String(data='b')) == "data is 'a\\n', golden 'b'"
     joints = JointState(name=['left', 'right'], velocity=[1.0])
-    assert first(joints, JointState(name=['left'], velocity=[1.0])) == 'length of name is 2, golden 1'
+    assert first(joints, JointState(name=['left'], velocity=[1.0])) == 'len(name) is 2, golden 1'
     assert first(joints, JointState(name=['left', 'r'])) == "name[1] is 'right', golden 'r'"
 
 
@@ -198,7 +198,7 @@ def test_the_arguments_of_check_are_checked(golden):
     run = golden(0.0)
     for tolerance in (-1.0, math.nan, math.inf):
         with pytest.raises(
-            ValueError, match=f'tolerance must be finite and not negative, got {tolerance}'
+            ValueError, match=f'tolerance must be finite and at least 0, got {tolerance}'
         ):
             run.check(tolerance=tolerance)
     for without in ('/odom', ['odom'], ['/a', 'b']):

@@ -142,7 +142,7 @@ def test_reading_and_drawing_load_nothing_of_ros(layer):
 @pytest.mark.parametrize('path', sources(*WITHOUT_ROS), ids=lambda path: str(path.relative_to(HOUSE)))
 def test_reading_and_drawing_name_ros_only_where_it_is_optional(path):
     named = {name.split('.')[0] for name in imported(path)} & set(ROS_MODULES)
-    checked_only = {'messages/conversion.py', 'messages/wire.py', 'recovery/decoding_check.py'}
+    checked_only = {'messages/conversion.py'}
     assert not named or str(path.relative_to(HOUSE)) in checked_only
 
 

@@ -13,6 +13,7 @@ from hypothesis.extra.numpy import arrays
 
 from diffdrive_jacobian.kinematics import diff_drive, joint_limits, manipulability, task_priority
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
+from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 
 EPS = np.finfo(float).eps
 SVD = 300.0 * EPS  # LAPACK stops when what is left beside the singular values is below some 90 eps.
@@ -274,6 +275,51 @@ def test_manipulability_is_the_volume_of_the_velocities_and_does_not_depend_on_a
     np.testing.assert_allclose(iv.manipulability(J), 0.0, atol=1e-13)
 
 
+@shapes
+def test_ellipsoids_contain_what_unit_joint_velocities_and_torques_can_do(m, n):
+    rng = np.random.default_rng(9)
+    J = rng.normal(size=(100, m, n))
+    (U, s), (same, inverse) = iv.velocity_ellipsoid(J), iv.force_ellipsoid(J)
+    assert np.array_equal(U, same)
+    np.testing.assert_allclose(transposed(U) @ U, np.broadcast_to(np.eye(m), U.shape), atol=1e-12)
+    np.testing.assert_allclose(s * s, np.linalg.eigvalsh(J @ transposed(J))[:, ::-1], atol=1e-9)
+    assert np.array_equal(iv.smallest_singular_value(J), s[:, -1])
+    assert np.array_equal(iv.condition_number(J), s[:, 0] / s[:, -1] if m <= n else [np.inf] * 100)
+    if m > n:  # Some velocities cannot be produced, and some forces need no torque.
+        assert not s[:, n:].any()
+        assert np.isinf(inverse[:, n:]).all()
+        return
+    np.testing.assert_allclose(s.prod(axis=-1), iv.manipulability(J), rtol=1e-9)
+    q_dot = np.linalg.pinv(J) @ (U * s[:, np.newaxis])  # joints of norm 1 for the ends of the axes
+    np.testing.assert_allclose(np.linalg.norm(q_dot, axis=1), 1.0)
+    tau = transposed(J) @ (U * inverse[:, np.newaxis])
+    np.testing.assert_allclose(np.linalg.norm(tau, axis=1), 1.0)
+
+
+def test_a_singular_direction_is_an_axis_of_length_zero_and_carries_every_force():
+    J = PlanarArm([1.0, 1.0, 1.0]).jacobian([0.3, 0.0, np.pi])
+    U, s = iv.velocity_ellipsoid(J)
+    np.testing.assert_allclose(np.abs(U[:, 1]), [np.cos(0.3), np.sin(0.3)])
+    assert s[1] == iv.smallest_singular_value(J) == 0.0
+    assert iv.force_ellipsoid(J).semi_axes[1] == iv.condition_number(J) == np.inf
+    assert iv.condition_number(np.zeros((2, 2))) == np.inf
+
+
+@shapes
+def test_a_masked_task_minimises_the_weighted_error_and_omits_entries_of_weight_zero(m, n):
+    rng = np.random.default_rng(10)
+    J, x_dot, M = rng.normal(size=(m, n)), rng.normal(size=m), rng.uniform(0.5, 2.0, m)
+    M[0] *= m == 1  # All entries are omitted, then nothing moves.
+    q_dot = iv.damped_least_squares(*iv.masked_task(J, x_dot, M), 0.0)
+    np.testing.assert_allclose(J.T @ (M * (x_dot - J @ q_dot)), 0.0, atol=1e-12)
+    M[-1] = 0.0
+    alone = iv.prioritized([iv.masked_task(J, x_dot, M)])
+    if m > 1:
+        roots = np.sqrt(M[:-1])
+        expected = np.linalg.pinv(roots[:, np.newaxis] * J[:-1]) @ (roots * x_dot[:-1])
+        np.testing.assert_allclose(alone, expected, atol=1e-12)
+
+
 # --- Shapes and bad input
 
 J, X_DOT, Q, WEIGHTS = np.ones((2, 3)), np.ones(2), np.zeros(3), np.array([1.0, 2.0, 0.5])
@@ -281,6 +327,11 @@ VALID = {
     iv.adjugate_inverse: {'J': np.array([[1.0, 2.0], [0.5, 3.0]])},
     iv.pseudoinverse: {'J': J, 'weights': WEIGHTS},
     iv.manipulability: {'J': J},
+    iv.velocity_ellipsoid: {'J': J},
+    iv.force_ellipsoid: {'J': J},
+    iv.smallest_singular_value: {'J': J},
+    iv.condition_number: {'J': J},
+    iv.masked_task: {'J': J, 'x_dot': X_DOT, 'mask': np.array([1.0, 0.0])},
     iv.damping: {'manipulability': 0.1, 'threshold': 0.2, 'maximum': 0.3},
     iv.damped_least_squares: {'J': J, 'x_dot': X_DOT, 'damping': 0.1, 'weights': WEIGHTS},
     iv.null_space_projector: {'J': J, 'damping': 0.1, 'weights': WEIGHTS},
@@ -341,7 +392,9 @@ def test_every_function_broadcasts_over_leading_axes_and_names_those_that_do_not
     whole = {key: np.broadcast_to(batch[key], (4, 5, *shapes[key])) for key in shapes}
     for index in np.ndindex(4, 5):
         one = function(**{key: value[index] for key, value in whole.items()}, **fixed)
-        np.testing.assert_allclose(at_once[index], one, rtol=1e-9, atol=1e-12)
+        batched = [part[index] for part in at_once] if isinstance(one, tuple) else [at_once[index]]
+        for got, expected in zip(batched, one if isinstance(one, tuple) else [one], strict=True):
+            np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-12)
     wrong = {key: np.stack([VALID[function][key]] * (2 if key == name else 3)) for key in shapes}
     if not alone:
         with pytest.raises(ValueError, match=rf'\b{name}\b.* must .*got'):
@@ -366,6 +419,9 @@ BAD = [
     (iv.prioritized, {'max_velocity': [1.0, 0.0, 1.0]}, r'^max_velocity must be positive, got'),
     (iv.limit_velocity, {'max_velocity': [1.0, 2.0]}, r'^max_velocity must have shape .* got \(2,\)'),
     (iv.damping, {'manipulability': -1e-9}, r'^manipulability must be zero or .* got -1e-09'),
+    (iv.masked_task, {'mask': [1.0, -1.0]}, r'^mask must be zero or positive .* got -1'),
+    (iv.masked_task, {'mask': [1.0]}, r'^mask must have shape .*2.* got \(1,\)'),
+    (iv.velocity_ellipsoid, {'J': np.ones(3)}, r'^J must have shape \(\.\.\., m, n\), got'),
     (iv.damping, {'threshold': 0.0}, r'^threshold must be positive .* got 0'),
     (iv.damping, {'maximum': -1.0}, r'^maximum must be zero or positive .* got -1'),
     (iv.joint_limit_cost, {'upper': Q - 1.0}, r'^upper must be above lower'),

@@ -12,6 +12,8 @@ import pytest
 from diffdrive_jacobian import kinematics
 from diffdrive_jacobian.kinematics import contact, diff_drive, se2
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
+from diffdrive_jacobian.kinematics.differentiation import numerical_jacobian
+from diffdrive_jacobian.kinematics.inverse_kinematics import pose_difference
 from diffdrive_jacobian.kinematics.mobile_manipulator import (
     MobileManipulator,
     mobile_manipulator_jacobian,
@@ -135,6 +137,12 @@ def mobile_manipulator(rng, links, heading, mount):
     return robot.jacobian(q, heading=heading), differences(tip, np.zeros((COUNT, 2 + links)))
 
 
+def any_function(rng, links):
+    arm, q = PlanarArm(rng.uniform(0.1, 1.0, links)), rng.uniform(-4.0, 4.0, (COUNT, links))
+    numeric = numerical_jacobian(arm.forward_kinematics, q, difference=pose_difference)
+    return numeric, arm.jacobian(q, heading=True)
+
+
 def arm_of_lengths(rng, links):
     lengths, q = rng.uniform(0.1, 1.0, links), rng.uniform(-4.0, 4.0, (COUNT, links))
     numeric = differences(lambda q: arm_forward_kinematics(lengths, q)[..., :2], q)
@@ -187,6 +195,15 @@ def joint_limit(rng):
     return iv.joint_limit_gradient(q, lower, upper)[:, np.newaxis], numeric
 
 
+def clearance(rng, links):
+    # Not folded, and obstacles beside elbows and tip: no joint moves the base.
+    arm, q = PlanarArm(rng.uniform(0.3, 1.0, links)), rng.uniform(-0.8, 0.8, (COUNT, links))
+    beside = rng.uniform(-0.1, 0.1, (COUNT, 2))
+    obstacle = arm.joint_positions(q)[range(COUNT), rng.integers(1, links + 1, COUNT)] + beside
+    numeric = differences(lambda q: arm.clearance(q, obstacle[:, np.newaxis])[..., np.newaxis], q)
+    return arm.clearance_gradient(q, obstacle)[:, np.newaxis], numeric
+
+
 CASES = [
     ('diff_drive.unicycle_jacobian', unicycle, {}),
     ('diff_drive.wheel_to_body_jacobian', wheel_to_body, {}),
@@ -213,6 +230,7 @@ CASES = [
         for heading in (False, True)
         for mount in MOUNTS
     ),
+    ('differentiation.numerical_jacobian', any_function, {'links': 3}),
     ('planar_arm.arm_jacobian', arm_of_lengths, {'links': 3}),
     ('mobile_manipulator.mobile_manipulator_jacobian', manipulator_of_lengths, {'links': 2}),
     *(
@@ -227,7 +245,24 @@ CASES = [
     ('manipulability.manipulability_gradient', manipulability, {'links': 3, 'heading': False}),
     ('manipulability.manipulability_gradient', manipulability, {'links': 4, 'heading': True}),
     ('joint_limits.joint_limit_gradient', joint_limit, {}),
+    ('planar_arm.PlanarArm.clearance_gradient', clearance, {'links': 3}),
 ]
+
+
+@pytest.mark.parametrize(
+    ('r', 'q', 'message'),
+    [
+        (lambda q: q, 0.0, r'^q must have shape'),
+        (lambda q: q, [np.nan], r'^q must be finite'),
+        (lambda q: q[0], [1.0], r'^r\(q\) must have shape'),
+        (lambda q: q * np.nan, [1.0], r'^r\(q\) must be finite'),
+        (lambda q: [q], [1.0], r'^r\(q\) must have one shape \(m,\), got \(1, 1\)'),
+        (lambda q: np.ones(1 + (q[0] > 0.0)), [0.0], r'^r\(q\) must have one shape'),
+    ],
+)
+def test_only_functions_from_vectors_to_vectors_are_differentiated(r, q, message):
+    with pytest.raises(ValueError, match=message):
+        numerical_jacobian(r, q)
 
 
 def label(name, options):

@@ -108,7 +108,7 @@ def test_drive_to_live_in_real_time(world):
         (watch_run, ['--port', '0'], 'must be an integer from 1 to 65535, got 0'),
         (watch_run, ['--port', '99999'], 'must be an integer from 1 to 65535, got 99999'),
         (watch_run, ['--rate', '2'], '--rate needs a BAG'),
-        (watch_run, ['bag', '--rate', '-2'], 'must be positive'),
+        (watch_run, ['bag', '--rate', '-2'], 'must be in [0.01, 1000], got -2.0'),
         (watch_run, ['bag', '--rate', '1e9'], 'must be in [0.01, 1000], got 1000000000.0'),
         (watch_run, ['bag', '--ros-args', '-p', 'x:=1'], 'a BAG needs no ROS arguments'),
         (drive_to, [], 'X Y (only --live needs no goal)'),

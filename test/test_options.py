@@ -94,7 +94,7 @@ def test_robot_stands_for_its_parameter_file(capsys):
 
 
 def test_another_robot_is_refused_with_those_there_are(capsys):
-    assert 'must be one of create3, turtlebot3_burger, got' in refused(
+    assert "must be one of 'create3', 'turtlebot3_burger', got" in refused(
         capsys, 'drive_to', 1, 1, '--robot', 'r2d2'
     )
     file = CONFIGS / 'create3.yaml'

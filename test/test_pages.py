@@ -16,7 +16,7 @@ import yaml
 from pages import PAGES, PARAMETERS, ROOT, blocks, check_output, is_run, run_page
 from rclpy.parameter import Parameter
 
-from diffdrive_jacobian import kinematics
+from diffdrive_jacobian import kinematics, plots
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
@@ -145,6 +145,51 @@ def library():
             if inspect.isclass(value):
                 names.update(vars(value))
     return names
+
+
+# --- Bodies of functions
+
+
+@pytest.mark.parametrize('name', [name for name, text in TEXTS.items() if '<!-- body' in text])
+def test_bodies_of_functions_are_as_in_the_source(name):
+    text = TEXTS[name]
+    assert text.count('<!-- body') == len(pages.BODY.findall(text)), 'a comment without its py block'
+    assert text == pages.with_bodies(text), 'python test/pages.py bodies writes them'
+
+
+def test_a_body_is_the_function_without_decorators_and_docstring():
+    place, stale = '<!-- body: diffdrive_jacobian.{} -->\n```py\n', 'of yesterday\n'
+    contact = place.format('kinematics.contact.wheel_contact_position')
+    method = place.format('kinematics.planar_arm.PlanarArm.integrate')
+    old = f'{contact}{stale}```\n\ntext\n\n{method}```\n'
+    new = pages.with_bodies(old)
+    position = """\
+def wheel_contact_position(x: Number, phi: Number, r: Number) -> Entries:
+    return [x + r * sin(phi), r + r * cos(phi), 0.0]
+"""
+    assert new.startswith(f'{contact}{position}```\n\ntext\n\n{method}def ')
+    assert stale not in new
+    assert pages.with_bodies(new) == new
+    with pytest.raises(AttributeError):
+        pages.body('diffdrive_jacobian.kinematics.contact.removed')
+
+
+# --- The documents, item by item
+
+ITEMS = 138
+"""What the five documents say, by the list of their items."""
+
+
+def test_each_item_of_the_documents_is_in_one_table_with_functions_and_tests_that_exist():
+    text = '\n'.join(TEXTS[f'doc/document_{name}.md'] for name in 'abcde')
+    rows = re.findall(r'^\| (\d+) [^|]*\|([^|]*)\|(.*)', text, re.MULTILINE)
+    assert [int(number) for number, _, _ in rows] == list(range(1, ITEMS + 1))
+    known = {*library(), *plots.__all__, *TOOLS, *NODES}
+    for number, functions, rest in rows:
+        for function in re.findall(r'`([\w.]+)', functions):
+            assert function.split('.')[-1] in known, (number, function)
+        for test in re.findall(r'`(test_\w+\.py)', rest):
+            assert (ROOT / 'test' / test).exists(), (number, test)
 
 
 # --- Nodes and tools

@@ -117,6 +117,37 @@ def test_two_links_by_the_adjugate_move_the_tip_as_told_and_are_singular_by_the_
     close(reach, np.broadcast_to(np.abs([sum(lengths), lengths[0] - lengths[1]]), reach.shape))
 
 
+@pytest.mark.parametrize('n', [1, 3, 5])
+def test_all_links_on_one_line_are_the_singular_configurations_of_any_arm(n):
+    arm = PlanarArm(np.linspace(0.3, 0.8, n))
+    q = arm.singular_configurations([0.4, -2.0])
+    assert q.shape == (2, 2 ** (n - 1), n)
+    close(iv.manipulability(arm.jacobian(q)), 0.0)
+    # Along the line nothing moves. Any bend makes the position regular.
+    close(np.einsum('abmn,am->abn', arm.jacobian(q), [[np.cos(a), np.sin(a)] for a in (0.4, -2.0)]), 0.0)
+    if n > 1:
+        assert iv.manipulability(arm.jacobian(q + 1e-3 * np.arange(n))).min() > 1e-5
+
+
+@two_links
+def test_elbow_down_and_elbow_up_put_the_tip_there_and_there_is_no_third_solution(lengths):
+    arm, rng = PlanarArm(lengths), np.random.default_rng(6)
+    q = rng.uniform([-np.pi, -np.pi], [np.pi, np.pi], (*BATCH, 2))
+    down_up = arm.inverse_kinematics(arm.forward_kinematics(q)[..., :2])
+    tips = arm.forward_kinematics(down_up)[..., :2]
+    close(tips, np.broadcast_to(arm.forward_kinematics(q)[..., np.newaxis, :2], tips.shape), 1e-12)
+    down, up = np.moveaxis(down_up, -2, 0)
+    assert np.array_equal(down[..., 1], -up[..., 1])
+    assert np.all(down[..., 1] >= 0.0)
+    difference = se2.wrap_angle(np.where(q[..., 1:] > 0.0, down, up) - q)
+    close(difference, 0.0, 1e-5)
+    # The rim, up to rounding.
+    angles = np.linspace(-3.0, 3.0, 50)
+    for reach in (sum(lengths), abs(lengths[0] - lengths[1])):
+        rim = reach * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+        close(arm.forward_kinematics(arm.inverse_kinematics(rim)[:, 0])[:, :2], rim, 1e-12)
+
+
 @two_links
 def test_stretched_and_folded_arms_are_refused(lengths):
     arm = PlanarArm(lengths)
@@ -141,6 +172,21 @@ def test_manipulability_of_a_nearly_stretched_arm_keeps_its_digits():
     q = np.column_stack([rng.uniform(-4.0, 4.0, 1000), 10.0 ** rng.uniform(-9.0, 0.0, 1000)])
     w = iv.manipulability(arm.jacobian(q))
     np.testing.assert_allclose(w, 0.7 * 0.4 * np.sin(q[:, 1]), rtol=1e-12, atol=1e-15)
+
+
+def test_clearance_is_the_distance_of_the_nearest_of_many_points_of_the_arm():
+    arm, rng = PlanarArm([0.5, 0.4, 0.3]), np.random.default_rng(6)
+    q, obstacle = rng.uniform(-4.0, 4.0, (200, 3)), rng.uniform(-1.5, 1.5, (200, 2))
+    joints, part = arm.joint_positions(q)[:, :, np.newaxis], np.linspace(0.0, 1.0, 1001)[:, np.newaxis]
+    points = (joints[:, :-1] + part * (joints[:, 1:] - joints[:, :-1])).reshape(200, -1, 2)
+    nearest = norm(points - obstacle[:, np.newaxis]).min(axis=-1)
+    clearance = arm.clearance(q, obstacle)
+    assert np.all(clearance <= nearest)
+    close(clearance, nearest, 1e-3)
+    # By hand: beside the second link of an arm like an L, at 0.1 m from its middle.
+    assert np.isclose(arm.clearance([0.0, np.pi / 2.0, 0.0], [0.6, 0.2]), 0.1)
+    close(arm.clearance_gradient([0.0, np.pi / 2.0, 0.0], [0.6, 0.2]), [0.2, 0.2, 0.0])
+    assert not arm.clearance_gradient([0.0, 0.0, 0.0], [0.3, 0.0]).any()  # it touches the first link
 
 
 def test_an_arm_keeps_its_lengths():
@@ -310,10 +356,19 @@ BAD = [
     ('q must', ARM.determinant, [[0.0] * 3, [0.0, NAN]]),
     ('q_1 must', ARM.singular_configurations, [NAN, 'a', 1j]),
     ('determinant is for an arm of 2 links, .* 3$', LONG.determinant, [[0.0] * 3]),
-    ('singular_configurations is for an arm of 2 links, .* 3$', LONG.singular_configurations, [0.0]),
+    ('inverse_kinematics is for an arm of 2 links, .* 3$', LONG.inverse_kinematics, [[0.1, 0.2]]),
+    ('position must have shape', ARM.inverse_kinematics, [[0.1] * 3, 0.1]),
+    ('position must be finite', ARM.inverse_kinematics, [[NAN, 0.0]]),
+    (
+        'position must be from 0.1 to 0.5 m away from the base, got .*',
+        ARM.inverse_kinematics,
+        [[0.5 + 1e-9, 0.0], [0.0, 0.1 - 1e-9], [[0.2, 0.2], [1e200, 1e200]]],
+    ),
     ('inverse_velocity is for .* 2 links', lambda x: LONG.inverse_velocity([0.0] * 3, x), [[0, 1]]),
     ('x_dot must', lambda x: ARM.inverse_velocity([0.0, 1.0], x), [[1.0] * 3, [NAN, 0.0], 'ab']),
     ('q and x_dot must .* broadcast', lambda q: ARM.inverse_velocity(q, ONES[2]), [np.ones((3, 2))]),
+    ('obstacle must', lambda o: ARM.clearance([0.0] * 2, o), [1.0, [1.0] * 3, [NAN, 0.0], 'ab']),
+    ('obstacle must', lambda o: ARM.clearance_gradient([0.0] * 2, o), [1.0, [1.0] * 3, [NAN, 0.0]]),
     ('wrench must', lambda w: ARM.joint_torques([0.0] * 2, w), [1.0, [1.0], [0.0] * 4, [NAN, 0.0]]),
     ('q and wrench must .* broadcast', lambda q: ARM.joint_torques(q, ONES[2]), [np.ones((3, 2))]),
     ('q_dot must', lambda q_dot: ARM.integrate([0.0] * 2, q_dot, 1.0), [[0.0], [NAN, 0.0]]),

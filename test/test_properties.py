@@ -171,7 +171,10 @@ def test_properties_are_values(one, expression):
             lambda: NeverFasterThan(1.0, 2.0, topic=''),
             "topic must be a string that is not empty, got ''",
         ),
-        (lambda: StatusProtocol(goals='goal_pose'), "goals must be a tuple of names, got 'goal_pose'"),
+        (
+            lambda: StatusProtocol(goals='goal_pose'),
+            "goals must be a list or tuple of names, got 'goal_pose'",
+        ),
         (lambda: StatusProtocol(namespace=1), 'namespace must be a string, got 1'),
         (
             lambda: StaysWithin((1, 0), (0, 1)),
@@ -291,7 +294,8 @@ def test_a_stop_is_an_acceleration_where_it_is_not_allowed(lockstep, send):
 def test_a_topic_of_another_type_is_an_error(lockstep, robot_at):
     lockstep.require(NeverFasterThan(0.5, 2.0, topic='joint_states'))
     with pytest.raises(
-        LockstepError, match=r'from messages of type Twist, .* got one of type JointState'
+        LockstepError,
+        match=r'from messages of type geometry_msgs/msg/Twist, .* of type sensor_msgs/msg/JointState',
     ):
         robot_at()
 

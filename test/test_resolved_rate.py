@@ -9,6 +9,7 @@ import pytest
 
 from diffdrive_jacobian.control import resolved_rate
 from diffdrive_jacobian.control.resolved_rate import StraightLine
+from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics.inverse_velocity import (
     joint_limit_cost,
     joint_limit_gradient,
@@ -26,9 +27,7 @@ REDUNDANT = PlanarArm([0.6, 0.5, 0.4])
 
 def elbow(tip):
     """Joint angles of ARM that put its tip there."""
-    x, y = np.moveaxis(np.asarray(tip, dtype=float), -1, 0)
-    q_2 = np.arccos((x * x + y * y - 1.0 - 0.64) / 1.6)
-    return np.stack([np.arctan2(y, x) - np.arctan2(0.8 * np.sin(q_2), 1.0 + 0.8 * np.cos(q_2)), q_2], -1)
+    return ARM.inverse_kinematics(tip)[..., 0, :]
 
 
 def tip_error(robot, line, gone):
@@ -93,6 +92,23 @@ def test_a_line_is_driven_at_its_speed_and_then_rests():
 
 
 # --- Inside
+
+
+@pytest.mark.parametrize('robot', [REDUNDANT, MobileManipulator(0.5, 0.5, REDUNDANT)])
+def test_position_and_heading_follow_a_line_also_across_pi_and_around(robot):
+    q0 = np.array([0.3, 0.9, -0.8]) if robot is REDUNDANT else np.array([0, 0, 0, 0.3, 0.9, -0.8])
+    x, y, heading = robot.forward_kinematics(q0)
+    turn = 0.3 if robot is REDUNDANT else 7.0
+    for end in ([x - 0.2, y + 0.1, heading + 0.5], [x, y, heading + turn]):
+        line = StraightLine([x, y, heading], end, 0.3)
+        gone = track_line(robot, q0, line, rate=400.0, settling=1.0)
+        reached = robot.forward_kinematics(gone.q[-1])
+        np.testing.assert_allclose(se2.wrap_angle(reached - end), 0.0, atol=1e-6)
+        assert gone.error.max() < 2e-3
+        wanted = np.array([line.position(t) for t in gone.times])
+        missing = wanted - robot.forward_kinematics(gone.q)
+        missing[:, 2] = se2.wrap_angle(missing[:, 2])
+        np.testing.assert_allclose(gone.error, np.linalg.norm(missing, axis=-1), atol=1e-12)
 
 
 def test_an_arm_follows_a_line_through_the_interior_to_a_tenth_of_a_millimetre():
@@ -280,7 +296,7 @@ BAD_OF_TRACKING = {
     'maximum_damping': [-1.0, np.nan, 'a'],
     'settling': [-1.0, np.nan, np.inf, 'a'],
     'q0': [np.zeros(3), [0.0, np.nan], np.zeros((5, 2)), 'ab'],
-    'line': [StraightLine([1.0], [1.1], 1.0), StraightLine([1.0] * 3, [1.1] * 3, 1.0)],
+    'line': [StraightLine([1.0], [1.1], 1.0), StraightLine([1.0] * 4, [1.1] * 4, 1.0)],
 }
 
 

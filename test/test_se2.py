@@ -136,6 +136,11 @@ def test_homogeneous_is_a_homomorphism_into_rigid_transforms(a, b):
     assert np.array_equal(H_a[:2, 2], a[:2])
     assert math.atan2(H_a[1, 0], H_a[0, 0]) == pytest.approx(a[2], rel=1e-15, abs=1e-15)
     assert np.linalg.det(H_a) == pytest.approx(1.0)
+    # In space the same motion, about the vertical: heights stay.
+    in_space, plane = se2.homogeneous_3d(a), [0, 1, 3]
+    assert np.array_equal(in_space[np.ix_(plane, plane)], H_a)
+    assert np.array_equal(in_space @ [0.0, 0.0, 2.0, 1.0], [*a[:2], 2.0, 1.0])
+    assert np.array_equal(in_space[[2, 3]], np.eye(4)[[2, 3]])
 
 
 # --- The exact arc
@@ -282,8 +287,8 @@ def test_the_jacobians_of_exp_lose_no_digits_near_zero(turn):
 def test_every_function_broadcasts_over_leading_axes():
     rng = np.random.default_rng(2)
     a, b, twist, dt = (rng.normal(size=shape) for shape in [(4, 1, 3), (5, 3), (4, 1, 2), (5,)])
-    unary = (se2.exp, se2.log, se2.inverse, se2.homogeneous, se2.adjoint)
-    unary += (se2.left_jacobian, se2.right_jacobian)
+    unary = (se2.exp, se2.log, se2.inverse, se2.homogeneous, se2.homogeneous_3d)
+    unary += (se2.adjoint, se2.left_jacobian, se2.right_jacobian)
     held = list(zip(b, dt, strict=True))
     for at_once, looped in [
         *((function(b), [function(row) for row in b]) for function in unary),

@@ -166,6 +166,15 @@ def test_limits_hold_at_each_sample_and_the_tip_falls_behind_on_its_line():
     assert np.abs(off).max() < 0.01
 
 
+def test_one_robot_may_have_many_limits():
+    limits = np.array([[np.inf], [1.0]]) * np.ones(5)
+    both = track_line(ROBOT, Q0, ahead(), max_velocity=limits)
+    for index, limit in enumerate(limits):
+        alone = track_line(ROBOT, Q0, ahead(), max_velocity=limit)
+        np.testing.assert_allclose(both.q[:, index], alone.q, atol=1e-9)
+        np.testing.assert_allclose(both.error[:, index], alone.error, atol=1e-9)
+
+
 def test_the_law_takes_weights_and_limits():
     rng = np.random.default_rng(2)
     J, x_dot, wish = rng.normal(size=(2, 5)), rng.normal(size=2), rng.normal(size=5)

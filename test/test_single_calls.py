@@ -10,7 +10,14 @@ import pytest
 
 from diffdrive_jacobian import control
 from diffdrive_jacobian.control import Arrival, StraightLine, VelocityLimits, Waypoints
-from diffdrive_jacobian.kinematics import contact, diff_drive, inverse_kinematics, inverse_velocity
+from diffdrive_jacobian.kinematics import (
+    contact,
+    diff_drive,
+    inverse_kinematics,
+    inverse_velocity,
+    rigid_body,
+    spatial,
+)
 from diffdrive_jacobian.kinematics.mobile_manipulator import MobileManipulator
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 
@@ -22,6 +29,7 @@ WIDE = PlanarArm([0.5, 0.4, 0.3]).jacobian([0.1, 0.2, 0.3])
 LIMITS = VelocityLimits(min_v=-0.1, max_v=0.22, min_omega=-2.0, max_omega=2.0, max_wheel_speed=10.0)
 RANGE = {'q': Q, 'lower': (-3.0, -2.0), 'upper': (2.0, 2.5)}
 LAW = {'state': POSE, 'goal': GOAL}
+HERE, THERE = np.eye(4), np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
 OPTIONS = {'limits', 'h', 'jacobian', 'tasks'}
 """Arguments that are not numbers, or that are in every call the same."""
 
@@ -36,10 +44,16 @@ CALLS = [
     (diff_drive.offset_point_jacobian, {'theta': 0.5, **WHEELS, 'd': -0.1}),
     (diff_drive.body_to_wheel, {'v': 0.2, 'omega': 0.5, **WHEELS}),
     (diff_drive.wheel_to_body, {'omega_R': 2.0, 'omega_L': 3.0, **WHEELS}),
+    (diff_drive.wheel_centres, {'pose': POSE, 'L': 0.16}),
+    (diff_drive.wheel_centre_velocities, {'theta': 0.5, 'q_dot': POSE, 'L': 0.16}),
     (diff_drive.no_lateral_slip_constraint, {'theta': 0.5}),
+    (diff_drive.lie_bracket, {'theta': 0.5}),
+    (diff_drive.controllability_matrix, {'theta': 0.5}),
     (diff_drive.rolling_constraints, {'theta': 0.5, **WHEELS}),
     (contact.wheel_contact_position, {'x': 0.1, 'phi': 0.5, 'r': 0.033}),
     (contact.wheel_contact_jacobian, {'phi': 0.5, 'r': 0.033}),
+    (rigid_body.point_velocity, {'v': POSE, 'omega': POSE, 'offset': (0.0, 0.1, 0.2)}),
+    (spatial.spatial_displacement, {'T': HERE, 'T_desired': THERE}),
     (contact.rolling_direction, {'r': 0.033}),
     (inverse_velocity.adjugate_inverse, {'J': J}),
     (inverse_velocity.pseudoinverse, {'J': WIDE}),
@@ -48,6 +62,11 @@ CALLS = [
     (inverse_velocity.null_space_projector, {'J': WIDE, 'damping': 0.1}),
     (inverse_velocity.redundant, {'J': WIDE, 'x_dot': X_DOT, 'q_dot_0': POSE, 'damping': 0.0}),
     (inverse_velocity.manipulability, {'J': WIDE}),
+    (inverse_velocity.velocity_ellipsoid, {'J': WIDE}),
+    (inverse_velocity.force_ellipsoid, {'J': WIDE}),
+    (inverse_velocity.smallest_singular_value, {'J': WIDE}),
+    (inverse_velocity.condition_number, {'J': WIDE}),
+    (inverse_velocity.masked_task, {'J': WIDE, 'x_dot': X_DOT, 'mask': (1.0, 0.5)}),
     (inverse_velocity.manipulability_gradient, {'jacobian': ARM.jacobian, 'q': Q}),
     (inverse_velocity.joint_limit_cost, RANGE),
     (inverse_velocity.joint_limit_gradient, RANGE),
@@ -59,7 +78,10 @@ CALLS = [
     (ARM.jacobian, {'q': Q}),
     (ARM.determinant, {'q': Q}),
     (ARM.singular_configurations, {'q_1': 0.5}),
+    (ARM.inverse_kinematics, {'position': (1.0, 0.5)}),
     (ARM.inverse_velocity, {'q': Q, 'x_dot': X_DOT}),
+    (ARM.clearance, {'q': Q, 'obstacle': GOAL}),
+    (ARM.clearance_gradient, {'q': Q, 'obstacle': GOAL}),
     (ARM.joint_torques, {'q': Q, 'wrench': (0.1, -0.2, 0.3)}),
     (ARM.integrate, {'q': Q, 'q_dot': X_DOT, 'dt': 0.1}),
     (ROBOT.forward_kinematics, {'q': WHOLE_Q}),
@@ -127,13 +149,13 @@ def outcome(call, arguments):
 
 def test_every_public_function_is_called_here():
     called = {call.__name__ for call, _ in CALLS}
-    for module in (contact, diff_drive, inverse_kinematics, inverse_velocity):
+    for module in (contact, diff_drive, inverse_kinematics, inverse_velocity, rigid_body, spatial):
         for name, value in vars(module).items():
             own = inspect.isfunction(value) and value.__module__.startswith('diffdrive_jacobian')
             listed = name in getattr(module, '__all__', ()) or value in vars(module).values()
             if own and listed and value.__module__ == module.__name__ and not name.startswith('_'):
                 assert name in called | ELSEWHERE
-    assert {*inverse_velocity.__all__} - {'CUTOFF', 'FILTER'} <= called
+    assert {*inverse_velocity.__all__} - {'CUTOFF', 'FILTER', 'Ellipsoid'} <= called
     for name in control.__all__:
         if inspect.isfunction(getattr(control, name)):
             assert name in called | ELSEWHERE

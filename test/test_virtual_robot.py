@@ -16,13 +16,13 @@ from ros_messages import (
     placement,
     pose_message,
     pose_of,
+    time_of,
     twist,
     twists,
 )
 
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
-from diffdrive_jacobian.messages.conversion import from_pose, from_time
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.testing import Lockstep
 
@@ -86,7 +86,7 @@ def test_idle_robot_reports_its_initial_pose(lockstep, robot_at, pose, theta):
     late = Topics(lockstep)
     assert topics.applied == late.starts == []
     (start,) = topics.starts
-    assert (start.pose.pose, from_time(start.header.stamp)) == (expected, SECOND)
+    assert (start.pose.pose, time_of(start)) == (expected, SECOND)
 
 
 def test_start_pose_is_latched(lockstep, robot_at):
@@ -123,7 +123,7 @@ def test_every_pose_lies_on_the_exact_arc_of_the_command(lockstep, robot_at, com
     assert len(topics.odom) == 50
     speeds = body_to_wheel(*command, 0.033, 0.16)
     for odometry, states in zip(topics.odom, topics.states, strict=True):
-        dt = (from_time(odometry.header.stamp) - begin) / 1e9
+        dt = (time_of(odometry) - begin) / 1e9
         assert odometry.pose.pose == pose_message(se2.integrate(start, command, dt))
         assert odometry.twist.twist == twist(*command)
         right, left = speeds
@@ -181,10 +181,10 @@ def test_a_way_there_and_back_ends_where_it_began(lockstep, robot_at, seed):
 def reproduce(applied, starts, instant):
     """Where `cmd_vel_out` and `start_pose` say that the robot is at an instant."""
     begin = max(
-        (start for start in starts if from_time(start.header.stamp) <= instant),
-        key=lambda start: from_time(start.header.stamp),
+        (start for start in starts if time_of(start) <= instant),
+        key=lambda start: time_of(start),
     )
-    pose, now = from_pose(begin.pose.pose), from_time(begin.header.stamp)
+    pose, now = pose_of(begin), time_of(begin)
     driven = (0.0, 0.0)
     for at, command in zip(instants(applied), twists(applied), strict=True):
         if at > instant:
@@ -214,10 +214,7 @@ def test_cmd_vel_out_and_start_pose_tell_every_odometry_pose(lockstep, robot_at,
     odom = [
         one for one in topics.odom if one.header.stamp not in [s.header.stamp for s in topics.starts]
     ]
-    errors = [
-        pose_of(one) - reproduce(topics.applied, topics.starts, from_time(one.header.stamp))
-        for one in odom
-    ]
+    errors = [pose_of(one) - reproduce(topics.applied, topics.starts, time_of(one)) for one in odom]
     assert np.max(np.abs(errors)) < 1e-13
     assert max(abs(one.twist.twist.linear.x) for one in topics.odom) == 0.4
 

@@ -24,7 +24,8 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.kinematics import se2
-from diffdrive_jacobian.messages.conversion import from_pose, from_pose_with_covariance
+from diffdrive_jacobian.messages.codecs import POSE_WITH_COVARIANCE
+from diffdrive_jacobian.messages.conversion import from_covariance
 
 # --- Commands
 
@@ -192,7 +193,7 @@ def test_initialpose_while_driving_carries_its_covariance(lockstep, robot_at, fr
     lockstep.publish(
         'initialpose', placement(2.0, 3.0, math.pi / 2, variances=(0.25, 0.5, 0.07), frame=frame)
     )
-    assert from_pose(topics.starts[-1].pose.pose) == pytest.approx([2.0, 3.0, math.pi / 2])
+    assert POSE_WITH_COVARIANCE.of(topics.starts[-1]).pose == pytest.approx([2.0, 3.0, math.pi / 2])
     lockstep.run_for(1.0)
     assert pose_of(topics.odom[-1]) == pytest.approx([2.0, 3.125, math.pi / 2], abs=1e-15)
     # Only the uncertain heading makes the pose more uncertain: the path ends on a circle, at an angle
@@ -245,11 +246,11 @@ def test_what_the_plane_fixes_may_have_any_covariance(lockstep, robot_at, index)
 
 
 def test_variances_that_rounding_made_negative_are_set_to_zero():
-    message, direction = placement(7.0).pose, np.array([0.6, 0.0, 0.8])
+    message, direction = placement(7.0), np.array([0.6, 0.0, 0.8])
     exact = np.outer(direction, direction)
     covariance = np.zeros((6, 6))
     covariance[np.ix_((0, 1, 5), (0, 1, 5))] = exact - 1e-12 * np.eye(3)
-    message.covariance = covariance.ravel()
-    _, found = from_pose_with_covariance(message)
+    message.pose.covariance = covariance.ravel()
+    found = from_covariance(POSE_WITH_COVARIANCE.of(message).covariance)
     np.testing.assert_allclose(found, exact, atol=1e-11)
     assert np.linalg.eigvalsh(found)[0] > -1e-15

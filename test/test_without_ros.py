@@ -16,8 +16,8 @@ from rclpy.serialization import serialize_message
 from ros_messages import goal, goals, joint_command, twist_stamped
 from test_reading import SECOND, changed, odom, start, status, write_bag
 
-from diffdrive_jacobian.bags.decoding import known_definition
 from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message
+from diffdrive_jacobian.bags.known_types import known_definition
 from diffdrive_jacobian.reading import read_run, verify
 from diffdrive_jacobian.tools.entry_points import ROS_MODULES
 
@@ -27,7 +27,9 @@ TOOLS = sorted(
     for one in entry_points(group='console_scripts')
     if one.value.startswith('diffdrive_jacobian.')
 )
-WITHOUT_ROS = ('calibrate_run', 'plot_run', 'recover_run', 'sweep_gains', 'verify_run')
+WITHOUT_ROS = (
+    *('calibrate_run', 'plot_jacobian', 'plot_run', 'recover_run', 'sweep_gains', 'verify_run'),
+)
 BAG = Path(__file__).parent / 'bags' / 'turtlebot3_fake_sqlite'
 """Recorded with ros2 bag record."""
 READ = """

@@ -54,7 +54,7 @@ def time_offset(recording: Recording, nominal: Geometry) -> float | None:
     lags, overlap, found = _correlations(ours, theirs)
     offsets = wheels[0] - poses[0] + lags * step
     samples = overlap * step / window
-    allowed = (overlap >= LEAST_OVERLAP * overlap.max()) | (np.abs(offsets) <= NEAR)
+    allowed = (overlap >= LEAST_OVERLAP * np.max(overlap)) | (np.abs(offsets) <= NEAR)
     either = (_ratio(np.maximum(found * [1.0, sign], 0.0)) for sign in (1.0, -1.0))
     g, turned = (np.where(allowed & (samples * one >= EVIDENCE), one, 0.0) for one in either)
     largest = int(np.argmax(g))

@@ -95,7 +95,7 @@ def densified(time: Array, angles: Array) -> tuple[Array, Array]:
 
 def poses_apart(segment: Segment, steps: float) -> int:
     """Return after how many poses, at least 1, the wheels have usually turned by some encoder steps."""
-    step = 12.0**0.5 * float(segment.wheel_errors.max(initial=0.0))
+    step = 12.0**0.5 * float(np.max(segment.wheel_errors, initial=0.0))
     angles = [np.interp(segment.time, segment.wheel_time, one) for one in segment.wheel_angles.T]
     turned = float(np.median(np.abs(np.diff(angles)).max(axis=0)))
     return max(1, math.ceil(steps * step / turned)) if turned > 0.0 else 1

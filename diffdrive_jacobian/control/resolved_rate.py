@@ -111,6 +111,8 @@ def _unlimited(
 class StraightLine:
     """Straight path at constant speed from one point to another, with rest before and after (D, 4.1).
 
+    The coordinates are those of the task: positions, or positions and headings.
+
     Raises:
         ValueError: The ends have different or no coordinates, the speed is not positive and finite, or
             the duration is not a finite number.

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from diffdrive_jacobian.diagnosis.description import CLOCK, Finding, Graph, Stream
+from diffdrive_jacobian.diagnosis.description import Finding, Graph, Stream
+from diffdrive_jacobian.messages.topics import CLOCK
 from diffdrive_jacobian.text import listed
 
 MAX_AGE = 1.0

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from diffdrive_jacobian.messages.topics import OF_EVERY_NODE
+
 INFINITE = 2**63 - 1
 """Duration that means no limit (ns)."""
-CLOCK = '/clock'
-INTERNAL = ('/rosout', '/parameter_events')
-"""Topics of every node, which are not listed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +95,7 @@ class Graph:
 
     def topics(self) -> list[str]:
         """Return the names of the topics, sorted, without those that every node has."""
-        return sorted({one.topic for one in self.endpoints} - set(INTERNAL))
+        return sorted({one.topic for one in self.endpoints} - set(OF_EVERY_NODE))
 
     def publishers(self, topic: str) -> list[Endpoint]:
         """Return the publishers of a topic."""

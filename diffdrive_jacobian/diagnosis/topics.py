@@ -6,21 +6,21 @@ from collections import Counter
 from collections.abc import Iterator
 
 from diffdrive_jacobian.diagnosis.description import (
-    CLOCK,
-    INTERNAL,
     Endpoint,
     Finding,
     Graph,
     Quality,
     base_name,
 )
-from diffdrive_jacobian.diagnosis.remedies import (
-    ONE_PUBLISHER,
-    SAME_NAMES,
-    START_PUBLISHER,
-    START_READER,
-)
+from diffdrive_jacobian.messages.topics import CLOCK, OF_EVERY_NODE, SAME_NAMES, TOPICS, Topic
 from diffdrive_jacobian.text import listed
+
+_UNKNOWN = Topic(name='')
+
+
+def _known(topic: str) -> Topic:
+    """Return what is known of a topic of this name, in any namespace."""
+    return TOPICS.get(base_name(topic), _UNKNOWN)
 
 
 def check_topics(graph: Graph) -> Iterator[Finding]:
@@ -127,12 +127,12 @@ def _changed_policy(reason: str) -> str:
 
 def _check_number_of_publishers(graph: Graph, topic: str) -> Iterator[Finding]:
     nodes = [one.node for one in graph.publishers(topic)]
-    name = base_name(topic)
+    known = _known(topic)
     if len(nodes) < 2 or topic == CLOCK:
         return
-    if name in ONE_PUBLISHER:
-        yield Finding(f'{listed(nodes)} publish {topic}', ONE_PUBLISHER[name])
-    elif name == 'cmd_vel':
+    if known.if_several:
+        yield Finding(f'{listed(nodes)} publish {topic}', known.if_several)
+    elif known.name == 'cmd_vel':
         yield Finding(
             f'{listed(nodes)} publish {topic}: the robot follows the last command of either',
             'drive by hand only while no goal is active, or use a multiplexer such as twist_mux',
@@ -148,21 +148,22 @@ def _check_missing(graph: Graph, topic: str) -> Iterator[Finding]:
         for one in graph.subscriptions(topic)
         if one.node not in {publisher.node for publisher in publishers}
     ]
-    name = base_name(topic)
-    if topic in INTERNAL:
+    known = _known(topic)
+    if topic in OF_EVERY_NODE:
         return
-    if publishers and not subscriptions and name in START_READER:
+    if publishers and not subscriptions and known.if_unread:
         yield Finding(
             f'{listed([one.node for one in publishers])} publishes {topic}, but nobody subscribes to it',
-            f'{START_READER[name]} {SAME_NAMES.format(name)}{_namesake(graph, topic, publishes=False)}',
+            f'{known.if_unread} {SAME_NAMES.format(known.name)}'
+            f'{_namesake(graph, topic, publishes=False)}',
             # Tools that publish goals come and go.
-            problem=name in ('cmd_vel', 'joint_command'),
+            problem=known.name in ('cmd_vel', 'joint_command'),
         )
-    if subscriptions and not publishers and name in START_PUBLISHER:
+    if subscriptions and not publishers and known.if_unpublished:
         yield Finding(
             f'{listed([one.node for one in subscriptions])} subscribes to {topic}, but nobody publishes '
             'it',
-            f'{START_PUBLISHER[name]} {SAME_NAMES.format(name)}'
+            f'{known.if_unpublished} {SAME_NAMES.format(known.name)}'
             f'{_namesake(graph, topic, publishes=True)}',
         )
 

@@ -24,8 +24,8 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from diffdrive_jacobian.drives.runners import NAME, in_lockstep, in_real_time
-from diffdrive_jacobian.messages import conversion as messages
-from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.messages.codecs import JOINT_STATE, Wheels
+from diffdrive_jacobian.messages.errors import MessageError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
@@ -34,6 +34,7 @@ from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.recording.selection import Selection
 from diffdrive_jacobian.ros.goal_client import GoalClient
 from diffdrive_jacobian.ros.node_runner import NodeRunner
+from diffdrive_jacobian.ros.serialization import ignoring_invalid
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.time_units import nanoseconds
 
@@ -272,12 +273,13 @@ class WheelSpeeds:
         self._names = names
         self.speeds = (0.0, 0.0)
         """Speeds of the right and the left wheel (rad/s)."""
-        node.create_subscription(JointState, 'joint_states', self._on_joint_states, 10)
+        received = ignoring_invalid(JOINT_STATE, JointState, self._on_joint_states)
+        node.create_subscription(JointState, 'joint_states', received, 10, raw=True)
 
-    def _on_joint_states(self, message: JointState) -> None:
+    def _on_joint_states(self, wheels: Wheels) -> None:
         # Other processes may publish, and anything.
         with suppress(MessageError):
-            self.speeds = messages.from_joint_state(message, self._names)
+            self.speeds = wheels.speeds(self._names)
 
 
 def recorder_of(runner: NodeRunner, recording: Recording | None) -> Callable[[], None]:

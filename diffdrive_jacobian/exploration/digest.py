@@ -6,16 +6,21 @@ import hashlib
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message
-from unique_identifier_msgs.msg import UUID
 
 from diffdrive_jacobian.lockstep.world import Lockstep
+from diffdrive_jacobian.messages.fields import is_identifier, plain, walk
+from diffdrive_jacobian.messages.structure import (
+    Array,
+    FieldType,
+    Number,
+    Sequence,
+    Structure,
+    structure,
+)
+from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.ros.rclpy_internals import wrap_publish
-
-OMITTED = ('/clock', '/rosout', '/parameter_events', '/fault_events')
-"""Topics that are not part of the hash: they do not belong to the nodes, or to their behaviour."""
 
 
 class MessageDigest:
@@ -39,7 +44,7 @@ class MessageDigest:
         def hashing(publish: Callable[..., None]) -> Callable[..., None]:
             def hashed(self: Publisher, msg: Any) -> None:
                 publish(self, msg)
-                if self.topic_name not in OMITTED:
+                if self.topic_name not in NOT_OF_ROBOTS:
                     add(self, msg)
 
             return hashed
@@ -59,22 +64,26 @@ class MessageDigest:
     def _add(self, publisher: Publisher, message: Any) -> None:
         if isinstance(message, bytes):
             message = deserialize_message(message, publisher.msg_type)
-        words = (str(self._world.now), publisher.topic_name, *self._values(message))
+        words = [str(self._world.now), publisher.topic_name]
+        for _, kind, value in walk(structure(type(message)), message, whole=is_identifier):
+            words += self._words(kind, value)
         self._hash.update('\0'.join(words).encode())
 
-    def _values(self, value: Any) -> list[str]:
-        """Return the fields of a message as text, with every bit of the numbers."""
-        if isinstance(value, UUID):
-            identifier = bytes(value.uuid)
-            number = self._identifiers.setdefault(identifier, len(self._identifiers))
-            return [str(number) if any(identifier) else 'none']
-        if hasattr(value, 'get_fields_and_field_types'):
-            names = value.get_fields_and_field_types()
-            return [word for name in names for word in self._values(getattr(value, name))]
-        if isinstance(value, float):
-            return [value.hex()]
-        if isinstance(value, np.ndarray):
-            return [value.tobytes().hex()]
-        if isinstance(value, (str, bytes, int, bool)):
-            return [repr(value)]
-        return [str(len(value)), *(word for one in value for word in self._values(one))]
+    def _words(self, kind: FieldType, value: Any) -> list[str]:
+        """Return a field of a message as text, with every bit of the numbers."""
+        match kind:
+            case Structure():
+                identifier = bytes(value.uuid)
+                number = self._identifiers.setdefault(identifier, len(self._identifiers))
+                return [str(number) if any(identifier) else 'none']
+            case Array(element=Number()):
+                return [value.tobytes().hex()]
+            case Array(element=element) | Sequence(element=element):
+                values = plain(value)
+                return [
+                    str(len(values)),
+                    *(word for one in values for word in self._words(element, one)),
+                ]
+            case Number() if isinstance(value, float):
+                return [value.hex()]
+        return [repr(value)]

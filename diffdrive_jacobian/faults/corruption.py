@@ -13,8 +13,9 @@ import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 
 from diffdrive_jacobian.faults.fault import Filter, TopicFault
-from diffdrive_jacobian.faults.message_fields import FieldType, MessageField
 from diffdrive_jacobian.messages import conversion
+from diffdrive_jacobian.messages.fields import MessageField, is_stamp
+from diffdrive_jacobian.messages.structure import FieldType, Number, Text
 from diffdrive_jacobian.numerics.checks import Probability
 from diffdrive_jacobian.numerics.fields import Name, one_of
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -23,7 +24,7 @@ _VALUES = {'nan': math.nan, 'inf': math.inf, '-inf': -math.inf}
 _WITH_AMOUNT = ('offset', 'scale', 'set')
 CHANGES = (*_VALUES, 'subnormal', 'negate', *_WITH_AMOUNT)
 """What can happen to a field."""
-_SUBNORMAL = {'double': 2.0**-1074, 'float': 2.0**-149}
+_SUBNORMAL = {'d': 2.0**-1074, 'f': 2.0**-149}
 """Least positive number of each type."""
 _STAMP_LIMITS = -(2**31) * NANOSECONDS, 2**31 * NANOSECONDS - 1
 """Least and largest time that `sec` and `nanosec` can represent (ns)."""
@@ -113,33 +114,35 @@ class Corrupt(TopicFault):
         """
         kind = field.type
         numeric = _is_number(self.amount)
-        if kind.is_float and numeric:
-            return self._of_float(kind)
-        if kind.limits is not None and numeric and self._fits_integers(kind.limits):
-            return self._of_integer(kind.limits)
-        if kind.is_boolean and (self.change == 'negate' or isinstance(self.amount, bool)):
-            amount = self.amount
-            return (lambda value: not value) if self.change == 'negate' else lambda _: amount
-        if kind.is_text and self.change == 'set' and isinstance(self.amount, str):
-            return self._of_text(kind)
-        if kind.is_stamp and self.change in ('offset', 'set') and numeric:
-            return self._of_stamp()
+        match kind:
+            case Number(is_float=True) if numeric:
+                return self._of_float(kind)
+            case Number(limits=(low, high)) if numeric and self._fits_integers((low, high)):
+                return self._of_integer((low, high))
+            case Number(code='?') if self.change == 'negate':
+                return lambda value: not value
+            case Number(code='?') if isinstance(self.amount, bool):
+                return lambda _: self.amount
+            case Text() if self.change == 'set' and isinstance(self.amount, str):
+                return self._of_text(kind)
+            case _ if is_stamp(kind) and self.change in ('offset', 'set') and numeric:
+                return self._of_stamp()
         amount = f' with amount {self.amount!r}' if self.change in _WITH_AMOUNT else ''
         raise ValueError(
             f"change {self.change!r}{amount} is not possible for field '{field.path}' of type "
-            f'{kind.name}: {_possible(kind)}'
+            f'{kind}: {_possible(kind)}'
         )
 
-    def _of_float(self, kind: FieldType) -> Callable[[float], float]:
+    def _of_float(self, kind: Number) -> Callable[[float], float]:
         amount = float(self.amount)
         if self.change in _VALUES:
             fixed = _VALUES[self.change]
             return lambda _: fixed
         if self.change == 'subnormal':
-            return lambda value: math.copysign(_SUBNORMAL[kind.name], value)
+            return lambda value: math.copysign(_SUBNORMAL[kind.code], value)
         if self.change == 'negate':
             return lambda value: -value
-        rounded = _float32 if kind.name == 'float' else float
+        rounded = _float32 if kind.code == 'f' else float
         if self.change == 'offset':
             return lambda value: rounded(value + amount)
         if self.change == 'scale':
@@ -168,11 +171,10 @@ class Corrupt(TopicFault):
             return lambda value: max(low, min(value + amount, high))
         return lambda _: amount
 
-    def _of_text(self, kind: FieldType) -> Callable[[str], str]:
+    def _of_text(self, kind: Text) -> Callable[[str], str]:
         text: str = self.amount
-        _, _, bound = kind.name.partition('<')
-        if bound and len(text.encode()) > int(bound.rstrip('>')):
-            raise ValueError(f'amount must fit into {kind.name}, got {len(text.encode())} bytes')
+        if kind.most is not None and len(text.encode()) > kind.most:
+            raise ValueError(f'amount must fit into {kind}, got {len(text.encode())} bytes')
         return lambda _: text
 
     def _of_stamp(self) -> Callable[[Any], Any]:
@@ -191,18 +193,18 @@ class Corrupt(TopicFault):
 
 def _possible(kind: FieldType) -> str:
     """Return which changes a type allows, for an error message."""
-    if kind.is_float:
-        return f'it must be one of {", ".join(map(repr, CHANGES))}, with a number as amount'
-    if kind.limits is not None:
-        signed = "'negate', " * (kind.limits[0] < 0)
-        low, high = kind.limits
-        return f"it must be {signed}'offset', 'scale' or 'set', with integers from {low} to {high}"
-    if kind.is_boolean:
-        return "it must be 'negate', or 'set' with a bool"
-    if kind.is_text:
-        return "it must be 'set' with a str"
-    if kind.is_stamp:
-        return "it must be 'offset' or 'set', with a number of seconds"
+    match kind:
+        case Number(is_float=True):
+            return f'it must be one of {", ".join(map(repr, CHANGES))}, with a number as amount'
+        case Number(limits=(low, high)):
+            signed = "'negate', " * (low < 0)
+            return f"it must be {signed}'offset', 'scale' or 'set', with integers from {low} to {high}"
+        case Number(code='?'):
+            return "it must be 'negate', or 'set' with a bool"
+        case Text():
+            return "it must be 'set' with a str"
+        case _ if is_stamp(kind):
+            return "it must be 'offset' or 'set', with a number of seconds"
     return 'name one of its fields that is a number, a bool, a string or a stamp'
 
 

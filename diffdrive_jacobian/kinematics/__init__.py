@@ -10,21 +10,27 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.kinematics import (
         contact,
         diff_drive,
+        differentiation,
         inverse_kinematics,
         inverse_velocity,
         mobile_manipulator,
         planar_arm,
+        rigid_body,
         se2,
+        spatial,
     )
 
 __all__ = [
     'contact',
     'diff_drive',
+    'differentiation',
     'inverse_kinematics',
     'inverse_velocity',
     'mobile_manipulator',
     'planar_arm',
+    'rigid_body',
     'se2',
+    'spatial',
 ]
 if not TYPE_CHECKING:
     # Nodes, which need few of them, start faster than with all.

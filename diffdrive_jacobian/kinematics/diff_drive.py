@@ -23,12 +23,16 @@ from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, f
 __all__ = [
     'body_to_wheel',
     'body_to_wheel_jacobian',
+    'controllability_matrix',
+    'lie_bracket',
     'no_lateral_slip_constraint',
     'offset_point',
     'offset_point_jacobian',
     'rolling_constraints',
     'single_wheel_jacobian',
     'unicycle_jacobian',
+    'wheel_centre_velocities',
+    'wheel_centres',
     'wheel_to_body',
     'wheel_to_body_jacobian',
     'wheel_to_position_jacobian',
@@ -39,6 +43,9 @@ __all__ = [
 @formula('() -> (3,2)')
 def unicycle_jacobian(theta: Number) -> Rows:
     """Map the body twist to the velocity in the world: `q_dot = S(theta) u` (A(4)-(7)).
+
+    S is the mobile robot's analog of the manipulator's Jacobian J(q), and has no singularities: its
+    columns are orthogonal for every heading.
 
     Args:
         theta: Headings, shape (...) (rad).
@@ -56,6 +63,8 @@ def unicycle_jacobian(theta: Number) -> Rows:
 @formula('(),() -> (2,2)', r=positive, L=positive)
 def wheel_to_body_jacobian(r: Number, L: Number) -> Rows:
     """Map wheel speeds to the body twist: `u = J_w w`, `J_w = [[r/2, r/2], [r/L, -r/L]]` (A(8), E).
+
+    A constant of the robot: unlike a manipulator's Jacobian it does not depend on the configuration.
 
     Args:
         r: Wheel radius, shape (...) (m).
@@ -251,6 +260,55 @@ def wheel_to_body(omega_R: Number, omega_L: Number, r: Number, L: Number) -> tup
     return v, omega
 
 
+@formula('(3),() -> (2,2)', L=positive)
+def wheel_centres(pose: Vector, L: Number) -> Rows:
+    """Return the positions of the centres of both wheels (E). The middle between them is the pose's.
+
+    They are `L/2` to the right and to the left of it, along `e_l = [sin, -cos]` and against it.
+
+    Args:
+        pose: `[x, y, theta]`, shape (..., 3).
+        L: Wheel separation, shape (...) (m).
+
+    Returns:
+        `[[x_R, y_R], [x_L, y_L]]`, shape (..., 2, 2) (m). Document E has them as `C_2` and `C_1`.
+
+    Raises:
+        ValueError: L is not positive and finite, or the pose is not finite.
+    """
+    x, y, theta = pose
+    return [
+        [x + L / 2.0 * sin(theta), y - L / 2.0 * cos(theta)],
+        [x - L / 2.0 * sin(theta), y + L / 2.0 * cos(theta)],
+    ]
+
+
+@formula('(),(3),() -> (2,2)', L=positive)
+def wheel_centre_velocities(theta: Number, q_dot: Vector, L: Number) -> Rows:
+    """Return the velocities of the centres of both wheels, `v_C + theta_dot k × CC_i` (E).
+
+    Their mean is the velocity of the axle centre C. Of wheels that roll without slip they are
+    `r omega_R e_f` and `r omega_L e_f`, along `e_f = [cos, sin]`.
+
+    Args:
+        theta: Headings, shape (...) (rad).
+        q_dot: `[x_dot, y_dot, theta_dot]` of the robot in the world, shape (..., 3) (m/s, m/s, rad/s).
+        L: Wheel separation, shape (...) (m).
+
+    Returns:
+        Velocities in the world, the right wheel's first, shape (..., 2, 2) (m/s).
+
+    Raises:
+        ValueError: L is not positive and finite, or theta or q_dot is not finite.
+    """
+    x_dot, y_dot, theta_dot = q_dot
+    turning = L / 2.0 * theta_dot
+    return [
+        [x_dot + turning * cos(theta), y_dot + turning * sin(theta)],
+        [x_dot - turning * cos(theta), y_dot - turning * sin(theta)],
+    ]
+
+
 @formula('() -> (1,3)')
 def no_lateral_slip_constraint(theta: Number) -> Rows:
     """Return the row `A(q) = [sin, -cos, 0]` with `A(q) q_dot = 0`, no lateral slip (A, E).
@@ -259,9 +317,48 @@ def no_lateral_slip_constraint(theta: Number) -> Rows:
         theta: Headings, shape (...) (rad).
 
     Returns:
-        The constraint, shape (..., 1, 3). Its null space is the range of S(theta).
+        The constraint, shape (..., 1, 3). Its null space is the range of S(theta). In the body frame
+        it is `[0, -1, 0]` for every heading.
     """
     return [[sin(theta), -cos(theta), 0.0]]
+
+
+@formula('() -> (3)')
+def lie_bracket(theta: Number) -> Entries:
+    """Return the Lie bracket of the columns of S(theta): `[g_1, g_2] = [sin, -cos, 0]` (A, 3.2.2).
+
+    `[g_1, g_2] = dg_2/dq g_1 - dg_1/dq g_2`. It is the direction that `no_lateral_slip_constraint`
+    forbids. Driving `a` forward, turning by `b`, driving back and turning back moves the robot by
+    `a b [g_1, g_2]`, to second order.
+
+    Args:
+        theta: Headings, shape (...) (rad).
+
+    Returns:
+        The bracket, shape (..., 3).
+    """
+    # dg_2/dq is zero, and dg_1/dq g_2 is the derivative of g_1 = [cos, sin, 0] by theta.
+    return [sin(theta), -cos(theta), 0.0]
+
+
+@formula('() -> (3,3)')
+def controllability_matrix(theta: Number) -> Rows:
+    """Return the columns `g_1, g_2, [g_1, g_2]`, of which g_1 and g_2 are those of S(theta) (A, 3.2.2).
+
+    Its rank is 3 for every heading, so a unicycle reaches every pose (the Lie algebra rank condition).
+
+    Source: W.-L. Chow, "Über Systeme von linearen partiellen Differentialgleichungen erster Ordnung",
+    1939; doc/mathematics.md, "Controllability".
+
+    Args:
+        theta: Headings, shape (...) (rad).
+
+    Returns:
+        The matrix, shape (..., 3, 3). Its determinant is 1.
+    """
+    S = unicycle_jacobian.formula(theta)
+    bracket = lie_bracket.formula(theta)
+    return [[*row, entry] for row, entry in zip(S, bracket, strict=True)]
 
 
 @formula('(),(),() -> (3,3),(3,2)', r=positive, L=positive)

@@ -40,7 +40,15 @@ from diffdrive_jacobian.kinematics.joint_limits import (
     joint_limit_gradient,
     limit_velocity,
 )
-from diffdrive_jacobian.kinematics.manipulability import manipulability, manipulability_gradient
+from diffdrive_jacobian.kinematics.manipulability import (
+    Ellipsoid,
+    condition_number,
+    force_ellipsoid,
+    manipulability,
+    manipulability_gradient,
+    smallest_singular_value,
+    velocity_ellipsoid,
+)
 from diffdrive_jacobian.kinematics.singular_values import (
     CUTOFF,
     EPS,
@@ -59,18 +67,24 @@ from diffdrive_jacobian.numerics.formula import Array, Number, Rows, Vector, for
 __all__ = [
     'CUTOFF',
     'FILTER',
+    'Ellipsoid',
     'adjugate_inverse',
+    'condition_number',
     'damped_least_squares',
     'damping',
+    'force_ellipsoid',
     'joint_limit_cost',
     'joint_limit_gradient',
     'limit_velocity',
     'manipulability',
     'manipulability_gradient',
+    'masked_task',
     'null_space_projector',
     'prioritized',
     'pseudoinverse',
     'redundant',
+    'smallest_singular_value',
+    'velocity_ellipsoid',
 ]
 
 TINY = 1e-290
@@ -125,6 +139,27 @@ def pseudoinverse(J: Any, *, weights: Vector = None) -> Array:
     W_half = root(weights)
     J_plus = svd(J / W_half).inverse()  # (J W^-1/2)^+
     return J_plus / column(W_half)  # W^-1/2 (J W^-1/2)^+
+
+
+@formula('(m,n),(m),(m) -> (m,n),(m)', mask=not_negative)
+def masked_task(J: Any, x_dot: Vector, mask: Vector) -> tuple[Array, Array]:
+    """Weigh the entries of a task, or omit some: `sqrt(M) J` and `sqrt(M) x_dot`.
+
+    An arm with fewer joints than entries of the task can only control some of them (D, 2.2). The result
+    is a task for all functions of this module. They then minimise `e^T M e` with the error
+    `e = x_dot - J q_dot`: `damped_least_squares(*masked_task(J, x_dot, mask), damping)`.
+
+    Args:
+        J: Jacobians, shape (..., m, n).
+        x_dot: Task velocities, shape (..., m).
+        mask: Weights of the entries, the diagonal of M, zero or positive, shape (..., m). Zero omits an
+            entry.
+
+    Returns:
+        The Jacobians and the velocities, same shapes, with rows of zeros for omitted entries.
+    """
+    M_half = root(mask)
+    return column(M_half) * J, M_half * x_dot  # sqrt(M) J, sqrt(M) x_dot
 
 
 @formula('(),(),() -> ()', manipulability=not_negative, threshold=positive, maximum=not_negative)

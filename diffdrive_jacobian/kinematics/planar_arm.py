@@ -1,4 +1,4 @@
-"""A planar arm of n revolute joints: positions, Jacobians, singularities, torques.
+"""A planar arm of n revolute joints: positions, Jacobians, singularities, clearance, torques.
 
 State: joint angles `q = [q_1, ..., q_n]` (rad), each counted from the link before it; the first from
 the x axis of the arm's base. Task: the tip's position x, y (m) and heading (rad), the sum of the angles.
@@ -13,15 +13,25 @@ doc/mathematics.md, "Manipulators".
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import accumulate
-from math import pi
+from itertools import accumulate, product
+from math import inf, pi
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics.singular_values import EPS, refuse_singular
 from diffdrive_jacobian.numerics.checks import array, positive
-from diffdrive_jacobian.numerics.elementary import cos, maximum, sin, wrap
+from diffdrive_jacobian.numerics.elementary import (
+    atan2,
+    cos,
+    hypot,
+    maximum,
+    minimum,
+    sin,
+    sqrt,
+    where,
+    wrap,
+)
 from diffdrive_jacobian.numerics.formula import Entries, Number, Rows, Vector, formula
 
 __all__ = ['PlanarArm', 'arm_forward_kinematics', 'arm_jacobian']
@@ -43,6 +53,32 @@ def arm_jacobian(lengths: Vector, q: Vector) -> Rows:
         [-sum(y[i:]) for i in range(len(q))],
         [sum(x[i:]) for i in range(len(q))],
     ]
+
+
+@formula('(n),(n),(2) -> (n)')
+def arm_up_to_nearest_point(lengths: Vector, q: Vector, obstacle: Vector) -> Entries:
+    """Return the lengths of the links of an arm that ends at its nearest point to an obstacle.
+
+    The link with that point is shortened, the links beyond it have the length 0. So the forward
+    kinematics and the Jacobian of this arm are those of the nearest point.
+
+    Args:
+        lengths: Lengths of the links, shape (..., n) (m).
+        q: Joint angles, shape (..., n) (rad).
+        obstacle: A point in the frame of the arm, shape (..., 2) (m).
+    """
+    x, y = arm_links(lengths, q)
+    nearest: Entries = list(lengths)
+    distance: Number = inf
+    for i, length in enumerate(lengths):
+        # From the joint to the obstacle, and the foot of its perpendicular, as a part of the link.
+        to_x, to_y = obstacle[0] - sum(x[:i]), obstacle[1] - sum(y[:i])
+        part = minimum(maximum((to_x * x[i] + to_y * y[i]) / length**2, 0.0), 1.0)
+        to_link = hypot(to_x - part * x[i], to_y - part * y[i])
+        up_to = [*lengths[:i], part * length, *[0.0] * (len(q) - i - 1)]
+        nearest = [where(to_link < distance, *pair) for pair in zip(up_to, nearest, strict=True)]
+        distance = minimum(distance, to_link)
+    return nearest
 
 
 def arm_links(lengths: Vector, q: Vector) -> tuple[list[Number], list[Number]]:
@@ -134,19 +170,55 @@ class PlanarArm:
         return np.asarray(_determinant(self.lengths, q))
 
     def singular_configurations(self, q_1: ArrayLike = 0.0) -> NDArray[np.float64]:
-        """Return the singular configurations of two links: stretched, q_2 = 0, and folded, q_2 = pi (A).
+        """Return the configurations in which the position is singular: all links on one line (A, D).
+
+        There the tip cannot move along that line. Two links are stretched, q_2 = 0, or folded, q_2 = pi.
 
         Args:
             q_1: Angle of the first joint, which does not matter, shape (...) (rad).
 
         Returns:
-            `[[q_1, 0], [q_1, pi]]`, shape (..., 2, 2) (rad).
+            `[q_1, q_2, ..., q_n]` with each of q_2 to q_n 0 or pi, shape (..., 2^(n - 1), n) (rad), the
+            stretched arm first. For two links `[[q_1, 0], [q_1, pi]]`.
+        """
+        q_1 = array('q_1', q_1)
+        others = list(product((0.0, pi), repeat=self.joints - 1))
+        q = np.empty((*q_1.shape, len(others), self.joints))
+        q[..., 0], q[..., 1:] = q_1[..., np.newaxis], others
+        return q
+
+    def inverse_kinematics(self, position: ArrayLike) -> NDArray[np.float64]:
+        """Return both explicit solutions of two links: elbow down and elbow up (D, 6).
+
+        `cos(q_2) = (x^2 + y^2 - l_1^2 - l_2^2) / (2 l_1 l_2)` by the law of cosines, and
+        `q_1 = atan2(y, x) - atan2(l_2 sin(q_2), l_1 + l_2 cos(q_2))`. Other arms, and headings, need
+        `inverse_kinematics.solve`.
+
+        Args:
+            position: Position of the tip, shape (..., 2) (m).
+
+        Returns:
+            `[down, up]`, shape (..., 2, 2) (rad). The first has q_2 from 0 to pi: seen along the line to
+            the tip, the elbow is on the right, below a tip straight ahead. The second has q_2 from -pi
+            to 0. They are the same where the arm is stretched or folded. For a tip on the base, which
+            any q_1 reaches, q_1 is 0.
 
         Raises:
-            ValueError: The arm has not two links.
+            ValueError: The arm has not two links, or a position is out of reach: its distance from the
+                base must be from `|l_1 - l_2|` to `l_1 + l_2`.
         """
-        self._need_two('singular_configurations')
-        return _singular_configurations(q_1)
+        self._need_two('inverse_kinematics')
+        position = array('position', position, 2)
+        distance = np.hypot(position[..., 0], position[..., 1])
+        least, most = abs(self.lengths[0] - self.lengths[1]), self.lengths.sum()
+        rounding = 4.0 * EPS * most
+        beyond = (distance < least - rounding) | (distance > most + rounding)
+        if beyond.any():
+            raise ValueError(
+                f'position must be from {least:g} to {most:g} m away from the base, '
+                f'got {position[beyond][0].tolist()}'
+            )
+        return _inverse_kinematics(self.lengths, position)
 
     def inverse_velocity(self, q: ArrayLike, x_dot: ArrayLike) -> NDArray[np.float64]:
         """Return joint velocities of two links for a velocity of the tip, by the adjugate (A, 3.2.1).
@@ -164,6 +236,37 @@ class PlanarArm:
         """
         self._need_two('inverse_velocity')
         return _inverse_velocity(self.lengths, q, x_dot)
+
+    def clearance(self, q: ArrayLike, obstacle: ArrayLike) -> NDArray[np.float64]:
+        """Return the distance of the arm from an obstacle, a point, to the nearest point of its links.
+
+        Args:
+            q: Joint angles, shape (..., n) (rad).
+            obstacle: A point in the frame of the arm, shape (..., 2) (m).
+
+        Returns:
+            The distance, shape (...) (m).
+        """
+        return np.asarray(_clearance(self.lengths, q, obstacle))
+
+    def clearance_gradient(self, q: ArrayLike, obstacle: ArrayLike) -> NDArray[np.float64]:
+        """Return the gradient of `clearance`: a motion away from an obstacle (A, 3.2.5).
+
+        It is `J^T n`, with the Jacobian J of the nearest point and the unit vector n from the obstacle
+        to it. Where the nearest point changes to another link, it jumps. As a secondary task:
+        `redundant(J, x_dot, k * arm.clearance_gradient(q, obstacle))`, k > 0.
+
+        Source: A. A. Maciejewski, C. A. Klein, "Obstacle avoidance for kinematically redundant
+        manipulators in dynamically varying environments", 1985.
+
+        Args:
+            q: Joint angles, shape (..., n) (rad).
+            obstacle: A point in the frame of the arm, shape (..., 2) (m).
+
+        Returns:
+            The gradients, shape (..., n) (m/rad). 0 where the arm touches the obstacle.
+        """
+        return _clearance_gradient(self.lengths, q, obstacle)
 
     def joint_torques(self, q: ArrayLike, wrench: ArrayLike) -> NDArray[np.float64]:
         """Return the joint torques of a wrench at the tip: `tau = J^T W` (D, 6).
@@ -212,11 +315,17 @@ def _determinant(lengths: Vector, q: Vector) -> Number:
     return l_1 * l_2 * sin(q_2)
 
 
-@formula('() -> (2,2)')
-def _singular_configurations(q_1: Number) -> Rows:
+@formula('(2),(2) -> (2,2)')
+def _inverse_kinematics(lengths: Vector, position: Vector) -> Rows:
+    (l_1, l_2), (x, y) = lengths, position
+    c_2 = (x * x + y * y - l_1 * l_1 - l_2 * l_2) / (2.0 * l_1 * l_2)
+    c_2 = maximum(minimum(c_2, 1.0), -1.0)  # only rounding is cut off
+    s_2 = sqrt(1.0 - c_2 * c_2)
+    bearing, inner = atan2(y, x), atan2(l_2 * s_2, l_1 + l_2 * c_2)
+    q_2 = atan2(s_2, c_2)
     return [
-        [q_1, 0.0],
-        [q_1, pi],
+        [wrap(bearing - inner), q_2],
+        [wrap(bearing + inner), -q_2],
     ]
 
 
@@ -229,6 +338,24 @@ def _inverse_velocity(lengths: Vector, q: Vector, x_dot: Vector) -> Entries:
     refuse_singular(determinant, abs(determinant) <= blur * lengths[0] * lengths[1])
     v_x, v_y = x_dot
     return [(d * v_x - b * v_y) / determinant, (a * v_y - c * v_x) / determinant]
+
+
+@formula('(n),(n),(2) -> ()')
+def _clearance(lengths: Vector, q: Vector, obstacle: Vector) -> Number:
+    nearest = arm_up_to_nearest_point.formula(lengths, q, obstacle)
+    x, y, _ = arm_forward_kinematics.formula(nearest, q)
+    return hypot(x - obstacle[0], y - obstacle[1])
+
+
+@formula('(n),(n),(2) -> (n)')
+def _clearance_gradient(lengths: Vector, q: Vector, obstacle: Vector) -> Entries:
+    nearest = arm_up_to_nearest_point.formula(lengths, q, obstacle)
+    x, y, _ = arm_forward_kinematics.formula(nearest, q)
+    J_x, J_y = arm_jacobian.formula(nearest, q)
+    away_x, away_y = x - obstacle[0], y - obstacle[1]
+    distance = hypot(away_x, away_y)
+    distance = where(distance > 0.0, distance, 1.0)
+    return [(J_xi * away_x + J_yi * away_y) / distance for J_xi, J_yi in zip(J_x, J_y, strict=True)]
 
 
 @formula('(n),(n),(m) -> (n)')

@@ -21,6 +21,7 @@ __all__ = [
     'compose',
     'exp',
     'homogeneous',
+    'homogeneous_3d',
     'integrate',
     'inverse',
     'left_jacobian',
@@ -199,6 +200,25 @@ def homogeneous(pose: Vector) -> Rows:
         [cos(theta), -sin(theta), x],
         [sin(theta), cos(theta), y],
         [0.0, 0.0, 1.0],
+    ]
+
+
+@formula('(3) -> (4,4)')
+def homogeneous_3d(pose: Vector) -> Rows:
+    """Return the homogeneous transform `H_B^W` of a pose in space, where z is up (document B).
+
+    Args:
+        pose: `[x, y, theta]`, shape (..., 3).
+
+    Returns:
+        Transforms, shape (..., 4, 4): they map `[x, y, z, 1]` in B to W.
+    """
+    x, y, theta = pose
+    return [
+        [cos(theta), -sin(theta), 0.0, x],
+        [sin(theta), cos(theta), 0.0, y],
+        [0.0, 0.0, 1.0, 0.0],
+        [0.0, 0.0, 0.0, 1.0],
     ]
 
 

@@ -21,6 +21,7 @@ from diffdrive_jacobian.live.robot_state import TRUTH_LIFE, RobotState
 from diffdrive_jacobian.live.session import Session, Snapshot
 from diffdrive_jacobian.live.trail import MAX_POINTS, Trail
 from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.reading.trace import jumps
 
 Array = NDArray[np.float64]
@@ -142,6 +143,7 @@ class _Film:
         self._configure(0)
         self._commands, self._wheels = robot.times(run.cmd_vel), robot.times(run.wheels)
         self._statuses = robot.run.goal_status.received
+        self._sensors = {topic: robot.times(getattr(run, topic.series)) for topic in SENSORS}
         self._truths = np.maximum.accumulate(robot.times(run.ground_truth))
         self.trail, self._trail_times = _trail(robot.time, run.odometry.values, robot.trace.breaks)
         self.true_trail, self._true_times = _trail(
@@ -164,6 +166,10 @@ class _Film:
         state.covariance = robot.covariance[index]
         state.command = robot.latest(self._commands, run.cmd_vel, time, COMMAND_LIFE)
         state.wheels = robot.latest(self._wheels, run.wheels, time, WHEELS_LIFE)
+        for topic, times in self._sensors.items():
+            latest = int(np.searchsorted(times, time, side='right')) - 1
+            values = getattr(run, topic.series).values[latest].tolist() if latest >= 0 else []
+            state.readings.update(zip(topic.columns, values, strict=False))
         self._set_goal(index)
         latest = int(np.searchsorted(self._truths, time, side='right')) - 1
         known = latest >= 0 and time - self._truths[latest] < TRUTH_LIFE

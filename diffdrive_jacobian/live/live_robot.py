@@ -5,13 +5,9 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
-from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Goals
 from numpy.typing import NDArray
 from rclpy.node import Node
 
@@ -35,9 +31,10 @@ from diffdrive_jacobian.live.robot_state import RobotState
 from diffdrive_jacobian.live.robot_topics import RobotTopics
 from diffdrive_jacobian.live.session import Session
 from diffdrive_jacobian.live.trigger_link import TriggerLink
-from diffdrive_jacobian.messages import conversion as messages
-from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
+from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, POSE, Motion, Route, Status
+from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError, from_covariance
 from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.ros.remote_goal import ignores_heading
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS, seconds
@@ -51,16 +48,6 @@ SERVICES = {
     'reset_odometry': 'the odometry cannot be reset',
 }
 """Services of a robot, and what it means if they fail."""
-
-
-def _motion(message: Any) -> tuple[float, NDArray[np.float64], tuple[float, float]]:
-    """Return stamp (s), pose (m, m, rad) and twist (m/s, rad/s) of an odometry.
-
-    Raises:
-        MessageError: A value is invalid.
-    """
-    pose, twist = messages.from_pose(message.pose.pose), messages.from_twist(message.twist.twist)
-    return seconds(messages.from_time(message.header.stamp)), pose, twist
 
 
 class LiveRobot:
@@ -84,9 +71,9 @@ class LiveRobot:
         self._node, self._session = node, session
         self.state = RobotState(namespace)
         self.topics = RobotTopics(node, namespace, names, polled=polled)
-        self.topics.listen(GoalStatus, 'goal_status', self._on_status, latched=True)
-        self.topics.listen(PoseStamped, 'goal_pose', self._on_goal_pose, latched=False)
-        self.topics.listen(Goals, 'goals', self._on_goals, latched=False)
+        self.topics.listen(GOAL_STATUS, 'goal_status', self._on_status, latched=True)
+        self.topics.listen(POSE, 'goal_pose', self._on_goals, latched=False)
+        self.topics.listen(GOALS, 'goals', self._on_goals, latched=False)
         self.topics.prepare()
         self.links: dict[str, ParameterLink] = {}
         """Parameters by role."""
@@ -109,61 +96,44 @@ class LiveRobot:
     def poll(self) -> None:
         """Take the latest messages."""
         now = time.monotonic()
-        odometry = self.topics.odometry.take()
-        if odometry is not None:
-            self._on_odometry(odometry, now)
-        truth = self.topics.truth.take()
-        if truth is not None:
-            with suppress(MessageError):
-                self.state.truly_moved(*_motion(truth))
-        joints = self.topics.joints.take()
-        if joints is not None:
+        followed = {name: latest.take() for name, latest in self.topics.followed.items()}
+        if followed['odom'] is not None:
+            self._on_odometry(followed['odom'], now)
+        if (truth := followed['ground_truth']) is not None:
+            self.state.truly_moved(seconds(truth.stamp), np.array(truth.pose), truth.twist)
+        for topic in SENSORS:
+            if topic.followed and (value := followed[topic.name]) is not None:
+                for row in topic.rows(value, self.state.wheel_names):
+                    self.state.readings.update(zip(topic.columns, row.values, strict=True))
+        if (wheels := followed['joint_states']) is not None:
             try:
-                self.state.wheels = messages.from_joint_state(joints, self.state.wheel_names)
+                self.state.wheels = wheels.speeds(self.state.wheel_names)
             except MessageError:
                 self.state.wheels = None
-        twist = self.topics.command.take() if self.topics.command is not None else None
-        if twist is not None:
-            try:
-                self.state.command = messages.from_twist(getattr(twist, 'twist', twist))
-                self._commanded = now
-            except MessageError:
-                pass
+        command = self.topics.command.take() if self.topics.command is not None else None
+        if command is not None:
+            self.state.command, self._commanded = command.twist, now
         elif now - self._commanded > COMMAND_LIFE:
             self.state.command = None
 
-    def _on_odometry(self, message: Any, now: float) -> None:
+    def _on_odometry(self, motion: Motion, now: float) -> None:
         try:
-            stamp, pose, twist = _motion(message)
-        except MessageError:
-            return
-        try:
-            _, covariance = messages.from_pose_with_covariance(message.pose)
+            covariance = from_covariance(motion.covariance)
         except MessageError:
             covariance = None
-        self._seen, self._frame = now, message.header.frame_id
-        self.state.moved(stamp, pose, twist, covariance)
+        self._seen, self._frame = now, motion.frame
+        self.state.moved(seconds(motion.stamp), np.array(motion.pose), motion.twist, covariance)
 
-    def _on_goal_pose(self, message: PoseStamped) -> None:
-        self._on_poses([message], message.header.stamp)
+    def _on_goals(self, route: Route) -> None:
+        goals = np.array(route.poses, dtype=np.float64)
+        self.state.goal.sent(goals.reshape(-1, 3), route.stamp)
 
-    def _on_goals(self, message: Goals) -> None:
-        self._on_poses(message.goals, message.header.stamp)
-
-    def _on_poses(self, poses: Any, stamp: Any) -> None:
-        try:
-            goals = np.array([messages.from_pose(one.pose) for one in poses], dtype=np.float64)
-        except MessageError:
-            return
-        self.state.goal.sent(goals.reshape(-1, 3), (stamp.sec, stamp.nanosec))
-
-    def _on_status(self, message: GoalStatus) -> None:
-        stamp = message.goal_info.stamp
-        if message.status not in set(GoalState):
+    def _on_status(self, one: Status) -> None:
+        if one.status not in set(GoalState):
             return
         goal = self.state.goal
         before = goal.state
-        goal.reported(GoalState(message.status), (stamp.sec, stamp.nanosec))
+        goal.reported(GoalState(one.status), one.stamp)
         if goal.has_ended() and self.on_end is not None:
             # Where the robot is by now.
             self.poll()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
 
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.clock import Clock
@@ -17,8 +16,8 @@ from diffdrive_jacobian.live.goal_progress import GoalEnd
 from diffdrive_jacobian.live.live_robot import LiveRobot
 from diffdrive_jacobian.live.pacing import Pacing
 from diffdrive_jacobian.live.session import Session, Snapshot
-from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.messages.parameter_values import changed_parameters
+from diffdrive_jacobian.messages.codecs import PARAMETER_EVENT, Changes
+from diffdrive_jacobian.messages.topics import PARAMETER_EVENTS, TOPICS
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
 from diffdrive_jacobian.text import printable
@@ -33,10 +32,6 @@ MAX_ROBOTS = 16
 """Largest number of robots that are shown."""
 LOST = 30.0
 """Time without odometry and publisher after which a robot is no longer shown (s)."""
-TOPICS = (
-    *('odom', 'ground_truth', 'joint_states', 'cmd_vel', 'goal_pose', 'goals', 'goal_status'),
-    'initialpose',
-)
 
 
 class LivePage(Node):  # type: ignore[misc]
@@ -66,12 +61,16 @@ class LivePage(Node):  # type: ignore[misc]
         self._goal_ended = goal_ended
         self.robots: dict[str, LiveRobot] = {}
         """Robots by namespace."""
-        self._names = {topic: self.resolve_topic_name(topic).rpartition('/')[2] for topic in TOPICS}
+        self._names = {
+            topic: self.resolve_topic_name(topic).rpartition('/')[2]
+            for topic in TOPICS
+            if '/' not in topic
+        }
         self._refused: set[str] = set()
         self._unshown: list[str] = []
         self._discovered = self._worked = -1.0
-        received = ignoring_invalid(ParameterEvent, self._on_parameter_event)
-        self.create_subscription(ParameterEvent, '/parameter_events', received, 10, raw=True)
+        received = ignoring_invalid(PARAMETER_EVENT, ParameterEvent, self._on_parameter_event)
+        self.create_subscription(ParameterEvent, PARAMETER_EVENTS, received, 10, raw=True)
         if polled:
             self.create_timer(PERIOD, self.work, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -191,11 +190,8 @@ class LivePage(Node):  # type: ignore[misc]
             if not one.node_name.startswith('_')
         ]
 
-    def _on_parameter_event(self, event: Any) -> None:
+    def _on_parameter_event(self, changes: Changes) -> None:
         for robot in self.robots.values():
             for link in robot.links.values():
-                if link.target == event.node:
-                    try:
-                        link.changed(changed_parameters(event))
-                    except MessageError:
-                        return
+                if link.target == changes.node:
+                    link.changed(changes.values)

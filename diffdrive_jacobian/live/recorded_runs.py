@@ -8,16 +8,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.bags.bag_reader import BagError, base_name, messages, namespace_of, open_bag
-from diffdrive_jacobian.bags.decoding import UndecodableError, decode
-from diffdrive_jacobian.messages.conversion import MessageError, from_pose_with_covariance, from_time
+from diffdrive_jacobian.bags.bag_reader import BagError, base_name, namespace_of, open_bag
+from diffdrive_jacobian.messages.conversion import MessageError, from_covariance
+from diffdrive_jacobian.messages.topics import TOPICS
 from diffdrive_jacobian.reading.reader import read_run
 from diffdrive_jacobian.reading.run import Run, Series
 from diffdrive_jacobian.reading.trace import Trace, seconds, trace
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 Array = NDArray[np.float64]
-ODOMETRY = 'nav_msgs/msg/Odometry'
 MAX_ROBOTS = 16
 """Largest number of robots that are shown."""
 
@@ -73,7 +72,7 @@ def read_robots(path: Path) -> list[RecordedRobot]:
             runs[namespace] = run
         notes += run.notes
     if not runs:
-        why = f'no valid message on a topic odom of {ODOMETRY}'
+        why = f'no valid message on a topic odom of {TOPICS["odom"].types[0]}'
         raise BagError('; '.join([f'{path} has no odometry: {why}', *notes]))
     first = min(int(run.odometry.stamps[0]) for run in runs.values())
     robots = []
@@ -87,14 +86,14 @@ def read_robots(path: Path) -> list[RecordedRobot]:
                 trace=traced,
                 start=start,
                 time=np.maximum.accumulate(traced.time + start),
-                covariance=_covariances(path, namespace, run.odometry),
+                covariance=_covariances(run),
             )
         )
     return robots
 
 
 def _is_odometry(topic: str, kind: str) -> bool:
-    return base_name(topic) == 'odom' and kind == ODOMETRY
+    return base_name(topic) == 'odom' and kind in TOPICS['odom'].types
 
 
 def _namespaces(path: Path) -> list[str]:
@@ -109,22 +108,12 @@ def _namespaces(path: Path) -> list[str]:
         )
 
 
-def _covariances(path: Path, namespace: str, odometry: Series) -> Array:
+def _covariances(run: Run) -> Array:
     """Return the covariance of the pose at each odometry, shape (n, 3, 3); zero where it is invalid."""
-    found: dict[tuple[int, int], Array] = {}
-    with open_bag(path) as reader:
-        connections = [
-            one
-            for one in reader.connections
-            if _is_odometry(one.topic, one.msgtype) and namespace_of(one.topic) == namespace
-        ]
-        for _, received, data in messages(reader, connections):
-            try:
-                message = decode(data, ODOMETRY)
-                stamp = from_time(message.header.stamp)
-                _, found[received, stamp or received] = from_pose_with_covariance(message.pose)
-            except (MessageError, UndecodableError):
-                continue
-    zero = np.zeros((3, 3))
-    pairs = zip(odometry.received.tolist(), odometry.stamps.tolist(), strict=True)
-    return np.array([found.get(pair, zero) for pair in pairs]).reshape(-1, 3, 3)
+    matrices = run.odometry_covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    for matrix in matrices:
+        try:
+            matrix[:] = from_covariance(matrix)
+        except MessageError:
+            matrix[:] = 0.0
+    return matrices

@@ -19,6 +19,7 @@ from diffdrive_jacobian.live.goal_progress import GoalEnd, GoalProgress
 from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.live.trail import JUMP, Trail
 from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.reading.run import number
@@ -65,6 +66,8 @@ class RobotState:
         """Speeds of the right and the left wheel (rad/s). None: unknown."""
         self.command: tuple[float, float] | None = None
         """Latest cmd_vel. None: none was received lately."""
+        self.readings: dict[str, float] = {}
+        """Latest values of sensors, by their names."""
         self.goal = GoalProgress()
         self.trail = Trail()
         self.truth: NDArray[np.float64] | None = None
@@ -211,6 +214,11 @@ class RobotState:
             'goal_heading_error': rounded(heading),
             'truth': rounded(self.truth),
             'law': self._law(self.goal.current),
+            'readings': [
+                [name, rounded(self.readings.get(name)), unit]
+                for topic in SENSORS
+                for name, unit in topic.readings.items()
+            ],
             'by_hand': by_hand,
             'commanded': self.command is not None,
             'chain': quantities.chain(

@@ -7,48 +7,48 @@ from itertools import islice
 from typing import Any, TypeVar
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist, TwistStamped
-from nav_msgs.msg import Goals, Odometry
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from nav_msgs.msg import Goals
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import JointState
 
+from diffdrive_jacobian.bags.message_definitions import message_class
 from diffdrive_jacobian.messages import conversion as messages
-from diffdrive_jacobian.messages import wire
-from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.messages.codecs import TWIST, Codec, Command
+from diffdrive_jacobian.messages.errors import MessageError
+from diffdrive_jacobian.messages.topics import TOPICS
 from diffdrive_jacobian.ros.rclpy_internals import Polled, waiting_messages
-from diffdrive_jacobian.ros.serialization import MAX_SIZE, checked_reader, ignoring_invalid
-from diffdrive_jacobian.ros.topic_errors import explaining_failure, type_name
+from diffdrive_jacobian.ros.serialization import MAX_SIZE, ignoring_invalid
+from diffdrive_jacobian.ros.topic_errors import explaining_failure
 
-T = TypeVar('T')
+V = TypeVar('V')
 
 LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Matches every publisher, and never makes one wait."""
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-TWISTS: dict[str, type] = {type_name(kind): kind for kind in (Twist, TwistStamped)}
-"""Types of cmd_vel by their names."""
-_twist, _twist_stamped = wire.twist_writer(Twist()), wire.twist_stamped_writer(TwistStamped())
 
 
 class Latest:
     """The latest message of a topic, as bytes until somebody looks at it."""
 
-    def __init__(self, node: Node, kind: type, topic: str, *, polled: bool) -> None:
+    def __init__(self, node: Node, codec: Codec[Any], topic: str, *, polled: bool) -> None:
         """Subscribe.
 
         Args:
             node: The node that subscribes.
-            kind: Type of the messages.
+            codec: What is read of the messages.
             topic: Name of the topic.
             polled: Whether `take` must fetch messages. Otherwise the executor delivers them.
 
         Raises:
             ParameterError: The topic has another type in this process.
         """
-        self._read: Callable[[bytes], Any] = checked_reader(kind)
+        kind = message_class(codec.type_name)
+        self._read: Callable[[bytes], Any] = codec.reader(kind, deserialize_message)
         self._polled = polled
         self._data: bytes | None = None
         group = Polled() if polled else None
@@ -61,7 +61,7 @@ class Latest:
         self._data = data
 
     def take(self) -> Any | None:
-        """Return the message that was received since the last call. None: none, or an invalid one."""
+        """Return the value that was received since the last call. None: none, or an invalid one."""
         if self._polled:
             # The queue has one place; more than that is a flood, which must not hold up the page.
             for message in islice(waiting_messages(self._subscription), 2):
@@ -96,27 +96,32 @@ class RobotTopics:
         """
         self._node, self._namespace, self._names, self._polled = node, namespace, names, polled
         self._publishers: dict[str, Publisher] = {}
-        self.odometry = Latest(node, Odometry, self.full('odom'), polled=polled)
-        self.joints = Latest(node, JointState, self.full('joint_states'), polled=polled)
-        self.truth = Latest(node, Odometry, self.full('ground_truth'), polled=polled)
+        self.followed = {
+            topic.name: Latest(node, topic.codecs[0], self.full(topic.name), polled=polled)
+            for topic in TOPICS.values()
+            if topic.followed
+        }
+        """Topics whose latest values the page shows, by their usual names."""
         self.command: Latest | None = None
         """cmd_vel. None: nobody publishes or reads it yet."""
-        self.twist_type: type = Twist
-        """Type of cmd_vel."""
         self._subscriptions: list[Subscription] = []
+        self._use_twist(TWIST)
 
     def full(self, name: str) -> str:
         """Return the fully qualified name of a topic or service of the robot."""
         return f'{self._namespace.rstrip("/")}/{self._names.get(name, name)}'
 
-    def listen(self, kind: type[T], topic: str, callback: Callable[[T], None], *, latched: bool) -> None:
+    def listen(
+        self, codec: Codec[V], topic: str, callback: Callable[[V], None], *, latched: bool
+    ) -> None:
         """Receive every message of a topic, except for what `ignoring_invalid` ignores."""
+        kind = message_class(codec.type_name)
         with explaining_failure(self._node, kind, self.full(topic)):
             self._subscriptions.append(
                 self._node.create_subscription(
                     kind,
                     self.full(topic),
-                    ignoring_invalid(kind, callback),
+                    ignoring_invalid(codec, kind, callback),
                     LATCHED if latched else 10,
                     raw=True,
                 )
@@ -124,22 +129,25 @@ class RobotTopics:
 
     def use_twist_type(self, types: list[str]) -> None:
         """Take the types that cmd_vel has in the graph."""
-        known = [TWISTS[name] for name in types if name in TWISTS]
-        if not known or (self.command is not None and self.twist_type in known):
+        known = [codec for codec in TOPICS['cmd_vel'].codecs if codec.type_name in types]
+        if not known or (self.command is not None and self._twist in known):
             return
         if self.command is not None:
             self.command.destroy(self._node)
         self._discard('cmd_vel')
-        self.twist_type = known[0]
-        self.command = Latest(self._node, self.twist_type, self.full('cmd_vel'), polled=self._polled)
+        self._use_twist(known[0])
+        self.command = Latest(self._node, self._twist, self.full('cmd_vel'), polled=self._polled)
+
+    def _use_twist(self, codec: Codec[Command]) -> None:
+        self._twist = codec
+        self._serialized_twist = codec.writer(message_class(codec.type_name)())
 
     # --- Publishing
 
     def publish_twist(self, twist: tuple[float, float], now: int) -> None:
         """Publish a command, at a time (ns)."""
-        stamped = self.twist_type is TwistStamped
-        data = _twist_stamped(twist, now) if stamped else _twist(*twist)
-        self._publisher(self.twist_type, 'cmd_vel').publish(data)
+        data = self._serialized_twist(Command(twist, now))
+        self._publisher(message_class(self._twist.type_name), 'cmd_vel').publish(data)
 
     def publish_goals(self, goals: NDArray[np.float64], now: int, *, together: bool) -> None:
         """Publish goals, `[x, y, theta]` each, shape (n, 3), at a time (ns).
@@ -170,10 +178,6 @@ class RobotTopics:
         found = self._node.get_subscriptions_info_by_topic(self.full(topic))
         return sum((one.node_namespace, one.node_name) not in own for one in found)
 
-    def stamp_type(self) -> str:
-        """Return the name of the type of cmd_vel."""
-        return type_name(self.twist_type)
-
     def prepare(self) -> None:
         """Create the publishers of goals, so that their readers are discovered before they are used."""
         for kind, topic in ((PoseStamped, 'goal_pose'), (Goals, 'goals')):
@@ -192,9 +196,8 @@ class RobotTopics:
 
     def destroy(self) -> None:
         """Destroy all subscriptions and publishers."""
-        for latest in (self.odometry, self.joints, self.truth, self.command):
-            if latest is not None:
-                latest.destroy(self._node)
+        for latest in (*self.followed.values(), *([self.command] if self.command else [])):
+            latest.destroy(self._node)
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         for topic in list(self._publishers):

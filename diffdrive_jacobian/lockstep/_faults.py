@@ -9,11 +9,12 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 
 from diffdrive_jacobian.lockstep._errors import IneffectiveFaultsError, LockstepError
-from diffdrive_jacobian.lockstep._fault_log import MAX_REPORTED, TOPIC, FaultEvent, FaultLog
+from diffdrive_jacobian.lockstep._fault_log import MAX_REPORTED, FaultEvent, FaultLog
 from diffdrive_jacobian.lockstep._injection import Fault, Injection, World
 from diffdrive_jacobian.lockstep._nodes import Nodes
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.lockstep.external.others import Isolated
+from diffdrive_jacobian.messages.topics import FAULT_EVENTS
 from diffdrive_jacobian.time_units import NANOSECONDS, in_seconds
 
 
@@ -56,7 +57,9 @@ class Faults:
             _check(fault, self._scheduler.agenda.now)
         self._settle()
         if self._log.publisher is None:
-            self._log.publisher = self._nodes.own.create_publisher(String, TOPIC, QoSProfile(depth=1000))
+            self._log.publisher = self._nodes.own.create_publisher(
+                String, FAULT_EVENTS, QoSProfile(depth=1000)
+            )
             self._scheduler.links.unaffected.add(self._log.publisher)
             # Recorders subscribe.
             self._settle()

@@ -20,10 +20,9 @@ from diffdrive_jacobian.lockstep._fault_log import FaultLog, Hits, totals
 from diffdrive_jacobian.lockstep._gate import Gate
 from diffdrive_jacobian.lockstep._link import Link, Source, Stage
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
+from diffdrive_jacobian.messages.topics import CLOCK
 from diffdrive_jacobian.time_units import in_seconds, nanoseconds
 
-CLOCK = '/clock'
-"""Topic whose messages lockstep replaces."""
 Filter = Callable[[int, bytes], Iterable[tuple[int, bytes]]]
 """Receives a world time (ns) and a message, returns messages with their delays (ns)."""
 Begin = Callable[[random.Random, type], Filter]

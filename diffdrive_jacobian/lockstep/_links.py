@@ -28,8 +28,8 @@ from rclpy.subscription import Subscription
 from diffdrive_jacobian.lockstep._clock import Agenda, Clocks
 from diffdrive_jacobian.lockstep._gate import Gates, send_unless_destroyed
 from diffdrive_jacobian.lockstep._link import Delivered, Link, Published, Source, Stage, Taken, pass_on
-from diffdrive_jacobian.lockstep._report import OMITTED
 from diffdrive_jacobian.lockstep._services import Member
+from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.ros.rclpy_internals import message_taker, receives_info, wrap_publish
 
 Filter = Callable[[Source | Link], Stage | None]
@@ -129,7 +129,7 @@ class Links:
                 if get_ident() != thread:
                     topic = self.topic_name
                     heard = bool(links.to(topic) or links.observers_of_published(topic))
-                    note_thread(self, f'publishes {topic}', heard=heard and topic not in OMITTED)
+                    note_thread(self, f'publishes {topic}', heard=heard and topic not in NOT_OF_ROBOTS)
                 source = sources.get(self) or links._source_of(self)
                 if (source.stages or gates.running is not None) and links._divert(self, source, msg):
                     return
@@ -325,7 +325,7 @@ class Links:
         return sum(
             source.count
             for publisher, source in self._sources.items()
-            if source.topic not in OMITTED and _subscriptions(publisher) > len(source.links)
+            if source.topic not in NOT_OF_ROBOTS and _subscriptions(publisher) > len(source.links)
         )
 
 

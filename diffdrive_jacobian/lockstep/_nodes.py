@@ -12,6 +12,7 @@ from rosgraph_msgs.msg import Clock
 
 from diffdrive_jacobian.lockstep._errors import LockstepError, described
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
+from diffdrive_jacobian.messages.topics import CLOCK
 from diffdrive_jacobian.ros.rclpy_internals import wrap_sleep
 
 
@@ -29,7 +30,7 @@ class Nodes:
         self._factories: dict[str, Callable[[], Node]] = {}
         self.own = Node('lockstep', start_parameter_services=False, enable_rosout=False)
         """The node of the test."""
-        scheduler.clocks.publisher = self.own.create_publisher(Clock, '/clock', 1)
+        scheduler.clocks.publisher = self.own.create_publisher(Clock, CLOCK, 1)
         self.observers = {self.own}
         """Nodes that belong to the test."""
         self.on_change: list[Callable[[], None]] = []
@@ -87,9 +88,7 @@ class Nodes:
     def _on_registered(self, node: Node) -> None:
         """Check a node that is new, or has created or destroyed an entity."""
         _check_sim_time(node)
-        if node is not self.own and any(
-            publisher.topic_name == '/clock' for publisher in node.publishers
-        ):
+        if node is not self.own and any(publisher.topic_name == CLOCK for publisher in node.publishers):
             name = node.get_fully_qualified_name()
             raise LockstepError(f'node {name} publishes /clock, which only lockstep may do')
         self._refuse_sleep(node)

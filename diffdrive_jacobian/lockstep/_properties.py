@@ -14,9 +14,9 @@ from rclpy.service import Service
 from diffdrive_jacobian.lockstep._errors import LockstepError, PropertyViolation, described
 from diffdrive_jacobian.lockstep._link import Delivered, Published
 from diffdrive_jacobian.lockstep._nodes import Nodes
-from diffdrive_jacobian.lockstep._report import OMITTED
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.lockstep.external.others import Isolated
+from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.ros.rclpy_internals import SERVICES_OF_RCLPY
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -119,7 +119,7 @@ class Properties:
         for of, names in expected:
             # One that was violated has observed something, or its absence.
             if id(of) in left and self._offered.isdisjoint(names):
-                known = ', '.join(sorted(self._offered.difference(OMITTED))) or 'none'
+                known = ', '.join(sorted(self._offered.difference(NOT_OF_ROBOTS))) or 'none'
                 raise LockstepError(
                     f'{of} observes {" and ".join(names)}, which no node has offered; topics '
                     f'and services: {known}'

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence as Values
 from typing import TYPE_CHECKING, Any
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
+from diffdrive_jacobian.messages.fields import is_stamp, plain, walk
+from diffdrive_jacobian.messages.structure import Array, FieldType, Sequence, Structure, Text, structure
+from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 if TYPE_CHECKING:
@@ -18,14 +21,12 @@ MAX_SHOWN = 4
 """Number of elements that are shown of an array."""
 MAX_CHECKED = 100
 """Length up to which arrays of zeros are omitted. Longer ones are not searched."""
-OMITTED = ('/clock', '/fault_events', '/parameter_events', '/rosout')
-"""Topics that are not reported."""
 
 
 def describe(
-    sources: Sequence[tuple[Publisher | None, Source]],
-    nodes: Sequence[Node],
-    existing: Sequence[Node],
+    sources: Values[tuple[Publisher | None, Source]],
+    nodes: Values[Node],
+    existing: Values[Node],
     now: int,
     world_time: int,
 ) -> str:
@@ -45,7 +46,7 @@ def describe(
     published = [
         (source.topic, names.get(publisher, 'a destroyed publisher'), source)
         for publisher, source in sources
-        if source.topic not in OMITTED or publisher is None
+        if source.topic not in NOT_OF_ROBOTS or publisher is None
     ]
     lines = [
         f'  {topic}: {source.count} from {node}, last at {source.at / NANOSECONDS:g} s: '
@@ -57,7 +58,7 @@ def describe(
     for node in nodes:
         for subscription in node.subscriptions:
             topic = subscription.topic_name
-            if topic not in active and topic not in OMITTED:
+            if topic not in active and topic not in NOT_OF_ROBOTS:
                 subscribers.setdefault(topic, []).append(node.get_fully_qualified_name())
     lines += [
         f'  {topic}: no message; subscribed by {", ".join(dict.fromkeys(those))}'
@@ -75,35 +76,41 @@ def brief(message: Any) -> str:
     """Return a message as one line with its nonzero fields."""
     if isinstance(message, bytes):
         return f'{len(message)} serialized bytes'
-    fields = ', '.join(f'{name}={value}' for name, value in _fields(message, ''))
-    return f'{type(message).__name__}({fields})'
+    kind = structure(type(message))
+    fields = (
+        (path, _shown(field, value)) for path, field, value in walk(kind, message, whole=_is_shown_whole)
+    )
+    return f'{kind.short_name}({", ".join(f"{path}={text}" for path, text in fields if text)})'
 
 
-def _fields(message: Any, prefix: str) -> Iterator[tuple[str, str]]:
-    for name in message.get_fields_and_field_types():
-        value, path = getattr(message, name), prefix + name
-        if hasattr(value, 'get_fields_and_field_types'):
-            if {'sec', 'nanosec'} == set(value.get_fields_and_field_types()):
-                if value.sec or value.nanosec:
-                    yield path, f'{value.sec + value.nanosec / NANOSECONDS:.9g} s'
-            else:
-                yield from _fields(value, f'{path}.')
-        elif isinstance(value, (str, bytes)):
-            if value:
-                yield path, repr(value)
-        elif hasattr(value, '__len__'):
-            if len(value) > MAX_CHECKED or any(not _is_zero(element) for element in value):
-                yield path, _array(value)
-        elif not _is_zero(value):
-            yield path, _scalar(value)
+def _is_shown_whole(kind: FieldType) -> bool:
+    return is_stamp(kind) or isinstance(kind, (Array, Sequence))
+
+
+def _shown(kind: FieldType, value: Any) -> str:
+    """Return the value of a field; '': it is zero, false or empty."""
+    if value is None:
+        # Not valid any more, see `Source.received`.
+        return 'None'
+    if is_stamp(kind):
+        nonzero = value.sec or value.nanosec
+        return f'{value.sec + value.nanosec / NANOSECONDS:.9g} s' if nonzero else ''
+    match kind:
+        case Array(element=element) | Sequence(element=element):
+            zero = len(value) <= MAX_CHECKED and all(_is_zero(one) for one in value)
+            return '' if zero else _array(element, value)
+        case Text():
+            return repr(value) if value else ''
+        case _:
+            return '' if _is_zero(value) else _scalar(kind, value)
 
 
 def _is_zero(value: Any) -> bool:
     return isinstance(value, (bool, int, float)) and value == 0
 
 
-def _scalar(value: Any) -> str:
-    if hasattr(value, 'get_fields_and_field_types'):
+def _scalar(kind: FieldType, value: Any) -> str:
+    if isinstance(kind, Structure):
         return brief(value)
     if isinstance(value, float):
         # Six digits, or all of them where that is shorter: 5e-324.
@@ -111,7 +118,6 @@ def _scalar(value: Any) -> str:
     return repr(value)
 
 
-def _array(values: Any) -> str:
-    first = values[:MAX_SHOWN]
-    shown = ', '.join(map(_scalar, first.tolist() if hasattr(first, 'tolist') else first))
+def _array(element: FieldType, values: Any) -> str:
+    shown = ', '.join(_scalar(element, one) for one in plain(values[:MAX_SHOWN]))
     return f'[{shown}]' if len(values) <= MAX_SHOWN else f'[{shown}, ... {len(values)} in all]'

@@ -11,21 +11,24 @@ from operator import itemgetter
 from typing import Any, NamedTuple
 
 from diffdrive_jacobian.errors import DiffdriveError
-from diffdrive_jacobian.messages.cdr_fields import check_readable, field_value
-from diffdrive_jacobian.messages.cdr_types import (
+from diffdrive_jacobian.messages.errors import MessageError
+from diffdrive_jacobian.messages.fields import check_readable, field_value
+from diffdrive_jacobian.messages.structure import (
+    BIG_ENDIAN,
     COUNT,
     ENCAPSULATION,
-    LITTLE_ENDIAN,
+    PLAIN,
     Array,
     FieldType,
     Number,
     Sequence,
     Structure,
     Text,
+    check_plain,
     least_size,
     structure,
+    uniform_size,
 )
-from diffdrive_jacobian.messages.errors import MessageError
 
 _MAX_LAYOUTS = 16
 """Layouts that a Reader keeps, one for each size of message."""
@@ -33,6 +36,8 @@ _MAX_VALUES = 256
 """Largest number of values of a layout that is kept."""
 _MAX_ELEMENTS = 64
 """Most strings or structures in a sequence that are read one by one. For more, rclpy takes less time."""
+_MAX_WALKED = 100_000
+"""Most strings and structures of one message that are visited one by one. More take seconds."""
 _MAX_REMEMBERED = 1024
 """Largest message whose texts are remembered (bytes)."""
 
@@ -55,7 +60,7 @@ class Reader:
 
     def __init__(
         self,
-        message_class: Any,
+        kind: Any,
         fields: Values[str],
         *,
         whole: bool = True,
@@ -64,21 +69,22 @@ class Reader:
         """Compile a reader.
 
         Args:
-            message_class: Type of the messages.
+            kind: Type of the messages: their class or its `Structure`.
             fields: Paths such as `header.stamp.sec`. A path to a number gives a number, to a string a
                 str, to an array or sequence of them a tuple. `len(goals)` gives the length of a
-                sequence.
+                sequence, `goals[].pose.position.x` a tuple with that field of each of its elements.
             whole: Whether what follows the last field must be valid too.
-            deserialize: Reads the encapsulations that this class does not, such as big-endian, and
+            deserialize: Reads the encapsulations that this class does not, such as parameter lists, and
                 sequences of many strings (`rclpy.serialization.deserialize_message`). None: these
-                encapsulations are invalid.
+                encapsulations are invalid. It needs the class.
 
         Raises:
             ValueError: A field does not exist, or cannot be read on its own.
-            TypeError: The message has a type of field that is not supported.
+            TypeError: The message has a wide string.
         """
-        self._class = message_class
-        self._type = structure(message_class)
+        self._class = kind
+        self._type = kind if isinstance(kind, Structure) else structure(kind)
+        check_plain(self._type)
         self._fields = tuple(fields)
         for field in self._fields:
             check_readable(self._type, field)
@@ -107,7 +113,7 @@ class Reader:
 
     def _read_new(self, data: bytes) -> tuple[Any, ...]:
         """Read a message whose layout is not known."""
-        if len(data) >= ENCAPSULATION and data[:2] != LITTLE_ENDIAN:
+        if len(data) >= ENCAPSULATION and data[:2] not in PLAIN:
             return self._read_message(data)
         most = math.inf if self._deserialize is None else _MAX_ELEMENTS
         try:
@@ -134,7 +140,7 @@ class Reader:
         return tuple(field_value(message, field) for field in self._fields)
 
     def _undecodable(self) -> DecodingError:
-        return DecodingError(f'it is not a {self._type.name} message')
+        return DecodingError(f'it is not a {self._type.short_name} message')
 
 
 class _Layout(NamedTuple):
@@ -158,11 +164,14 @@ class _Walk:
         self._missing = set(fields)
         self._whole = whole
         self._offset = ENCAPSULATION
-        self._format = ['<2s']
+        self._order = '>' if data[:2] == BIG_ENDIAN else '<'
+        self._format = [f'{self._order}2s']
         self._formatted = 2
         self._values = 1
+        self._walked = 0
         self._lengths = [0]
-        self._picks: dict[str, Any] = {}
+        self._picks: dict[str, Any] = {field: [] for field in fields if '[]' in field}
+        """Where the fields are among the unpacked values: an index, a slice, or a list of them."""
         self._texts: set[str] = set()
 
     def layout(self, kind: Structure) -> _Layout:
@@ -175,8 +184,12 @@ class _Walk:
 
     def _picker(self) -> Callable[[tuple[Any, ...]], tuple[Any, ...]]:
         picks = [self._picks[field] for field in self._fields]
-        # An itemgetter of one index returns no tuple.
-        pick: Any = itemgetter(*picks) if len(picks) > 1 else _few(picks)
+        of_each = any(isinstance(one, list) for one in picks)
+        if of_each:
+            pick: Any = _each(picks)
+        else:
+            # An itemgetter of one index returns no tuple.
+            pick = itemgetter(*picks) if len(picks) > 1 else _few(picks)
         texts = [number for number, field in enumerate(self._fields) if field in self._texts]
         if not texts:
             picker: Callable[[tuple[Any, ...]], tuple[Any, ...]] = pick
@@ -184,7 +197,7 @@ class _Walk:
 
         # A short message has few texts, and usually the same ones as before.
         convert = _converted_before if self._offset <= _MAX_REMEMBERED else _converted
-        if texts == [0] and len(picks) > 2:
+        if texts == [0] and len(picks) > 2 and not of_each:
             # Such as a frame and numbers.
             text, numbers = picks[0], itemgetter(*picks[1:])
             return lambda values: (convert(values[text]), *numbers(values))
@@ -197,66 +210,84 @@ class _Walk:
 
         return pick_texts
 
+    @property
+    def _done(self) -> bool:
+        return not (self._missing or self._whole)
+
     def _walk(self, kind: FieldType, path: str) -> None:
-        wanted = path in self._missing
         match kind:
             case Structure():
+                if not kind.fields:
+                    self._take('', 1)
                 for name, field in kind.fields:
-                    if not (self._missing or self._whole):
+                    if self._done:
                         return
                     self._walk(field, f'{path}.{name}' if path else name)
             case Number():
-                self._numbers(kind, 1, wanted)
-                if wanted:
-                    self._picks[path] = self._values - 1
+                self._numbers(kind, 1, path)
             case Text():
-                self._text(wanted)
-                if wanted:
-                    self._picks[path] = self._values - 1
+                self._text(path in self._missing)
+                self._found(path, self._values - 1, is_text=True)
             case Array():
                 self._elements(kind.element, kind.count, path)
             case Sequence():
-                length = f'len({path})'
                 count = self._length()
-                if length in self._missing:
-                    self._picks[length] = self._values - 1
-                    self._missing.discard(length)
-                    if not (self._missing or self._whole):
-                        return
-                self._elements(kind.element, count, path)
-        if wanted:
+                self._found(f'len({path})', self._values - 1)
+                if not self._done:
+                    self._elements(kind.element, count, path)
+
+    def _found(self, path: str, pick: int | slice, *, is_text: bool = False) -> None:
+        """Note where a field is among the unpacked values, if it is asked for."""
+        if path not in self._missing:
+            return
+        if is_text:
+            self._texts.add(path)
+        if '[]' in path:
+            self._picks[path].append(pick)
+        else:
+            self._picks[path] = pick
             self._missing.discard(path)
-            if isinstance(kind, Text) or isinstance(getattr(kind, 'element', None), Text):
-                self._texts.add(path)
 
     def _elements(self, kind: FieldType, count: int, path: str) -> None:
         # Without this check a large number would take long, or much memory.
         if count * least_size(kind) > len(self._data) - self._offset:
             raise struct.error('more elements than bytes')
-        wanted = path in self._missing
-        first = self._values
         if isinstance(kind, Number):
-            self._numbers(kind, count, wanted)
-            if wanted:
-                self._picks[path] = slice(first, self._values)
-        elif count > self._most:
+            self._numbers(kind, count, path, many=True)
+            return
+        inner = f'{path}[]'
+        unit = uniform_size(kind)
+        if unit and not any(one.startswith(inner) for one in self._missing):
+            # Such as points, which are doubles without padding.
+            if count:
+                self._align(unit)
+            self._take('', count * least_size(kind))
+            return
+        if count > self._most:
             raise _ManyElementsError
-        elif isinstance(kind, Text):
+        self._walked += count
+        if self._walked > _MAX_WALKED:
+            raise struct.error('more elements than are read')
+        if isinstance(kind, Text):
+            first, wanted = self._values, path in self._missing
             for _ in range(count):
                 self._text(wanted)
-            if wanted:
-                # Each string comes after its length.
-                self._picks[path] = slice(first + 1, self._values, 2)
-        else:
-            for _ in range(count):
-                self._walk(kind, f'{path}[]')
+            # Each string comes after its length.
+            self._found(path, slice(first + 1, self._values, 2), is_text=True)
+            return
+        for _ in range(count):
+            self._walk(kind, inner)
+        self._missing.difference_update([one for one in self._missing if one.startswith(inner)])
 
-    def _numbers(self, kind: Number, count: int, wanted: bool) -> None:
+    def _numbers(self, kind: Number, count: int, path: str, *, many: bool = False) -> None:
+        wanted = path in self._missing
+        first = self._values
         if count:
             self._align(kind.size)
         self._take(f'{count}{kind.code}' if wanted else '', count * kind.size)
         if wanted:
             self._values += count
+            self._found(path, slice(first, self._values) if many else first)
 
     def _text(self, wanted: bool) -> None:
         size = self._length()
@@ -266,7 +297,7 @@ class _Walk:
 
     def _length(self) -> int:
         self._align(COUNT.size)
-        (length,) = struct.unpack_from('<I', self._data, self._offset)
+        (length,) = struct.unpack_from(f'{self._order}I', self._data, self._offset)
         self._lengths.append(self._values)
         self._take('I', COUNT.size)
         self._values += 1
@@ -296,8 +327,21 @@ def _few(indices: Values[Any]) -> Callable[[tuple[Any, ...]], tuple[Any, ...]]:
     return lambda values: tuple(values[index] for index in indices)
 
 
-def _converted(raw: bytes | tuple[bytes, ...]) -> str | tuple[str, ...]:
-    return _text(raw) if isinstance(raw, bytes) else tuple(map(_text, raw))
+def _each(picks: Values[Any]) -> Callable[[tuple[Any, ...]], tuple[Any, ...]]:
+    """Return a function as `_few`, which returns a tuple of values for a list of indices."""
+
+    def pick(values: tuple[Any, ...]) -> tuple[Any, ...]:
+        return tuple(
+            tuple(values[index] for index in one) if isinstance(one, list) else values[one]
+            for one in picks
+        )
+
+    return pick
+
+
+def _converted(raw: Any) -> Any:
+    """Return a string, or strings as deep in tuples as they are."""
+    return _text(raw) if isinstance(raw, bytes) else tuple(map(_converted, raw))
 
 
 _converted_before = lru_cache(maxsize=64)(_converted)

@@ -7,7 +7,8 @@ from collections.abc import Sequence as Values
 from itertools import accumulate, pairwise
 from typing import Any, NamedTuple
 
-from diffdrive_jacobian.messages.cdr_types import (
+from diffdrive_jacobian.messages.errors import MessageError
+from diffdrive_jacobian.messages.structure import (
     COUNT,
     ENCAPSULATION,
     LITTLE_ENDIAN,
@@ -17,9 +18,9 @@ from diffdrive_jacobian.messages.cdr_types import (
     Sequence,
     Structure,
     Text,
+    check_plain,
     structure,
 )
-from diffdrive_jacobian.messages.errors import MessageError
 
 
 class Writer:
@@ -38,16 +39,17 @@ class Writer:
         Raises:
             ValueError: A field does not exist, is no number, or is not in the order of the message.
             MessageError: The template cannot be serialized.
-            TypeError: The message has a type of field that is not supported.
+            TypeError: The message has a wide string.
         """
         encoder = _Encoder()
         message_class: Any = type(template)
         kind = structure(message_class)
+        check_plain(kind)
         try:
             encoder.encode(kind, template, '')
         except (struct.error, OverflowError, UnicodeEncodeError) as error:
-            raise MessageError(f'{kind.name} cannot be serialized: {error}') from error
-        self._name = kind.name
+            raise MessageError(f'{kind.short_name} cannot be serialized: {error}') from error
+        self._name = kind.short_name
         runs = _runs(encoder, fields)
         content = bytes(encoder.buffer)
         # All is packed at once: what does not change as strings of bytes, between the runs of numbers.
@@ -102,6 +104,8 @@ class _Encoder:
         """Append a value."""
         match kind:
             case Structure():
+                if not kind.fields:
+                    self.buffer += b'\0'
                 for name, field in kind.fields:
                     self.encode(field, getattr(value, name), f'{path}.{name}' if path else name)
             case Number():

@@ -4,9 +4,9 @@ Poses are `[x, y, theta]` (m, m, rad), twists `(v, omega)` (m/s, rad/s), times i
 Wheels are ordered left, right in messages, as is usual in ROS, and right, left in the mathematics. Only
 this module converts between these orders, and only it writes stamps.
 
-The `set_` functions fill an existing message. The `from_` functions check what they read. They raise
-MessageError, which reports the value and the range allowed. Those with `_values` take the numbers of a
-message instead of the message, for readers of serialized messages (`messages.wire`).
+The `set_` functions fill an existing message. The `from_` functions take the fields of a message and
+check them. They raise MessageError, which reports the value and the range allowed. Which fields these
+are is said in `messages.codecs`.
 """
 
 from __future__ import annotations
@@ -16,13 +16,11 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
-    # Fields are accessed by name only, so messages of rosbags work as well as those of rclpy.
     from builtin_interfaces.msg import Time
-    from geometry_msgs.msg import Pose, PoseWithCovariance, Twist
-    from sensor_msgs.msg import JointState
+    from geometry_msgs.msg import Pose
 
 from diffdrive_jacobian.messages.errors import MessageError as MessageError
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION as MAX_POSITION
@@ -33,9 +31,6 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 
 MAX_WAYPOINTS = 2_000
 """Largest number of poses in a `goals` message: rclpy takes about 20 us to convert each of them."""
-
-# Indices of (x, y, yaw) in the row-major 6x6 covariances of ROS.
-_PLANAR = np.array([6 * row + column for row in (0, 1, 5) for column in (0, 1, 5)])
 
 
 def quoted(texts: Iterable[str], most: int = 4) -> str:
@@ -52,17 +47,12 @@ def set_time(stamp: Time, nanoseconds: int) -> None:
     stamp.sec, stamp.nanosec = divmod(nanoseconds, NANOSECONDS)
 
 
-def from_time(stamp: Time) -> int:
+def from_time(sec: int, nanosec: int) -> int:
     """Return the time of a stamp (ns).
 
     Raises:
         MessageError: `sec` is negative, or `nanosec` is a second or more.
     """
-    return from_time_values(int(stamp.sec), int(stamp.nanosec))
-
-
-def from_time_values(sec: int, nanosec: int) -> int:
-    """Return the time of a stamp (ns), as `from_time`."""
     if sec < 0 or nanosec >= NANOSECONDS:
         raise MessageError(
             'its stamp must have sec of at least 0 and nanosec below 1000000000, '
@@ -71,20 +61,14 @@ def from_time_values(sec: int, nanosec: int) -> int:
     return sec * NANOSECONDS + nanosec
 
 
-def from_twist(message: Twist) -> tuple[float, float]:
-    """Return `(v, omega)` (m/s, rad/s); the other components are ignored.
+def from_twist(
+    x: float, y: float, z: float, roll: float, pitch: float, yaw: float
+) -> tuple[float, float]:
+    """Return `(v, omega)` (m/s, rad/s) from the linear and the angular components; others are ignored.
 
     Raises:
         MessageError: A component is NaN or infinite, or v or omega is out of range.
     """
-    linear, angular = message.linear, message.angular
-    return from_twist_values(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
-
-
-def from_twist_values(
-    x: float, y: float, z: float, roll: float, pitch: float, yaw: float
-) -> tuple[float, float]:
-    """Return `(v, omega)` from the linear and the angular components, as `from_twist`."""
     # A sum that is finite has finite terms.
     if not math.isfinite(x + y + z + roll + pitch + yaw):
         linear, angular = (x, y, z), (roll, pitch, yaw)
@@ -109,26 +93,15 @@ def plausible_twist(v: float, omega: float) -> tuple[float, float]:
     return v, omega
 
 
-def from_pose(message: Pose) -> NDArray[np.float64]:
-    """Return `[x, y, theta]`, shape (3,); z, roll and pitch are ignored.
+def from_pose(
+    x: float, y: float, qx: float, qy: float, qz: float, qw: float
+) -> tuple[float, float, float]:
+    """Return `(x, y, theta)` (m, m, rad) from x, y and the quaternion x, y, z, w.
 
     Raises:
         MessageError: The position is not finite or out of range, or the quaternion is not of unit
             length.
     """
-    return np.array(from_pose_values(*pose_values(message)))
-
-
-def pose_values(message: Pose) -> tuple[float, float, float, float, float, float]:
-    """Return the fields of a pose that `from_pose` reads: x, y and the quaternion x, y, z, w."""
-    position, q = message.position, message.orientation
-    return position.x, position.y, q.x, q.y, q.z, q.w
-
-
-def from_pose_values(
-    x: float, y: float, qx: float, qy: float, qz: float, qw: float
-) -> tuple[float, float, float]:
-    """Return `(x, y, theta)` from x, y and the quaternion x, y, z, w, as `from_pose`."""
     if not (abs(x) <= MAX_POSITION and abs(y) <= MAX_POSITION):
         raise MessageError(
             f'position must be finite and within {MAX_POSITION:g} m, got x {x:g}, y {y:g}'
@@ -150,52 +123,44 @@ def set_pose(message: Pose, pose: NDArray[np.float64]) -> None:
     message.orientation.z, message.orientation.w = math.sin(theta / 2.0), math.cos(theta / 2.0)
 
 
-def from_pose_with_covariance(
-    message: PoseWithCovariance,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return `[x, y, theta]` and its covariance, shapes (3,) and (3, 3).
+def from_covariance(covariance: ArrayLike) -> NDArray[np.float64]:
+    """Return a covariance of x, y and yaw, shape (3, 3), from its nine entries, row by row.
 
     Raises:
-        MessageError: As `from_pose`, or the covariance is not finite, symmetric and positive
-            semidefinite.
+        MessageError: It is not finite, symmetric and positive semidefinite.
     """
-    pose = from_pose(message.pose)
-    covariance = np.asarray(message.covariance)[_PLANAR].reshape(3, 3)
-    scale = np.abs(covariance).max()
-    valid = scale <= MAX_POSITION**2 and np.abs(covariance - covariance.T).max() <= 1e-9 * scale
+    matrix = np.reshape(covariance, (3, 3))
+    scale = np.abs(matrix).max()
+    valid = scale <= MAX_POSITION**2 and np.abs(matrix - matrix.T).max() <= 1e-9 * scale
     if valid:
-        symmetric = (covariance + covariance.T) / 2.0
+        symmetric = (matrix + matrix.T) / 2.0
         values, vectors = np.linalg.eigh(symmetric)
         valid = values[0] >= -1e-9 * scale
     if not valid:
         raise MessageError(
             f'covariance of x, y, yaw must be finite, at most {MAX_POSITION**2:g}, symmetric and '
             'positive semidefinite, '
-            f'got {covariance.tolist()}'
+            f'got {matrix.tolist()}'
         )
     if values[0] < 0.0:
         # Rounding of the sender: as the motion grows, so would a negative variance.
         symmetric = vectors * np.maximum(values, 0.0) @ vectors.T
-    return pose, (symmetric + symmetric.T) / 2.0
+    return np.asarray((symmetric + symmetric.T) / 2.0)
 
 
-def from_joint_state(message: JointState, names: tuple[str, str]) -> tuple[float, float]:
+def from_joints(
+    joints: Sequence[str], velocities: Sequence[float], names: tuple[str, str]
+) -> tuple[float, float]:
     """Return `(omega_R, omega_L)` (rad/s).
 
     Args:
-        message: The message to read.
+        joints: Names of the joints of a message.
+        velocities: Their velocities (rad/s).
         names: Names of the left and the right wheel joint.
 
     Raises:
         MessageError: A joint is missing, has no velocity, or its velocity is not finite or out of range.
     """
-    return from_joint_values(message.name, message.velocity, names)
-
-
-def from_joint_values(
-    joints: Sequence[str], velocities: Sequence[float], names: tuple[str, str]
-) -> tuple[float, float]:
-    """Return `(omega_R, omega_L)` from the fields of a JointState, as `from_joint_state`."""
     if len(velocities) != len(joints):
         raise MessageError(
             f'joint command must have a velocity for each name, got {len(joints)} names '

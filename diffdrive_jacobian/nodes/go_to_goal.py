@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import Any
 
 from action_msgs.msg import GoalInfo, GoalStatus
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Goals, Odometry
 from std_srvs.srv import Trigger
@@ -16,7 +17,14 @@ from diffdrive_jacobian.control import Arrival, Controller
 from diffdrive_jacobian.control.sampling import LARGEST_TURN, without_whole_turns
 from diffdrive_jacobian.kinematics.saturation import scaled_to_limits
 from diffdrive_jacobian.messages import conversion as messages
-from diffdrive_jacobian.messages import wire
+from diffdrive_jacobian.messages.codecs import (
+    GOALS,
+    ODOMETRY_POSE,
+    POSE,
+    TWIST,
+    TWIST_STAMPED,
+    Command,
+)
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
 from diffdrive_jacobian.nodes.goal import Goal, GoalIdentifiers, read_goal
 from diffdrive_jacobian.nodes.other_drivers import OtherDrivers
@@ -32,6 +40,7 @@ __all__ = ['GoToGoal']
 
 RATE_PERIODS = 10
 """Number of periods of the odometry from which its rate is measured."""
+_read_goals = serialization.reader(Goals, GOALS.fields)
 SLOW_TURN = 60.0
 """Time for half a turn above which a limit of the yaw rate is reported (s)."""
 
@@ -73,14 +82,13 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         stamped = self.parameters.enable_stamped_cmd_vel
         self._cmd_vel = self.advertise(TwistStamped if stamped else Twist, 'cmd_vel')
         self._status = self.advertise(GoalStatus, 'goal_status', latched=True)
-        self.subscribe(Odometry, 'odom', self._on_odometry, fields=wire.ODOMETRY)
-        self.subscribe(PoseStamped, 'goal_pose', self._on_goal_pose)
-        # As bytes, because creating Python objects from a long message blocks the node for seconds.
-        self.subscribe(Goals, 'goals', self._on_goals, raw=True)
+        self.subscribe(Odometry, 'odom', self._on_odometry, codec=ODOMETRY_POSE)
+        self.subscribe(PoseStamped, 'goal_pose', self._on_goal_pose, codec=POSE)
+        # As bytes, because reading a long message blocks the node for seconds.
+        self.subscribe(Goals, 'goals', self._on_goals)
         self.provide(Trigger, 'cancel_goal', self._on_cancel)
         # Without a frame: the twist is in the body frame, whose name this node does not know.
-        self._stamped_twist = wire.twist_stamped_writer(TwistStamped()) if stamped else None
-        self._twist = wire.twist_writer(Twist())
+        self._serialized = TWIST_STAMPED.writer(TwistStamped()) if stamped else TWIST.writer(Twist())
         self._watchdog = Watchdog(self, self._on_stale_odometry)
         self._others = OtherDrivers(self, self._cmd_vel, self._on_other_driver)
         self._configure()
@@ -101,11 +109,11 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
 
     # --- Goals
 
-    def _on_goal_pose(self, message: PoseStamped) -> None:
-        info = self._identifiers.info(message.header.stamp, self.now())
-        self._warn_of_integers('goal_pose', [message])
+    def _on_goal_pose(self, sec: int, nanosec: int, frame: str, *pose: float) -> None:
+        info = self._identifiers.info(Time(sec=sec, nanosec=nanosec), self.now())
+        self._warn_of_integers('goal_pose', [pose])
         try:
-            goal = Goal(info, *read_goal(message.header.frame_id, [message]))
+            goal = Goal(info, *read_goal(frame, [frame], [pose]))
             self._match_frames(goal)
         except MessageError as error:
             self._refuse(info, error)
@@ -122,18 +130,19 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         try:
             if count > MAX_WAYPOINTS:
                 raise MessageError(f'goals must contain at most {MAX_WAYPOINTS} poses, got {count}')
-            message = serialization.deserialized(data, Goals)
-            self._warn_of_integers('goals', message.goals)
-            goal = Goal(info, *read_goal(message.header.frame_id, message.goals))
+            _, _, frame, frames, *columns = _read_goals(data)
+            poses = [*zip(*columns, strict=True)]
+            self._warn_of_integers('goals', poses)
+            goal = Goal(info, *read_goal(frame, frames, poses))
             self._match_frames(goal)
         except MessageError as error:
             self._refuse(info, error)
             return
         self._accept(goal)
 
-    def _warn_of_integers(self, topic: str, goals: Sequence[PoseStamped]) -> None:
-        for goal in goals:
-            self.warn_of_integers(f'a pose on {topic}', *messages.pose_values(goal.pose))
+    def _warn_of_integers(self, topic: str, poses: Iterable[Sequence[float]]) -> None:
+        for pose in poses:
+            self.warn_of_integers(f'a pose on {topic}', *pose)
 
     def _refuse(self, info: GoalInfo, error: MessageError) -> None:
         """Publish that a goal is aborted. The active goal is kept."""
@@ -199,7 +208,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
     def _on_odometry(self, frame: str, *values: float) -> None:
         goal, now = self._goal, self.now()
         try:
-            pose = messages.from_pose_values(*values)
+            pose = messages.from_pose(*values)
             underway = self._driving or (goal is not None and goal.executing)
             if underway and frame != self._odom_frame:
                 raise MessageError(
@@ -299,10 +308,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
 
     def _publish_command(self, v: float, omega: float) -> None:
         self._driving = (v, omega) != (0.0, 0.0)
-        if self._stamped_twist is None:
-            command = self._twist(v, omega)
-        else:
-            command = self._stamped_twist((v, omega), self.now())
+        command = self._serialized(Command((v, omega), self.now()))
         self._others.sent(command)
         self._cmd_vel.publish(command)
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from action_msgs.msg import GoalInfo
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseStamped
 from unique_identifier_msgs.msg import UUID
 
 from diffdrive_jacobian.control import Waypoints
@@ -50,18 +49,25 @@ class GoalIdentifiers:
         return GoalInfo(goal_id=UUID(uuid=list(identifier.bytes)), stamp=stamp)
 
 
-def read_goal(frame: str, poses: Sequence[PoseStamped]) -> tuple[str, Waypoints]:
+def read_goal(
+    frame: str, frames: Sequence[str], poses: Sequence[Sequence[float]]
+) -> tuple[str, Waypoints]:
     """Return the frame and the poses of a goal.
+
+    Args:
+        frame: Frame of the message.
+        frames: Frames of its poses; '': that of the message.
+        poses: The fields of each pose, as `from_pose` takes them.
 
     Raises:
         MessageError: There is no pose, a pose is invalid, or the poses are in several frames.
     """
     if not poses:
         raise MessageError('goals must contain at least one pose, got none (to stop, call cancel_goal)')
-    frames = {pose.header.frame_id or frame for pose in poses}
-    if len(frames) > 1:
+    distinct = {one or frame for one in frames}
+    if len(distinct) > 1:
         raise MessageError(
-            f'all poses must be given in one frame, got {messages.quoted(sorted(frames))}'
+            f'all poses must be given in one frame, got {messages.quoted(sorted(distinct))}'
         )
-    read = np.array([messages.from_pose(pose.pose) for pose in poses])
-    return frames.pop(), Waypoints(read)
+    read = np.array([messages.from_pose(*pose) for pose in poses])
+    return distinct.pop(), Waypoints(read)

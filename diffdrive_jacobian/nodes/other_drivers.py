@@ -8,12 +8,11 @@ from collections.abc import Callable
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 
-from diffdrive_jacobian.messages import wire
-from diffdrive_jacobian.messages.cdr import DecodingError
-from diffdrive_jacobian.messages.conversion import MessageError, from_twist_values
+from diffdrive_jacobian.messages.codecs import TWIST, TWIST_STAMPED
+from diffdrive_jacobian.messages.errors import MessageError
 from diffdrive_jacobian.ros.graph_faults import publishers_of
-from diffdrive_jacobian.ros.serialization import reader
 from diffdrive_jacobian.ros.shared_graph import MAX_AGE, SharedGraph
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -48,9 +47,8 @@ class OtherDrivers:
         # Serialized, as they arrive again.
         self._sent: deque[bytes] = deque(maxlen=REMEMBERED)
         kind = publisher.msg_type
-        stamped = len(wire.TWIST_STAMPED) - len(wire.TWIST)
-        self._skipped = stamped if kind.__name__ == 'TwistStamped' else 0
-        self._read = reader(kind, wire.TWIST_STAMPED if self._skipped else wire.TWIST)
+        codec = TWIST_STAMPED if kind.__name__ == 'TwistStamped' else TWIST
+        self._read = codec.reader(kind, deserialize_message)
         self._searched = 0
 
     @property
@@ -98,8 +96,8 @@ class OtherDrivers:
         if not self._active or data in self._sent:
             return
         try:
-            v, omega = from_twist_values(*self._read(data)[self._skipped :])
-        except (DecodingError, MessageError):
+            v, omega = self._read(data).twist
+        except MessageError:
             # The robot drops it as well.
             return
         # A joystick that nobody touches may send zeros.

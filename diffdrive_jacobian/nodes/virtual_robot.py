@@ -6,8 +6,9 @@ The unicycle model is integrated exactly. The motion depends on the commands and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import (
@@ -27,7 +28,17 @@ from std_srvs.srv import Trigger
 from diffdrive_jacobian.diagnosis.lasting import Interleaving
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.messages import conversion as messages
-from diffdrive_jacobian.messages import wire
+from diffdrive_jacobian.messages.codecs import (
+    JOINT_STATE,
+    ODOMETRY,
+    POSE_WITH_COVARIANCE,
+    TWIST,
+    TWIST_STAMPED,
+    Command,
+    Motion,
+    Place,
+    Wheels,
+)
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.command_time import command_time
 from diffdrive_jacobian.nodes.condition import Condition
@@ -46,9 +57,6 @@ from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import nanoseconds, seconds
 
 __all__ = ['VirtualRobot']
-
-Command: TypeAlias = tuple[tuple[float, float], int]
-"""Twist `(v, omega)` (m/s, rad/s) and stamp (ns; 0: none)."""
 
 
 class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
@@ -83,18 +91,20 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         if self.parameters.command_interface == 'wheels':
             source = 'joint_command'
             wheels = self.subscribe(
-                JointState, source, self._on_joint_command, fields=wire.JOINT_STATE, numbers=numbers
+                JointState, source, self._on_joint_command, codec=JOINT_STATE, numbers=numbers
             )
             self.watch(unpublished(self, wheels, source))
-        elif self.parameters.enable_stamped_cmd_vel:
-            fields = wire.TWIST_STAMPED
-            self.subscribe(TwistStamped, source, self._on_twist_stamped, fields=fields, numbers=numbers)
         else:
-            self.subscribe(Twist, source, self._on_twist, fields=wire.TWIST, numbers=numbers)
+            stamped = self.parameters.enable_stamped_cmd_vel
+            kind, codec = (TwistStamped, TWIST_STAMPED) if stamped else (Twist, TWIST)
+            apply = partial(self._apply, codec.value)
+            self.subscribe(kind, source, apply, codec=codec, numbers=numbers)
         self.watch(alternating_commands(self, source, numbers), ALTERNATION_PATIENCE)
         self.watch(several_publishers(self, 'odom'))
         self.watch(goals_without_controller(self, 'goal_pose', 'goals'))
-        self.subscribe(PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose)
+        self.subscribe(
+            PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, codec=POSE_WITH_COVARIANCE
+        )
         self.provide(Trigger, 'reset_odometry', self._on_reset)
         self._timer = self.create_timer(1.0 / self.parameters.publish_rate, self._on_tick)
         self._jumps = self._watch_jumps()
@@ -150,7 +160,9 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     def _publish_start(self, robot: Robot) -> None:
         """Publish the pose and the time at which the odometry starts."""
-        self._start_pose.publish(self._serialized_start(robot))
+        frame = self.parameters.odom_frame_id
+        place = Place(robot.stamp, frame, robot.pose_tuple, robot.covariance_tuple)
+        self._start_pose.publish(self._serialized_start(place))
 
     def _on_tick(self) -> None:
         advanced = self._advance()
@@ -159,10 +171,21 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         now, robot = advanced
         truth = robot.at(now)
         state = self.condition.reported(truth)
-        self._odom.publish(self._serialized_odometry(state, self._period))
-        self._joint_states.publish(self._serialized_joints(now, state.wheel_speeds, state.wheel_angles))
+        motion = Motion(
+            state.stamp,
+            self.parameters.odom_frame_id,
+            state.pose_tuple,
+            state.twist,
+            state.covariance_tuple,
+            state.twist_covariance_tuple(self._period),
+        )
+        self._odom.publish(self._serialized_odometry(motion))
+        wheels = Wheels.of(now, self.parameters.wheel_names, state.wheel_speeds, state.wheel_angles)
+        self._joint_states.publish(self._serialized_joints(wheels))
         if self._ground_truth is not None:
-            self._ground_truth.publish(self._serialized_truth(truth))
+            frame = self.parameters.ground_truth_frame_id
+            true = Motion(truth.stamp, frame, truth.true_pose_tuple, truth.true_twist)
+            self._ground_truth.publish(self._serialized_truth(true))
         if self._transforms is not None:
             messages.set_time(self._odometry.header.stamp, now)
             messages.set_pose(self._odometry.pose.pose, state.pose)
@@ -170,33 +193,18 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     # --- Commands
 
-    def _on_twist(self, *fields: float) -> None:
-        self._apply(self._read_twist, fields)
-
-    def _on_twist_stamped(self, *fields: Any) -> None:
-        self._apply(self._read_twist_stamped, fields)
-
     def _on_joint_command(self, *fields: Any) -> None:
-        self._apply(self._read_joint_command, fields)
+        self._apply(self._read_joint_command, *fields)
 
-    @staticmethod
-    def _read_twist(*twist: float) -> Command:
-        return messages.from_twist_values(*twist), 0
-
-    @staticmethod
-    def _read_twist_stamped(sec: int, nanosec: int, *twist: float) -> Command:
-        return messages.from_twist_values(*twist), messages.from_time_values(sec, nanosec)
-
-    def _read_joint_command(
-        self, sec: int, nanosec: int, joints: Sequence[str], velocities: Sequence[float]
-    ) -> Command:
-        speeds = messages.from_joint_values(joints, velocities, self.parameters.wheel_names)
+    def _read_joint_command(self, *fields: Any) -> Command:
+        wheels = JOINT_STATE.value(*fields)
+        speeds = wheels.speeds(self.parameters.wheel_names)
         # Not later: the twist of such speeds is zero.
         self.warn_of_integers('a command on joint_command', *speeds)
         v, omega = self._model.twist(*speeds)
-        return messages.plausible_twist(v, omega), messages.from_time_values(sec, nanosec)
+        return Command(messages.plausible_twist(v, omega), wheels.stamp)
 
-    def _apply(self, read: Callable[..., Command], fields: tuple[Any, ...]) -> None:
+    def _apply(self, read: Callable[..., Command], *fields: Any) -> None:
         """Apply a command, or log why it is dropped.
 
         Args:
@@ -223,20 +231,22 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     def _publish_applied(self, robot: Robot) -> None:
         """Publish the command that the robot follows, with the time from which it does."""
-        self._applied.publish(self._serialized_command(robot.twist, robot.stamp))
+        self._applied.publish(self._serialized_command(Command(robot.twist, robot.stamp)))
 
     # --- Pose
 
-    def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
+    def _on_initial_pose(self, sec: int, nanosec: int, frame: str, *values: Any) -> None:
         advanced = self._advance()
-        frame, ours = message.header.frame_id, self.parameters.odom_frame_id
-        self.warn_of_integers('initialpose', *messages.pose_values(message.pose.pose))
+        ours = self.parameters.odom_frame_id
+        self.warn_of_integers('initialpose', *values[:6])
         try:
             if advanced is None:
                 raise MessageError(NO_CLOCK)
             if frame not in ('', ours):
                 raise MessageError(f"its frame must be '{printable(ours)}', got '{printable(frame)}'")
-            pose, covariance = messages.from_pose_with_covariance(message.pose)
+            # Its stamp does not matter: the robot is placed when the message is received.
+            place = POSE_WITH_COVARIANCE.value(0, 0, frame, *values)
+            pose, covariance = np.array(place.pose), messages.from_covariance(place.covariance)
         except MessageError as error:
             self.get_logger().warning(f'initialpose dropped: {error}', throttle_duration_sec=THROTTLE)
             return
@@ -320,11 +330,12 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         start, command = PoseWithCovarianceStamped(), TwistStamped()
         self._odometry.header.frame_id = start.header.frame_id = parameters.odom_frame_id
         command.header.frame_id = parameters.base_frame_id
-        self._serialized_odometry = wire.odometry_writer(self._odometry)
-        self._serialized_truth = wire.ground_truth_writer(truth)
-        self._serialized_start = wire.start_pose_writer(start)
-        self._serialized_command = wire.twist_stamped_writer(command)
-        self._serialized_joints = wire.joint_state_writer(JointState(name=list(parameters.wheel_names)))
+        joints = JointState(name=[*parameters.wheel_names], position=[0.0, 0.0], velocity=[0.0, 0.0])
+        self._serialized_odometry = ODOMETRY.writer(self._odometry)
+        self._serialized_truth = ODOMETRY.writer(truth)
+        self._serialized_start = POSE_WITH_COVARIANCE.writer(start)
+        self._serialized_command = TWIST_STAMPED.writer(command)
+        self._serialized_joints = JOINT_STATE.writer(joints)
 
     def _transform_broadcaster(self) -> Any | None:
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from geometry_msgs.msg import Twist, TwistStamped
@@ -10,8 +11,14 @@ from std_msgs.msg import Float64MultiArray
 
 from diffdrive_jacobian.diagnosis.lasting import Interleaving
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
-from diffdrive_jacobian.messages import conversion as messages
-from diffdrive_jacobian.messages import wire
+from diffdrive_jacobian.messages.codecs import (
+    JOINT_STATE,
+    TWIST,
+    TWIST_STAMPED,
+    WHEEL_ARRAY,
+    WheelArray,
+    Wheels,
+)
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.command_time import command_time
 from diffdrive_jacobian.parameters.wheel_bridge import WheelBridgeParameters
@@ -40,13 +47,9 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         )
         self._configure()
         self._commands = numbers = Interleaving()
-        if parameters.enable_stamped_cmd_vel:
-            fields = wire.TWIST_STAMPED
-            self.subscribe(
-                TwistStamped, 'cmd_vel', self._on_twist_stamped, fields=fields, numbers=numbers
-            )
-        else:
-            self.subscribe(Twist, 'cmd_vel', self._on_twist, fields=wire.TWIST, numbers=numbers)
+        stamped = parameters.enable_stamped_cmd_vel
+        kind, self._codec = (TwistStamped, TWIST_STAMPED) if stamped else (Twist, TWIST)
+        self.subscribe(kind, 'cmd_vel', self._on_command, codec=self._codec, numbers=numbers)
         self.watch(unread(self._joint_command, 'joint_command'))
         self.watch(alternating_commands(self, 'cmd_vel', numbers), ALTERNATION_PATIENCE)
         self._last = 0
@@ -55,21 +58,14 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         self._watchdog.start(self._timeout)
         self.announce(subscribed=['cmd_vel'], publishing=['joint_command'])
 
-    def _on_twist(self, *twist: float) -> None:
-        self._apply(twist, 0, 0)
-
-    def _on_twist_stamped(self, sec: int, nanosec: int, *twist: float) -> None:
-        self._apply(twist, sec, nanosec)
-
-    def _apply(self, twist: tuple[float, ...], sec: int, nanosec: int) -> None:
+    def _on_command(self, *fields: Any) -> None:
         now = self.now()
         # The time of the last command is meaningless after time went back.
         last = self._last if self._last <= now else 0
         try:
             if now == 0:
                 raise MessageError(NO_CLOCK)
-            v, omega = messages.from_twist_values(*twist)
-            stamp = messages.from_time_values(sec, nanosec)
+            (v, omega), stamp = self._codec.value(*fields)
             self._last = command_time(stamp, now, last, self._timeout)
         except MessageError as error:
             self.get_logger().warning(f'command dropped: {error}', throttle_duration_sec=THROTTLE)
@@ -92,7 +88,7 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
 
     def _publish(self, speeds: tuple[Any, Any], stamp: int) -> None:
         self._moving = speeds != (0.0, 0.0)
-        self._joint_command.publish(self._serialized(stamp, speeds))
+        self._joint_command.publish(self._serialized(speeds, stamp))
 
     def _on_silence(self) -> None:
         if self._moving:
@@ -120,9 +116,11 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         """Compute from the parameters what every command needs."""
         parameters = self.parameters
         self._timeout = nanoseconds(parameters.cmd_vel_timeout)
-        self._serialized: wire.WheelWriter
+        self._serialized: Callable[[tuple[float, float], int], bytes]
+        speeds, names = [0.0, 0.0], parameters.wheel_names
         if self._joint_command.msg_type is JointState:
-            names = list(parameters.wheel_names)
-            self._serialized = wire.joint_command_writer(JointState(name=names))
+            joints = JOINT_STATE.writer(JointState(name=[*names], velocity=speeds))
+            self._serialized = lambda speeds, stamp: joints(Wheels.of(stamp, names, speeds))
         else:
-            self._serialized = wire.wheel_array_writer(Float64MultiArray())
+            array = WHEEL_ARRAY.writer(Float64MultiArray(data=speeds))
+            self._serialized = lambda speeds, _: array(WheelArray.of(speeds))

@@ -233,7 +233,10 @@ def _packed(result: Any, core: Shape, batch: tuple[int, ...]) -> Any:
     if not batch:
         packed = np.array(result, dtype=np.float64)
     elif isinstance(result, np.ndarray) and result.ndim == len(batch) + len(core):
-        packed = entries_last(result, len(core))
+        shape = (*result.shape[: len(core)], *batch)
+        # It may depend on some of the arguments only.
+        whole = result if result.shape == shape else np.broadcast_to(result, shape).copy()
+        packed = entries_last(whole, len(core))
     elif core:
         rows = result if len(core) == 2 else [result]
         packed = np.empty((*batch, len(rows), len(rows[0])))

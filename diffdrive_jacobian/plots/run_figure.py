@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.plots.fault_marks import ViolationMark, mark_faults
 from diffdrive_jacobian.plots.ground_truth import draw_ground_truth, ground_truth_mark
 from diffdrive_jacobian.plots.output_files import FORMATS, create
@@ -52,7 +53,7 @@ STYLES: tuple[Any, ...] = ('-', (0, (5, 1.5)), '-.', (0, (1.2, 1)), (0, (7, 1.5,
 LIMIT = (0, (6, 3))
 HEADING = (0, (1, 1.2))
 GREY, COMMAND = '#777777', '#d2d2d2'
-LABELS = {
+_FIXED = {
     'distance': 'distance to goal [m]',
     'bearing_error': 'bearing error [rad]',
     'v': r'speed $v$ [m/s]',
@@ -60,6 +61,11 @@ LABELS = {
     'right': r'right wheel $\omega_R$ [rad/s]',
     'left': r'left wheel $\omega_L$ [rad/s]',
 }
+LABELS = {
+    **_FIXED,
+    **{name: f'{name} [{unit}]' for topic in SENSORS for name, unit in topic.readings.items()},
+}
+"""Quantities over time, and the labels of their axes."""
 _ARROW: Any = {
     'units': 'inches',
     'scale_units': 'inches',
@@ -135,9 +141,15 @@ def figure(runs: Sequence[Run], violations: Sequence[ViolationMark] = ()) -> Fig
         *(('distance', 'bearing_error') if any(len(run.goals) for run in runs) else ()),
         *('v', 'omega'),
         *(('right', 'left') if any(len(run.wheels) + len(run.wheel_commands) for run in runs) else ()),
+        *(
+            column
+            for topic in SENSORS
+            if any(len(getattr(run, topic.series)) for run in runs)
+            for column in topic.columns
+        ),
     ]
     columns = 1 if len(quantities) == 2 else 2
-    rows = len(quantities) // columns
+    rows = -(-len(quantities) // columns)
     labels = names([run.path for run in runs])
     with styled():
         drawing = Figure(figsize=SIZE, layout='constrained')

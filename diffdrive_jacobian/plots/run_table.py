@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.plots.output_files import create
 from diffdrive_jacobian.reading.run import Run, Series
 from diffdrive_jacobian.reading.trace import Trace, seconds, trace
@@ -17,10 +18,14 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 
 __all__ = ['COLUMNS', 'table', 'write_csv']
 
-COLUMNS = (
+_FIXED = (
     *('time_s', 'x_m', 'y_m', 'theta_rad', 'v_mps', 'omega_radps'),
     *('distance_m', 'bearing_error_rad', 'v_command_mps', 'omega_command_radps'),
     *('omega_right_radps', 'omega_left_radps', 'goal_heading_error_rad'),
+)
+COLUMNS = (
+    *_FIXED,
+    *(f'{name}_{unit}' for topic in SENSORS for name, unit in topic.readings.items()),
 )
 """Columns of the table, with their units."""
 DECIMALS = 9
@@ -32,7 +37,8 @@ def table(run: Run) -> NDArray[np.float64]:
 
     Time counts from the first odometry message. The command is the latest one at that time: as applied
     (`cmd_vel_out`), or as sent (`cmd_vel`) if that was not recorded. Wheel speeds are interpolated
-    linearly between the messages of `joint_states`. Unknown values are NaN.
+    linearly between the messages of `joint_states`. Of other sensors it is the latest value. Unknown
+    values are NaN.
 
     Raises:
         BagError: There is no odometry.
@@ -48,15 +54,16 @@ def table(run: Run) -> NDArray[np.float64]:
             _latest(one, commands),
             _interpolated(one, run.wheels),
             one.goal_heading_error,
+            *(_latest(one, getattr(run, topic.series)) for topic in SENSORS),
         ]
     )
 
 
 def _latest(one: Trace, series: Series) -> NDArray[np.float64]:
-    """Return the latest value at each odometry message, NaN before the first one, shape (n, 2)."""
+    """Return the latest values at each odometry message, NaN before the first one, shape (n, k)."""
     at, known = _clocks(one, series)
     last = np.searchsorted(known, at, side='right')
-    return np.vstack([np.full((1, 2), np.nan), series.values])[last]
+    return np.vstack([np.full((1, series.values.shape[1]), np.nan), series.values])[last]
 
 
 def _interpolated(one: Trace, series: Series) -> NDArray[np.float64]:

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from functools import wraps
+from typing import TYPE_CHECKING, Any, ParamSpec
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+P = ParamSpec('P')
 DPI = 130
 """Resolution of figures (dots per inch)."""
 _STYLE: Any = {
@@ -26,3 +32,14 @@ def styled() -> Any:
     # The backend is not needed, and would not be restored.
     style: Any = {name: value for name, value in matplotlib.rcParamsDefault.items() if name != 'backend'}
     return matplotlib.rc_context({**style, **_STYLE})
+
+
+def picture(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Let a function draw its figure in this style."""
+
+    @wraps(draw)
+    def drawn(*args: P.args, **kwargs: P.kwargs) -> Figure:
+        with styled():
+            return draw(*args, **kwargs)
+
+    return drawn

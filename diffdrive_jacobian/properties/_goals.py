@@ -6,9 +6,16 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from rclpy.publisher import Publisher
-from rclpy.serialization import deserialize_message
 
-from diffdrive_jacobian.properties._messages import Pose, Twist, planar, read_pose, read_twist
+from diffdrive_jacobian.messages.codecs import GOALS, POSE
+from diffdrive_jacobian.properties._messages import (
+    FieldReader,
+    Pose,
+    Twist,
+    planar,
+    read_pose,
+    read_twist,
+)
 
 STANDING = Twist(0.01, 0.05)
 """Largest twist of a robot that counts as standing."""
@@ -24,21 +31,21 @@ class Goal(NamedTuple):
     """Stamp of its message: sec and nanosec."""
 
 
+_read_goal = FieldReader(lambda kind: GOALS.fields if kind.__name__ == 'Goals' else POSE.fields).read
+
+
 def read_goal(message_type: type, message: Any, seconds: float) -> Goal | None:
     """Return the goal in a PoseStamped, or the last one in a Goals message; None: there is none."""
-    if isinstance(message, bytes):
-        try:
-            message = deserialize_message(message, message_type)
-        except Exception:
-            # rclpy raises several types for bytes that are not a message.
-            return None
-    if hasattr(message, 'goals') and not message.goals:
+    fields = _read_goal(message_type, message)
+    if fields is None:
         return None
-    pose = message.goals[-1].pose if hasattr(message, 'goals') else message.pose
-    position, orientation = pose.position, pose.orientation
-    stamp = int(message.header.stamp.sec), int(message.header.stamp.nanosec)
-    quaternion = orientation.x, orientation.y, orientation.z, orientation.w
-    return Goal(planar(position.x, position.y, *quaternion), seconds, stamp)
+    sec, nanosec, _, *pose = fields
+    if message_type.__name__ == 'Goals':
+        frames, *columns = pose
+        if not frames:
+            return None
+        pose = [column[-1] for column in columns]
+    return Goal(planar(*pose), seconds, (int(sec), int(nanosec)))
 
 
 class Motion:

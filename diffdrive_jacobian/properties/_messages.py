@@ -5,24 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import suppress
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 from rclpy.serialization import deserialize_message
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader
-
-_TWISTS = {
-    'Twist': '',
-    'TwistStamped': 'twist.',
-    'Odometry': 'twist.twist.',
-    'TwistWithCovarianceStamped': 'twist.twist.',
-}
-"""Where the twist is, by the names of the types of messages."""
-_POSE = ('position.x', 'position.y', *(f'orientation.{name}' for name in 'xyzw'))
-_POSES = {'PoseStamped': 'pose.', 'Odometry': 'pose.pose.', 'PoseWithCovarianceStamped': 'pose.pose.'}
-"""Where the pose is, by the names of the types of messages."""
+from diffdrive_jacobian.messages.codecs import POSE_IN, TWIST_IN, pose_fields, twist_fields
+from diffdrive_jacobian.messages.fields import field_value
+from diffdrive_jacobian.messages.structure import structure
 
 
 class Pose(NamedTuple):
@@ -70,7 +61,7 @@ class FieldReader:
     def __init__(self, fields_of: Callable[[type], tuple[str, ...]]) -> None:
         """Start without a type. `fields_of` returns the paths of the fields of a type of messages."""
         self._fields_of = fields_of
-        self._readers: dict[type, tuple[Callable[..., Any], Callable[..., Any]]] = {}
+        self._readers: dict[type, tuple[tuple[str, ...], Reader]] = {}
         self._last: tuple[type, bytes, tuple[Any, ...] | None] | None = None
 
     def read(self, message_type: type, message: Any) -> tuple[Any, ...] | None:
@@ -81,21 +72,19 @@ class FieldReader:
         if message_type not in self._readers:
             fields = self._fields_of(message_type)
             reader = Reader(message_type, fields, deserialize=deserialize_message)
-            self._readers[message_type] = reader, attrgetter(*fields)
-        from_bytes, from_object = self._readers[message_type]
+            self._readers[message_type] = fields, reader
+        fields, read = self._readers[message_type]
         if not isinstance(message, bytes):
-            return tuple(from_object(message))
+            return tuple(field_value(message, field) for field in fields)
         values: tuple[Any, ...] | None = None
         with suppress(DecodingError):
-            values = from_bytes(message)
+            values = read(message)
         self._last = message_type, message, values
         return values
 
 
-_read_twist = FieldReader(
-    lambda kind: tuple(_prefix(kind, _TWISTS, 'twist') + name for name in ('linear.x', 'angular.z'))
-).read
-_read_pose = FieldReader(lambda kind: tuple(_prefix(kind, _POSES, 'pose') + name for name in _POSE)).read
+_read_twist = FieldReader(lambda kind: twist_fields(_known(kind, TWIST_IN, 'twist'))).read
+_read_pose = FieldReader(lambda kind: pose_fields(_known(kind, POSE_IN, 'pose'))).read
 
 
 def read_twist(message_type: type, message: Any) -> Twist | None:
@@ -105,7 +94,7 @@ def read_twist(message_type: type, message: Any) -> Twist | None:
         LockstepError: Messages of this type have no twist.
     """
     fields = _read_twist(message_type, message)
-    return None if fields is None else Twist(float(fields[0]), float(fields[1]))
+    return None if fields is None else Twist(float(fields[0]), float(fields[-1]))
 
 
 def read_pose(message_type: type, message: Any) -> Pose | None:
@@ -124,10 +113,12 @@ def planar(x: float, y: float, qx: float, qy: float, qz: float, qw: float) -> Po
     return Pose(float(x), float(y), yaw)
 
 
-def _prefix(message_type: type, prefixes: dict[str, str], what: str) -> str:
-    if message_type.__name__ not in prefixes:
+def _known(message_type: Any, prefixes: dict[str, str], what: str) -> str:
+    """Return the name of a type that has a pose or a twist."""
+    name = structure(message_type).name.replace('/', '/msg/')
+    if name not in prefixes:
         raise LockstepError(
             f'a property reads a {what} from messages of type {", ".join(prefixes)}, got one of type '
-            f'{message_type.__name__}: it observes a wrong topic'
+            f'{name}: it observes a wrong topic'
         )
-    return prefixes[message_type.__name__]
+    return name

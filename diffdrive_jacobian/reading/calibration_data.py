@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rosbags.rosbag2 import Reader
@@ -18,17 +19,17 @@ from diffdrive_jacobian.bags.bag_reader import (
     recorded_parameters,
     stored_connections,
 )
-from diffdrive_jacobian.bags.decoding import (
-    UndecodableError,
-    decode,
+from diffdrive_jacobian.bags.known_types import (
+    known_structure,
     recorded_definition_differs,
     type_hashes,
 )
 from diffdrive_jacobian.calibration.measurements import Recording
-from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.messages.cdr import DecodingError
+from diffdrive_jacobian.messages.codecs import JOINT_STATE, Codec
+from diffdrive_jacobian.messages.errors import MessageError
 from diffdrive_jacobian.reading.calibration_choice import chosen_topic, dimensions_of, wheel_names
 from diffdrive_jacobian.reading.calibration_samples import (
-    JOINTS,
     POSES,
     JointRows,
     PoseRows,
@@ -86,7 +87,7 @@ def read_wheels_and_reference(
     path = Path(path)
     with open_bag(path) as reader:
         parameters = recorded_parameters(reader)
-        wheels_topic = chosen_topic(reader, wheels, '--wheels-topic', WHEELS, (JOINTS,))
+        wheels_topic = chosen_topic(reader, wheels, '--wheels-topic', WHEELS, (JOINT_STATE.type_name,))
         poses_topic = chosen_topic(
             reader, reference, '--reference', REFERENCE, tuple(POSES), any_name=True
         )
@@ -137,8 +138,11 @@ def _read(
     """Read the messages of some topics; return how many were skipped, by topic and reason."""
     tally: Counter[tuple[str, str]] = Counter()
     invalid: Counter[str] = Counter()
-    kinds = {JOINTS, *POSES}
-    connections = [one for one in reader.connections if one.topic in sinks and one.msgtype in kinds]
+    codecs: dict[str, Codec[Any]] = {JOINT_STATE.type_name: JOINT_STATE, **POSES}
+    connections = [one for one in reader.connections if one.topic in sinks and one.msgtype in codecs]
+    readers = {
+        kind: codecs[kind].reader(known_structure(kind)) for kind in {one.msgtype for one in connections}
+    }
     stored = stored_connections(reader)
     foreign = {
         one.id
@@ -155,8 +159,8 @@ def _read(
             tally[topic, f'were recorded with another definition of {connection.msgtype}'] += 1
             continue
         try:
-            sinks[topic].add(received, decode(data, connection.msgtype), connection.msgtype)
-        except UndecodableError:
+            sinks[topic].add(received, readers[connection.msgtype](data))
+        except DecodingError:
             tally[topic, 'cannot be decoded'] += 1
         except MessageError:
             tally[topic, 'hold invalid or implausible values'] += 1

@@ -5,27 +5,20 @@ from __future__ import annotations
 import math
 from array import array
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.bag_reader import BagError
-from diffdrive_jacobian.messages.conversion import MessageError, from_pose_values, from_time, quoted
+from diffdrive_jacobian.messages.codecs import FRAME, POSE_IN, STAMP, Codec, Wheels, pose_fields
+from diffdrive_jacobian.messages.conversion import MessageError, from_pose, from_time, quoted
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 
-JOINTS = 'sensor_msgs/msg/JointState'
-POSES: dict[str, Callable[[Any], Any]] = {
-    'nav_msgs/msg/Odometry': lambda message: message.pose.pose,
-    'geometry_msgs/msg/PoseStamped': lambda message: message.pose,
-    'geometry_msgs/msg/PoseWithCovarianceStamped': lambda message: message.pose.pose,
-}
-"""Types of a reference, and where they have the pose."""
 MOST_TILT = 0.5
 """Median tilt of the sensor beyond which its frame is not that of a floor (rad)."""
 FARTHEST = 2e7
@@ -34,6 +27,38 @@ FASTEST = 300.0
 """Wheel speed beyond which angles jump (rad/s)."""
 BACK = 0.5
 """A clock that goes back further was reset (s)."""
+
+
+class SpatialPlace(NamedTuple):
+    """A pose of a sensor in space."""
+
+    stamp: int
+    """(ns)"""
+    frame: str
+    x: float
+    """(m), as y and z."""
+    y: float
+    z: float
+    theta: float
+    """Yaw (rad)."""
+    tilt: float
+    """Angle between its z axis and that of the frame (rad)."""
+
+
+def _spatial(sec: int, nanosec: int, frame: str, x: float, y: float, *more: float) -> SpatialPlace:
+    qx, qy, qz, qw, z = more
+    if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST):
+        raise MessageError(f'position must be finite and within {FARTHEST:g} m')
+    _, _, theta = from_pose(0.0, 0.0, qx, qy, qz, qw)
+    tilt = math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (qx**2 + qy**2))))
+    return SpatialPlace(from_time(sec, nanosec), frame, x, y, z, theta, tilt)
+
+
+POSES = {
+    kind: Codec(kind, (*STAMP, FRAME, *pose_fields(kind), f'{prefix}position.z'), _spatial)
+    for kind, prefix in POSE_IN.items()
+}
+"""Types of a reference."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -65,20 +90,19 @@ class JointRows:
     layouts: dict[tuple[str, ...], _Layout] = field(default_factory=dict)
     count: int = 0
 
-    def add(self, received: int, message: Any, kind: str) -> None:
+    def add(self, received: int, wheels: Wheels) -> None:
         """Add a message.
 
         Raises:
             MessageError: It is invalid.
         """
-        names = tuple(message.name)
-        for values in (message.position, message.velocity):
+        names = wheels.joints
+        for values in (wheels.positions, wheels.velocities):
             if len(values) not in (0, len(names)):
                 raise MessageError('joint state must have as many values as names')
         layout = self.layouts.setdefault(names, _Layout())
-        stamp = from_time(message.header.stamp) or received
-        layout.order.extend((self.count, received, stamp))
-        for table, values in ((layout.positions, message.position), (layout.speeds, message.velocity)):
+        layout.order.extend((self.count, received, wheels.stamp or received))
+        for table, values in ((layout.positions, wheels.positions), (layout.speeds, wheels.velocities)):
             table.extend(values if len(values) else [math.nan] * len(names))
         self.count += 1
 
@@ -134,21 +158,11 @@ class PoseRows:
     frames: Counter[str] = field(default_factory=Counter)
     count: int = 0
 
-    def add(self, received: int, message: Any, kind: str) -> None:
-        """Add a message.
-
-        Raises:
-            MessageError: It is invalid.
-        """
-        pose = POSES[kind](message)
-        place, q = pose.position, pose.orientation
-        if not (abs(place.x) <= FARTHEST and abs(place.y) <= FARTHEST):
-            raise MessageError(f'position must be finite and within {FARTHEST:g} m')
-        _, _, theta = from_pose_values(0.0, 0.0, q.x, q.y, q.z, q.w)
-        tilt = math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (q.x**2 + q.y**2))))
-        self.times.extend((received, from_time(message.header.stamp) or received))
-        self.poses.extend((place.x, place.y, theta, place.z, tilt))
-        self.frames[str(message.header.frame_id)] += 1
+    def add(self, received: int, place: SpatialPlace) -> None:
+        """Add a message."""
+        self.times.extend((received, place.stamp or received))
+        self.poses.extend((place.x, place.y, place.theta, place.z, place.tilt))
+        self.frames[place.frame] += 1
         self.count += 1
 
     def samples(self) -> Samples:

@@ -23,24 +23,16 @@ from diffdrive_jacobian.bags.bag_reader import (
     recorded_parameters,
     stored_connections,
 )
-from diffdrive_jacobian.bags.decoding import (
-    UndecodableError,
-    decode,
+from diffdrive_jacobian.bags.known_types import (
+    known_structure,
     recorded_definition_differs,
     type_hashes,
 )
-from diffdrive_jacobian.messages.conversion import MessageError
-from diffdrive_jacobian.messages.parameter_values import changed_parameters
-from diffdrive_jacobian.reading.rows import (
-    FAULT_EVENTS,
-    OF_ALL_ROBOTS,
-    PARAMETER_EVENTS,
-    ROW_READERS,
-    SERIES_TOPICS,
-    check_goals,
-    fault_event,
-)
-from diffdrive_jacobian.reading.run import COLUMNS, COVARIANCES, Run, Series
+from diffdrive_jacobian.messages.cdr import DecodingError
+from diffdrive_jacobian.messages.codecs import Changes, FaultEvent
+from diffdrive_jacobian.messages.errors import MessageError
+from diffdrive_jacobian.messages.topics import READABLE, TOPICS, Topic
+from diffdrive_jacobian.reading.run import Run, Series
 from diffdrive_jacobian.text import printable
 
 __all__ = [
@@ -85,7 +77,7 @@ def read_run(
             namespace.
     """
     path = Path(path)
-    rows: dict[str, list[tuple[int, int, list[float]]]] = defaultdict(list)
+    rows: dict[str, list[tuple[int, int, tuple[float, ...]]]] = defaultdict(list)
     events: list[tuple[int, str, dict[str, Any]]] = []
     fault_events: list[tuple[int, str, str]] = []
     with open_bag(path) as reader:
@@ -104,42 +96,44 @@ def read_run(
             for one in connections
             if recorded_definition_differs(one.msgtype, type_hashes(one, stored))
         }
+        readers = {
+            one.id: chosen[one.id].codec(one.msgtype).reader(known_structure(one.msgtype))
+            for one in connections
+        }
         for connection, received, data in messages(reader, connections, tally.invalid):
             if interrupted():
                 raise ReadingInterruptedError
-            topic, kind = chosen[connection.id], connection.msgtype
+            topic = chosen[connection.id]
             tally.read[connection.topic] += 1
             if connection.id in foreign:
                 tally.foreign[connection.topic] += 1
                 continue
             try:
-                if topic == 'goals':
-                    check_goals(data)
-                message = decode(data, kind)
-                if topic == PARAMETER_EVENTS[0]:
-                    if namespace in (None, namespace_of(message.node)):
-                        events.append((received, message.node, changed_parameters(message)))
-                    continue
-                if topic == FAULT_EVENTS[0]:
-                    fault_events.append((received, *fault_event(message)))
-                    continue
-                read = list(ROW_READERS[topic, kind](message, names))
-            except UndecodableError:
+                value = readers[connection.id](data)
+                if isinstance(value, Changes):
+                    if namespace in (None, namespace_of(value.node)):
+                        events.append((received, value.node, value.values))
+                elif isinstance(value, FaultEvent):
+                    fault_events.append((received, value.fault, value.what))
+                else:
+                    found = [
+                        (received, stamp or received, row) for stamp, row in topic.rows(value, names)
+                    ]
+                    rows[topic.series].extend(found)
+            except DecodingError:
                 tally.undecodable[connection.topic] += 1
             except MessageError:
                 # The nodes drop it as well.
                 tally.refused[connection.topic] += 1
-            else:
-                rows[topic].extend((received, stamp or received, values) for stamp, values in read)
         notes = tally.notes(connections)
-    beside = {'odometry': COVARIANCES, 'start_pose': COVARIANCES[:6]}
     series, covariances = {}, {}
-    for name, columns in COLUMNS.items():
-        more = beside.get(name, ())
-        one = _series(_in_order(rows, SERIES_TOPICS[name]), columns + more)
-        count = len(columns)
-        covariances[name] = one.values[:, count:].copy()
-        series[name] = replace(one, values=one.values[:, :count].copy(), columns=columns)
+    for topic in TOPICS.values():
+        if topic.series in series or not topic.series:
+            continue
+        one = _series(rows[topic.series], topic.columns + topic.covariances)
+        count = len(topic.columns)
+        covariances[topic.series] = one.values[:, count:].copy()
+        series[topic.series] = replace(one, values=one.values[:, :count].copy(), columns=topic.columns)
     return Run(
         path=path,
         odometry_covariances=covariances['odometry'],
@@ -195,19 +189,17 @@ class _Tally:
         return tuple(lines)
 
 
-def _choose(reader: Reader, given: dict[str, str], namespace: str | None) -> dict[int, str]:
-    """Return which connections are which topics of a run: id of the connection to usual name.
+def _choose(reader: Reader, given: dict[str, str], namespace: str | None) -> dict[int, Topic]:
+    """Return which connections are which topics of a run, by the id of the connection.
 
     Raises:
         BagError: A given topic is missing or has another type, a name has several topics, or the
             namespace has none.
     """
-    chosen: dict[int, str] = {}
-    usual = {name for name, _ in ROW_READERS} | {*OF_ALL_ROBOTS}
-    if unknown := sorted(set(given) - usual):
-        raise BagError(f'topics must be among {", ".join(sorted(usual))}, got {unknown[0]!r}')
-    for name in sorted(usual):
-        types = {kind for topic, kind in (*ROW_READERS, PARAMETER_EVENTS, FAULT_EVENTS) if topic == name}
+    chosen: dict[int, Topic] = {}
+    if unknown := sorted(set(given) - READABLE.keys()):
+        raise BagError(f'topics must be among {", ".join(sorted(READABLE))}, got {unknown[0]!r}')
+    for name, topic in sorted(READABLE.items()):
         candidates = [
             connection
             for connection in reader.connections
@@ -215,14 +207,14 @@ def _choose(reader: Reader, given: dict[str, str], namespace: str | None) -> dic
                 connection.topic == given[name]
                 if name in given
                 else base_name(connection.topic) == name
-                and (name in OF_ALL_ROBOTS or namespace in (None, namespace_of(connection.topic)))
+                and (topic.shared or namespace in (None, namespace_of(connection.topic)))
             )
         ]
-        matching = [connection for connection in candidates if connection.msgtype in types]
+        matching = [connection for connection in candidates if connection.msgtype in topic.types]
         if name in given and not matching:
             raise BagError(
-                f'{reader.path} has no topic {given[name]} of {" or ".join(sorted(types))}; it has '
-                f'{", ".join(sorted({one.topic for one in reader.connections})) or "none"}'
+                f'{reader.path} has no topic {given[name]} of {" or ".join(sorted(topic.types))}; '
+                f'it has {", ".join(sorted({one.topic for one in reader.connections})) or "none"}'
             )
         if len({connection.topic for connection in matching}) > 1:
             raise BagError(
@@ -230,10 +222,11 @@ def _choose(reader: Reader, given: dict[str, str], namespace: str | None) -> dic
                 f'{", ".join(sorted({one.topic for one in matching}))}; choose one of them, or one '
                 'namespace (--namespace)'
             )
-        chosen.update((connection.id, name) for connection in matching)
-    if namespace is not None and not set(chosen.values()) - {*OF_ALL_ROBOTS}:
+        chosen.update((connection.id, topic) for connection in matching)
+    if namespace is not None and all(topic.shared for topic in chosen.values()):
+        of_robots = {name for name, topic in READABLE.items() if not topic.shared}
         topics = (one.topic for one in reader.connections)
-        there = {namespace_of(one) for one in topics if base_name(one) in usual - {*OF_ALL_ROBOTS}}
+        there = {namespace_of(one) for one in topics if base_name(one) in of_robots}
         raise BagError(
             f'{reader.path} has no topics of a run in the namespace {namespace}; it has them in '
             f'{", ".join(sorted(there)) or "none"}'
@@ -249,12 +242,7 @@ def _wheel_names(parameters: dict[str, dict[str, Any]]) -> tuple[str, str]:
     return WHEELS
 
 
-def _in_order(rows: dict[str, list[Any]], topics: tuple[str, ...]) -> list[Any]:
-    """Return the rows of several topics in the order of their recording."""
-    return sorted((row for topic in topics for row in rows[topic]), key=lambda row: row[0])
-
-
-def _series(rows: list[tuple[int, int, list[float]]], columns: tuple[str, ...]) -> Series:
+def _series(rows: list[tuple[int, int, tuple[float, ...]]], columns: tuple[str, ...]) -> Series:
     return Series(
         received=np.array([row[0] for row in rows], dtype=np.int64),
         stamps=np.array([row[1] for row in rows], dtype=np.int64),

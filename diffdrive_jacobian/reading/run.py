@@ -16,26 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.bag_reader import BagError
+from diffdrive_jacobian.messages.topics import TOPICS
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 MAX_NUMBER = 1e6
 """Largest magnitude of the numeric parameters of our nodes (m, m/s, rad/s)."""
-COLUMNS = {
-    'odometry': ('x', 'y', 'theta', 'v', 'omega'),
-    'ground_truth': ('x', 'y', 'theta', 'v', 'omega'),
-    'cmd_vel': ('v', 'omega'),
-    'cmd_vel_out': ('v', 'omega'),
-    'start_pose': ('x', 'y', 'theta'),
-    'wheel_commands': ('omega_R', 'omega_L'),
-    'wheels': ('omega_R', 'omega_L'),
-    'goals': ('x', 'y', 'theta'),
-    'goal_status': ('status',),
-}
+COLUMNS = {topic.series: topic.columns for topic in TOPICS.values() if topic.series}
 """Columns of the values of each series of a `Run`."""
 _CONTROLLER = {'controller', 'use_goal_heading', 'xy_goal_tolerance'}
 """Parameters by which a go_to_goal of another name is known."""
-COVARIANCES = ('xx', 'xy', 'xt', 'yy', 'yt', 'tt', 'vv', 'vw', 'ww')
-"""Columns of `Run.odometry_covariances`; the first six are those of `Run.start_covariances`."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, repr=False)

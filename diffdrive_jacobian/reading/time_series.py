@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.reading.run import Series, number
 from diffdrive_jacobian.reading.trace import Array, Indices, Mask, Trace, seconds
 
@@ -13,6 +14,8 @@ BUCKETS = 1500
 """A longer line is reduced to the minimum and the maximum of so many parts."""
 _TWIST = {'v': 0, 'omega': 1}
 _WHEEL = {'right': 0, 'left': 1}
+_READINGS = {column: topic for topic in SENSORS for column in topic.columns}
+"""Quantities of sensors, and their topics."""
 _BODY = ('virtual_robot', 'go_to_goal')
 _LIMITS = {
     'v': (_BODY, 'linear.x.max_velocity', 'linear.x.min_velocity'),
@@ -25,6 +28,11 @@ _LIMITS = {
 def measured(one: Trace, quantity: str) -> Array:
     """Return the measured values of a quantity, shape (m, 2); m may be 0."""
     run = one.run
+    if quantity in _READINGS:
+        topic = _READINGS[quantity]
+        series = getattr(run, topic.series)
+        values = series.values[:, topic.columns.index(quantity)]
+        return _continued(one, np.column_stack([seconds(run, series), values]))
     if quantity in _WHEEL:
         values = np.column_stack([seconds(run, run.wheels), run.wheels.values[:, _WHEEL[quantity]]])
         return line(values, _back_in_time(values))

@@ -13,6 +13,7 @@ from rclpy.node import Node
 
 from diffdrive_jacobian.bags.bag_writer import Summary
 from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.messages.topics import OF_EVERY_NODE
 from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording, RecordingError
 from diffdrive_jacobian.recording.selection import Selection
@@ -25,8 +26,6 @@ DISCOVERY_PERIOD = 0.2
 """Time between two searches for new topics (s)."""
 WAIT_SHOWN = 0.5
 """A wait for late messages that is longer than this is shown (s)."""
-EVERY_NODE = ('/parameter_events', '/rosout')
-"""Topics that every node publishes."""
 
 
 class Status(NamedTuple):
@@ -209,6 +208,6 @@ def _published(node: Node) -> list[str]:
     for topic in topics:
         # A DDS application without ROS can use any name.
         with suppress(ValueError, NameValidationException):
-            if topic not in EVERY_NODE and node.count_publishers(topic):
+            if topic not in OF_EVERY_NODE and node.count_publishers(topic):
                 found.append(topic)
     return found

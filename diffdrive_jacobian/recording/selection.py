@@ -4,21 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-RUN_TOPICS = (
-    'cmd_vel',
-    'cmd_vel_out',
-    'odom',
-    'ground_truth',
-    'start_pose',
-    'initialpose',
-    'goal_pose',
-    'goals',
-    'goal_status',
-    'joint_command',
-    'joint_states',
-    '/tf',
-    '/parameter_events',
-)
+from diffdrive_jacobian.messages.topics import TOPICS
+
+RUN_TOPICS = tuple(topic.name for topic in TOPICS.values() if topic.recorded)
 """The topics of a run."""
 
 

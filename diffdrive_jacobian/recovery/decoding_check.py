@@ -6,20 +6,22 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from diffdrive_jacobian.bags.decoding import UndecodableError, decode, is_known, known_definition
 from diffdrive_jacobian.bags.journal import Channel
-from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
+from diffdrive_jacobian.bags.known_types import known_definition
+from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition
+from diffdrive_jacobian.messages.cdr import DecodingError, Reader
+from diffdrive_jacobian.messages.structure import DefinitionError, defined
 from diffdrive_jacobian.text import printable
 
 Decoder = Callable[[bytes], Any]
-"""Decodes a message, or raises UndecodableError."""
+"""Decodes a message, or raises DecodingError."""
 
 
 class DecodingCheck:
     """Counts, by topic, the messages that readers cannot decode.
 
-    Types of ROS 2 Jazzy are checked without ROS. Others are checked if rclpy is there and their package
-    is installed as it was recorded.
+    Types of ROS 2 Jazzy are checked without ROS, others if their package is installed as it was
+    recorded.
     """
 
     def __init__(self) -> None:
@@ -41,7 +43,7 @@ class DecodingCheck:
             return
         try:
             decoder(data)
-        except UndecodableError:
+        except DecodingError:
             self._failed[channel.topic] += 1
 
     @property
@@ -62,25 +64,12 @@ class DecodingCheck:
 def _decoder(channel: Channel) -> Decoder | None:
     """Return a function that decodes the messages of a channel; None: its definition is not known."""
     name = channel.type_name
-    if is_known(name) and known_definition(name).type_hash == channel.type_hash:
-        return lambda data: decode(data, name)
-    try:
-        if definition(name).type_hash == channel.type_hash:
-            return _rclpy_decoder(message_class(name))
-    except (UnknownTypeError, ImportError):
-        # The type is not installed, or rclpy is not.
-        pass
-    return None
-
-
-def _rclpy_decoder(message_type: Any) -> Decoder:
-    from rclpy.serialization import deserialize_message
-
-    def decoder(data: bytes) -> Any:
+    for known in (known_definition, definition):
         try:
-            return deserialize_message(data, message_type)
-        except (RuntimeError, ValueError, AssertionError, SystemError, MemoryError) as error:
-            # MemoryError: a damaged length.
-            raise UndecodableError(f'not a message of {message_type.__name__}') from error
-
-    return decoder
+            found = known(name)
+            if found.type_hash == channel.type_hash:
+                return Reader(defined(name, found.text), ())
+        except (UnknownTypeError, DefinitionError, TypeError):
+            # The type is not installed, or has what is not read here.
+            continue
+    return None

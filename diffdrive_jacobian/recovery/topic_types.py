@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
-from diffdrive_jacobian.bags.decoding import known_definition
+from diffdrive_jacobian.bags.known_types import known_definition
 from diffdrive_jacobian.bags.message_definitions import Definition, UnknownTypeError, definition
 from diffdrive_jacobian.recovery.salvage_mcap import Topic
 

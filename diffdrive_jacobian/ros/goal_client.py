@@ -20,8 +20,8 @@ from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.control import Arrival
 from diffdrive_jacobian.messages import conversion as messages
-from diffdrive_jacobian.messages import wire
-from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.messages.codecs import GOAL_STATUS, MOTION, Motion, Status
+from diffdrive_jacobian.messages.errors import MessageError
 from diffdrive_jacobian.ros.node import THROTTLE
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
 from diffdrive_jacobian.ros.topic_errors import explaining_failure
@@ -32,8 +32,6 @@ DRIVEN_POINT_PARAMETERS = ('controller', 'offset')
 """Parameters of a controller that determine which point of the robot it drives."""
 ENDED = (GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED)
 """Status of goals that are not driven to any more."""
-ODOMETRY = (*wire.STAMP, 'twist.twist.linear.x', 'twist.twist.angular.z', *wire.ODOMETRY[1:])
-"""Fields of an Odometry: stamp, v and omega, and the pose for `from_pose_values`."""
 MESSAGES: dict[str, type] = {'goal_pose': PoseStamped, 'goals': Goals}
 """Topic of goals to its type."""
 
@@ -105,10 +103,10 @@ class GoalClient(Node):  # type: ignore[misc]
             self._publisher = self.create_publisher(MESSAGES[topic], topic, 10)
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         with explaining_failure(self, GoalStatus, 'goal_status'):
-            received = ignoring_invalid(GoalStatus, self._on_status)
+            received = ignoring_invalid(GOAL_STATUS, GoalStatus, self._on_status)
             self.create_subscription(GoalStatus, 'goal_status', received, latched, raw=True)
         with explaining_failure(self, Odometry, 'odom'):
-            moved = ignoring_invalid(Odometry, self._on_odometry, ODOMETRY)
+            moved = ignoring_invalid(MOTION, Odometry, self._on_odometry, self._on_invalid_odometry)
             self.create_subscription(Odometry, 'odom', moved, 10, raw=True)
         # rclpy reports a name that is too long only here.
         self.resolve_service_name('cancel_goal')
@@ -212,21 +210,20 @@ class GoalClient(Node):  # type: ignore[misc]
 
     # --- Messages
 
-    def _on_status(self, message: GoalStatus) -> None:
-        # The status of an older goal is latched and comes first.
-        if self._message is not None and message.goal_info.stamp == self._message.header.stamp:
-            self.status = message.status
-
-    def _on_odometry(self, *values: Any) -> None:
-        # Other processes may publish, and anything.
-        sec, nanosec, v, omega, *pose_values = values
-        try:
-            pose = np.array(messages.from_pose_values(*pose_values))
-            stamp = messages.from_time_values(sec, nanosec)
-        except MessageError as error:
-            self.get_logger().warning(f'odometry dropped: {error}', throttle_duration_sec=THROTTLE)
+    def _on_status(self, one: Status) -> None:
+        if self._message is None:
             return
-        self.robot = RobotState(pose, (v, omega) != (0.0, 0.0), stamp)
+        stamp = self._message.header.stamp
+        # The status of an older goal is latched and comes first.
+        if one.stamp == (stamp.sec, stamp.nanosec):
+            self.status = one.status
+
+    def _on_invalid_odometry(self, error: MessageError) -> None:
+        # Other processes may publish, and anything.
+        self.get_logger().warning(f'odometry dropped: {error}', throttle_duration_sec=THROTTLE)
+
+    def _on_odometry(self, motion: Motion) -> None:
+        self.robot = RobotState(np.array(motion.pose), motion.twist != (0.0, 0.0), motion.stamp)
         self.seen = self._monotonic()
         if self._send_on_odometry:
             self.send()

@@ -15,12 +15,7 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from diffdrive_jacobian.diagnosis.lasting import Interleaving
-from diffdrive_jacobian.diagnosis.remedies import (
-    ONE_PUBLISHER,
-    SAME_NAMES,
-    START_PUBLISHER,
-    START_READER,
-)
+from diffdrive_jacobian.messages.topics import SAME_NAMES, TOPICS
 from diffdrive_jacobian.ros.shared_graph import SharedGraph
 from diffdrive_jacobian.text import listed, printable
 
@@ -41,7 +36,7 @@ def unread(publisher: Publisher, name: str, own: Callable[[], int] = lambda: 0) 
         own: Returns the number of subscriptions of the node itself.
     """
     topic = publisher.topic_name
-    start = START_READER[name]
+    start = TOPICS[name].if_unread
 
     def check() -> str | None:
         if publisher.get_subscription_count() > own():
@@ -60,7 +55,7 @@ def unpublished(node: Node, subscription: Subscription, name: str) -> Check:
         name: Name of the topic as the node gives it, before it is remapped.
     """
     graph, topic = SharedGraph(node), subscription.topic_name
-    start = START_PUBLISHER[name]
+    start = TOPICS[name].if_unpublished
 
     def check() -> str | None:
         if graph.count_publishers(topic):
@@ -72,7 +67,7 @@ def unpublished(node: Node, subscription: Subscription, name: str) -> Check:
 
 def several_publishers(node: Node, name: str) -> Check:
     """Return a check whether several nodes publish a topic that must have one publisher."""
-    graph, topic, remedy = SharedGraph(node), node.resolve_topic_name(name), ONE_PUBLISHER[name]
+    graph, topic, remedy = SharedGraph(node), node.resolve_topic_name(name), TOPICS[name].if_several
 
     def check() -> str | None:
         if graph.count_publishers(topic) < 2:
@@ -115,7 +110,7 @@ def goals_without_controller(node: Node, *names: str) -> Check:
             if graph.count_publishers(topic) and not graph.count_subscriptions(topic):
                 return (
                     f'{listed(publishers_of(node, topic))} publishes {topic}, but no controller is '
-                    f'subscribed to it, so that goals are lost: {START_READER[name]} '
+                    f'subscribed to it, so that goals are lost: {TOPICS[name].if_unread} '
                     f'{SAME_NAMES.format(name)}'
                 )
         return None

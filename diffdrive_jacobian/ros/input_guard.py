@@ -49,7 +49,7 @@ def _guarded_clock(node: Node, accept: Callable[[Clock], None]) -> Callable[[Clo
 
     def on_clock(message: Clock) -> None:
         try:
-            from_time(message.clock)
+            from_time(message.clock.sec, message.clock.nanosec)
         except MessageError as error:
             log.warning(f'/clock dropped: {error}', throttle_duration_sec=THROTTLE)
             return

@@ -8,7 +8,7 @@ and report each once.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
@@ -25,6 +25,7 @@ from rclpy.subscription import Subscription
 
 from diffdrive_jacobian.diagnosis.lasting import Interleaving, LastingFault
 from diffdrive_jacobian.messages.cdr import DecodingError
+from diffdrive_jacobian.messages.codecs import Codec
 from diffdrive_jacobian.messages.integers import integer_warning
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, changed
 from diffdrive_jacobian.ros import parameters as ros_parameters
@@ -120,8 +121,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         topic: str,
         callback: Callable[..., None],
         *,
-        fields: Sequence[str] | None = None,
-        raw: bool = False,
+        codec: Codec[Any] | None = None,
         numbers: Interleaving | None = None,
     ) -> Subscription:
         """Create a subscription with reliable QoS, keep last 10.
@@ -131,12 +131,11 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         Args:
             message: Type of the messages.
             topic: Name of the topic.
-            callback: Called with each message.
-            fields: Paths of the fields that the callback receives instead, one argument each, as
-                `messages.cdr.Reader` returns them. A message object takes several times as long.
-            raw: Whether the callback receives the serialized bytes.
-            numbers: Receives the sequence number of each message before the callback is called. Not
-                with `raw`.
+            callback: Called with the fields of each message that the codec reads, one argument each. Its
+                `value` checks them.
+            codec: What is read of the messages. None: the callback receives the serialized bytes.
+            numbers: Receives the sequence number of each message before the callback is called. It
+                needs a codec.
 
         Raises:
             ParameterError: As for `advertise`.
@@ -147,11 +146,13 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
 
         self._types.add(topic, type_name(message), subscribed=True)
         profile = QoSProfile(depth=10)
+        if codec is not None:
+            callback = decoding(message, codec.fields, callback, dropped, numbers)
         with explaining_failure(self, message, topic):
             return self.create_subscription(
                 message,
                 topic,
-                callback if raw else decoding(message, fields, callback, dropped, numbers),
+                callback,
                 profile,
                 qos_overriding_options=self._qos_options('subscription', topic, profile),
                 raw=True,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import struct
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -20,7 +19,6 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, JointState, LaserScan
 
 from diffdrive_jacobian.diagnosis.description import (
-    CLOCK,
     ClockMessages,
     Endpoint,
     Graph,
@@ -28,10 +26,16 @@ from diffdrive_jacobian.diagnosis.description import (
     Quality,
     Stream,
 )
+from diffdrive_jacobian.messages.cdr import DecodingError
+from diffdrive_jacobian.messages.codecs import CLOCK as CLOCK_TIME
+from diffdrive_jacobian.messages.codecs import STAMP
+from diffdrive_jacobian.messages.topics import CLOCK
 from diffdrive_jacobian.ros.runner import ros_context, running
+from diffdrive_jacobian.ros.serialization import reader
 from diffdrive_jacobian.ros.topic_errors import type_name
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 PERIOD = 0.25
 """Time between two looks at the graph (s)."""
@@ -40,10 +44,8 @@ MAX_NODES = 200
 MAX_TOPICS = 50
 """Number of topics that are received."""
 STAMPED = (Odometry, TwistStamped, JointState, LaserScan, Imu)
-"""Types of messages that are received. They begin with the stamp."""
+"""Types of messages with a stamp that are received."""
 RECEIVED = {type_name(one): one for one in (*STAMPED, Twist, Clock)}
-_TIME = {True: struct.Struct('<xxxxiI'), False: struct.Struct('>xxxxiI')}
-"""Encapsulation and time at the beginning of a message, by whether it is little endian."""
 
 
 def observe(
@@ -104,7 +106,8 @@ class Observer(Node):  # type: ignore[misc]
                 future.add_done_callback(partial(self._on_answer, name))
 
     def _subscribe(self, topic: str, kind: str) -> None:
-        received = self._received[topic] = _Received(stamped=RECEIVED[kind] in STAMPED)
+        stamp = _stamp_reader(RECEIVED[kind], STAMP) if RECEIVED[kind] in STAMPED else None
+        received = self._received[topic] = _Received(stamp)
         # It matches every publisher.
         profile = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
         callback: Callable[[bytes], None] = partial(received.add, self._simulated)
@@ -170,10 +173,11 @@ class _ClockReceived:
         self._first = 0
         self.last = 0
         """The last time (ns); 0: none was received."""
+        self._time = _stamp_reader(Clock, CLOCK_TIME.fields)
 
     def add(self, data: bytes) -> None:
         """Receive a serialized message."""
-        now = _stamp(data)
+        now = self._time(data)
         if self._messages:
             self._went_back += now < self.last
         else:
@@ -193,8 +197,8 @@ class _ClockReceived:
 class _Received:
     """What was received on a topic."""
 
-    def __init__(self, *, stamped: bool) -> None:
-        self._stamped = stamped
+    def __init__(self, stamp: Callable[[bytes], int] | None) -> None:
+        self._stamp = stamp
         self._messages = 0
         self._first = 0.0
         self._last = 0.0
@@ -207,7 +211,7 @@ class _Received:
         self._first = self._first or now
         self._last = now
         self._messages += 1
-        stamp = _stamp(data) if self._stamped else 0
+        stamp = 0 if self._stamp is None else self._stamp(data)
         if stamp == 0:
             return
         # The youngest one: this process may be late, and others may be.
@@ -240,12 +244,18 @@ def _nearer(one: float | None, other: float) -> float:
     return other if one is None else min(one, other, key=abs)
 
 
-def _stamp(data: bytes) -> int:
-    """Return the time at the beginning of a serialized message (ns); 0: it is too short."""
-    if len(data) < 12:
-        return 0
-    seconds, nanoseconds = _TIME[bool(data[1] & 1)].unpack_from(data)
-    return int(seconds) * 10**9 + int(nanoseconds)
+def _stamp_reader(kind: type, fields: tuple[str, ...]) -> Callable[[bytes], int]:
+    """Return a function that returns a time in a serialized message (ns); 0: it is none."""
+    read = reader(kind, fields, whole=False)
+
+    def stamp(data: bytes) -> int:
+        try:
+            seconds, nanoseconds = read(data)
+        except DecodingError:
+            return 0
+        return int(seconds) * NANOSECONDS + int(nanoseconds)
+
+    return stamp
 
 
 def _endpoint(info: Any, topic: str, publishes: bool) -> Endpoint:

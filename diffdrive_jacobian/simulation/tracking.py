@@ -1,4 +1,4 @@
-"""Simulation of arms and mobile manipulators whose tip follows a straight line.
+"""Simulation of arms and mobile manipulators whose tip follows a straight line, also with its heading.
 
 Source: document D, 4.1; documents A and C on damping and redundancy; doc/mathematics.md, "Control laws".
 """
@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.control.resolved_rate import StraightLine, resolved_rate
+from diffdrive_jacobian.kinematics.inverse_kinematics import pose_difference
 from diffdrive_jacobian.kinematics.inverse_velocity import damping as damping_factor
 from diffdrive_jacobian.kinematics.inverse_velocity import manipulability
 from diffdrive_jacobian.numerics.checks import array, leading, not_negative, number, positive
@@ -31,8 +33,8 @@ class Manipulator(Protocol):
     def forward_kinematics(self, q: ArrayLike) -> Array:
         """Return the tip's `[x, y, heading]`, shape (..., 3), of configurations, shape (..., n)."""
 
-    def jacobian(self, q: ArrayLike) -> Array:
-        """Return the Jacobian of the tip's position, shape (..., 2, inputs)."""
+    def jacobian(self, q: ArrayLike, heading: bool = False) -> Array:
+        """Return the Jacobian of the tip's position, shape (..., 2, inputs), or (..., 3, inputs)."""
 
     def integrate(self, q: ArrayLike, q_dot: ArrayLike, dt: ArrayLike) -> Array:
         """Return the configuration after a time at constant input, shape (..., n)."""
@@ -45,7 +47,8 @@ class Tracking(NamedTuple):
         times: Shape (k + 1,) (s).
         q: Configurations, shape (k + 1, ..., n).
         q_dot: Inputs from each sample to the next, shape (k, ..., inputs) (rad/s).
-        error: Distance of the tip from its desired position, shape (k + 1, ...) (m).
+        error: Distance of the tip from its desired position, shape (k + 1, ...) (m). For lines with a
+            heading the norm of `[x, y, heading]`, in which 1 rad counts as 1 m.
     """
 
     times: Array
@@ -76,7 +79,9 @@ def track_line(
     Args:
         robot: The arm or the mobile manipulator.
         q0: Configurations at the start, shape (..., n).
-        line: Desired path of the tip, a `control.StraightLine`; leading axes as those of q0.
+        line: Desired path of the tip, a `control.StraightLine` of `[x, y]` or of `[x, y, heading]`;
+            leading axes as those of q0. Headings are not wrapped: from 0 to 2 pi is a full turn. With
+            them the speed of the line is the norm of `[x_dot, y_dot, heading_dot]` (m/s, rad/s).
         rate: Control rate (Hz). Inputs are constant between samples.
         gain: K of the feedback (1/s); below the rate.
         threshold: Manipulability below which there is damping; None: no damping, and near a singularity
@@ -120,10 +125,12 @@ def track_line(
     if threshold is not None:
         threshold = number('threshold', threshold, positive)
     q = array('q0', q0, 'n')
-    if line.start.shape[-1] != 2:
-        raise ValueError(f'line must have 2 coordinates, got {line.start.shape[-1]}')
+    size = line.start.shape[-1]
+    if size not in (2, 3):
+        raise ValueError(f'line must have 2 or 3 coordinates, got {size}')
     leading(q0=q.shape[:-1], line=line.duration.shape)
-    inputs = robot.jacobian(q).shape[-1]
+    J_of = robot.jacobian if size == 2 else partial(robot.jacobian, heading=True)
+    inputs = J_of(q).shape[-1]
     if weights is not None:
         weights = array('weights', weights, inputs)
         positive('weights', weights)
@@ -131,34 +138,40 @@ def track_line(
     W_half = np.ones(inputs) if weights is None else np.sqrt(weights)
     track, velocities, errors = [q], [], []
     for step in range(steps):
-        x, x_desired = robot.forward_kinematics(q)[..., :2], line.position(step / rate)
+        x, x_desired = robot.forward_kinematics(q)[..., :size], line.position(step / rate)
         # The velocity that moves the target to its next sample, also when the line ends before it.
         x_dot_desired = (line.position((step + 1) / rate) - x_desired) * rate
-        J = robot.jacobian(q)
+        J, error = J_of(q), _error(x_desired, x)
         factor: ArrayLike = 0.0
         if threshold is not None:
             factor = damping_factor(manipulability(J / W_half[..., np.newaxis, :]), threshold, most)
         q_dot = resolved_rate(
-            *(J, x, x_desired, x_dot_desired, gain, factor),
+            # The error as if x were 0: headings are not simply subtracted.
+            *(J, np.zeros_like(error), error, x_dot_desired, gain, factor),
             None if secondary is None else _inputs(robot, secondary, q, inputs, W_half),
             max_correction=line.speed,
             weights=weights,
             max_velocity=max_velocity,
         )
         q = robot.integrate(q, q_dot, 1.0 / rate)
-        errors.append(np.linalg.norm(x_desired - x, axis=-1))
+        errors.append(np.linalg.norm(error, axis=-1))
         velocities.append(q_dot)
         track.append(q)
-    x, x_desired = robot.forward_kinematics(q)[..., :2], line.position(steps / rate)
-    errors.append(np.linalg.norm(x_desired - x, axis=-1))
+    x, x_desired = robot.forward_kinematics(q)[..., :size], line.position(steps / rate)
+    errors.append(np.linalg.norm(_error(x_desired, x), axis=-1))
     shape = np.broadcast_shapes(track[0].shape, track[-1].shape)
     track[0] = np.broadcast_to(track[0], shape)
     return Tracking(
         np.arange(steps + 1) / rate,
         np.array(track),
         np.array(velocities) if steps else np.empty((0, *shape[:-1], inputs)),
-        np.array(errors),
+        np.array([np.broadcast_to(error, shape[:-1]) for error in errors]),
     )
+
+
+def _error(x_desired: Array, x: Array) -> Array:
+    """Return what is missing, the heading wrapped if there is one."""
+    return x_desired - x if x.shape[-1] == 2 else pose_difference(x_desired, x)
 
 
 def _check_callables(robot: Manipulator, secondary: object) -> None:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
+from collections.abc import Sequence as Values
 from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Any, TypeAlias
 
+from diffdrive_jacobian.messages.fields import is_identifier, plain, walk
+from diffdrive_jacobian.messages.structure import COUNT, Array, FieldType, Sequence, structure
 from diffdrive_jacobian.time_units import NANOSECONDS
 
-Messages: TypeAlias = Sequence[tuple[int, bytes]]
+Messages: TypeAlias = Values[tuple[int, bytes]]
 """Messages of a topic: the time of each (ns), and its CDR."""
 MAX_SHOWN = 200
 """Length of the longest value that is shown (characters)."""
@@ -89,20 +92,19 @@ class Comparison:
             return f'was published at {_seconds(one[0])}, golden at {_seconds(golden[0])}'
         if one[1] == golden[1]:
             return None
-        for path, value, expected in _pairs(deserialize(one[1]), deserialize(golden[1]), ''):
-            if (what := self._value_difference(value, expected)) is not None:
+        for path, kind, value, expected in _pairs(deserialize(one[1]), deserialize(golden[1])):
+            if (what := self._value_difference(kind, value, expected)) is not None:
                 return f'at {_seconds(one[0])}: {path} {what}'
         # Only the bytes of the padding differ, or identifiers.
         return None
 
-    def _value_difference(self, value: Any, golden: Any) -> str | None:
+    def _value_difference(self, kind: FieldType, value: Any, golden: Any) -> str | None:
         """Return how a value differs from the golden one; None: it does not. NaN is equal to NaN."""
-        if isinstance(value, _Identifier):
-            renamed = self._golden_of.setdefault(value, golden), self._run_of.setdefault(golden, value)
+        if is_identifier(kind):
+            one, other = bytes(value.uuid), bytes(golden.uuid)
+            renamed = self._golden_of.setdefault(one, other), self._run_of.setdefault(other, one)
             return (
-                None
-                if renamed == (golden, value)
-                else 'identifies something else than in the golden run'
+                None if renamed == (other, one) else 'identifies something else than in the golden run'
             )
         if value == golden or (value != value and golden != golden):
             return None
@@ -114,30 +116,19 @@ class Comparison:
         return f'is {value!r}, golden {golden!r}: differs by {apart:.3g}, allowed {self._tolerance:g}'
 
 
-class _Identifier(bytes):
-    """The bytes of a UUID."""
-
-
-def _pairs(value: Any, golden: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the path of each field of a message, and its two values."""
-    if hasattr(value, 'get_fields_and_field_types'):
-        if type(value).__name__ == 'UUID':
-            yield path, _Identifier(value.uuid), _Identifier(golden.uuid)
-            return
-        for name in value.get_fields_and_field_types():
-            separator = '.' if path else ''
-            yield from _pairs(getattr(value, name), getattr(golden, name), f'{path}{separator}{name}')
-    elif hasattr(value, '__len__') and not isinstance(value, (str, bytes)):
-        if len(value) != len(golden):
-            yield f'length of {path}', len(value), len(golden)
-        # Python's numbers: NumPy's are shown with their types.
-        values, expected = (
-            list(one.tolist() if hasattr(one, 'tolist') else one) for one in (value, golden)
-        )
-        for index, (element, other) in enumerate(zip(values, expected, strict=False)):
-            yield from _pairs(element, other, f'{path}[{index}]')
-    else:
-        yield path, value, golden
+def _pairs(value: Any, golden: Any) -> Iterator[tuple[str, FieldType, Any, Any]]:
+    """Yield path and type of each number or string of two messages of one type, and its two values."""
+    kind = structure(type(value))
+    walks = (walk(kind, one, whole=is_identifier) for one in (value, golden))
+    # Where a length differs, what follows does not correspond, but the length comes first.
+    for (path, field, one), (_, _, other) in zip(*walks, strict=False):
+        if not isinstance(field, (Array, Sequence)):
+            yield path, field, one, other
+            continue
+        if len(one) != len(other):
+            yield f'len({path})', COUNT, len(one), len(other)
+        for index, pair in enumerate(zip(plain(one), plain(other), strict=False)):
+            yield f'{path}[{index}]', field.element, *pair
 
 
 def _shown(value: Any) -> str:

@@ -18,13 +18,14 @@ from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
 from diffdrive_jacobian.bags.qos import from_rosbags
 from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.messages.topics import CLOCK, OF_EVERY_NODE, TRANSFORMS
 from diffdrive_jacobian.numerics.fields import between
 from diffdrive_jacobian.testing.differences import Comparison, TopicDifference
 from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
 TOLERANCE = 1e-9
 """Default tolerance of floats: the last bits may differ between CPUs."""
-NOT_COMPARED = ('/clock', '/parameter_events', '/rosout', '/tf')
+NOT_COMPARED = (CLOCK, *OF_EVERY_NODE, TRANSFORMS)
 """Topics that are neither stored nor compared. `/tf` is published only where tf2_ros is installed."""
 MAX_TOPICS = 8
 """Number of topics with differences that are listed."""

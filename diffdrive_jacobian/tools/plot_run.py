@@ -10,6 +10,7 @@ from pathlib import Path
 
 from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
 from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.messages.topics import READABLE
 from diffdrive_jacobian.plots.output_files import FORMATS, NOT_OVERWRITTEN, check_directory
 from diffdrive_jacobian.plots.run_figure import draw, names
 from diffdrive_jacobian.plots.run_table import DECIMALS, write_csv
@@ -23,21 +24,6 @@ from diffdrive_jacobian.tools._waiting import busy
 from diffdrive_jacobian.tools.entry_points import OUTPUT_ERROR
 
 PROGRAM = 'plot_run'
-TOPICS = (
-    'odom',
-    'ground_truth',
-    'cmd_vel',
-    'cmd_vel_out',
-    'start_pose',
-    'goal_pose',
-    'goals',
-    'goal_status',
-    'joint_command',
-    'joint_states',
-    'parameter_events',
-    'fault_events',
-)
-"""Topics whose name in the bag can be given by --topic."""
 
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
@@ -190,9 +176,9 @@ def _checked(path: Path, *, replace: bool) -> Path:
 
 def _topic(text: str) -> tuple[str, str]:
     name, separator, topic = text.partition('=')
-    if name not in TOPICS or not separator or not topic:
+    if name not in READABLE or not separator or not topic:
         raise argparse.ArgumentTypeError(
-            f'must be NAME=TOPIC with NAME one of {", ".join(TOPICS)}, got {text!r}'
+            f'must be NAME=TOPIC with NAME one of {", ".join(READABLE)}, got {text!r}'
         )
     return name, topic if topic.startswith('/') else f'/{topic}'
 

@@ -72,6 +72,15 @@ def no_lateral_slip(theta: float) -> Array:
     return np.array([[sin(theta), -cos(theta), 0.0]])
 
 
+def bracket(theta: float) -> Array:
+    return np.array([sin(theta), -cos(theta), 0.0])
+
+
+def controllability(theta: float) -> Array:
+    c, s = cos(theta), sin(theta)
+    return np.array([[c, 0.0, s], [s, 0.0, -c], [0.0, 1.0, 0.0]])
+
+
 def rolling(theta: float, r: float, L: float) -> tuple[Array, Array]:
     c, s = cos(theta), sin(theta)
     return (
@@ -152,6 +161,13 @@ def positions(lengths: Array, q: Array) -> Array:
     angles = np.cumsum(q)
     links = np.stack([lengths * np.cos(angles), lengths * np.sin(angles)], axis=-1)
     return np.concatenate([np.zeros((1, 2)), np.cumsum(links, axis=0)])
+
+
+def clearance(lengths: Array, q: Array, obstacle: Array) -> float:
+    joints = positions(lengths, q)
+    links, to_obstacle = np.diff(joints, axis=0), obstacle - joints[:-1]
+    part = np.clip((to_obstacle * links).sum(axis=-1) / lengths**2, 0.0, 1.0)
+    return float(np.linalg.norm(to_obstacle - part[:, np.newaxis] * links, axis=-1).min())
 
 
 def tip(lengths: Array, q: Array) -> Array:

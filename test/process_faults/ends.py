@@ -83,11 +83,14 @@ PROGRAMS = (
     Program('doctor', _paths(), (130, 0, 1)),
     Program('verify_run', _paths('BAG'), (130, 0, 1)),
     Program('plot_run', _paths('BAG', '-o', 'NEW.png'), (130, 0, 1)),
+    Program('plot_jacobian', _paths('geometry', '-o', 'NEW.png'), (130, 0)),
     Program('recover_run', _paths('BAG', '-o', 'NEW'), (130, 0, 1)),
     Program('sweep_gains', _paths('-o', 'NEW.png'), (130, 0)),
     Program('calibrate_run', _paths('BAG'), (130, 0, 1, 2)),
 )
-WITHOUT_ROS = ('verify_run', 'plot_run', 'recover_run', 'sweep_gains', 'calibrate_run')
+WITHOUT_ROS = (
+    *('verify_run', 'plot_run', 'plot_jacobian', 'recover_run', 'sweep_gains', 'calibrate_run'),
+)
 GOALS = '/goals'
 """Namespace of the robot to which all goals are sent."""
 MODES = ('start-up', 'running', 'busy', 'callback', 'twice')

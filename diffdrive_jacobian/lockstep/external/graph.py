@@ -19,12 +19,11 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
-from diffdrive_jacobian.lockstep._report import OMITTED
 from diffdrive_jacobian.lockstep.external.expectations import Due
 from diffdrive_jacobian.lockstep.external.waiting import Probe
+from diffdrive_jacobian.messages.topics import CLOCK, NOT_OF_ROBOTS, OF_EVERY_NODE
 from diffdrive_jacobian.time_units import NANOSECONDS
 
-CLOCK = '/clock'
 UNKNOWN = '_NODE_NAME_UNKNOWN_'
 """Name of a node whose endpoints have been discovered before its name."""
 UNTIMED = 2.0
@@ -60,11 +59,7 @@ class ExternalGraph:
     def published_topics(self) -> list[str]:
         """Return the topics that external nodes publish, without those of every node."""
         names = (name for name, _ in self._node.get_topic_names_and_types())
-        return [
-            name
-            for name in names
-            if name not in ('/rosout', '/parameter_events') and self.publishers(name)
-        ]
+        return [name for name in names if name not in OF_EVERY_NODE and self.publishers(name)]
 
     def subscribed_nodes(self, topic: str) -> set[str]:
         """Return the names of the external nodes that are subscribed to a topic."""
@@ -166,7 +161,7 @@ class Discovery:
             for node in self._nodes
             for endpoints in (node.publishers, node.subscriptions)
             for endpoint in endpoints
-            if endpoint.topic_name not in OMITTED
+            if endpoint.topic_name not in NOT_OF_ROBOTS
         )
 
     def awaited_nodes(self, expected: Sequence[Due], probes: Sequence[Probe]) -> set[str]:

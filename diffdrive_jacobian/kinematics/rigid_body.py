@@ -1,0 +1,42 @@
+"""Velocities of the points of a rigid body.
+
+A body moves with the angular velocity `omega` (rad/s) while its point P has the velocity `v` (m/s). Any
+other point Q of it then has the velocity `v + omega × PQ`. A wheel that rolls and an axle that turns are
+such bodies, so document E derives the differential drive with this equation alone.
+
+All vectors are in the same frame. Everything broadcasts over leading axes. Wrong shapes, values that are
+not finite, and results that overflow raise ValueError.
+
+Source: document E, `v_C = v_P + omega × PC` and `v_C2 = v_C1 + theta_dot k × C1C2`.
+"""
+
+from __future__ import annotations
+
+from diffdrive_jacobian.numerics.formula import Entries, Vector, formula
+
+__all__ = ['point_velocity']
+
+
+@formula('(3),(3),(3) -> (3)')
+def point_velocity(v: Vector, omega: Vector, offset: Vector) -> Entries:
+    """Return the velocity of a point Q of a rigid body: `v_Q = v_P + omega × PQ` (E).
+
+    Args:
+        v: Velocity of the point P of the body, shape (..., 3) (m/s).
+        omega: Angular velocity of the body, shape (..., 3) (rad/s).
+        offset: Vector from P to Q, shape (..., 3) (m).
+
+    Returns:
+        Velocities of Q, shape (..., 3) (m/s).
+
+    Raises:
+        ValueError: Something is not finite, or shapes do not broadcast.
+    """
+    v_x, v_y, v_z = v
+    omega_x, omega_y, omega_z = omega
+    x, y, z = offset
+    return [
+        v_x + omega_y * z - omega_z * y,
+        v_y + omega_z * x - omega_x * z,
+        v_z + omega_x * y - omega_y * x,
+    ]

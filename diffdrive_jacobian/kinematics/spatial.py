@@ -1,0 +1,83 @@
+"""The spatial displacement between two poses in space: six numbers, the error of document D.
+
+A pose is a homogeneous transform `[[R, p], [0, 1]]`, shape (4, 4), with the rotation matrix R and the
+position p (m). Everything broadcasts over leading axes. In the plane the same displacement is
+`se2.compose(se2.inverse(pose), target)`.
+
+Source: document D, 6; doc/mathematics.md, "Inverse kinematics".
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from diffdrive_jacobian.kinematics.singular_values import product, times, transposed
+from diffdrive_jacobian.numerics.checks import finite
+from diffdrive_jacobian.numerics.formula import Array, formula
+
+__all__ = ['spatial_displacement']
+
+ROUNDING = 1e-6
+"""Largest deviation of `R^T R` from the identity in the norm of Frobenius."""
+
+
+def _rigid(name: str, T: Array) -> None:
+    """Require homogeneous transforms, shape (..., 4, 4).
+
+    Raises:
+        ValueError: An entry is not finite, R is no rotation matrix, or the last row is not 0, 0, 0, 1.
+    """
+    finite(name, T)
+    R = T[..., :3, :3]
+    with np.errstate(over='ignore', invalid='ignore'):
+        skew = np.linalg.norm(np.swapaxes(R, -1, -2) @ R - np.eye(3), axis=(-2, -1))
+    inside = (skew < ROUNDING) & (np.linalg.det(R) > 0.0) & np.all(T[..., 3, :] == (0, 0, 0, 1), axis=-1)
+    if not inside.all():
+        raise ValueError(
+            f'{name} must be [[R, p], [0, 0, 0, 1]] with a rotation matrix R, '
+            f'got {T[~inside][0].tolist()}'
+        )
+
+
+@formula('(4,4),(4,4) -> (6)', T=_rigid, T_desired=_rigid)
+def spatial_displacement(T: Any, T_desired: Any) -> Array:
+    """Return the displacement from a pose to another one: `Delta = (t, v theta)` (D, 6).
+
+    Args:
+        T: The pose of the end effector E, shape (..., 4, 4).
+        T_desired: Its desired pose, shape (..., 4, 4).
+
+    Returns:
+        `[t_x, t_y, t_z, v_x theta, v_y theta, v_z theta]` in the frame E, shape (..., 6) (m, rad): the
+        translation, and the axis v of the rotation times its angle theta, 0 to pi. At pi the sign of v
+        is one of both.
+
+    Raises:
+        ValueError: An argument is no homogeneous transform.
+    """
+    R_transposed = transposed(T[:3, :3])
+    t = times(R_transposed, T_desired[:3, 3] - T[:3, 3])  # R^T (p_desired - p)
+    return np.concatenate([t, _rotation_vector(product(R_transposed, T_desired[:3, :3]))])
+
+
+def _rotation_vector(R: Array) -> Array:
+    """Return axis times angle of rotation matrices, shapes (3, ...) and (3, 3, ...), unchecked."""
+    (a, b, c), (d, e, f), (g, h, i) = R
+    # The unit quaternion q = [cos(theta/2), v sin(theta/2)] times each of its entries times 4.
+    rows = np.array(
+        [
+            [1.0 + a + e + i, h - f, c - g, d - b],
+            [h - f, 1.0 + a - e - i, b + d, c + g],
+            [c - g, b + d, 1.0 - a + e - i, f + h],
+            [d - b, c + g, f + h, 1.0 - a - e + i],
+        ]
+    )
+    # The row of the largest entry loses no digits.
+    longest = np.linalg.norm(rows, axis=1).argmax(axis=0)
+    q = np.take_along_axis(rows, longest[np.newaxis, np.newaxis], axis=0)[0]
+    q = q * np.where(q[0] < 0.0, -1.0, 1.0)
+    sine = np.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    theta = 2.0 * np.arctan2(sine, q[0])
+    return np.asarray(q[1:] * (theta / np.where(sine > 0.0, sine, 1.0)))

@@ -1,0 +1,486 @@
+"""The messages of the nodes: which fields are read, what value they make, and how it is written.
+
+A `Codec` belongs to a type of message. It reads serialized messages field by field, see `messages.cdr`,
+without their Python classes, so that bags are read where no ROS is installed, too. What it reads it
+checks, and what it writes it reads again as the same value.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from operator import itemgetter
+from typing import Any, Generic, NamedTuple, TypeVar
+
+from diffdrive_jacobian.messages.cdr import Reader, Writer
+from diffdrive_jacobian.messages.conversion import (
+    MAX_WAYPOINTS,
+    MessageError,
+    from_joints,
+    from_pose,
+    from_time,
+    from_twist,
+)
+from diffdrive_jacobian.messages.fields import field_value
+from diffdrive_jacobian.time_units import NANOSECONDS
+
+V = TypeVar('V')
+
+STAMP = ('header.stamp.sec', 'header.stamp.nanosec')
+FRAME = 'header.frame_id'
+TWIST_IN = {
+    'geometry_msgs/msg/Twist': '',
+    'geometry_msgs/msg/TwistStamped': 'twist.',
+    'geometry_msgs/msg/TwistWithCovarianceStamped': 'twist.twist.',
+    'nav_msgs/msg/Odometry': 'twist.twist.',
+}
+"""Where messages have a twist."""
+POSE_IN = {
+    'geometry_msgs/msg/PoseStamped': 'pose.',
+    'geometry_msgs/msg/PoseWithCovarianceStamped': 'pose.pose.',
+    'nav_msgs/msg/Odometry': 'pose.pose.',
+}
+"""Where messages have a pose."""
+
+# (x, y, yaw) and (v, omega) in the row-major 6x6 covariances of ROS.
+_PLANAR = [6 * row + column for row in (0, 1, 5) for column in (0, 1, 5)]
+_FORWARD_AND_YAW = [6 * row + column for row in (0, 5) for column in (0, 5)]
+_planar, _forward_and_yaw = itemgetter(*_PLANAR), itemgetter(*_FORWARD_AND_YAW)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Codec(Generic[V]):
+    """How one type of message becomes a value, and back."""
+
+    type_name: str
+    """`package/msg/Name`."""
+    fields: tuple[str, ...]
+    """Paths of the fields that are read, as `cdr.Reader` takes them."""
+    value: Callable[..., V]
+    """Returns the value of these fields. It raises MessageError if they are invalid."""
+    written: tuple[str, ...] = ()
+    """Paths of the numbers that are written, as `cdr.Writer` takes them."""
+    numbers: Callable[[V], tuple[Any, ...]] = lambda _: ()
+    """Returns these numbers of a value."""
+    header: Codec[Any] | None = None
+    """What is read and checked before the rest, which may be long."""
+
+    def of(self, message: Any) -> V:
+        """Return the value in a message object.
+
+        Raises:
+            MessageError: It is invalid.
+        """
+        return self.value(*(field_value(message, field) for field in self.fields))
+
+    def reader(
+        self, kind: Any, deserialize: Callable[[bytes, Any], Any] | None = None
+    ) -> Callable[[bytes], V]:
+        """Return a function that returns the value in a serialized message.
+
+        It raises MessageError: DecodingError if the bytes are not a message of the type, and others if
+        the value is invalid.
+
+        Args:
+            kind: Type of the messages: their class or its `Structure`.
+            deserialize: As for `cdr.Reader`.
+        """
+        read, value = Reader(kind, self.fields, deserialize=deserialize), self.value
+        if self.header is None:
+            return lambda data: value(*read(data))
+        first = Reader(kind, self.header.fields, whole=False, deserialize=deserialize)
+        check = self.header.value
+
+        def checked(data: bytes) -> V:
+            check(*first(data))
+            return value(*read(data))
+
+        return checked
+
+    def writer(self, template: Any) -> Callable[[V], bytes]:
+        """Return a function that serializes values.
+
+        Args:
+            template: A message object whose strings and lengths are those of all messages.
+        """
+        write, numbers = Writer(template, self.written), self.numbers
+        return lambda value: write(*numbers(value))
+
+
+def stamp_of(stamp: int) -> tuple[int, int]:
+    """Return `sec` and `nanosec` of a time (ns)."""
+    return divmod(stamp, NANOSECONDS)
+
+
+def twist_fields(type_name: str) -> tuple[str, ...]:
+    """Return the fields of a twist for `from_twist` in a type of `TWIST_IN`."""
+    prefix = TWIST_IN[type_name]
+    return tuple(f'{prefix}{part}.{axis}' for part in ('linear', 'angular') for axis in 'xyz')
+
+
+def pose_fields(type_name: str) -> tuple[str, ...]:
+    """Return the fields of a pose for `from_pose` in a type of `POSE_IN`."""
+    return tuple(POSE_IN[type_name] + field for field in _POSE)
+
+
+_POSE = ('position.x', 'position.y', *(f'orientation.{axis}' for axis in 'xyzw'))
+_PLANAR_POSE = ('position.x', 'position.y', 'orientation.z', 'orientation.w')
+
+
+def _pose_numbers(pose: tuple[float, float, float]) -> tuple[float, float, float, float]:
+    x, y, theta = pose
+    return x, y, math.sin(theta / 2.0), math.cos(theta / 2.0)
+
+
+# --- Commands: cmd_vel, cmd_vel_out
+
+
+class Command(NamedTuple):
+    """A body twist to follow."""
+
+    twist: tuple[float, float]
+    """`(v, omega)` (m/s, rad/s)."""
+    stamp: int = 0
+    """From when on (ns); 0: from when it is received."""
+
+
+TWIST = Codec(
+    'geometry_msgs/msg/Twist',
+    twist_fields('geometry_msgs/msg/Twist'),
+    lambda *twist: Command(from_twist(*twist)),
+    ('linear.x', 'angular.z'),
+    lambda command: command.twist,
+)
+TWIST_STAMPED = Codec(
+    'geometry_msgs/msg/TwistStamped',
+    (*STAMP, *twist_fields('geometry_msgs/msg/TwistStamped')),
+    lambda sec, nanosec, *twist: Command(from_twist(*twist), from_time(sec, nanosec)),
+    (*STAMP, 'twist.linear.x', 'twist.angular.z'),
+    lambda command: (*stamp_of(command.stamp), *command.twist),
+)
+
+# --- Poses: odom, ground_truth, start_pose, initialpose
+
+
+class Motion(NamedTuple):
+    """Pose and twist at a time."""
+
+    stamp: int
+    """(ns)"""
+    frame: str
+    """Frame of the pose."""
+    pose: tuple[float, float, float]
+    """`(x, y, theta)` (m, m, rad)."""
+    twist: tuple[float, float]
+    """`(v, omega)` in the body frame (m/s, rad/s)."""
+    covariance: tuple[float, ...] = (0.0,) * 9
+    """Of x, y, theta, row by row; not checked, see `from_covariance`."""
+    twist_covariance: tuple[float, ...] = (0.0,) * 4
+    """Of v and omega, row by row; not checked."""
+
+
+class Place(NamedTuple):
+    """A pose at a time."""
+
+    stamp: int
+    """(ns)"""
+    frame: str
+    """Frame of the pose."""
+    pose: tuple[float, float, float]
+    """`(x, y, theta)` (m, m, rad)."""
+    covariance: tuple[float, ...] = (0.0,) * 9
+    """As of a `Motion`."""
+
+
+def _motion(sec: int, nanosec: int, frame: str, *values: Any) -> Motion:
+    *numbers, of_pose, of_twist = values
+    return Motion(
+        from_time(sec, nanosec),
+        frame,
+        from_pose(*numbers[:6]),
+        from_twist(*numbers[6:]),
+        _planar(of_pose),
+        _forward_and_yaw(of_twist),
+    )
+
+
+def _place(sec: int, nanosec: int, frame: str, *values: Any) -> Place:
+    *pose, covariance = values
+    return Place(from_time(sec, nanosec), frame, from_pose(*pose), _planar(covariance))
+
+
+_WRITTEN_PLACE = (
+    *STAMP,
+    *(f'pose.pose.{field}' for field in _PLANAR_POSE),
+    *(f'pose.covariance[{index}]' for index in _PLANAR),
+)
+ODOMETRY = Codec(
+    'nav_msgs/msg/Odometry',
+    (
+        *(*STAMP, FRAME),
+        *pose_fields('nav_msgs/msg/Odometry'),
+        *twist_fields('nav_msgs/msg/Odometry'),
+        *('pose.covariance', 'twist.covariance'),
+    ),
+    _motion,
+    (
+        *_WRITTEN_PLACE,
+        *('twist.twist.linear.x', 'twist.twist.angular.z'),
+        *(f'twist.covariance[{index}]' for index in _FORWARD_AND_YAW),
+    ),
+    lambda motion: (
+        *stamp_of(motion.stamp),
+        *_pose_numbers(motion.pose),
+        *motion.covariance,
+        *motion.twist,
+        *motion.twist_covariance,
+    ),
+)
+MOTION = Codec(
+    'nav_msgs/msg/Odometry',
+    ODOMETRY.fields[:-2],
+    lambda sec, nanosec, frame, *values: Motion(
+        from_time(sec, nanosec), frame, from_pose(*values[:6]), from_twist(*values[6:])
+    ),
+)
+"""Odometry without its covariances."""
+ODOMETRY_POSE = Codec(
+    'nav_msgs/msg/Odometry',
+    (FRAME, *pose_fields('nav_msgs/msg/Odometry')),
+    lambda frame, *pose: (frame, from_pose(*pose)),
+)
+"""Frame and pose of an odometry, for the controller, which needs no more of each."""
+POSE_WITH_COVARIANCE = Codec(
+    'geometry_msgs/msg/PoseWithCovarianceStamped',
+    (
+        *(*STAMP, FRAME),
+        *pose_fields('geometry_msgs/msg/PoseWithCovarianceStamped'),
+        'pose.covariance',
+    ),
+    _place,
+    _WRITTEN_PLACE,
+    lambda place: (*stamp_of(place.stamp), *_pose_numbers(place.pose), *place.covariance),
+)
+
+# --- Goals: goal_pose, goals, goal_status
+
+
+class Route(NamedTuple):
+    """Goals that came in one message."""
+
+    stamp: tuple[int, int]
+    """`sec` and `nanosec`, by which goals are told apart, and which may be anything."""
+    frame: str
+    """Frame of those that name none."""
+    poses: tuple[tuple[float, float, float], ...]
+    """`(x, y, theta)` of each (m, m, rad)."""
+    frames: tuple[str, ...] = ()
+    """Their frames; empty: `frame`."""
+
+    @property
+    def time(self) -> int:
+        """The stamp as a time (ns).
+
+        Raises:
+            MessageError: It is none.
+        """
+        return from_time(*self.stamp)
+
+
+class Status(NamedTuple):
+    """What a controller reports of a goal."""
+
+    status: int
+    """As in action_msgs/GoalStatus."""
+    stamp: tuple[int, int]
+    """Stamp of the message with the goal, as of a `Route`."""
+
+    @property
+    def time(self) -> int:
+        """The stamp as a time (ns).
+
+        Raises:
+            MessageError: It is none.
+        """
+        return from_time(*self.stamp)
+
+
+def _header(sec: int, nanosec: int, count: int) -> tuple[tuple[int, int], int]:
+    if count > MAX_WAYPOINTS:
+        raise MessageError(f'goals must contain at most {MAX_WAYPOINTS} poses, got {count}')
+    return (sec, nanosec), count
+
+
+POSE = Codec(
+    'geometry_msgs/msg/PoseStamped',
+    (*STAMP, FRAME, *pose_fields('geometry_msgs/msg/PoseStamped')),
+    lambda sec, nanosec, frame, *pose: Route((sec, nanosec), frame, (from_pose(*pose),)),
+    (*STAMP, *(f'pose.{field}' for field in _PLANAR_POSE)),
+    lambda route: (*route.stamp, *_pose_numbers(route.poses[0])),
+)
+GOALS_HEADER = Codec('nav_msgs/msg/Goals', (*STAMP, 'len(goals)'), _header)
+"""Stamp and number of poses."""
+GOALS = Codec(
+    'nav_msgs/msg/Goals',
+    (*STAMP, FRAME, 'goals[].header.frame_id', *(f'goals[].pose.{field}' for field in _POSE)),
+    lambda sec, nanosec, frame, frames, *columns: Route(
+        (sec, nanosec),
+        frame,
+        tuple(from_pose(*pose) for pose in zip(*columns, strict=True)),
+        frames,
+    ),
+    header=GOALS_HEADER,
+)
+GOAL_STATUS = Codec(
+    'action_msgs/msg/GoalStatus',
+    ('status', 'goal_info.stamp.sec', 'goal_info.stamp.nanosec'),
+    lambda status, sec, nanosec: Status(status, (sec, nanosec)),
+)
+
+# --- Wheels: joint_command, joint_states
+
+
+class Wheels(NamedTuple):
+    """Joints in the order of their message: left, right in those of this package."""
+
+    stamp: int
+    """(ns)"""
+    joints: tuple[str, ...]
+    """Their names."""
+    positions: tuple[float, ...]
+    """(rad); empty: unknown."""
+    velocities: tuple[float, ...]
+    """(rad/s); empty: unknown."""
+
+    @classmethod
+    def of(
+        cls,
+        stamp: int,
+        joints: tuple[str, ...],
+        speeds: tuple[float, float],
+        angles: tuple[float, float] | None = None,
+    ) -> Wheels:
+        """Return the joints of two wheels.
+
+        Args:
+            stamp: Time (ns).
+            joints: Names of the left and the right wheel joint.
+            speeds: `(omega_R, omega_L)` (rad/s).
+            angles: Of the right and the left wheel (rad); None: unknown.
+        """
+        return cls(stamp, joints, () if angles is None else angles[::-1], speeds[::-1])
+
+    def speeds(self, names: tuple[str, str]) -> tuple[float, float]:
+        """Return `(omega_R, omega_L)` (rad/s) of the left and the right wheel joint of these names.
+
+        Raises:
+            MessageError: A joint is missing, or its velocity is.
+        """
+        return from_joints(self.joints, self.velocities, names)
+
+
+class WheelArray(NamedTuple):
+    """Speeds of the left and the right wheel, without their names and a stamp."""
+
+    velocities: tuple[float, ...]
+    """(rad/s)"""
+    stamp: int = 0
+
+    @classmethod
+    def of(cls, speeds: tuple[float, float]) -> WheelArray:
+        """Return the wheels with the speeds `(omega_R, omega_L)` (rad/s)."""
+        return cls(speeds[::-1])
+
+    def speeds(self, names: tuple[str, str]) -> tuple[float, float]:
+        """As `Wheels.speeds`."""
+        return from_joints(names, self.velocities, names)
+
+
+JOINT_STATE = Codec(
+    'sensor_msgs/msg/JointState',
+    (*STAMP, 'name', 'position', 'velocity'),
+    lambda sec, nanosec, *values: Wheels(from_time(sec, nanosec), *values),
+    (*STAMP, 'position', 'velocity'),
+    lambda wheels: (*stamp_of(wheels.stamp), *wheels.positions, *wheels.velocities),
+)
+WHEEL_ARRAY = Codec(
+    'std_msgs/msg/Float64MultiArray',
+    ('data',),
+    WheelArray,
+    ('data',),
+    lambda wheels: wheels.velocities,
+)
+
+# --- Events: parameter_events, fault_events
+
+
+class Changes(NamedTuple):
+    """New values of the parameters of a node."""
+
+    node: str
+    """Full name of the node."""
+    values: dict[str, Any]
+    """New values by name; None: the parameter was not set."""
+
+
+class FaultEvent(NamedTuple):
+    """What a fault of a lockstep world did."""
+
+    fault: str
+    """The fault, as Python source."""
+    what: str
+
+
+_VALUES = (
+    None,
+    *('bool_value', 'integer_value', 'double_value', 'string_value', 'byte_array_value'),
+    *('bool_array_value', 'integer_array_value', 'double_array_value', 'string_array_value'),
+)
+"""Fields of a ParameterValue by its type, the constants of rcl_interfaces/msg/ParameterType."""
+_PARAMETER = ('name', 'value.type', *(f'value.{field}' for field in _VALUES if field))
+
+
+def parameter_value(kind: int, *values: Any) -> Any:
+    """Return the value of a parameter from its type and the fields of `ParameterValue`.
+
+    Raises:
+        MessageError: The type is unknown.
+    """
+    if not 0 <= kind < len(_VALUES):
+        raise MessageError(f'the type of a parameter must be 0 to {len(_VALUES) - 1}, got {kind}')
+    value = values[kind - 1] if kind else None
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _changes(node: str, *columns: tuple[Any, ...]) -> Changes:
+    count = len(_PARAMETER)
+    parameters = (
+        parameter for part in (columns[:count], columns[count:]) for parameter in zip(*part, strict=True)
+    )
+    return Changes(node, {name: parameter_value(*value) for name, *value in parameters})
+
+
+def _fault_event(text: str) -> FaultEvent:
+    try:
+        fields = json.loads(text)
+        fault, what = fields['fault'], fields['what']
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise MessageError('it must be a JSON object with fault and what') from error
+    if not isinstance(fault, str) or not isinstance(what, str):
+        raise MessageError('fault and what must be strings')
+    return FaultEvent(fault, what)
+
+
+PARAMETER_EVENT = Codec(
+    'rcl_interfaces/msg/ParameterEvent',
+    (
+        'node',
+        *(f'new_parameters[].{field}' for field in _PARAMETER),
+        *(f'changed_parameters[].{field}' for field in _PARAMETER),
+    ),
+    _changes,
+)
+FAULT_EVENT = Codec('std_msgs/msg/String', ('data',), _fault_event)
+CLOCK = Codec('rosgraph_msgs/msg/Clock', ('clock.sec', 'clock.nanosec'), from_time)

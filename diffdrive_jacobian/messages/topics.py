@@ -1,0 +1,252 @@
+"""The topics of the robot, each said once: what reads, records, draws, checks or shows them asks here.
+
+A new topic is an entry in `TOPICS`, its codec in `messages.codecs`, and the node that publishes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from diffdrive_jacobian.messages import codecs
+from diffdrive_jacobian.messages.codecs import Codec
+
+Names = tuple[str, str]
+"""Names of the left and the right wheel joint."""
+
+
+class Row(NamedTuple):
+    """What one message adds to a series of a run."""
+
+    stamp: int
+    """(ns); 0: it has none."""
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Topic:
+    """A topic, and what the tools do with it."""
+
+    name: str
+    """Without namespace; of one that all robots share, from `/` on."""
+    codecs: tuple[Codec[Any], ...] = ()
+    """One for each type that it may have. Empty: its messages are only passed on."""
+    recorded: bool = True
+    """Whether it is recorded as part of a run."""
+    of_robot: bool = True
+    """Whether its messages are the behaviour of a robot, and not of ROS or of the test."""
+    series: str = ''
+    """Field of `Run` with its values, or ''."""
+    columns: tuple[str, ...] = ()
+    """Names of these values."""
+    units: tuple[str, ...] = ()
+    """Units of the columns of a sensor, which are tabulated, drawn and shown by their names. Empty: what
+    draws and shows them knows what they mean."""
+    covariances: tuple[str, ...] = ()
+    """Names of the values that follow them in the rows."""
+    rows: Callable[[Any, Names], Iterable[Row]] = lambda value, names: ()
+    """Returns the rows of a value. It raises MessageError if the value lacks what is needed."""
+    followed: bool = False
+    """Whether the live page looks at its latest value."""
+    if_unread: str = ''
+    """What to start if nobody is subscribed to it; '': nothing."""
+    if_unpublished: str = ''
+    """What to start if it has subscriptions and no publisher; '': nothing."""
+    if_several: str = ''
+    """What to do about several publishers; '': they are allowed."""
+
+    @property
+    def shared(self) -> bool:
+        """Whether all robots share it."""
+        return self.name.startswith('/')
+
+    @property
+    def base_name(self) -> str:
+        """The name without namespace."""
+        return self.name.removeprefix('/')
+
+    @property
+    def readings(self) -> dict[str, str]:
+        """Names and units of the columns of a sensor; {}: it is none."""
+        return dict(zip(self.columns, self.units, strict=True)) if self.units else {}
+
+    @property
+    def readable(self) -> bool:
+        """Whether reading a run takes something from it."""
+        return bool(self.series) or self.name in (PARAMETER_EVENTS, FAULT_EVENTS)
+
+    def codec(self, type_name: str) -> Codec[Any]:
+        """Return the codec of a type that it may have.
+
+        Raises:
+            KeyError: It may not.
+        """
+        return {codec.type_name: codec for codec in self.codecs}[type_name]
+
+    @property
+    def types(self) -> tuple[str, ...]:
+        """The types that it may have, `package/msg/Name`."""
+        return tuple(codec.type_name for codec in self.codecs)
+
+
+# --- Rows of a run
+
+_POSE = ('x', 'y', 'theta')
+_TWIST = ('v', 'omega')
+_WHEELS = ('omega_R', 'omega_L')
+_OF_POSE = ('xx', 'xy', 'xt', 'yy', 'yt', 'tt')
+_OF_TWIST = ('vv', 'vw', 'ww')
+
+
+def _command(command: codecs.Command, _: Names) -> list[Row]:
+    return [Row(command.stamp, command.twist)]
+
+
+def _motion(motion: codecs.Motion, _: Names) -> list[Row]:
+    return [Row(motion.stamp, (*motion.pose, *motion.twist))]
+
+
+def _odometry(motion: codecs.Motion, _: Names) -> list[Row]:
+    vv, vw, _vw, ww = motion.twist_covariance
+    covariances = (*_upper(motion.covariance), vv, vw, ww)
+    return [Row(motion.stamp, (*motion.pose, *motion.twist, *covariances))]
+
+
+def _place(place: codecs.Place, _: Names) -> list[Row]:
+    return [Row(place.stamp, (*place.pose, *_upper(place.covariance)))]
+
+
+def _upper(covariance: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the entries xx, xy, xt, yy, yt, tt."""
+    return covariance[:3] + covariance[4:6] + covariance[8:]
+
+
+def _route(route: codecs.Route, _: Names) -> list[Row]:
+    return [Row(route.time, pose) for pose in route.poses]
+
+
+def _status(status: codecs.Status, _: Names) -> list[Row]:
+    return [Row(status.time, (float(status.status),))]
+
+
+def _wheels(wheels: codecs.Wheels | codecs.WheelArray, names: Names) -> list[Row]:
+    return [Row(wheels.stamp, wheels.speeds(names))]
+
+
+# --- The table
+
+CLOCK = '/clock'
+ROSOUT = '/rosout'
+PARAMETER_EVENTS = '/parameter_events'
+FAULT_EVENTS = '/fault_events'
+TRANSFORMS = '/tf'
+
+TOPICS = {
+    topic.name: topic
+    for topic in (
+        Topic(
+            name='cmd_vel',
+            codecs=(codecs.TWIST, codecs.TWIST_STAMPED),
+            series='cmd_vel',
+            columns=_TWIST,
+            rows=_command,
+            if_unread='start virtual_robot, wheel_bridge or the driver of your robot',
+        ),
+        Topic(
+            name='cmd_vel_out',
+            codecs=(codecs.TWIST_STAMPED,),
+            series='cmd_vel_out',
+            columns=_TWIST,
+            rows=_command,
+        ),
+        Topic(
+            name='odom',
+            codecs=(codecs.ODOMETRY,),
+            series='odometry',
+            columns=_POSE + _TWIST,
+            covariances=_OF_POSE + _OF_TWIST,
+            rows=_odometry,
+            followed=True,
+            if_unpublished='start virtual_robot or the driver of your robot',
+            if_several='their poses alternate; stop one of them, or give each robot a namespace '
+            '(-r __ns:=/NAME)',
+        ),
+        Topic(
+            name='ground_truth',
+            codecs=(codecs.MOTION,),
+            series='ground_truth',
+            columns=_POSE + _TWIST,
+            rows=_motion,
+            followed=True,
+        ),
+        Topic(
+            name='start_pose',
+            codecs=(codecs.POSE_WITH_COVARIANCE,),
+            series='start_pose',
+            columns=_POSE,
+            covariances=_OF_POSE,
+            rows=_place,
+            if_several='give each robot a namespace (-r __ns:=/NAME)',
+        ),
+        Topic(name='initialpose', codecs=(codecs.POSE_WITH_COVARIANCE,)),
+        Topic(
+            name='goal_pose',
+            codecs=(codecs.POSE,),
+            series='goals',
+            columns=_POSE,
+            rows=_route,
+            if_unread='start go_to_goal',
+        ),
+        Topic(
+            name='goals',
+            codecs=(codecs.GOALS,),
+            series='goals',
+            columns=_POSE,
+            rows=_route,
+            if_unread='start go_to_goal',
+        ),
+        Topic(
+            name='goal_status',
+            codecs=(codecs.GOAL_STATUS,),
+            series='goal_status',
+            columns=('status',),
+            rows=_status,
+            if_several='two controllers drive one robot; stop one of them, or give each a namespace',
+        ),
+        Topic(
+            name='joint_command',
+            codecs=(codecs.JOINT_STATE, codecs.WHEEL_ARRAY),
+            series='wheel_commands',
+            columns=_WHEELS,
+            rows=_wheels,
+            if_unread='start virtual_robot with -p command_interface:=wheels, or your motor driver',
+            if_unpublished='start wheel_bridge (or the robot without command_interface:=wheels)',
+            if_several='their commands alternate; stop one of them, or give each robot a namespace',
+        ),
+        Topic(
+            name='joint_states',
+            codecs=(codecs.JOINT_STATE,),
+            series='wheels',
+            columns=_WHEELS,
+            rows=_wheels,
+            followed=True,
+        ),
+        Topic(name=TRANSFORMS),
+        Topic(name=PARAMETER_EVENTS, codecs=(codecs.PARAMETER_EVENT,), of_robot=False),
+        Topic(name=FAULT_EVENTS, codecs=(codecs.FAULT_EVENT,), recorded=False, of_robot=False),
+        Topic(name=CLOCK, codecs=(codecs.CLOCK,), recorded=False, of_robot=False),
+        Topic(name=ROSOUT, recorded=False, of_robot=False),
+    )
+}
+"""All topics of the package by their names."""
+SAME_NAMES = 'in the same namespace, or remap the topic ({}:=NAME)'
+"""Where to start what `Topic.if_unread` and `Topic.if_unpublished` say."""
+OF_EVERY_NODE = (PARAMETER_EVENTS, ROSOUT)
+"""Topics that every node publishes."""
+NOT_OF_ROBOTS = tuple(topic.name for topic in TOPICS.values() if not topic.of_robot)
+"""Topics that do not belong to the behaviour of the nodes."""
+SENSORS = [topic for topic in TOPICS.values() if topic.units]
+"""Topics whose values are tabulated, drawn and shown by their names."""
+READABLE = {topic.base_name: topic for topic in TOPICS.values() if topic.readable}
+"""Topics from which a run is read, by their names without namespace."""

@@ -1,0 +1,73 @@
+"""Draw a picture of the documents."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from diffdrive_jacobian import plots
+from diffdrive_jacobian.plots.output_files import FORMATS, create, extension, new_file
+from diffdrive_jacobian.plots.rendering import render
+from diffdrive_jacobian.plots.style import styled
+from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools._waiting import busy
+
+PROGRAM = 'plot_jacobian'
+
+
+def main(arguments: Sequence[str], signals: Signals) -> int:
+    """Run the tool; return the exit code."""
+    options = _cli.parse(_parser(), arguments, ros=False)
+    output = f'{options.name}.png' if options.output is None else options.output
+    try:
+        path = new_file(output, FORMATS, 'picture', replace=options.force)
+        with busy(PROGRAM, 'drawing'), signals.ending_at_once(), styled():
+            content = render(getattr(plots, options.name)(), extension(path))
+        if signals.count:
+            print(f'{PROGRAM}: interrupted: nothing was written', file=sys.stderr)
+            return _cli.INTERRUPTED
+        create(path, content, replace=options.force)
+    except (ValueError, FileExistsError) as error:
+        return _cli.complain(PROGRAM, error)
+    except ModuleNotFoundError as error:
+        if (error.name or '').split('.')[0] != 'matplotlib':
+            raise
+        return _cli.complain(
+            PROGRAM, "matplotlib is not installed: pip install 'diffdrive_jacobian[plot]'"
+        )
+    except OSError as error:
+        message = f'{output} cannot be written: {error.strerror or error}'
+        return _cli.complain(PROGRAM, message, _cli.FAILED)
+    print(path)
+    return _cli.DONE
+
+
+def _name(text: str) -> str:
+    """Parse the name of a picture."""
+    if text not in plots.PICTURES:
+        raise argparse.ArgumentTypeError(f'must be one of {", ".join(plots.PICTURES)}, got {text!r}')
+    return text
+
+
+def _parser() -> _cli.Parser:
+    width = max(map(len, plots.PICTURES))
+    pictures = '\n'.join(f'  {name:{width}}  {what}' for name, what in plots.PICTURES.items())
+    parser = _cli.Parser(
+        prog=PROGRAM,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description='Draw a picture of the documents, to scale and computed by the library:\n\n'
+        f'{pictures}\n\n'
+        'An existing file is not overwritten without --force. Exit code 0: drawn; 1: the file cannot\n'
+        'be written; 2: wrong arguments, or no matplotlib; 130: interrupted.',
+    )
+    parser.add_argument('name', metavar='NAME', type=_name, help='the picture, one of those above')
+    parser.add_argument(
+        '-o',
+        '--output',
+        metavar='FILE',
+        help=f'file to write, .{", .".join(FORMATS)} (default: NAME.png)',
+    )
+    _cli.add_force(parser, 'the file')
+    return parser
