@@ -38,9 +38,9 @@ TWIST_IN = {
 }
 """Where messages have a twist."""
 POSE_IN = {
+    'nav_msgs/msg/Odometry': 'pose.pose.',
     'geometry_msgs/msg/PoseStamped': 'pose.',
     'geometry_msgs/msg/PoseWithCovarianceStamped': 'pose.pose.',
-    'nav_msgs/msg/Odometry': 'pose.pose.',
 }
 """Where messages have a pose."""
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -125,9 +125,7 @@ def our_controller(**kwargs: Any) -> CountedController:
     """Make our controller with a goal that it never reaches."""
     slow = Parameter('linear.x.max_velocity', value=SPEED)
     controller = CountedController(parameter_overrides=[slow], **kwargs)
-    goal = PoseStamped()
-    goal.pose.position.x = goal.pose.position.y = FAR
-    controller._on_goal_pose(goal)
+    controller._on_goal_pose(0, 0, '', FAR, FAR, 0.0, 0.0, 0.0, 1.0)
     return controller
 
 
