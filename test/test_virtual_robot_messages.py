@@ -26,7 +26,7 @@ from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.messages.codecs import POSE_WITH_COVARIANCE
-from diffdrive_jacobian.messages.conversion import from_covariance
+from diffdrive_jacobian.messages.covariances import from_covariance
 
 # --- Commands
 

@@ -167,7 +167,7 @@ class Motion(NamedTuple):
     twist: tuple[float, float]
     """`(v, omega)` in the body frame (m/s, rad/s)."""
     covariance: tuple[float, ...] = (0.0,) * 9
-    """Of x, y, theta, row by row; not checked, see `from_covariance`."""
+    """Of x, y, theta, row by row; not checked, see `covariances.from_covariance`."""
     twist_covariance: tuple[float, ...] = (0.0,) * 4
     """Of v and omega, row by row; not checked."""
 
