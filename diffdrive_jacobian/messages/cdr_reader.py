@@ -196,11 +196,8 @@ class _Walk:
     def _picker(self) -> Callable[[tuple[Any, ...]], tuple[Any, ...]]:
         picks = [self._picks[field] for field in self._fields]
         of_each = any(isinstance(one, list) for one in picks)
-        if of_each:
-            pick: Any = _each(picks)
-        else:
-            # An itemgetter of one index returns no tuple.
-            pick = itemgetter(*picks) if len(picks) > 1 else _few(picks)
+        # An itemgetter of one index returns no tuple.
+        pick: Any = _picked(picks) if of_each or len(picks) < 2 else itemgetter(*picks)
         texts = [number for number, field in enumerate(self._fields) if field in self._texts]
         if not texts:
             picker: Callable[[tuple[Any, ...]], tuple[Any, ...]] = pick
@@ -339,12 +336,8 @@ class _Walk:
             self._formatted = offset
 
 
-def _few(indices: Values[Any]) -> Callable[[tuple[Any, ...]], tuple[Any, ...]]:
-    return lambda values: tuple(values[index] for index in indices)
-
-
-def _each(picks: Values[Any]) -> Callable[[tuple[Any, ...]], tuple[Any, ...]]:
-    """Return a function as `_few`, which returns a tuple of values for a list of indices."""
+def _picked(picks: Values[Any]) -> Callable[[tuple[Any, ...]], tuple[Any, ...]]:
+    """Return a function of values that returns those at some indices, and a tuple for a list of them."""
 
     def pick(values: tuple[Any, ...]) -> tuple[Any, ...]:
         return tuple(
