@@ -29,3 +29,8 @@ def seconds(nanoseconds: int) -> float:
         nanoseconds: The duration (ns).
     """
     return nanoseconds / NANOSECONDS
+
+
+def in_seconds(time: int) -> str:
+    """Return a time (ns) in seconds, as text, in as many digits as it has."""
+    return f'{time / NANOSECONDS:.9f}'.rstrip('0').rstrip('.') + ' s'

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from nav_msgs.msg import Goals
 from process_faults.outcome import Outcome
 from rclpy.parameter import Parameter
+from ros_messages import value_of
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian import faults
@@ -143,7 +144,7 @@ def chain(world, case):
     # Whatever has happened, the next goal is reached.
     for name in NODES:
         world.find(name)
-    pose = np.array(ODOMETRY.of(world.last('odom')).pose)
+    pose = np.array(value_of(ODOMETRY, world.last('odom')).pose)
     assert all(map(math.isfinite, pose)), pose
     x, y, theta = map(float, pose)
     goal = x + 0.2 * math.cos(theta + 1.0), y + 0.2 * math.sin(theta + 1.0), 0.0

@@ -72,9 +72,14 @@ def twists(messages):
     return [(one.linear.x, one.angular.z) for one in bare]
 
 
+def value_of(codec, message):
+    """Read a message as those who receive it."""
+    return codec.reader(type(message))(serialize_message(message))
+
+
 def pose_of(message):
     codec = ODOMETRY if isinstance(message, Odometry) else POSE_WITH_COVARIANCE
-    return np.array(codec.of(message).pose)
+    return np.array(value_of(codec, message).pose)
 
 
 def covariance_of(odometry):

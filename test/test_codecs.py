@@ -16,7 +16,7 @@ from nav_msgs.msg import Goals, Odometry
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message, serialize_message
-from ros_messages import goal, goals, joint_command, odometry, pose_of, twist
+from ros_messages import goal, goals, joint_command, odometry, pose_of, twist, value_of
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -120,7 +120,7 @@ def test_names_change_with_the_parameters(lockstep):
 def test_the_controller_reads_frame_and_pose_of_an_odometry(message):
     frame, pose = ODOMETRY_POSE.reader(Odometry)(serialize_message(message))
     assert frame == message.header.frame_id
-    assert pose == ODOMETRY.of(message).pose == tuple(pose_of(message))
+    assert pose == value_of(ODOMETRY, message).pose == tuple(pose_of(message))
 
 
 times = st.integers(0, 2**31 * 10**9 - 1)
@@ -164,9 +164,9 @@ def test_what_is_written_is_read_again(codec, template, values, data):
     serialized = codec.writer(template)(value)
     kind = type(template)
     found = codec.reader(kind)(serialized)
-    # Without the class, as bags are read, and as an object, as users have it.
+    # Without the class, as bags are read, and as rclpy reads it.
     assert codec.reader(known_structure(codec.type_name))(serialized) == found
-    assert codec.of(deserialize_message(serialized, kind)) == found
+    assert value_of(codec, deserialize_message(serialized, kind)) == found
     expected = codec.numbers(value)
     assert codec.numbers(found) == pytest.approx(expected, rel=1e-14, abs=1e-14)
 
@@ -215,7 +215,7 @@ def test_values_of_parameters_are_those_of_rclpy():
     assert found == ('/a', {str(kind): one for kind, one in enumerate(values)})
     event.changed_parameters[0].value.type = 10
     with pytest.raises(MessageError, match='must be 0 to 9, got 10'):
-        PARAMETER_EVENT.of(event)
+        value_of(PARAMETER_EVENT, event)
 
 
 @settings(max_examples=100, deadline=None)

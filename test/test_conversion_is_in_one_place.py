@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from rclpy.serialization import deserialize_message
+from ros_messages import value_of
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
@@ -64,4 +65,8 @@ def test_wheels_are_left_right_in_messages_and_right_left_in_the_library(angles)
     assert list(state.velocity) == list(array.data) == [2.0, 3.0]
     assert list(state.position) == ([] if angles is None else [-0.5, 0.5])
     assert (state.header.stamp.sec, state.header.stamp.nanosec) == (1, 500_000_000)
-    assert JOINT_STATE.of(state).speeds(names) == WHEEL_ARRAY.of(array).speeds(names) == speeds
+    assert (
+        value_of(JOINT_STATE, state).speeds(names)
+        == value_of(WHEEL_ARRAY, array).speeds(names)
+        == speeds
+    )

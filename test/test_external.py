@@ -22,10 +22,12 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.faults import ClockPause, Kill, Loss, TimeJump
-from diffdrive_jacobian.lockstep import _external_process as external_process
-from diffdrive_jacobian.lockstep._external_answers import AnswersDue, TicksDue
-from diffdrive_jacobian.lockstep._external_topic import ExternalTopic
-from diffdrive_jacobian.lockstep._report import Traffic
+from diffdrive_jacobian.lockstep._clock import Agenda, Clocks
+from diffdrive_jacobian.lockstep._gate import Gates
+from diffdrive_jacobian.lockstep._links import Links
+from diffdrive_jacobian.lockstep.external import process as external_process
+from diffdrive_jacobian.lockstep.external.expectations import AnswersDue, TicksDue
+from diffdrive_jacobian.lockstep.external.topic import ExternalTopic
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.properties import NeverFasterThan
@@ -551,7 +553,8 @@ def test_ticks_that_were_due_before_a_restart_are_not_awaited():
 def test_messages_before_a_restart_are_not_delivered(ros):
     publisher = ros.peer.create_publisher(Twist, 'cmd_vel', 10)
     infos = ros.peer.get_publishers_info_by_topic('/cmd_vel')
-    topic = ExternalTopic(ros.peer, '/cmd_vel', infos, Traffic(lambda: 0))
+    links = Links(Agenda(), Gates(Agenda()), Clocks(0))
+    topic = ExternalTopic(ros.peer, '/cmd_vel', infos, links)
     for _ in range(3):
         publisher.publish(Twist())
     assert topic.count() == len(topic.deliver()) == 3

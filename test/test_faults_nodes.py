@@ -13,7 +13,7 @@ from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian import faults
-from diffdrive_jacobian.lockstep._keeper import check_holdable
+from diffdrive_jacobian.lockstep._services import check_holdable
 from diffdrive_jacobian.testing import LockstepError
 
 

@@ -11,6 +11,8 @@ from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian import faults
+from diffdrive_jacobian.properties import end_of_faults
+from diffdrive_jacobian.properties._node_time import delays
 from diffdrive_jacobian.testing import LockstepError
 
 INF = float('inf')
@@ -234,3 +236,43 @@ def test_the_expression_of_a_fault_is_short():
 def test_invalid_values_are_named(make, words):
     with pytest.raises(ValueError, match=words):
         make()
+
+
+# --- Faults of others
+
+
+@dataclass(frozen=True, repr=False)
+class Starved(faults.NodeFault):
+    """Each callback takes simulated time, of which properties learn by the fault itself."""
+
+    seconds: float
+
+    def install(self, injection):
+        gate, cost = injection.gate(self.node), round(self.seconds * 1e9)
+
+        def begin():
+            gate.slow(cost)
+            injection.note('the CPU is busy')
+            return lambda: gate.quicken(cost)
+
+        injection.during(begin)
+
+    @property
+    def longest_delay(self):
+        return self.seconds
+
+    def reaction_delay(self, node, since, now):
+        return 10.0 * self.seconds if self.overlap(since, now) > -self.seconds else 0.0
+
+
+def test_a_fault_of_ones_own_says_itself_what_it_does(lockstep):
+    source, sink = lockstep.create(Source), lockstep.create(Sink)
+    fault = Starved('sink', 0.03, start=0.15, duration=0.3)
+    lockstep.inject(fault)
+    lockstep.run_for(0.6)
+    assert whats(lockstep) == ['begins', 'the CPU is busy', 'ends']
+    assert [number for number, _ in sink.received] == list(range(1, 7))
+    assert end_of_faults(lockstep) == fault.end + 0.03
+    assert delays(lockstep, sink, 0.2) == 0.3
+    assert delays(lockstep, sink, 0.5) == 0.0
+    assert delays(lockstep, source, 0.2) == 0.0

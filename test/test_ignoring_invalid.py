@@ -10,7 +10,7 @@ from nav_msgs.msg import Goals, Odometry
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message, serialize_message
-from ros_messages import goal, goals, odometry
+from ros_messages import goal, goals, odometry, value_of
 from sensor_msgs.msg import JointState
 
 from diffdrive_jacobian.messages.codecs import (
@@ -38,7 +38,7 @@ def test_invalid_messages_are_ignored_without_a_word(codec, message, capfd):
         callback(invalid)
     assert received == []
     callback(data)
-    assert received == [codec.of(message)]
+    assert received == [value_of(codec, message)]
     assert refused == []
     assert capfd.readouterr() == ('', '')
 
@@ -75,7 +75,7 @@ def test_sequences_that_are_cut_off_are_ignored_without_a_word(codec, message, c
         callback(data[:end])
     assert received == []
     callback(data)
-    assert received == [codec.of(message)]
+    assert received == [value_of(codec, message)]
     assert capfd.readouterr() == ('', '')
 
 

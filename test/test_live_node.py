@@ -259,7 +259,7 @@ def test_parameters_are_set_and_refusals_are_shown(driven):
 
 
 def test_changes_of_others_are_followed(driven):
-    controller = next(node for node in driven.world._executor.nodes if isinstance(node, GoToGoal))
+    controller = next(node for node in driven.world.nodes if isinstance(node, GoToGoal))
     from rclpy.parameter import Parameter
 
     controller.set_parameters([Parameter('kv', value=1.25)])

@@ -132,7 +132,7 @@ def test_a_node_that_another_one_destroys_receives_nothing_more(lockstep):
     second.create_subscription(Vector3, 'a', heard.append, 10)
     lockstep.publish('a', Vector3())
     assert heard == []
-    assert second not in lockstep._executor.nodes
+    assert second not in lockstep.nodes
 
 
 def test_a_node_processes_what_was_sent_before_it_is_removed(lockstep):
@@ -150,7 +150,7 @@ def test_a_node_that_was_destroyed_can_be_removed(lockstep):
     node = lockstep.add(Node('short_lived'))
     node.destroy_node()
     lockstep.remove(node)
-    assert lockstep._executor.nodes == [lockstep.node]
+    assert lockstep.nodes == [lockstep.node]
 
 
 def test_what_could_not_be_published_is_not_reported(lockstep):

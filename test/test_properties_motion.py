@@ -384,10 +384,10 @@ def test_what_another_process_receives_is_not_known(lockstep):
     ):
         lockstep.require(required)
         with pytest.raises(LockstepError, match='/cmd_vel, which is in another process'):
-            lockstep._traffic.note_external(source, [message])
-        lockstep._watches.pop().end()
+            lockstep._scheduler.links.note_external(source, [message])
+        lockstep._properties.required.pop().end()
     lockstep.require(NeverFasterThan(0.5, 1.0))
-    lockstep._traffic.note_external(source, [message])
+    lockstep._scheduler.links.note_external(source, [message])
     with pytest.raises(PropertyViolation, match=r'v 0.75 m/s'):
         lockstep.settle()
 

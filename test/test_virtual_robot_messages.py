@@ -19,13 +19,14 @@ from ros_messages import (
     twist,
     twist_stamped,
     twists,
+    value_of,
 )
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.messages.codecs import POSE_WITH_COVARIANCE
-from diffdrive_jacobian.messages.conversion import from_covariance
+from diffdrive_jacobian.messages.covariances import from_covariance
 
 # --- Commands
 
@@ -193,7 +194,9 @@ def test_initialpose_while_driving_carries_its_covariance(lockstep, robot_at, fr
     lockstep.publish(
         'initialpose', placement(2.0, 3.0, math.pi / 2, variances=(0.25, 0.5, 0.07), frame=frame)
     )
-    assert POSE_WITH_COVARIANCE.of(topics.starts[-1]).pose == pytest.approx([2.0, 3.0, math.pi / 2])
+    assert value_of(POSE_WITH_COVARIANCE, topics.starts[-1]).pose == pytest.approx(
+        [2.0, 3.0, math.pi / 2]
+    )
     lockstep.run_for(1.0)
     assert pose_of(topics.odom[-1]) == pytest.approx([2.0, 3.125, math.pi / 2], abs=1e-15)
     # Only the uncertain heading makes the pose more uncertain: the path ends on a circle, at an angle
@@ -251,6 +254,6 @@ def test_variances_that_rounding_made_negative_are_set_to_zero():
     covariance = np.zeros((6, 6))
     covariance[np.ix_((0, 1, 5), (0, 1, 5))] = exact - 1e-12 * np.eye(3)
     message.pose.covariance = covariance.ravel()
-    found = from_covariance(POSE_WITH_COVARIANCE.of(message).covariance)
+    found = from_covariance(value_of(POSE_WITH_COVARIANCE, message).covariance)
     np.testing.assert_allclose(found, exact, atol=1e-11)
     assert np.linalg.eigvalsh(found)[0] > -1e-15

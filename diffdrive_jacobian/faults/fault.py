@@ -1,8 +1,8 @@
 """The base classes of all faults.
 
 A fault is a value: a frozen dataclass that can be compared, pickled and printed as the Python expression
-that makes it. `Lockstep.inject` lets it happen. How it happens is in `install`, which uses the hooks
-that the world offers to every fault (`Injection`).
+that makes it. `Lockstep.inject` lets it happen. How it happens is in `install`, which uses what the
+world offers to every fault (`Injection`).
 """
 
 from __future__ import annotations
@@ -14,11 +14,15 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+from rclpy.node import Node
+
 from diffdrive_jacobian.faults.expression import Expression
 from diffdrive_jacobian.lockstep._injection import Injection
 from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
 from diffdrive_jacobian.numerics.fields import Name, Text
 
+Undo = Callable[[], None]
+"""Ends what a fault does."""
 Filter = Callable[[int, bytes], Iterable[tuple[int, bytes]]]
 """What a topic fault does with a message.
 
@@ -44,9 +48,48 @@ class Fault(Expression, ABC):
     start: NotNegative = 0.0
     duration: PositiveOrInfinite = math.inf
 
+    at_once: ClassVar[bool] = False
+    """Whether it happens once, when it begins, and is over then unless it has a duration."""
+
     @abstractmethod
     def install(self, injection: Injection) -> None:
-        """Schedule the fault in a world."""
+        """Say what happens in a world when the fault begins and ends."""
+
+    @property
+    def end(self) -> float:
+        """World time at which it has ended (s); infinite: never."""
+        if self.at_once and math.isinf(self.duration):
+            return self.start
+        return self.start + self.duration
+
+    @property
+    def longest_delay(self) -> float:
+        """How long something that it has delayed is under way at most (s)."""
+        return 0.0
+
+    @property
+    def clock_jumps(self) -> tuple[float, ...]:
+        """World times at which the clock of the nodes jumps because of it (s)."""
+        return ()
+
+    @property
+    def affected_node(self) -> str:
+        """Name of the node that it affects; empty: none in particular."""
+        return ''
+
+    def reaction_delay(self, node: Node, since: float, now: float) -> float:
+        """Return by how much it may have delayed a reaction of the node that it affects (s).
+
+        Args:
+            node: The node.
+            since: World time from which on it could react (s).
+            now: World time of the reaction (s).
+        """
+        return 0.0
+
+    def overlap(self, since: float, now: float) -> float:
+        """Return how much of an interval of world time it lasts (s); negative: it is as far away."""
+        return min(now, self.start + self.duration) - max(since, self.start)
 
 
 @dataclass(frozen=True, repr=False)

@@ -6,9 +6,13 @@ The name of a node without a slash at the beginning is taken to be in the namesp
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-from diffdrive_jacobian.faults.fault import Fault
+from rclpy.node import Node
+
+from diffdrive_jacobian.faults.fault import Fault, Undo
+from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._injection import Injection
 from diffdrive_jacobian.numerics.checks import Positive
 from diffdrive_jacobian.numerics.fields import Name
@@ -25,6 +29,11 @@ class NodeFault(Fault):
 
     node: Name
 
+    @property
+    def affected_node(self) -> str:
+        """Name of the node."""
+        return self.node
+
 
 @dataclass(frozen=True, repr=False)
 class Kill(NodeFault):
@@ -36,8 +45,33 @@ class Kill(NodeFault):
     """
 
     def install(self, injection: Injection) -> None:
-        """Schedule the end of the node."""
-        injection.kill(self.node)
+        """Destroy the node when the fault begins, and create it again when it ends."""
+        world, name = injection.world, injection.gate(self.node).name
+        # The faults because of which the node is not there.
+        deaths = world.shared[f'deaths of {name}']
+
+        def die() -> Undo:
+            deaths.append(self)
+            victim = world.find(name)
+            if victim is None:
+                injection.note('the node is not there')
+                return rise
+            if math.isfinite(self.duration) and not world.restartable(name):
+                raise LockstepError(
+                    f'{self!r} cannot start {name} again: create it with Lockstep.create'
+                )
+            world.kill(victim)
+            injection.note(f'{name} is killed')
+            return rise
+
+        def rise() -> None:
+            deaths.remove(self)
+            # One that was created after the fault began was not killed.
+            if not deaths and world.restartable(name) and world.find(name) is None:
+                world.restart(name)
+                injection.note(f'{name} is started again')
+
+        injection.during(die)
 
 
 @dataclass(frozen=True, repr=False)
@@ -51,7 +85,22 @@ class Hang(NodeFault):
 
     def install(self, injection: Injection) -> None:
         """Hold the callbacks of the node."""
-        injection.hold(self.node)
+        gate = injection.gate(self.node)
+
+        def freeze() -> Undo:
+            gate.hold()
+            return thaw
+
+        def thaw() -> None:
+            what = [f'{len(gate.waiting)} messages and requests wait', gate.lost()]
+            injection.note(', '.join(filter(None, what)))
+            gate.release()
+
+        injection.during(freeze)
+
+    def reaction_delay(self, node: Node, since: float, now: float) -> float:
+        """Return for how long the node was frozen (s)."""
+        return max(self.overlap(since, now), 0.0)
 
 
 @dataclass(frozen=True, repr=False)
@@ -72,7 +121,31 @@ class Slow(NodeFault):
 
     def install(self, injection: Injection) -> None:
         """Set the duration of the callbacks."""
-        injection.slow(self.node, nanoseconds(self.seconds))
+        gate, cost = injection.gate(self.node), nanoseconds(self.seconds)
+
+        def slow() -> Undo:
+            gate.slow(cost)
+            return quicken
+
+        def quicken() -> None:
+            gate.quicken(cost)
+            if lost := gate.lost():
+                injection.note(lost)
+
+        injection.during(slow)
+
+    @property
+    def longest_delay(self) -> float:
+        """Duration of a callback (s)."""
+        return self.seconds
+
+    def reaction_delay(self, node: Node, since: float, now: float) -> float:
+        """Return the duration of the callbacks that may come first (s).
+
+        One that has begun, others that wait, and that of the timer, which may expire early.
+        """
+        longest = (3.0 + len(list(node.timers))) * self.seconds
+        return longest if self.overlap(since, now) > -longest else 0.0
 
 
 @dataclass(frozen=True, repr=False)
@@ -89,5 +162,22 @@ class TimerJitter(NodeFault):
 
     def install(self, injection: Injection) -> None:
         """Delay the ticks of the timers."""
-        rng = injection.rng(self.node)
-        injection.delay_timers(self.node, lambda: nanoseconds(self.seconds * rng.random()))
+        rng, delays = injection.rng(self.node), injection.gate(self.node).timer_delays
+
+        def draw() -> int:
+            return nanoseconds(self.seconds * rng.random())
+
+        def begin() -> Undo:
+            delays.append(draw)
+            return lambda: delays.remove(draw)
+
+        injection.during(begin)
+
+    @property
+    def longest_delay(self) -> float:
+        """Longest delay of a tick (s)."""
+        return self.seconds
+
+    def reaction_delay(self, node: Node, since: float, now: float) -> float:
+        """Return the longest delay of a tick (s)."""
+        return self.seconds if self.overlap(since, now) > -self.seconds else 0.0

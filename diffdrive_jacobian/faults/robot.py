@@ -17,7 +17,7 @@ from typing import Annotated, ClassVar
 
 from rclpy.node import Node
 
-from diffdrive_jacobian.faults.fault import Fault
+from diffdrive_jacobian.faults.fault import Fault, Undo
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._injection import Injection
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
@@ -28,8 +28,8 @@ from diffdrive_jacobian.simulation.encoders import MAX_PER_REVOLUTION
 from diffdrive_jacobian.simulation.robot import RobotModel
 from diffdrive_jacobian.simulation.slip import MAX_SEED, Drift
 
-Undo = Callable[[], None]
-"""Ends the effect of a fault on a robot."""
+DECAY = 7.0
+"""Time constants after which a robot whose motors lag stands still: exp(-7) is 0.001."""
 Wheel = Annotated[str, one_of('left', 'right')]
 Multiplier = Annotated[float, partial(number, check=between(0.01, 100.0))]
 
@@ -44,38 +44,44 @@ class RobotFault(Fault):
 
     robot: Name = field(default='virtual_robot', kw_only=True)
 
-    lasting: ClassVar[bool] = True
-    """Whether the fault also applies to a robot that is created again while it lasts."""
-
     @abstractmethod
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo | None:
         """Begin the fault. Return what ends it; None: nothing does."""
 
     def install(self, injection: Injection) -> None:
         """Apply the fault to the robot, whenever there is one during the fault."""
-        undone: list[tuple[Node, Undo]] = []
-        done = False
+        name, world = injection.gate(self.robot).name, injection.world
+        affected: Node | None = None
+        undo: Undo | None = None
 
-        def begin(node: Node) -> None:
-            nonlocal done
-            if not isinstance(node, VirtualRobot):
+        def meet() -> None:
+            nonlocal affected, undo
+            robot = world.find(name) if injection.active else None
+            if robot is None or robot is affected:
+                return
+            if not isinstance(robot, VirtualRobot):
                 raise LockstepError(
-                    f'{self!r} needs a VirtualRobot, but node {node.get_fully_qualified_name()} is a '
-                    f'{type(node).__name__}'
+                    f'{self!r} needs a VirtualRobot, but node {name} is a {type(robot).__name__}'
                 )
-            if self.lasting or not done:
-                done = True
-                undo = self.apply(node, injection)
-                undone[:] = [(node, undo)] if undo is not None else []
-                if not self.lasting:
-                    injection.end()
+            affected, undo = robot, self.apply(robot, injection)
+            if self.at_once:
+                injection.end()
 
-        def end(node: Node) -> None:
-            for affected, undo in undone:
-                if affected is node:
-                    undo()
+        def begin() -> Undo:
+            meet()
+            return end
 
-        injection.change_node(self.robot, begin, end)
+        def end() -> None:
+            if undo is not None and affected is world.find(name):
+                undo()
+
+        injection.when_nodes_change(meet)
+        injection.during(begin)
+
+    @property
+    def affected_node(self) -> str:
+        """Name of its node."""
+        return self.robot
 
 
 @dataclass(frozen=True, repr=False)
@@ -140,6 +146,10 @@ class ActuatorLag(RobotFault):
             return replace(model, actuators=replace(actuators, lag=max(actuators.lag, self.seconds)))
 
         return robot.condition.change(lag)
+
+    def reaction_delay(self, node: Node, since: float, now: float) -> float:
+        """Return the time after which the wheels have followed a command (s)."""
+        return DECAY * self.seconds if self.overlap(since, now) > -DECAY * self.seconds else 0.0
 
 
 @dataclass(frozen=True, repr=False)
@@ -230,7 +240,7 @@ class Push(RobotFault):
     dtheta: Finite = 0.0
     noticed: Annotated[bool, boolean] = False
 
-    lasting: ClassVar[bool] = False
+    at_once: ClassVar[bool] = True
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> None:
         """Displace the robot."""

@@ -71,6 +71,12 @@ class Delay(TopicFault):
 
         return delay
 
+    @property
+    def longest_delay(self) -> float:
+        """Delay at the end of the fault (s). Without growth also one without an end has a longest."""
+        growth = self.growth * self.duration if self.growth else 0.0
+        return self.seconds + self.spread + growth
+
 
 @dataclass(frozen=True, repr=False)
 class Reorder(TopicFault):
@@ -93,6 +99,11 @@ class Reorder(TopicFault):
             return [(late if rng.random() < self.probability else 0, data)]
 
         return reorder
+
+    @property
+    def longest_delay(self) -> float:
+        """Time for which a message is held back (s)."""
+        return self.seconds
 
 
 @dataclass(frozen=True, repr=False)
@@ -117,6 +128,11 @@ class Duplicate(TopicFault):
             return [(nanoseconds(number * self.seconds), data) for number in range(copies + 1)]
 
         return duplicate
+
+    @property
+    def longest_delay(self) -> float:
+        """Time between the first and the last arrival of a message (s)."""
+        return self.copies * self.seconds
 
 
 @dataclass(frozen=True, repr=False)

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
-from diffdrive_jacobian.faults.fault import Fault
+from rclpy.exceptions import ParameterUninitializedException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from diffdrive_jacobian.faults.fault import Fault, Undo
 from diffdrive_jacobian.faults.nodes import NodeFault
+from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._injection import Injection
 from diffdrive_jacobian.numerics.checks import PositiveOrInfinite, finite, number
 from diffdrive_jacobian.numerics.fields import Name
-from diffdrive_jacobian.time_units import nanoseconds
+from diffdrive_jacobian.ros.rclpy_internals import PARAMETERS_OF_RCLPY, declared_parameters
+from diffdrive_jacobian.time_units import in_seconds, nanoseconds
 
 
 def _jump(name: str, value: Any) -> float:
@@ -46,9 +54,30 @@ class TimeJump(Fault):
 
     seconds: Annotated[float, _jump]
 
+    at_once: ClassVar[bool] = True
+
     def install(self, injection: Injection) -> None:
-        """Schedule the jump of the clock."""
-        injection.jump(nanoseconds(self.seconds))
+        """Shift the clock when the fault begins, and back when it ends."""
+
+        def jump(duration: int) -> int:
+            done = injection.world.shift_clock(duration)
+            injection.note(f'the clock has jumped by {in_seconds(done)}')
+            return done
+
+        def begin() -> Undo:
+            done = jump(nanoseconds(self.seconds))
+
+            def back() -> None:
+                jump(-done)
+
+            return back
+
+        injection.during(begin)
+
+    @property
+    def clock_jumps(self) -> tuple[float, ...]:
+        """World times at which it begins and ends (s)."""
+        return self.start, self.start + self.duration
 
 
 @dataclass(frozen=True, repr=False)
@@ -59,8 +88,8 @@ class ClockPause(Fault):
     """
 
     def install(self, injection: Injection) -> None:
-        """Schedule the pause of the clock."""
-        injection.pause_clock()
+        """Stop the clock during the fault."""
+        injection.during(injection.world.pause_clock)
 
 
 @dataclass(frozen=True, repr=False)
@@ -77,8 +106,21 @@ class LateService(Fault):
 
     def install(self, injection: Injection) -> None:
         """Delay the responses of the service."""
+        world = injection.world
+        name = world.node.resolve_service_name(self.service)
         late = nanoseconds(self.seconds) if math.isfinite(self.seconds) else None
-        injection.delay_responses(self.service, late)
+        held = 'a response is never sent' if late is None else f'a response is {in_seconds(late)} late'
+
+        def is_there(nodes: Iterable[Node]) -> bool:
+            return any(one.service_name == name for node in nodes for one in node.services)
+
+        injection.expect(f'no service {name} was seen', is_there)
+        injection.during(lambda: world.delay_responses(name, late, lambda: injection.note(held)))
+
+    @property
+    def longest_delay(self) -> float:
+        """Delay of a response (s); 0: it is never sent."""
+        return self.seconds if math.isfinite(self.seconds) else 0.0
 
 
 @dataclass(frozen=True, repr=False)
@@ -99,5 +141,76 @@ class ParameterChange(NodeFault):
     value: Annotated[Any, _parameter_value]
 
     def install(self, injection: Injection) -> None:
-        """Schedule the change of the parameter."""
-        injection.change_parameter(self.node, self.name, self.value)
+        """Change the parameter when the fault begins, and back when it ends.
+
+        While a later change of it lasts, that one remains, and at its end the value is as before both.
+        """
+        gate, world = injection.gate(self.node), injection.world
+        # The parameters that are changed now, the earliest change first.
+        changes: list[_Change] = world.shared[f'parameters of {gate.name}']
+        own: list[_Change] = []
+
+        def begin() -> Undo:
+            target = world.find(gate.name)
+            if target is None:
+                injection.note('the node is not there')
+            else:
+                gate.enter(self, 'parameters', lambda: change(target))
+            return end
+
+        def change(target: Node) -> None:
+            before = self._set(injection, target, self.value)
+            if before is not None:
+                own.append(_Change(target, self.name, before))
+                changes.extend(own)
+
+        def end() -> None:
+            target = world.find(gate.name)
+            if target is not None:
+                # A frozen node may not have processed the change yet.
+                gate.enter(self, 'parameters', lambda: change_back(target))
+
+        def change_back(target: Node) -> None:
+            for one in own:
+                later = [
+                    other
+                    for other in changes[changes.index(one) + 1 :]
+                    if (other.node, other.name) == (one.node, self.name)
+                ]
+                changes.remove(one)
+                if later:
+                    later[0].before = one.before
+                elif one.node is target:
+                    self._set(injection, target, one.before)
+
+        injection.during(begin)
+
+    def _set(self, injection: Injection, node: Node, value: Any) -> Any:
+        """Set the parameter. Return its value before; None: the node refused it, or it had none."""
+        if not node.has_parameter(self.name):
+            declared = sorted(declared_parameters(node))
+            known = ', '.join(one for one in declared if not one.startswith(PARAMETERS_OF_RCLPY))
+            raise LockstepError(
+                f'{self!r}: {node.get_fully_qualified_name()} has no parameter {self.name!r}; '
+                f'it has {known or "none"}'
+            )
+        value = list(value) if isinstance(value, tuple) else value
+        before = None
+        with suppress(ParameterUninitializedException):
+            before = node.get_parameter(self.name).value
+        result = node.set_parameters_atomically([Parameter(self.name, value=value)])
+        if not result.successful:
+            injection.note(f'{self.name} = {value!r} is refused: {result.reason}')
+            return None
+        injection.note(f'{self.name} is {value!r}, was {before!r}')
+        return before
+
+
+@dataclass(eq=False)
+class _Change:
+    """A parameter that a fault has changed."""
+
+    node: Node
+    name: str
+    before: Any
+    """Value before the change."""

@@ -46,17 +46,17 @@ class PropertyViolation(LockstepError):  # noqa: N818
     The message begins with the property, the time, what was observed and what is allowed.
     """
 
-    def __init__(self, requirement: Any, seconds: float, text: str, report: str = '') -> None:
+    def __init__(self, violated: Any, seconds: float, text: str, report: str = '') -> None:
         """Describe a violation.
 
         Args:
-            requirement: The property.
+            violated: The property.
             seconds: Time since the start of the `Lockstep` (s).
             text: What was observed, and what is allowed.
             report: The last messages of all topics.
         """
-        super().__init__(requirement, seconds, text, report)
-        self.property = requirement
+        super().__init__(violated, seconds, text, report)
+        self.property = violated
         """The property that is violated."""
         self.seconds = seconds
         """World time since the start of the `Lockstep` (s)."""
@@ -69,3 +69,10 @@ class PropertyViolation(LockstepError):  # noqa: N818
         """Return the message."""
         first = f'{self.property} is violated at {self.seconds:g} s: {self.text}'
         return f'{first}\n{self.report}' if self.report else first
+
+
+def described(value: Any) -> str:
+    """Return a description of an argument of a wrong kind."""
+    if isinstance(value, type):
+        return f'the class {value.__name__}'
+    return f"'{value}'" if isinstance(value, str) else f'an object of the class {type(value).__name__}'

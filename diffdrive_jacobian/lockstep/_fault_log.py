@@ -11,7 +11,7 @@ from typing import Any
 from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
-from diffdrive_jacobian.time_units import NANOSECONDS
+from diffdrive_jacobian.time_units import NANOSECONDS, in_seconds
 
 """Topic of the events."""
 MAX_EVENTS = 200
@@ -178,8 +178,3 @@ def _kind(data: bytes, out: list[tuple[int, bytes]]) -> str:
     if len(out) > 1:
         return f'arrives {len(out)} times{changed}'
     return f'delayed{changed}' if late else changed.removeprefix(' and ')
-
-
-def in_seconds(time: int) -> str:
-    """Return a time (ns) in seconds, in as many digits as it has."""
-    return f'{time / NANOSECONDS:.9f}'.rstrip('0').rstrip('.') + ' s'

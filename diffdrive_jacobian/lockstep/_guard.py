@@ -22,7 +22,7 @@ from typing import Any
 import rclpy
 from rclpy.node import Node
 
-from diffdrive_jacobian.lockstep import _executor
+from diffdrive_jacobian.lockstep import _scheduler
 from diffdrive_jacobian.ros import rclpy_internals
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -143,8 +143,8 @@ class Guard:
 
 
 def _stack(frame: FrameType | None) -> Iterator[FrameType]:
-    """Yield the frames of the running callback, innermost first, without those of the executor."""
-    while frame is not None and frame.f_code.co_filename != _executor.__file__:
+    """Yield the frames of the running callback, innermost first, without those of the scheduler."""
+    while frame is not None and frame.f_code.co_filename != _scheduler.__file__:
         yield frame
         frame = frame.f_back
 

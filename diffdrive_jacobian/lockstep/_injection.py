@@ -1,163 +1,367 @@
-"""The faults of a world. The faults themselves are defined in `diffdrive_jacobian.faults`."""
+"""One fault in a world: its time, its random numbers, its events, and what it affects.
+
+The faults themselves are defined in `diffdrive_jacobian.faults`. A fault has a method `install`, which
+says with the methods of an `Injection` what happens when it begins and when it ends.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from functools import partial
-from typing import Any, Protocol
+import math
+import random
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
 
 from rclpy.node import Node
-from rclpy.publisher import Publisher
-from rclpy.serialization import serialize_message
-from rclpy.subscription import Subscription
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
-from diffdrive_jacobian.lockstep._fault_log import MAX_REPORTED, FaultEvent, in_seconds
-from diffdrive_jacobian.lockstep._gated_reader import GatedReader, Stage
-from diffdrive_jacobian.lockstep._gates import send_unless_destroyed
-from diffdrive_jacobian.lockstep._injection_base import Timed, World
-from diffdrive_jacobian.lockstep._node_injection import NodeInjection
-from diffdrive_jacobian.lockstep._report import Traffic
-from diffdrive_jacobian.lockstep._topic_injection import TopicInjection
-from diffdrive_jacobian.time_units import NANOSECONDS
+from diffdrive_jacobian.lockstep._fault_log import FaultLog, Hits, totals
+from diffdrive_jacobian.lockstep._gate import Gate
+from diffdrive_jacobian.lockstep._link import Link, Source, Stage
+from diffdrive_jacobian.lockstep._scheduler import Scheduler
+from diffdrive_jacobian.messages.topics import CLOCK
+from diffdrive_jacobian.time_units import in_seconds, nanoseconds
+
+Filter = Callable[[int, bytes], Iterable[tuple[int, bytes]]]
+"""Receives a world time (ns) and a message, returns messages with their delays (ns)."""
+Begin = Callable[[random.Random, type], Filter]
+"""Returns the filter of one subscription."""
+Undo = Callable[[], None]
+"""Ends what a fault does."""
 
 
-class Injection(TopicInjection, NodeInjection):
-    """What one fault does to a world. A fault calls these methods in its method `install`."""
+class Fault(Protocol):
+    """What lockstep needs of a fault."""
 
+    @property
+    def start(self) -> float:
+        """World time at which it begins (s)."""
 
-class Injectable(Timed, Protocol):
-    """A fault."""
+    @property
+    def duration(self) -> float:
+        """How long it lasts (s)."""
 
     def install(self, injection: Injection) -> None:
-        """Schedule it."""
+        """Say what happens when it begins and ends."""
 
 
-class Injections:
-    """All faults of a world."""
+@dataclass(frozen=True)
+class World:
+    """What faults can do with a world.
 
-    def __init__(self, world: World, traffic: Traffic) -> None:
-        """Start without faults, and open all gates."""
-        self._world = world
-        self._traffic = traffic
-        self._stages: dict[Publisher, list[Stage]] = {}
-        self.all: list[Injection] = []
-        """In the order of injection."""
-        executor, keeper = world.executor, world.keeper
-        executor.use(keeper)
-        executor.deliveries.new_reader = self._reader
-        executor.deliveries.replace(executor.nodes)
-        traffic.intercept = self._intercept
+    Attributes:
+        scheduler: Executes the nodes.
+        node: Node of the test, which resolves names.
+        log: Keeps the events.
+        observers: Nodes that are affected only by faults that name them.
+        restartable: Returns whether the node of a name can be created again.
+        restart: Creates the node of a name again.
+        shared: Lists that faults share, by name.
+    """
 
-    def add(self, fault: Injectable, seed: int) -> None:
-        """Inject a fault."""
-        same = sum(injection.fault == fault for injection in self.all)
-        injection = Injection(self._world, fault, len(self.all), same, seed)
-        fault.install(injection)
-        self.all.append(injection)
-        injection.schedule()
-        for reader in self._world.executor.deliveries.readers():
-            if isinstance(reader, GatedReader):
-                injection.filter_reader(reader)
-        for publisher, stages in self._stages.items():
-            if (stage := injection.publisher_stage(self._owner(publisher), publisher)) is not None:
-                stages.append(stage)
+    scheduler: Scheduler
+    node: Node
+    log: FaultLog
+    observers: set[Node]
+    restartable: Callable[[str], bool]
+    restart: Callable[[str], None]
+    shared: defaultdict[str, list[Any]] = field(default_factory=lambda: defaultdict(list))
+
+    def find(self, name: str) -> Node | None:
+        """Return the node that has a fully qualified name now; None: there is none."""
+        nodes = self.scheduler.nodes
+        return next((node for node in nodes if node.get_fully_qualified_name() == name), None)
+
+    def kill(self, node: Node) -> None:
+        """Remove and destroy a node at once."""
+        self.scheduler.kill(node)
+
+    def shift_clock(self, duration: int) -> int:
+        """Let the clock of the nodes jump by a time (ns). Return by how much it did."""
+        return self.scheduler.clocks.shift(duration)
+
+    def pause_clock(self) -> Undo:
+        """Stop the clock of the nodes. Return what lets it go on."""
+        clocks = self.scheduler.clocks
+        clocks.pauses += 1
+
+        def go_on() -> None:
+            clocks.pauses -= 1
+
+        return go_on
+
+    def delay_responses(self, service: str, late: int | None, note: Callable[[], None]) -> Undo:
+        """Delay the responses of a service. Return what ends that.
+
+        Args:
+            service: Full name of the service.
+            late: The delay (ns). None: they are never sent.
+            note: Called for each response.
+        """
+        return self.scheduler.responses.delay(service, late, note)
+
+
+class _Filtered(NamedTuple):
+    """What a fault filters."""
+
+    topic: str
+    owner: str
+    begin: Begin
+    keeps_order: bool
+    at_publisher: bool
+
+
+class Injection:
+    """What one fault does to a world. A fault calls its methods in `install`."""
+
+    def __init__(self, world: World, fault: Fault, position: int, same: int, seed: int) -> None:
+        """Start without effect.
+
+        Args:
+            world: The world.
+            fault: The fault.
+            position: Number of faults that were injected before.
+            same: Number of equal ones among them. Random numbers depend on this, not on `position`, so
+                that they stay the same when another fault is added or left out.
+            seed: Seed of the random numbers.
+        """
+        self.world = world
+        """What the fault can do."""
+        self.fault = fault
+        self._position = position
+        self._seed = f'{seed}/{same}/{fault!r}'
+        self._agenda = world.scheduler.agenda
+        self.active = False
+        """Whether the fault has begun and has not ended."""
+        self.ended = False
+        """Whether it has ended."""
+        self._generators: Counter[str] = Counter()
+        self.missing: str | None = None
+        """What the fault needs and has not met, as a sentence; None: nothing."""
+        self._is_there: Callable[[Iterable[Node]], bool] = any
+        self._begins: list[Callable[[], Undo | None]] = []
+        self._ends: list[Undo] = []
+        self._meetings: list[Callable[[], None]] = []
+        self._filtered: _Filtered | None = None
+        self._hits: list[Hits] = []
+        self._last_arrival = 0
+        """World time at which the last message arrives that the fault has delayed (ns)."""
+
+    # --- Time
+
+    def schedule(self) -> None:
+        """Schedule the start and the end of the fault."""
+        start, duration = self.fault.start, self.fault.duration
+        self._agenda.at(nanoseconds(start), self._start)
+        if math.isfinite(duration):
+            self._agenda.at(nanoseconds(start) + nanoseconds(duration), self.end)
+
+    def during(self, begin: Callable[[], Undo | None]) -> None:
+        """Call a function when the fault begins. It returns what is called when the fault ends."""
+        self._begins.append(begin)
+
+    def _start(self) -> None:
+        self.active = True
+        self.note('begins')
+        for begin in self._begins:
+            undo = begin()
+            if undo is not None:
+                self._ends.append(undo)
+
+    def end(self) -> None:
+        """End the fault now. Messages that it has delayed still arrive late."""
+        if self.ended:
+            return
+        self.active, self.ended = False, True
+        for undo in self._ends:
+            undo()
+        if self._last_arrival > self._agenda.now:
+            self._flush()
+            self.note(f'is over, its last message arrives at {in_seconds(self._last_arrival)}')
+            self._agenda.at(self._last_arrival, self._note_end)
+        else:
+            self._note_end()
+
+    def _flush(self) -> None:
+        for hits in self._hits:
+            hits.flush()
+
+    def _note_end(self) -> None:
+        self._flush()
+        affected = totals(self._hits)
+        what = f'ends: {affected}' if affected else 'ends'
+        self.world.log.add(self._position, self.fault, what, last=True)
+
+    # --- Random numbers
+
+    def rng(self, key: str) -> random.Random:
+        """Return a generator of random numbers. Each call with the same key returns another one."""
+        self._generators[key] += 1
+        return random.Random(f'{self._seed}/{key}/{self._generators[key]}')
+
+    # --- Events
+
+    def note(self, what: str) -> None:
+        """Add an event."""
+        self.world.log.add(self._position, self.fault, what)
+
+    def state(self) -> str:
+        """Return whether the fault is active, and what it did so far."""
+        if self.active:
+            state = 'active'
+        elif not self.ended:
+            state = f'has not begun, starts at {self.fault.start:g} s'
+        elif self._last_arrival > self._agenda.now:
+            state = f'over, its last message arrives at {in_seconds(self._last_arrival)}'
+        else:
+            state = 'ended'
+        details = self.missing or totals(self._hits)
+        return f'{state}, {details}' if details else state
+
+    def unfinished(self) -> list[str]:
+        """Return what the fault did to the latest messages, as far as there is no event of it yet."""
+        return [text for hits in self._hits if (text := hits.open())]
+
+    # --- What the fault affects
+
+    def expect(self, missing: str, is_there: Callable[[Iterable[Node]], bool]) -> None:
+        """Expect something that the fault affects.
+
+        Args:
+            missing: What to report if it never appears.
+            is_there: Returns whether it is there, among nodes.
+        """
+        self.missing = missing
+        self._is_there = is_there
+        self.look()
+
+    def when_nodes_change(self, action: Callable[[], None]) -> None:
+        """Call a function whenever a node is added, or has created or destroyed an entity."""
+        self._meetings.append(action)
 
     def look(self) -> None:
-        """Check which faults have met what they affect."""
-        for injection in self.all:
-            injection.look()
+        """Check whether there is anything that the fault affects, after nodes have changed."""
+        if self.missing is not None and self._is_there(self.world.scheduler.nodes):
+            self.missing = None
+        for action in self._meetings:
+            action()
 
-    def ineffective(self) -> list[str]:
-        """Return descriptions of the faults that met nothing that they could affect."""
-        return [text for injection in self.all if (text := injection.ineffective())]
+    def full_name(self, node: str) -> str:
+        """Return the fully qualified name of a node, in the namespace of the test by default."""
+        return full_name(node, self.world.node)
 
-    def missing(self) -> list[str]:
-        """Return what these faults needed, as sentences."""
-        return [injection.missing for injection in self.all if injection.missing]
+    def gate(self, node: str) -> Gate:
+        """Return the gate of a node, which is expected to be there some time.
 
-    def events(self) -> list[FaultEvent]:
-        """Return all events, also of the latest messages, of which there may be more."""
-        log = self._world.log
-        return [
-            *log.events,
-            *(log.event(one.fault, text) for one in self.all for text in one.unfinished()),
-        ]
+        Raises:
+            LockstepError: It is the node of the test itself.
+        """
+        name = self.full_name(node)
+        if name == self.world.node.get_fully_qualified_name():
+            raise LockstepError(f'{self.fault!r} names the node of the test itself')
+        self.expect(
+            f'no node {name} was seen',
+            lambda nodes: any(one.get_fully_qualified_name() == name for one in nodes),
+        )
+        return self.world.scheduler.gates.of(name)
 
-    def describe(self) -> str:
-        """Return the faults and their latest events as text."""
-        events = self.events()
-        hidden = max(0, len(events) - MAX_REPORTED)
-        return '\n'.join(
-            [
-                f'faults, {in_seconds(self._world.executor.agenda.now)} after the start:',
-                *(f'  {one.fault!r}: {one.state()}' for one in self.all),
-                f'events of faults{f", without the first {hidden}" if hidden else ""}:',
-                *(f'  {event}' for event in events[hidden:]),
-            ]
+    def filter_topic(
+        self,
+        topic: str,
+        node: str,
+        begin: Begin,
+        *,
+        keeps_order: bool = False,
+        at_publisher: bool = False,
+    ) -> None:
+        """Filter the messages of a topic.
+
+        Args:
+            topic: Name of the topic.
+            node: Name of the node whose subscriptions are filtered; empty: all but observers.
+            begin: Returns the filter of a subscription.
+            keeps_order: Whether a message never overtakes an earlier one.
+            at_publisher: Whether messages are filtered when they are published, once for all.
+
+        Raises:
+            LockstepError: The topic is /clock.
+        """
+        name = self.world.node.resolve_topic_name(topic)
+        if name == CLOCK:
+            raise LockstepError(
+                f'{self.fault!r}: lockstep sets the clocks itself; use TimeJump or ClockPause'
+            )
+        owner = node and self.full_name(node)
+        self._filtered = _Filtered(name, owner, begin, keeps_order, at_publisher)
+        kind, of = 'publisher' if at_publisher else 'subscription', f' of {owner}' if owner else ''
+
+        def is_there(nodes: Iterable[Node]) -> bool:
+            return any(
+                endpoint.topic_name == name
+                for one in nodes
+                for endpoint in (one.publishers if at_publisher else one.subscriptions)
+                if self._concerns(one, owner)
+            )
+
+        self.expect(f'no {kind}{of} of {name} was seen', is_there)
+
+    def _concerns(self, node: Node, owner: str) -> bool:
+        """Return whether the fault affects a node."""
+        return bool(
+            node.get_fully_qualified_name() == owner or (not owner and node not in self.world.observers)
         )
 
-    # --- In
+    def receivers(self, names: Callable[[str], set[str]]) -> set[str]:
+        """Return the names of the nodes whose subscriptions the fault affects.
 
-    def _reader(self, subscription: Subscription, node: Node) -> GatedReader:
-        reader = self._world.keeper.reader(subscription, node)
-        for injection in self.all:
-            injection.filter_reader(reader)
-        return reader
+        Args:
+            names: Returns the names of the subscribed nodes of a topic.
+        """
+        filtered = self._filtered
+        if filtered is None or filtered.at_publisher:
+            return set()
+        found = names(filtered.topic)
+        return found & {filtered.owner} if filtered.owner else found
 
-    # --- Out
+    def stage_of(self, end: Source | Link) -> Stage | None:
+        """Return the stage of the fault at one end of a link; None: it does not affect it."""
+        filtered = self._filtered
+        if filtered is None or filtered.at_publisher != isinstance(end, Source):
+            return None
+        if end.topic != filtered.topic or end.owner is None:
+            return None
+        if not self._concerns(end.owner, filtered.owner):
+            return None
+        return self._stage(filtered, end.owner, end.message_type)
 
-    def _intercept(self, publisher: Publisher, message: Any) -> bool:
-        """Send a message of a node later, or another one. Return False if it can be sent now."""
-        if publisher is self._world.log.publisher:
-            return False
-        gate = self._world.keeper.gates.running
-        if gate is None and not self._stages_of(publisher):
-            return False
-        data = message if isinstance(message, bytes) else serialize_message(message)
-        if gate is not None:
-            gate.leave(partial(self._pass, publisher, 0, data))
-        else:
-            self._pass(publisher, 0, data)
-        return True
+    def _stage(self, filtered: _Filtered, node: Node, message_type: type) -> Stage:
+        topic, name = filtered.topic, node.get_fully_qualified_name()
+        change = filtered.begin(self.rng(f'{name} {topic}'), message_type)
+        observe = getattr(change, 'observe', None)
+        hits = Hits(f'{topic} {"from" if filtered.at_publisher else "to"} {name}', self.note)
+        self._hits.append(hits)
+        agenda, earliest = self._agenda, 0
 
-    def _stages_of(self, publisher: Publisher) -> list[Stage]:
-        if publisher not in self._stages:
-            owner = self._owner(publisher)
-            if owner is None:
-                # Of a node that has not been added yet.
-                return []
-            found = [injection.publisher_stage(owner, publisher) for injection in self.all]
-            self._stages[publisher] = [stage for stage in found if stage is not None]
-        return self._stages[publisher]
-
-    def _owner(self, publisher: Publisher) -> Node | None:
-        nodes = self._world.executor.nodes
-        return next((node for node in nodes if publisher in node.publishers), None)
-
-    def _pass(self, publisher: Publisher, first: int, data: bytes) -> None:
-        """Pass a message through the stages of its publisher from `first` on, and send it."""
-        stages, agenda = self._stages_of(publisher), self._world.executor.agenda
-        if first == len(stages):
-            send_unless_destroyed(self._traffic.publish_now, publisher, data)
-            return
-        for delay, out in stages[first](data):
-            if delay > 0:
-                agenda.at(agenda.now + delay, partial(self._pass, publisher, first + 1, out))
+        def stage(data: bytes) -> list[tuple[int, bytes]]:
+            nonlocal earliest
+            now = agenda.now
+            if self.active:
+                out = list(change(now, data))
             else:
-                self._pass(publisher, first + 1, out)
+                out = [(0, data)]
+                if observe is not None:
+                    observe(now, data)
+            if filtered.keeps_order:
+                out = [(max(delay, earliest - now), data) for delay, data in out]
+                earliest = max([earliest, *(now + delay for delay, _ in out)])
+            self._last_arrival = max([self._last_arrival, *(now + delay for delay, _ in out)])
+            hits.add(now, data, out, active=self.active)
+            return out
+
+        return stage
 
 
-def check_injectable(faults: Iterable[Any], now: int) -> None:
-    """Check the arguments of `inject`.
-
-    Raises:
-        LockstepError: One is no fault, or over at the world time `now` (ns).
-    """
-    for fault in faults:
-        if isinstance(fault, type) or not callable(getattr(fault, 'install', None)):
-            raise LockstepError(f'inject takes faults, got {fault!r}')
-        if fault.start + fault.duration <= now / NANOSECONDS:
-            raise LockstepError(
-                f'{fault!r} is over: {now / NANOSECONDS:g} s have passed since the start'
-            )
+def full_name(node: str, base: Node) -> str:
+    """Return the fully qualified name of a node, in the namespace of another one by default."""
+    return node if node.startswith('/') else f'{base.get_namespace().rstrip("/")}/{node}'

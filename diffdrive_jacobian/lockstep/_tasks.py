@@ -1,4 +1,4 @@
-"""Tasks and coroutines of the nodes."""
+"""Tasks and coroutines of the nodes, and the executor that a node sees, which creates them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.task import Task
 
+from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._gate import Gate
 from diffdrive_jacobian.ros.rclpy_internals import new_task
 
 
@@ -23,21 +25,19 @@ class Tasks:
         """Return the number of tasks that are not done."""
         return len(self._tasks)
 
-    def create(self, owner: Node | None, callback: Any, args: Any, kwargs: Any, executor: Any) -> Task:
-        """Add a function or a coroutine of a node. Return its future."""
+    def create(self, owner: Node, gate: Gate, callback: Any, args: Any, kwargs: Any) -> Task:
+        """Add a function or a coroutine of a node with a gate. Return its future."""
         if _is_async(callback):
             callback, args, kwargs = callback(*args, **kwargs), (), {}
-        task = _Task(callback, new_task(callback, args, kwargs, executor), owner)
+        task = _Task(callback, new_task(callback, args, kwargs, owner.executor), owner, gate)
         self._tasks.append(task)
         return task.future
 
-    def run(self, frozen: Callable[[Node], bool] | None = None) -> bool:
+    def run(self) -> bool:
         """Continue each task once. Return whether any made progress.
 
-        It is not known what a coroutine waits for, so it is continued and may wait again.
-
-        Args:
-            frozen: Returns whether a node is frozen: its tasks are not continued.
+        It is not known what a coroutine waits for, so it is continued and may wait again. Those of a
+        node whose gate is closed are not continued.
         """
         progress = False
         tasks, self._tasks = self._tasks, []
@@ -45,7 +45,7 @@ class Tasks:
         try:
             while tasks:
                 task = tasks.pop(0)
-                if frozen is not None and task.owner is not None and frozen(task.owner):
+                if task.gate.closed:
                     waiting.append(task)
                     continue
                 progress |= task.proceed()
@@ -68,9 +68,10 @@ class Tasks:
 class _Task:
     """A task and the point at which its coroutine waits."""
 
-    def __init__(self, handler: Any, future: Task, owner: Node | None) -> None:
+    def __init__(self, handler: Any, future: Task, owner: Node, gate: Gate) -> None:
         self.future = future
         self.owner = owner
+        self.gate = gate
         self._handler = handler
         # A reference is kept so that no later object has the same identity.
         self._waits_for: Any = self
@@ -96,3 +97,46 @@ def _is_async(callback: Any) -> bool:
     return inspect.iscoroutinefunction(callback) or inspect.iscoroutinefunction(
         getattr(callback, '__call__', None)  # noqa: B004
     )
+
+
+class Facade:
+    """The executor of a node, as the node sees it."""
+
+    def __init__(self, changed: Callable[[], None], create_task: Callable[..., Task]) -> None:
+        self._changed = changed
+        self._create_task = create_task
+        self.released = False
+        """Whether lockstep is about to remove the node."""
+
+    def add_node(self, node: Node) -> bool:
+        """Accept a node. It was added before its `executor` is set."""
+        return True
+
+    def remove_node(self, node: Node) -> None:
+        """Accept the removal of a node by lockstep.
+
+        Raises:
+            LockstepError: Another executor is about to add the node.
+        """
+        if not self.released:
+            raise LockstepError(
+                f'node {node.get_fully_qualified_name()} is in lockstep and cannot be spun by another '
+                'executor'
+            )
+
+    def wake(self) -> None:
+        """Note that a node has created or destroyed an entity."""
+        self._changed()
+
+    def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
+        """Schedule a function or a coroutine. Return its future."""
+        return self._create_task(callback, *args, **kwargs)
+
+    def __getattr__(self, name: str) -> Any:
+        raise _NoAttributeError(
+            f'a node in lockstep cannot call executor.{name}: lockstep executes its callbacks'
+        )
+
+
+class _NoAttributeError(LockstepError, AttributeError):
+    """The executor has no such attribute. `hasattr` returns False."""

@@ -3,32 +3,42 @@
 One step publishes /clock and executes the callbacks of all messages, service calls and timers that are
 due, and of all that they cause. Then time advances to the next timer. Nothing waits for the wall clock,
 so a run is as fast as the machine. Its results are the same each time, bit for bit.
+
+A world consists of its nodes (`_nodes`), the links between them (`_links`), and a scheduler, which
+executes one callback after the other (`_scheduler`) while time advances (`_simulated_time`). There may
+be faults (`_faults`), properties (`_properties`) and nodes in other processes (`external`).
 """
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any, ClassVar, TypeVar
 
 import rclpy
-from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
-from rosgraph_msgs.msg import Clock
+from rclpy.publisher import Publisher
 
-from diffdrive_jacobian.lockstep._errors import InitializedError, LockstepError
-from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
-from diffdrive_jacobian.lockstep._external_answers import Expectation
+from diffdrive_jacobian.lockstep._errors import InitializedError, LockstepError, described
+from diffdrive_jacobian.lockstep._fault_log import FaultEvent
+from diffdrive_jacobian.lockstep._faults import Faults
 from diffdrive_jacobian.lockstep._guard import Guard
-from diffdrive_jacobian.lockstep._messaging import described
-from diffdrive_jacobian.lockstep._processes import Processes
-from diffdrive_jacobian.lockstep._requirements import Requirements
-from diffdrive_jacobian.lockstep._simulated_time import checked_nanoseconds
-from diffdrive_jacobian.messages.topics import CLOCK
+from diffdrive_jacobian.lockstep._injection import Fault, full_name
+from diffdrive_jacobian.lockstep._messaging import Messaging
+from diffdrive_jacobian.lockstep._nodes import Nodes
+from diffdrive_jacobian.lockstep._properties import Properties, Property
+from diffdrive_jacobian.lockstep._report import describe
+from diffdrive_jacobian.lockstep._scheduler import Scheduler
+from diffdrive_jacobian.lockstep._simulated_time import CONNECTION, SimulatedTime, checked_nanoseconds
+from diffdrive_jacobian.lockstep.external.expectations import Expectation
+from diffdrive_jacobian.lockstep.external.others import External, Isolated, variables
+from diffdrive_jacobian.lockstep.external.process import ExternalProcess
 from diffdrive_jacobian.ros.fastdds_profiles import withdraw
-from diffdrive_jacobian.ros.rclpy_internals import refuse_init, wrap_sleep
-from diffdrive_jacobian.ros.runner import UserError, environment, ros_context
+from diffdrive_jacobian.ros.rclpy_internals import refuse_init
+from diffdrive_jacobian.ros.runner import DISCOVERY, UserError, environment, ros_context
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 ISOLATED = ('--ros-args', '-p', 'start_type_description_service:=false')
 """ROS arguments of a world without external nodes, before those of the user: only tools in other
@@ -36,7 +46,7 @@ processes call that service, and it takes time to create."""
 N = TypeVar('N', bound=Node)
 
 
-class Lockstep(Requirements, Processes):
+class Lockstep:
     """Executes nodes in the default context of rclpy, in simulated time.
 
     Nodes are created as usual, after the `Lockstep`, and added to it. `use_sim_time` is true for all of
@@ -82,7 +92,7 @@ class Lockstep(Requirements, Processes):
             ValueError: `start` or `patience` is not positive, or too long, or `external` or `domain_id`
                 is invalid.
         """
-        super().__init__(checked_nanoseconds('start', start))
+        begin = checked_nanoseconds('start', start)
         checked_nanoseconds('patience', patience)
         if args and args[0] != '--ros-args':
             raise LockstepError(f"args must begin with '--ros-args', got {args[0]!r}")
@@ -91,43 +101,67 @@ class Lockstep(Requirements, Processes):
         if rclpy.ok():
             raise LockstepError('rclpy is already initialized: only lockstep may do that')
         self._thread = threading.get_ident()
-        self._on_new: list[Callable[[], None]] = []
+        self._start = begin
         self._closing = ExitStack()
         try:
-            defaults = ISOLATED if external is None else ()
-            self._enter([*defaults, *args], patience, self._variables(external, domain_id))
-            if external is not None:
-                self._open_to(external)
+            self._compose(args, patience, external, variables(external, domain_id))
         except BaseException:
             Lockstep._open = None
             self._closing.close()
             raise
 
-    def _enter(self, args: Sequence[str], patience: float, variables: Mapping[str, str | None]) -> None:
-        arguments = ['lockstep', *args, '--ros-args', '-p', 'use_sim_time:=true']
+    def _compose(
+        self,
+        args: Sequence[str],
+        patience: float,
+        external: Iterable[Expectation] | None,
+        environment_of_others: dict[str, str],
+    ) -> None:
+        """Create the parts of the world."""
+        defaults = ISOLATED if external is None else ()
+        arguments = ['lockstep', *defaults, *args, '--ros-args', '-p', 'use_sim_time:=true']
+        isolated = {**dict.fromkeys(DISCOVERY), DISCOVERY[0]: 'OFF'}
         try:
-            with environment(variables):
+            with environment({**isolated, **environment_of_others}):
                 context = self._closing.enter_context(ros_context(arguments, default=True))
         except UserError as error:
             raise LockstepError(str(error)) from error
         refuse_init(context, _refuse_init)
         withdraw()
-        self._executor = QuiescentExecutor(context, self._on_registered)
+        self._scheduler = scheduler = Scheduler(context, self._start)
         self._closing.callback(self._destroy_nodes)
+        self._closing.callback(scheduler.links.close)
         try:
-            self._guard = Guard(patience, lambda: self._executor.nodes)
+            guard = Guard(patience, lambda: scheduler.nodes)
         except ValueError as error:
             raise LockstepError('Lockstep must be created and used in the main thread') from error
-        self._closing.callback(self._guard.close)
-        self._traffic.start(self._executor.deliveries, self._executor.note_thread)
-        self._closing.callback(self._traffic.close)
-        self.node = Node('lockstep', start_parameter_services=False, enable_rosout=False)
-        self._executor.clocks.publisher = self.node.create_publisher(Clock, CLOCK, 1)
-        self._executor.add(self.node)
+        self._closing.callback(guard.close)
+        self._nodes = Nodes(scheduler)
+        self.node = self._nodes.own
+        """Node for the publishers, subscriptions and clients of a test."""
+        self._time = SimulatedTime(
+            scheduler,
+            guard,
+            check_open=self._check_open,
+            discovered=self._on_discovery,
+            report=self.report,
+        )
+        others: Isolated = Isolated()
+        if external is not None:
+            others = External(
+                self.node, scheduler, self._time.watched, self.report, environment_of_others
+            )
+            self._closing.callback(others.close)
+            others.declare(external)
+        self._time.others = self._others = others
+        self._messaging = Messaging(scheduler, self._nodes, self._time, self.report)
+        self._faults = Faults(scheduler, self._nodes, others, self.settle)
+        self._properties = Properties(scheduler, self._nodes, others, self.report)
+        self._time.check = self._properties.check
         Lockstep._open = self
-        self._publish_clock()
+        self._time.arrive()
 
-    # --- Life
+    # --- Opening and closing
 
     def __enter__(self) -> Lockstep:
         """Return this object."""
@@ -149,10 +183,18 @@ class Lockstep(Requirements, Processes):
             self._closing.close()
 
     def _destroy_nodes(self) -> None:
-        nodes = self._executor.nodes
-        self._executor.close()
+        nodes = self._scheduler.nodes
+        self._scheduler.close()
         for node in nodes:
             node.destroy_node()
+
+    def _check_open(self) -> None:
+        if Lockstep._open is not self:
+            raise LockstepError('this Lockstep is closed')
+        if threading.get_ident() != self._thread:
+            raise LockstepError('Lockstep must be created and used in the main thread')
+
+    # --- Nodes
 
     def add(self, node: N, *, observer: bool = False) -> N:
         """Add a node. It receives the time, and its callbacks that are due are executed.
@@ -170,35 +212,42 @@ class Lockstep(Requirements, Processes):
                 time; or it is no node.
         """
         self._check_open()
-        self._check_new(node)
-        if self._busy:
+        self._nodes.check_new(node)
+        if self._time.busy:
             name = node.get_fully_qualified_name()
             raise LockstepError(f'node {name} cannot be added within a callback')
-        if observer:
-            self._observers.add(node)
-        self._executor.add(node)
-        self._publish_clock()
+        self._nodes.add(node, observer=observer)
+        self._time.arrive()
         return node
 
-    def _check_new(self, node: Node) -> None:
-        if not isinstance(node, Node):
-            hint = f'; create one: add({node.__name__}(...))' if isinstance(node, type) else ''
-            raise LockstepError(f'add takes a node, got {described(node)}{hint}')
-        try:
-            name = node.get_fully_qualified_name()
-        except InvalidHandle as error:
-            raise LockstepError('the node was destroyed before it was added') from error
-        if node in self._executor.nodes:
-            raise LockstepError(f'node {name} was already added')
-        if any(other.get_fully_qualified_name() == name for other in self._executor.nodes):
-            raise LockstepError(f'another node has the name {name}: give one of them a namespace')
-        if node.context is not self.node.context:
-            raise LockstepError(
-                f'node {name} is in another context: create it without context=, after Lockstep()'
-            )
-        if node.executor is not None:
-            raise LockstepError(f'node {name} is in another executor: remove it from there')
-        self._check_sim_time(node)
+    def create(self, factory: Callable[[], N]) -> N:
+        """Create a node with a function, add it, and return it.
+
+        A fault that kills the node calls the function again to start it anew. `find` returns the node
+        that is there now.
+
+        Raises:
+            LockstepError: As of `add`, or `factory` is no function.
+        """
+        self._check_open()
+        if isinstance(factory, Node) or not callable(factory):
+            raise LockstepError(f'create takes a function that returns a node, got {described(factory)}')
+        node = self.add(factory())
+        self._nodes.created(node, factory)
+        return node
+
+    def find(self, name: str) -> Node:
+        """Return the node that has a name now.
+
+        Raises:
+            LockstepError: There is none.
+        """
+        self._check_open()
+        nodes = {node.get_fully_qualified_name(): node for node in self._scheduler.nodes}
+        full = full_name(name, self.node)
+        if full not in nodes:
+            raise LockstepError(f'there is no node {full}; nodes: {", ".join(nodes)}')
+        return nodes[full]
 
     def remove(self, node: Node) -> None:
         """Remove and destroy a node without stopping it, as if its process was killed.
@@ -207,65 +256,354 @@ class Lockstep(Requirements, Processes):
             LockstepError: The node was not added.
         """
         self._check_open()
-        if node is self.node or node not in self._executor.nodes:
+        if node is self.node or node not in self._scheduler.nodes:
             raise LockstepError('the node to remove was not added')
-        self._executor.killed.add(node)
-        with self._watched():
-            self._executor.remove(node)
+        self._scheduler.killed.add(node)
+        with self._time.watched():
+            self._scheduler.remove(node)
             node.destroy_node()
 
-    def _check_open(self) -> None:
-        if Lockstep._open is not self:
-            raise LockstepError('this Lockstep is closed')
-        if threading.get_ident() != self._thread:
-            raise LockstepError('Lockstep must be created and used in the main thread')
+    @property
+    def nodes(self) -> list[Node]:
+        """The nodes that are there now, with that of the test."""
+        return self._scheduler.nodes
 
-    def _on_registered(self, node: Node) -> None:
-        self._check_sim_time(node)
-        if node is not self.node and any(publisher.topic_name == CLOCK for publisher in node.publishers):
-            name = node.get_fully_qualified_name()
-            raise LockstepError(f'node {name} publishes /clock, which only lockstep may do')
-        self._refuse_sleep(node)
-        for callback in self._on_new:
-            callback()
+    @property
+    def killed(self) -> set[Node]:
+        """The nodes that were removed without being stopped."""
+        return self._scheduler.killed
+
+    def node_of(self, publisher: Publisher) -> Node | None:
+        """Return the node that has a publisher; None: it was removed."""
+        for node in self._scheduler.nodes:
+            if any(one is publisher for one in node.publishers):
+                return node
+        return None
 
     def on_new_topics(self, callback: Callable[[], None]) -> None:
         """Call a function whenever a node is added, or has created or destroyed an entity."""
-        self._on_new.append(callback)
+        self._nodes.on_change.append(callback)
 
-    def _refuse_sleep(self, node: Node) -> None:
-        """Make `sleep_until` of a node's clock raise an error within callbacks.
+    # --- Time
 
-        The time could not come before the callback returns, and rclpy would wait where no signal handler
-        runs.
+    @property
+    def now(self) -> int:
+        """Simulated time (ns)."""
+        return self._scheduler.clocks.now
+
+    @property
+    def elapsed(self) -> float:
+        """Simulated time since the start, by the clock of the nodes (s)."""
+        return (self.now - self._start) / NANOSECONDS
+
+    @property
+    def world_time(self) -> int:
+        """Time that has passed in the world since the start (ns).
+
+        It always advances. The clock of the nodes, `now`, may jump or stand still.
         """
-        name = node.get_fully_qualified_name()
+        return self._scheduler.agenda.now
 
-        def refusing(sleep_until: Callable[..., Any]) -> Callable[..., Any]:
-            def refuse(until: Any, *args: Any, **kwargs: Any) -> Any:
-                if threading.get_ident() == self._thread:
-                    raise LockstepError(
-                        f'node {name} sleeps on its clock within a callback: simulated time cannot '
-                        'advance before the callback returns'
-                    )
-                return sleep_until(until, *args, **kwargs)
+    def settle(self) -> None:
+        """Execute all callbacks that are due at the current time."""
+        __tracebackhide__ = True
+        self._time.settle()
 
-            return refuse
+    def step(self, at_most: float | None = None) -> None:
+        """Advance to the time at which the next timer expires.
 
-        wrap_sleep(node.get_clock(), refusing)
+        Args:
+            at_most: Largest duration of the step (s).
+
+        Raises:
+            ValueError: `at_most` is not positive, or too long.
+            LockstepError: No timer is running and `at_most` is not given, or time cannot advance.
+        """
+        __tracebackhide__ = True
+        self._time.step(at_most)
+
+    def run_for(self, seconds: float) -> None:
+        """Advance by a duration (s), from one timer to the next.
+
+        Raises:
+            ValueError: `seconds` is not positive, or too long.
+            LockstepError: Time cannot advance.
+        """
+        __tracebackhide__ = True
+        self._time.run_for(seconds)
+
+    def run_until(self, condition: Callable[[], object], timeout: float, what: str = '') -> None:
+        """Advance until a condition is true.
+
+        Args:
+            condition: The condition. It is called once at each simulated time, after all callbacks.
+            timeout: Longest simulated time (s).
+            what: Description of the condition for the error message.
+
+        Raises:
+            ValueError: `timeout` is not positive, or too long.
+            LockstepError: The condition did not become true in time, or time cannot advance.
+        """
+        __tracebackhide__ = True
+        self._time.run_until(condition, timeout, what)
+
+    def jump(self, seconds: float) -> None:
+        """Jump by a duration of time (s), forward or back, as when a simulator is reset.
+
+        Timers do not expire one by one in between. rcl determines how they react to the jump.
+
+        Raises:
+            ValueError: `seconds` is zero or not finite, or the new time does not fit into a stamp.
+        """
+        __tracebackhide__ = True
+        self._time.jump(seconds)
+
+    # --- Messages and services
+
+    def publish(self, topic: str, message: Any, *, latched: bool = False) -> None:
+        """Publish a message and execute all callbacks that it causes (within a callback: later).
+
+        Args:
+            topic: Name of the topic.
+            message: The message.
+            latched: Whether latched (transient local) subscriptions receive it, too, also later ones.
+
+        Raises:
+            LockstepError: The topic has no subscription (and the message is not latched), one of another
+                quality of service, or another type, or it is subscribed to by a node that was not added.
+                Or the arguments are no topic and no message.
+        """
+        self._check_open()
+        self._messaging.publish(topic, message, latched)
+
+    def last(self, topic: str) -> Any:
+        """Return the last message of a topic, as its subscriptions received it.
+
+        Raises:
+            LockstepError: No message was published on the topic.
+        """
+        self._check_open()
+        return self._messaging.last(topic)
+
+    def listen(self, message_type: type, topic: str, *, latched: bool = False) -> list[Any]:
+        """Return a list to which the messages of a topic are appended.
+
+        Args:
+            message_type: Type of the topic.
+            topic: Name of the topic.
+            latched: Whether to include earlier messages of a latched topic.
+
+        Raises:
+            LockstepError: The topic has another type, or an argument is no type or no name.
+        """
+        self._check_open()
+        return self._messaging.listen(message_type, topic, latched)
+
+    def call(self, service_type: Any, name: str, request: Any = None, *, timeout: float = 10.0) -> Any:
+        """Call a service and return the response.
+
+        Args:
+            service_type: Type of the service.
+            name: Name of the service.
+            request: The request; None: an empty one.
+            timeout: Longest simulated time for the response (s); wall time if another process provides
+                the service.
+
+        Raises:
+            LockstepError: There is no such service, or it does not respond in time.
+        """
+        self._check_open()
+        return self._messaging.call(service_type, name, request, timeout)
+
+    def report(self) -> str:
+        """Return the last messages of all topics, and what faults did, as text."""
+        scheduler = self._scheduler
+        text = describe(
+            scheduler.links.sources(), scheduler.nodes, scheduler.existing, self.now, self.world_time
+        )
+        text = '\n  '.join([text, *self._others.describe()])
+        return '\n'.join([text, *self._faults.describe()])
+
+    # --- Faults
+
+    def inject(self, *faults: Fault, seed: int = 0) -> None:
+        """Inject faults. Their times count from the start of this `Lockstep`.
+
+        Faults of one topic affect a message in the order in which they were injected. The random numbers
+        of a fault depend on `seed` and the fault alone, not on other faults, unless they are equal.
+
+        Args:
+            faults: The faults, see `diffdrive_jacobian.faults`.
+            seed: Seed of their random numbers.
+
+        Raises:
+            LockstepError: An argument is no fault, or a fault is over already, or affects what nodes in
+                other processes receive.
+        """
+        self._check_open()
+        self._faults.inject(faults, seed)
+
+    @property
+    def faults(self) -> list[Any]:
+        """The faults that were injected."""
+        return self._faults.faults
+
+    @property
+    def fault_events(self) -> list[FaultEvent]:
+        """What the injected faults did so far."""
+        return self._faults.events()
+
+    def check_faults(self) -> None:
+        """Check that every injected fault met something that it could affect.
+
+        Raises:
+            LockstepError: One did not, for example because the name of its topic is misspelt.
+        """
+        self._faults.check()
+
+    # --- Properties
+
+    def require(self, *properties: Property) -> None:
+        """Require properties from now on, at each time step.
+
+        A violation is raised as a PropertyViolation by the method that advanced time. The property is
+        not required any longer afterwards.
+
+        Args:
+            properties: Objects such as `NeverFasterThan(0.5, 2.0)` of the package `properties`.
+
+        Raises:
+            LockstepError: An argument is not a property.
+        """
+        self._check_open()
+        self._properties.require(self, properties)
+
+    def finish(self) -> None:
+        """Check the properties at the end of a run. Nothing is required any longer afterwards.
+
+        The fixture `lockstep` calls it at the end of a test that has passed.
+
+        Raises:
+            PropertyViolation: A property is violated: something that had to happen has not happened.
+            LockstepError: A property observes a topic of which no node has had a publisher, or a service
+                that no node has had, or a fault met nothing. A name may be misspelt.
+        """
+        self._check_open()
+        self._time.check_threads()
+        if self._properties:
+            # Not otherwise: a test may have passed because a callback raises what it expects.
+            self.settle()
+        self._properties.finish()
+        self.check_faults()
+
+    def expect(self, *names: str) -> None:
+        """Expect that some node has a publisher of one of these topics, or one of these services.
+
+        Called by properties. `finish` raises an error if none had.
+        """
+        self._properties.expect(names)
+
+    def on_published(self, topic: str, observe: Callable[[Publisher, Any], None]) -> str:
+        """Call a function with the publisher and the message after each message of a topic is published.
+
+        The message is a `bytes` object if serialized bytes were published.
+
+        Returns:
+            The full name of the topic.
+        """
+        return self._properties.on_published(topic, observe)
+
+    def on_delivered(self, topic: str, observe: Callable[[Node, Any, Any], None]) -> str:
+        """Call a function with each message of a topic that the nodes receive, before their callbacks.
+
+        The function receives the node, the type of the message, and the message, a `bytes` object if the
+        subscription is raw.
+
+        Returns:
+            The full name of the topic.
+        """
+        return self._properties.on_delivered(topic, observe)
+
+    def on_response(self, service: str, observe: Callable[[Node, Any], None]) -> str:
+        """Call a function with the node and each response of a service, when the node has given it.
+
+        A fault may delay the response on its way.
+
+        Returns:
+            The full name of the service.
+        """
+        return self._properties.on_response(service, observe)
+
+    # --- Nodes in other processes
+
+    @property
+    def domain_id(self) -> int:
+        """ROS domain of the external nodes.
+
+        Raises:
+            LockstepError: The world is isolated.
+        """
+        return int(self.environment['ROS_DOMAIN_ID'])
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """Environment variables for a process that is to be discovered, besides those of this one.
+
+        Raises:
+            LockstepError: The world is isolated.
+        """
+        self._check_open()
+        return self._others.environment
+
+    def start(
+        self,
+        *command: str | os.PathLike[str],
+        answers: Iterable[Expectation] = (),
+        use_sim_time: bool = True,
+        cwd: str | os.PathLike[str] | None = None,
+        env: Mapping[str, str] | None = None,
+    ) -> ExternalProcess:
+        """Start a process in the ROS domain of this world. When the world is closed, it is ended
+        with all that it has started.
+
+        Args:
+            command: The program and its arguments: `'ros2', 'run', 'my_package', 'my_node'`.
+            answers: What is awaited from it, as for `external`, until the test ends it.
+            use_sim_time: Whether to add `--ros-args -p use_sim_time:=true` to the command.
+            cwd: Its working directory; None: that of this process.
+            env: Further environment variables.
+
+        Returns:
+            The process. It runs, but is not discovered yet: see `connect`.
+
+        Raises:
+            LockstepError: The world is isolated, or the process cannot be started.
+            ValueError: `answers` is invalid.
+        """
+        self._check_open()
+        return self._others.start(command, answers, use_sim_time, cwd, env)
+
+    def connect(self, timeout: float = CONNECTION) -> None:
+        """Wait until the external nodes are discovered, and have discovered the nodes of the world.
+
+        The methods that let time pass do so themselves, also after new nodes were added or started. Only
+        then do external nodes receive the time. In an isolated world there is nothing to wait for.
+
+        Args:
+            timeout: Longest wall time (s).
+
+        Raises:
+            ValueError: `timeout` is not positive.
+            LockstepError: Nodes are not discovered in time, or a process has ended.
+        """
+        __tracebackhide__ = True
+        checked_nanoseconds('timeout', timeout)
+        self._time.connect(timeout)
 
     def _on_discovery(self) -> None:
-        super()._on_discovery()
-        for callback in self._on_new:
-            callback()
-
-    @staticmethod
-    def _check_sim_time(node: Node) -> None:
-        if not node.get_parameter('use_sim_time').value:
-            raise LockstepError(
-                f'node {node.get_fully_qualified_name()} runs on wall time: '
-                'its parameter use_sim_time must be true'
-            )
+        """Note that topics may have been discovered."""
+        self._faults.check_receivers()
+        self._nodes.note_change()
 
 
 def _refuse_init(*_: Any, **__: Any) -> None:

@@ -23,7 +23,6 @@ from diffdrive_jacobian.messages.conversion import (
     from_time,
     from_twist,
 )
-from diffdrive_jacobian.messages.fields import field_value
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 V = TypeVar('V')
@@ -38,9 +37,9 @@ TWIST_IN = {
 }
 """Where messages have a twist."""
 POSE_IN = {
+    'nav_msgs/msg/Odometry': 'pose.pose.',
     'geometry_msgs/msg/PoseStamped': 'pose.',
     'geometry_msgs/msg/PoseWithCovarianceStamped': 'pose.pose.',
-    'nav_msgs/msg/Odometry': 'pose.pose.',
 }
 """Where messages have a pose."""
 
@@ -66,14 +65,6 @@ class Codec(Generic[V]):
     """Returns these numbers of a value."""
     header: Codec[Any] | None = None
     """What is read and checked before the rest, which may be long."""
-
-    def of(self, message: Any) -> V:
-        """Return the value in a message object.
-
-        Raises:
-            MessageError: It is invalid.
-        """
-        return self.value(*(field_value(message, field) for field in self.fields))
 
     def reader(
         self, kind: Any, deserialize: Callable[[bytes, Any], Any] | None = None
@@ -176,7 +167,7 @@ class Motion(NamedTuple):
     twist: tuple[float, float]
     """`(v, omega)` in the body frame (m/s, rad/s)."""
     covariance: tuple[float, ...] = (0.0,) * 9
-    """Of x, y, theta, row by row; not checked, see `from_covariance`."""
+    """Of x, y, theta, row by row; not checked, see `covariances.from_covariance`."""
     twist_covariance: tuple[float, ...] = (0.0,) * 4
     """Of v and omega, row by row; not checked."""
 

@@ -15,12 +15,11 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
 if TYPE_CHECKING:
+    import numpy as np
     from builtin_interfaces.msg import Time
     from geometry_msgs.msg import Pose
+    from numpy.typing import NDArray
 
 from diffdrive_jacobian.messages.errors import MessageError as MessageError
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION as MAX_POSITION
@@ -121,31 +120,6 @@ def set_pose(message: Pose, pose: NDArray[np.float64]) -> None:
     x, y, theta = pose.tolist()
     message.position.x, message.position.y = x, y
     message.orientation.z, message.orientation.w = math.sin(theta / 2.0), math.cos(theta / 2.0)
-
-
-def from_covariance(covariance: ArrayLike) -> NDArray[np.float64]:
-    """Return a covariance of x, y and yaw, shape (3, 3), from its nine entries, row by row.
-
-    Raises:
-        MessageError: It is not finite, symmetric and positive semidefinite.
-    """
-    matrix = np.reshape(covariance, (3, 3))
-    scale = np.abs(matrix).max()
-    valid = scale <= MAX_POSITION**2 and np.abs(matrix - matrix.T).max() <= 1e-9 * scale
-    if valid:
-        symmetric = (matrix + matrix.T) / 2.0
-        values, vectors = np.linalg.eigh(symmetric)
-        valid = values[0] >= -1e-9 * scale
-    if not valid:
-        raise MessageError(
-            f'covariance of x, y, yaw must be finite, at most {MAX_POSITION**2:g}, symmetric and '
-            'positive semidefinite, '
-            f'got {matrix.tolist()}'
-        )
-    if values[0] < 0.0:
-        # Rounding of the sender: as the motion grows, so would a negative variance.
-        symmetric = vectors * np.maximum(values, 0.0) @ vectors.T
-    return np.asarray((symmetric + symmetric.T) / 2.0)
 
 
 def from_joints(

@@ -40,6 +40,7 @@ from diffdrive_jacobian.messages.codecs import (
     Wheels,
 )
 from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.messages.covariances import from_covariance
 from diffdrive_jacobian.nodes.command_time import command_time
 from diffdrive_jacobian.nodes.condition import Condition
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
@@ -246,7 +247,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
                 raise MessageError(f"its frame must be '{printable(ours)}', got '{printable(frame)}'")
             # Its stamp does not matter: the robot is placed when the message is received.
             place = POSE_WITH_COVARIANCE.value(0, 0, frame, *values)
-            pose, covariance = np.array(place.pose), messages.from_covariance(place.covariance)
+            pose, covariance = np.array(place.pose), from_covariance(place.covariance)
         except MessageError as error:
             self.get_logger().warning(f'initialpose dropped: {error}', throttle_duration_sec=THROTTLE)
             return

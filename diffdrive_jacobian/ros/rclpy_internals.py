@@ -4,7 +4,7 @@ No other module imports from `rclpy.impl` or `rclpy.experimental`, or accesses a
 object of rclpy. Each function names what it relies on. `test/test_rclpy_internals.py` has a test for
 each, so that a release of rclpy that differs fails there first. Tried with rclpy 7.1.6 (Jazzy).
 
-`lockstep._executor` and `lockstep._served` also rely on how the EventsExecutor accesses nodes.
+`lockstep._scheduler` and `lockstep._services` also rely on how the EventsExecutor accesses nodes.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
         LockstepError,
         PropertyViolation,
     )
-    from diffdrive_jacobian.lockstep._external_answers import Answers, Every, Idle
+    from diffdrive_jacobian.lockstep.external.expectations import Answers, Every, Idle
     from diffdrive_jacobian.lockstep.world import Lockstep
     from diffdrive_jacobian.testing.golden_run import GoldenRun
     from diffdrive_jacobian.testing.recorded_run import RecordedRun
@@ -92,7 +92,7 @@ _MODULES = {
         'waypoints',
     ),
     'lockstep._errors': ('IneffectiveFaultsError', 'LockstepError', 'PropertyViolation'),
-    'lockstep._external_answers': ('Answers', 'Every', 'Idle'),
+    'lockstep.external.expectations': ('Answers', 'Every', 'Idle'),
     'lockstep.world': ('Lockstep',),
     'testing.golden_run': ('GoldenRun',),
     'testing.recorded_run': ('RecordedRun',),

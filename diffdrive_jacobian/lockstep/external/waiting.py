@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 
+from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
-from rclpy.publisher import Publisher
+from rclpy.task import Future
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
-from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
-from diffdrive_jacobian.lockstep._external_answers import WITHIN
-from diffdrive_jacobian.lockstep._external_probe import Probe
-from diffdrive_jacobian.lockstep._external_process import ExternalProcess
+from diffdrive_jacobian.lockstep._scheduler import Scheduler
+from diffdrive_jacobian.lockstep.external.process import ExternalProcess
 
 CLOCK_PERIOD = 0.1
 """Period at which the time is published again, because a message may be lost (s)."""
@@ -21,6 +20,13 @@ NAP = 0.0001
 """Period at which a condition is checked (s)."""
 SLOW_NAP = 0.002
 """The same after `CLOCK_PERIOD` (s)."""
+ROUNDS = 3
+"""Number of requests.
+
+When the first response is there, all that was sent before the first request has arrived. When the
+second is there, the callbacks of its messages have been executed, and when the third is there, those of
+the timers that the time among them has made due.
+"""
 
 
 class Waiting:
@@ -28,8 +34,7 @@ class Waiting:
 
     def __init__(
         self,
-        node: Node,
-        executor: QuiescentExecutor,
+        scheduler: Scheduler,
         watched: Callable[[], AbstractContextManager[None]],
         report: Callable[[], str],
         awaited: Callable[[ExternalProcess], bool],
@@ -37,14 +42,12 @@ class Waiting:
         """Start without processes.
 
         Args:
-            node: Node of the world.
-            executor: Executes its nodes.
+            scheduler: Executes the nodes of the world.
             watched: Returns a context in which callbacks may be executed.
             report: Returns the last messages of all topics, and the states of the processes, as text.
             awaited: Returns whether anything is awaited from a process.
         """
-        self._node = node
-        self._executor = executor
+        self._scheduler = scheduler
         self._watched = watched
         self._report = report
         self._awaited = awaited
@@ -70,23 +73,9 @@ class Waiting:
             if now - repeated > CLOCK_PERIOD:
                 repeated = now
                 self.check_processes()
-                self._executor.clocks.publish()
+                self._scheduler.clocks.publish()
             self.serve()
             time.sleep(NAP if now - begin < CLOCK_PERIOD else SLOW_NAP)
-
-    def for_subscription(self, publisher: Publisher) -> None:
-        """Wait until a publisher has a subscription. If none comes, return after a while."""
-        with suppress(LockstepError):
-            self.until(publisher.get_subscription_count, WITHIN, str)
-
-    def for_service(self, name: str) -> None:
-        """Wait until a service is discovered. If none is, return after a while."""
-
-        def discovered() -> bool:
-            return any(name == other for other, _ in self._node.get_service_names_and_types())
-
-        with suppress(LockstepError):
-            self.until(discovered, WITHIN, str)
 
     def ask(self, probe: Probe, rounds: int) -> None:
         """Send requests to a node, each after the response to the one before.
@@ -100,7 +89,7 @@ class Waiting:
     def serve(self) -> None:
         """Process requests and responses. Messages wait until everything has been received."""
         with self._watched():
-            self._executor.serve()
+            self._scheduler.serve()
 
     def check_processes(self) -> None:
         """Check that no process has failed.
@@ -117,3 +106,66 @@ class Waiting:
     def describe(self) -> list[str]:
         """Return the states of the processes."""
         return [process.describe() for process in self.processes]
+
+
+class Probe:
+    """Asks a node for none of its parameters."""
+
+    def __init__(self, node: Node, name: str, within: float) -> None:
+        """Create a client.
+
+        Args:
+            node: Node of the client.
+            name: Name of the node that is asked.
+            within: Longest wall time for a response (s).
+        """
+        self.service: str = node.resolve_service_name(f'{name}/get_parameters')
+        self.name = self.service.removesuffix('/get_parameters')
+        """Full name of the node that is asked."""
+        self.within = within
+        self._node = node
+        self._client = node.create_client(GetParameters, self.service)
+
+    def ready(self) -> bool:
+        """Return whether a request can be sent."""
+        return bool(self._client.service_is_ready())
+
+    def unready(self) -> str:
+        """Return the message of the error that no request can be sent."""
+        return f'the service {self.service} cannot be reached'
+
+    def no_response(self) -> str:
+        """Return the message of the error that a request is not answered."""
+        return f'{self.name} has not responded to {self.service} within {self.within:g} s of wall time'
+
+    def ask(self) -> Future:
+        """Send a request. Return the future of its response."""
+        return self._client.call_async(GetParameters.Request())
+
+    def close(self) -> None:
+        """Destroy the client."""
+        self._node.destroy_client(self._client)
+
+
+class Repeated:
+    """A request that is repeated until one is answered."""
+
+    def __init__(self, probe: Probe, period: float) -> None:
+        """Send the first one.
+
+        Args:
+            probe: Sends the requests.
+            period: Period of the repetition (s).
+        """
+        self._probe = probe
+        self._period = period
+        self._responses = [probe.ask()]
+        self._sent = time.monotonic()
+
+    def answered(self) -> bool:
+        """Return whether any request was answered. Repeat it if it is time."""
+        now = time.monotonic()
+        if now - self._sent > self._period:
+            self._sent = now
+            self._responses.append(self._probe.ask())
+        return any(response.done() for response in self._responses)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+import sys
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
 from rclpy.exceptions import InvalidHandle
-from rclpy.qos import HistoryPolicy, QoSProfile
 from rclpy.timer import Timer
 
-from diffdrive_jacobian.lockstep._agenda import Agenda
+from diffdrive_jacobian.lockstep._clock import Agenda
 
 
 class Waiting(NamedTuple):
@@ -22,21 +21,11 @@ class Waiting(NamedTuple):
     since: int
     """World time of its arrival (ns)."""
     queue: Any
-    """The subscription, service or client in whose queue it is."""
+    """The link, service or client in whose queue it is."""
     name: str
     """Name of the queue."""
     work: Callable[[], Any]
     """Executes it."""
-
-
-@dataclass(eq=False)
-class Change:
-    """A parameter that a fault has changed."""
-
-    node: Any
-    name: str
-    before: Any
-    """Value before the change."""
 
 
 class Gate:
@@ -52,43 +41,44 @@ class Gate:
         self.name = name
         self._gates = gates
         self._agenda = gates.agenda
-        self._changed = gates.changed
+        self.closed = False
+        """Whether no callback of the node is executed."""
+        self.free = True
+        """Whether a callback can be executed at once, and takes no time."""
         self.costs: list[int] = []
-        """Durations of a callback, to be added (ns)."""
+        """Durations of a callback, to be added (ns). See `slow`."""
         self.timer_delays: list[Callable[[], int]] = []
         """Functions that return the delay of a tick (ns)."""
+        self.suspended: set[Timer] = set()
+        """Timers whose tick is delayed."""
         self.waiting: deque[Waiting] = deque()
         """Callbacks that wait, the oldest first."""
-        self.lost: Counter[str] = Counter()
-        """Number of messages and requests that were lost from full queues, by name."""
-        self.changes: list[Change] = []
-        """Parameters that are changed now, the earliest change first."""
-        self.deaths = 0
-        """Number of faults because of which the node is not there."""
+        self._lost: Counter[str] = Counter()
+        self._delayed: set[Timer] = set()
         self._holds = 0
         self._busy = False
         self._outbox: list[Callable[[], None]] = []
         self._life = 0
 
-    @property
-    def closed(self) -> bool:
-        """Whether no callback of the node is executed."""
-        return self._busy or self._holds > 0
-
-    @property
-    def free(self) -> bool:
-        """Whether a callback can be executed at once, and takes no time."""
-        return not (self.waiting or self.costs or self._busy or self._holds)
-
     def hold(self) -> None:
         """Freeze the node."""
         self._holds += 1
-        self._changed(self)
+        self._change()
 
     def release(self) -> None:
         """Continue the node."""
         self._holds -= 1
-        self._changed(self)
+        self._change()
+
+    def slow(self, cost: int) -> None:
+        """Let each callback take a time (ns)."""
+        self.costs.append(cost)
+        self._update()
+
+    def quicken(self, cost: int) -> None:
+        """Let callbacks not take this time any more."""
+        self.costs.remove(cost)
+        self._update()
 
     def reset(self) -> None:
         """Forget what waits: the node was killed."""
@@ -96,30 +86,46 @@ class Gate:
         self._busy = False
         self.waiting.clear()
         self._outbox.clear()
-        self._changed(self)
+        self._change()
+
+    def lost(self) -> str:
+        """Return what was lost from full queues since the last call; empty: nothing."""
+        texts = [f'{count} of {name}' for name, count in sorted(self._lost.items())]
+        self._lost.clear()
+        return f'lost from full queues: {", ".join(texts)}' if texts else ''
+
+    def _update(self) -> None:
+        self.closed = self._busy or self._holds > 0
+        self.free = not (self.closed or self.waiting or self.costs)
+
+    def _change(self) -> None:
+        """Note that the gate has opened or closed."""
+        self._update()
+        self._gates.changed(self)
 
     # --- In
 
-    def enter(self, queue: Any, name: str, depth: int | None, work: Callable[[], Any]) -> None:
+    def enter(self, queue: Any, name: str, work: Callable[[], Any], depth: int = sys.maxsize) -> None:
         """Execute a callback, or let it wait in a queue. A full queue loses its oldest one.
 
         Args:
-            queue: The subscription, service or client.
+            queue: The link, service or client.
             name: Its name.
-            depth: Largest number of callbacks in its queue; None: there is no limit.
             work: Executes the callback.
+            depth: Largest number of callbacks in its queue.
         """
         if not (self.closed or self.waiting):
             self.run(work)
             return
         if not self.closed:
             # Others that wait are being served, or an exception has stopped that.
-            self._agenda.at(self._agenda.now, partial(self._changed, self))
+            self._agenda.at(self._agenda.now, self._change)
         same = [waiting for waiting in self.waiting if waiting.queue is queue]
-        if depth is not None and len(same) >= depth:
+        if len(same) >= depth:
             self.waiting.remove(same[0])
-            self.lost[name] += 1
+            self._lost[name] += 1
         self.waiting.append(Waiting(self._agenda.now, queue, name, work))
+        self._update()
 
     def run(self, work: Callable[[], Any]) -> Any:
         """Execute a callback, and return its result. What it sends leaves when its time is over."""
@@ -133,19 +139,46 @@ class Gate:
             self._gates.running = None
             self._busy = True
             self._agenda.at(self._agenda.now + duration, partial(self._finish, self._life))
-            self._changed(self)
+            self._change()
 
     def serve_next(self) -> None:
         """Execute the oldest callback that waits."""
-        self.run(self.waiting.popleft().work)
+        work = self.waiting.popleft().work
+        self._update()
+        self.run(work)
 
     def _finish(self, life: int) -> None:
         """End the time that a callback takes."""
         if life != self._life:
             return
         self._busy = False
-        self._flush()
-        self._changed(self)
+        self._update()
+        outbox, self._outbox = self._outbox, []
+        for send in outbox:
+            send()
+        self._change()
+
+    # --- Timers
+
+    def may_tick(self, timer: Timer) -> bool:
+        """Return whether a timer that is due ticks now. Otherwise it does later."""
+        if self.closed:
+            return False
+        if timer in self._delayed:
+            self._delayed.remove(timer)
+            return True
+        delay = sum(draw() for draw in self.timer_delays)
+        if delay == 0:
+            return True
+        self.suspended.add(timer)
+        self._agenda.at(self._agenda.now + delay, partial(self._resume, timer))
+        self._change()
+        return False
+
+    def _resume(self, timer: Timer) -> None:
+        self.suspended.discard(timer)
+        self._delayed.add(timer)
+        self._change()
 
     # --- Out
 
@@ -158,79 +191,24 @@ class Gate:
         """Send something when the time of the callback is over."""
         self._outbox.append(send)
 
-    def _flush(self) -> None:
-        outbox, self._outbox = self._outbox, []
-        for send in outbox:
-            send()
-
-
-class ResponseDelay(NamedTuple):
-    """A delay of the responses of a service."""
-
-    service: str
-    delay: int | None
-    """Delay (ns). None: they are never sent."""
-    note: Callable[[], None]
-    """Called for each response."""
-
 
 class Gates:
     """The gates of all nodes."""
 
-    def __init__(self, agenda: Agenda, changed: Callable[[Gate], None]) -> None:
-        """Start without gates. `changed` is called when one has opened or closed."""
+    def __init__(self, agenda: Agenda) -> None:
+        """Start without gates."""
         self.agenda = agenda
-        self.changed = changed
+        self.changed: Callable[[Gate], None] = lambda _: None
+        """Called when a gate has opened or closed."""
         self.running: Gate | None = None
         """Gate of the node whose callback is being executed and takes time."""
         self._gates: dict[str, Gate] = {}
-        self.response_delays: list[ResponseDelay] = []
-        """Delays of services, to be added."""
-        self.suspended: set[Timer] = set()
-        """Timers whose tick is delayed."""
-        self._delayed: set[Timer] = set()
 
     def of(self, name: str) -> Gate:
         """Return the gate of the node with a fully qualified name."""
         if name not in self._gates:
             self._gates[name] = Gate(name, self)
         return self._gates[name]
-
-    def response_delay(self, service: str) -> int | None:
-        """Return the delay of a response of a service (ns); None: it is never sent."""
-        delays = []
-        for name, delay, note in self.response_delays:
-            if name == service:
-                note()
-                delays.append(delay)
-        return None if None in delays else sum(delay or 0 for delay in delays)
-
-    # --- Timers
-
-    def may_tick(self, gate: Gate, timer: Timer) -> bool:
-        """Return whether a timer that is due ticks now. Otherwise it does later."""
-        if gate.closed:
-            return False
-        if timer in self._delayed:
-            self._delayed.remove(timer)
-            return True
-        delay = sum(draw() for draw in gate.timer_delays)
-        if delay == 0:
-            return True
-        self.suspended.add(timer)
-        self.agenda.at(self.agenda.now + delay, partial(self._resume, gate, timer))
-        self.changed(gate)
-        return False
-
-    def _resume(self, gate: Gate, timer: Timer) -> None:
-        self.suspended.discard(timer)
-        self._delayed.add(timer)
-        self.changed(gate)
-
-
-def depth_of(profile: QoSProfile) -> int | None:
-    """Return the depth of a queue; None: it has no limit."""
-    return None if profile.history == HistoryPolicy.KEEP_ALL else max(1, profile.depth)
 
 
 def send_unless_destroyed(send: Callable[..., None], *args: Any) -> None:

@@ -1,10 +1,9 @@
-"""An executor that detects when all work is done, and does it in a reproducible order.
+"""Which callback comes next: the scheduler detects when all work is done, and does it in a fixed order.
 
-Messages are taken from the subscriptions in the order in which they were published. Requests and
-responses of services, actions and events of QoS come through the EventsExecutor of rclpy, services in
-their place among the messages. Timers are called one by one, the most overdue first, each after all
-messages are processed: the EventsExecutor would call them from a second thread, at times and in an order
-that vary.
+Messages are taken from the links in the order in which they were published. Requests and responses of
+services, actions and events of QoS come through the EventsExecutor of rclpy, services in their place
+among the messages. Timers are called one by one, the most overdue first, each after all messages are
+processed: the EventsExecutor would call them from a second thread, at times and in an order that vary.
 """
 
 from __future__ import annotations
@@ -21,18 +20,15 @@ from rclpy.event_handler import EventHandler
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.subscription import Subscription
-from rclpy.task import Task
 from rclpy.timer import Timer
 
-from diffdrive_jacobian.lockstep._agenda import Agenda
-from diffdrive_jacobian.lockstep._clocks import Clocks
-from diffdrive_jacobian.lockstep._deliveries import Deliveries, SentElsewhere, is_latched
+from diffdrive_jacobian.lockstep._clock import Agenda, Clocks, Timers, is_due
 from diffdrive_jacobian.lockstep._errors import LockstepError
-from diffdrive_jacobian.lockstep._facade import Facade
-from diffdrive_jacobian.lockstep._keeper import Keeper
-from diffdrive_jacobian.lockstep._served import Responded, Served
+from diffdrive_jacobian.lockstep._gate import Gate, Gates
+from diffdrive_jacobian.lockstep._link import is_latched
+from diffdrive_jacobian.lockstep._links import Links, SentElsewhere
+from diffdrive_jacobian.lockstep._services import Member, Responses, check_holdable
 from diffdrive_jacobian.lockstep._tasks import Tasks
-from diffdrive_jacobian.lockstep._timers import Timers, is_due
 from diffdrive_jacobian.ros.rclpy_internals import (
     TimerHandle,
     events_executor,
@@ -44,15 +40,15 @@ LATCHED_PATIENCE = Duration(seconds=5.0)
 """Longest time for a latched message to reach a later subscription (s). It takes microseconds."""
 
 
-class QuiescentExecutor:
+class Scheduler:
     """Executes the callbacks of nodes until none is left at the current simulated time."""
 
-    def __init__(self, context: Context, on_registered: Callable[[Node], None]) -> None:
+    def __init__(self, context: Context, start: int) -> None:
         """Start without nodes.
 
         Args:
             context: The context of the nodes.
-            on_registered: Called with each node when it is new or has created or destroyed an entity.
+            start: What their clocks show at the start (ns).
 
         Raises:
             LockstepError: This rclpy has no EventsExecutor.
@@ -63,8 +59,9 @@ class QuiescentExecutor:
                 'lockstep needs the EventsExecutor of rclpy, which this ROS installation does not have'
             )
         self._events = events
-        self._on_registered = on_registered
-        self._served: dict[Node, Served] = {}
+        self.registered: Callable[[Node], None] = lambda _: None
+        """Called with each node when it is new or has created or destroyed an entity."""
+        self._members: dict[Node, Member] = {}
         self._changed = False
         self._has_actions = False
         self._has_events = False
@@ -72,32 +69,29 @@ class QuiescentExecutor:
         """Whether there are no messages from other processes."""
         self.unserved: set[Subscription] = set()
         """Subscriptions whose messages are not taken."""
-        self.tasks = Tasks()
-        self.agenda = Agenda()
-        """What happens at later times."""
-        self.deliveries = Deliveries(self.task_creator)
-        """The messages that wait."""
-        self.response_observers: list[Responded] = []
-        """Called with each response that a node gives."""
         self.killed: set[Node] = set()
         """The nodes that were removed without being stopped."""
+        self.agenda = Agenda()
+        """What happens at later times."""
+        self.clocks = Clocks(start)
+        self.timers = Timers()
+        self.tasks = Tasks()
+        self.gates = Gates(self.agenda)
+        self.gates.changed = self._on_gate
+        self.links = Links(self.agenda, self.gates, self.clocks)
+        self.responses = Responses(self.agenda)
         self._restore_calls = wrap_calls(self._noting)
         self._context = context
         self._created: list[weakref.ref[Node]] = []
         self._restore_nodes = on_new_node(self._note_node)
-        self.clocks = Clocks()
-        self.clock_pauses = 0
-        """Number of faults because of which the clocks of the nodes stand."""
-        self.timers = Timers()
-        self.keeper: Keeper | None = None
-        """Keeper of the gates of the nodes. None: they are always open."""
+        self.links.start(self._members, self.note_thread)
 
     def _noting(self, send: Callable[..., Any]) -> Callable[..., Any]:
         """Return a method that sends a request or a response, and takes its place among the messages."""
-        deliveries, pending = self.deliveries, self.deliveries.pending
+        links, pending = self.links, self.links.pending
 
         def sent(entity: Any, *args: Any, **kwargs: Any) -> Any:
-            if threading.get_ident() != deliveries.thread:
+            if threading.get_ident() != links.thread:
                 self.note_thread(entity, f'calls or answers {entity.service_name}')
             result = send(entity, *args, **kwargs)
             pending.append(None)
@@ -117,11 +111,11 @@ class QuiescentExecutor:
         """
         for node in self.existing:
             if any(one is entity for one in (*node.publishers, *node.clients, *node.services)):
-                added = node in self._served
+                added = node in self._members
                 if added or heard:
                     what = f'node {node.get_fully_qualified_name()} {does}'
                     sent = SentElsewhere(node, added, what, threading.current_thread().name)
-                    self.deliveries.elsewhere[entity] = sent
+                    self.links.elsewhere[entity] = sent
 
     # --- Nodes
 
@@ -138,32 +132,24 @@ class QuiescentExecutor:
     @property
     def nodes(self) -> list[Node]:
         """The nodes, in the order in which they were added."""
-        return list(self._served)
+        return list(self._members)
 
     def add(self, node: Node) -> None:
         """Add a node."""
-        create_task = self.task_creator(node)
-        # The node itself keeps a weak reference only.
-        facade = Facade(self._note_change, create_task)
-        served = Served(node, create_task, facade, self.response_observers)
-        self._served[node] = served
-        if self.keeper is not None:
-            self.keeper.admit(served)
-        node.executor = facade
-        self._events.add_node(served)
-        self.clocks.find(self._served)
+        gate = self.gates.of(node.get_fully_qualified_name())
+        member = Member(node, gate, self.tasks, self._note_change, self.responses)
+        self._members[node] = member
+        if gate.closed:
+            check_holdable(member.node)
+        node.executor = member.facade
+        self._events.add_node(member)
+        self.clocks.find(self._members)
         self._changed = True
-
-    def use(self, keeper: Keeper) -> None:
-        """Set the keeper of the gates of the nodes."""
-        self.keeper = keeper
-        for served in self._served.values():
-            keeper.admit(served)
 
     def remove(self, node: Node) -> None:
         """Remove a node, after it has processed what was sent to it."""
         self.settle()
-        if node in self._served:
+        if node in self._members:
             # Otherwise it was destroyed before.
             self._forget(node)
         self._note_change()
@@ -177,22 +163,22 @@ class QuiescentExecutor:
         self._note_change()
 
     def _forget(self, node: Node) -> None:
-        served = self._served.pop(node)
+        member = self._members.pop(node)
         self.tasks.cancel(node)
-        if self.keeper is not None:
-            self.keeper.dismiss(node)
-        _release(served)
-        self._events.remove_node(served)
+        member.gate.reset()
+        member.release()
+        self._events.remove_node(member)
 
     def close(self) -> None:
         """Remove all nodes and shut down."""
         self._restore_calls()
         self._restore_nodes()
         self.tasks.cancel()
-        for served in self._served.values():
-            _release(served)
-        self._served.clear()
-        self.deliveries.close()
+        for member in self._members.values():
+            member.release()
+        self._members.clear()
+        # So that the subscriptions can be destroyed.
+        self.links.update(())
         self._events.shutdown()
 
     # --- Work
@@ -219,10 +205,10 @@ class QuiescentExecutor:
                 return self._sooner(until_next)
         return self.settle()
 
-    def advance(self, now: int) -> int | None:
-        """Set the clocks of the nodes to a time (ns), and settle."""
-        if not self.clock_pauses:
-            self.clocks.set(now)
+    def advance(self) -> int | None:
+        """Set the clocks of the nodes to the present time, and settle."""
+        if not self.clocks.pauses:
+            self.clocks.set()
         if not self._has_work():
             called, until_next = self._call_timers()
             if called:
@@ -232,16 +218,12 @@ class QuiescentExecutor:
     def _has_work(self) -> bool:
         """Return whether anything waits to be executed, or may wait without having been noticed."""
         return bool(
-            self.deliveries.pending
-            or self._changed
-            or self.tasks
-            or self._has_actions
-            or not self.isolated
+            self.links.pending or self._changed or self.tasks or self._has_actions or not self.isolated
         )
 
     def _sooner(self, until_next: int | None) -> int | None:
         """Return the time until the next timer or action (ns); None: there is none."""
-        if self.clock_pauses:
+        if self.clocks.pauses:
             until_next = None
         until_action = self.agenda.until_next()
         if until_action is None or until_next is None:
@@ -263,20 +245,11 @@ class QuiescentExecutor:
             due, until_next = self.timers.due()
             if not due:
                 return called, self._sooner(until_next)
-            keeper = self.keeper
             for handle, timer, node in due:
-                if is_due(handle) and (keeper is None or keeper.may_tick(node, timer)):
+                if is_due(handle) and self._may_tick(timer, node):
                     called = True
-                    self.call_timer(handle, timer, node)
+                    self._call_timer(handle, timer, node)
                     self.handle_all(after_callback=True)
-
-    def task_creator(self, node: Node) -> Callable[..., Task]:
-        """Return a function that schedules functions and coroutines of a node for the current time."""
-
-        def create_task(callback: Any, *args: Any, **kwargs: Any) -> Task:
-            return self.tasks.create(node, callback, args, kwargs, node.executor)
-
-        return create_task
 
     def handle_all(self, *, after_callback: bool = False) -> None:
         """Process messages, service calls and tasks until none is left that can continue.
@@ -291,14 +264,8 @@ class QuiescentExecutor:
             if self._register_changed():
                 # A new client or service may already have been called.
                 events = True
-            elif not self._run_tasks():
+            elif not (self.tasks and self.tasks.run()):
                 return
-
-    def _run_tasks(self) -> bool:
-        """Continue the tasks. Return whether any made progress."""
-        return bool(
-            self.tasks and self.tasks.run(self.keeper.closed if self.keeper is not None else None)
-        )
 
     def serve(self) -> None:
         """Process requests and responses. Messages wait."""
@@ -311,15 +278,15 @@ class QuiescentExecutor:
         Args:
             events: Whether the EventsExecutor may have events although no request or response was sent.
         """
-        pending, poll = self.deliveries.pending, self.deliveries.poll
+        pending, poll = self.links.pending, self.links.poll
         take = pending.popleft
         while True:
             while pending:
-                if (reader := take()) is None:
+                if (link := take()) is None:
                     self._handle_events()
                     events = True
                 else:
-                    reader.deliver()
+                    link.deliver()
             if not ((events and self._handle_events()) or pending or poll() or pending):
                 return
 
@@ -336,13 +303,59 @@ class QuiescentExecutor:
             events += 1
         return events > 1
 
-    def call_timer(self, handle: TimerHandle, timer: Timer, node: Node) -> None:
-        """Call the callback of a timer."""
+    # --- Timers and gates
+
+    def _may_tick(self, timer: Timer, node: Node) -> bool:
+        """Return whether a timer that is due ticks now. Otherwise it does later."""
+        gate = self._members[node].gate
+        return gate.may_tick(timer) if self.timers.is_simulated(timer) else not gate.closed
+
+    def _call_timer(self, handle: TimerHandle, timer: Timer, node: Node) -> None:
+        """Call the callback of a timer.
+
+        That of a timer on wall time takes no simulated time, because nobody knows when it comes.
+        """
         handle.call_timer()
-        keeper = self.keeper
-        result = timer.callback() if keeper is None else keeper.run(node, timer)
+        member = self._members[node]
+        if member.gate.costs and self.timers.is_simulated(timer):
+            result = member.gate.run(timer.callback)
+        else:
+            result = timer.callback()
         if inspect.iscoroutine(result):
-            self.task_creator(node)(result)
+            member.create_task(result)
+
+    def _update_timers(self) -> None:
+        """Find the timers that may tick."""
+        self.timers.update(
+            (timer, node)
+            for node, member in self._members.items()
+            if not member.gate.closed
+            for timer in node.timers
+            if timer not in member.gate.suspended
+        )
+
+    def _on_gate(self, gate: Gate) -> None:
+        """Continue what was held back by a gate that has opened."""
+        self._update_timers()
+        member = next((member for member in self._members.values() if member.gate is gate), None)
+        if member is None:
+            return
+        if gate.closed:
+            check_holdable(member.node)
+            return
+        while gate.waiting and not gate.closed:
+            self.handle_all()
+            self._serve(gate, member.node)
+
+    def _serve(self, gate: Gate, node: Node) -> None:
+        """Execute what has waited longest: a message or request, or a timer of a node that is slow."""
+        entry = self.timers.most_overdue(node) if gate.costs else None
+        if entry is not None and self.agenda.now - entry[0] < gate.waiting[0].since:
+            _, handle, timer = entry
+            if self._may_tick(timer, node):
+                self._call_timer(handle, timer, node)
+        else:
+            gate.serve_next()
 
     # --- Entities
 
@@ -352,7 +365,7 @@ class QuiescentExecutor:
         New ones are registered when all is processed that waits. Destroyed ones receive nothing more.
         """
         self._changed = True
-        self.deliveries.drop_destroyed(self._served)
+        self.links.drop_destroyed(self._members)
 
     def _register_changed(self) -> bool:
         """Register if a node has created or destroyed an entity. Return whether one has."""
@@ -372,9 +385,9 @@ class QuiescentExecutor:
         Another thread delivers latched messages to later subscriptions. This waits for them, and
         processes those of one topic before those of the next, which fixes their order.
         """
-        for node in [node for node in self._served if _is_destroyed(node)]:
+        for node in [node for node in self._members if _is_destroyed(node)]:
             self._forget(node)
-        for node, served in self._served.items():
+        for node, member in self._members.items():
             if list(node.guards):
                 raise LockstepError(
                     f'node {node.get_fully_qualified_name()} has a guard condition, which lockstep does '
@@ -383,29 +396,22 @@ class QuiescentExecutor:
             for publisher in node.publishers:
                 if is_latched(publisher):
                     publisher.wait_for_all_acked(LATCHED_PATIENCE)
-            served.update()
-            self._on_registered(node)
+            member.update()
+            self.registered(node)
         self._events.wake()
         # The registration itself does not count as an event.
         self._handle_events()
-        without = self.clocks.find(self._served) | self.unserved
-        new = self.deliveries.update(self._served, without)
+        without = self.clocks.find(self._members) | self.unserved
+        new = self.links.update(self._members.values(), without)
         # Messages that a subscription has received before.
-        for reader in sorted(new, key=lambda reader: reader.latched):
-            self.deliveries.admit(reader)
+        for link in sorted(new, key=lambda link: link.latched):
+            self.links.admit(link)
             self._drain()
         # Actions, or a user's own entities. Who sends them something is not known.
-        waitables = [waitable for node in self._served for waitable in node.waitables]
+        waitables = [waitable for node in self._members for waitable in node.waitables]
         self._has_actions = any(not isinstance(waitable, EventHandler) for waitable in waitables)
         self._has_events = not all(map(_is_of_discovery, waitables))
-        self.update_timers()
-
-    def update_timers(self) -> None:
-        """Find the timers that may tick."""
-        if self.keeper is None:
-            self.timers.update(self._served)
-        else:
-            self.keeper.update_timers()
+        self._update_timers()
 
 
 def _nothing() -> None:
@@ -418,11 +424,6 @@ def _is_of_discovery(waitable: Any) -> bool:
     Those of rclpy itself, which report that two do not match.
     """
     return isinstance(waitable, EventHandler) and 'INCOMPATIBLE' in waitable.event_type.name
-
-
-def _release(served: Served) -> None:
-    served.facade.released = True
-    served.node.executor = None
 
 
 def _is_destroyed(node: Node) -> bool:

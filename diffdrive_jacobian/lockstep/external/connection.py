@@ -9,16 +9,13 @@ from contextlib import AbstractContextManager, suppress
 from rclpy.node import Node
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
-from diffdrive_jacobian.lockstep._executor import QuiescentExecutor
-from diffdrive_jacobian.lockstep._external_answers import Expectation, Idle
-from diffdrive_jacobian.lockstep._external_discovery import UNTIMED, Discovery
-from diffdrive_jacobian.lockstep._external_expectations import Due, Expectations
-from diffdrive_jacobian.lockstep._external_graph import ExternalGraph
-from diffdrive_jacobian.lockstep._external_probe import ROUNDS, Probe, Repeated
-from diffdrive_jacobian.lockstep._external_process import ExternalProcess, end_all
-from diffdrive_jacobian.lockstep._external_topic import ExternalTopic
-from diffdrive_jacobian.lockstep._external_waiting import Waiting
-from diffdrive_jacobian.lockstep._report import Traffic
+from diffdrive_jacobian.lockstep._scheduler import Scheduler
+from diffdrive_jacobian.lockstep.external.expectations import Due, Expectation, Expectations
+from diffdrive_jacobian.lockstep.external.graph import UNTIMED, Discovery, ExternalGraph
+from diffdrive_jacobian.lockstep.external.process import ExternalProcess, end_all
+from diffdrive_jacobian.lockstep.external.topic import ExternalTopic
+from diffdrive_jacobian.lockstep.external.waiting import ROUNDS, Probe, Repeated, Waiting
+from diffdrive_jacobian.ros.rclpy_internals import wait_for_message
 
 DISCOVERY_PERIOD = 0.01
 """Period at which the graph is queried during discovery (s)."""
@@ -33,44 +30,40 @@ UNCONFIRMED = 0.5
 
 
 class Connection:
-    """Declarations, and discovery of the nodes that are to meet them. Base class of `External`."""
+    """Declarations, and discovery of the nodes that are to meet them."""
 
     def __init__(
         self,
         node: Node,
-        executor: QuiescentExecutor,
-        traffic: Traffic,
+        scheduler: Scheduler,
         watched: Callable[[], AbstractContextManager[None]],
         report: Callable[[], str],
-        now: Callable[[], int],
     ) -> None:
         """Start without expectations.
 
         Args:
             node: Node of the world.
-            executor: Executes its nodes.
-            traffic: Counts their messages.
+            scheduler: Executes its nodes.
             watched: Returns a context in which callbacks may be executed.
             report: Returns the last messages of all topics as text.
-            now: Returns the simulated time (ns).
         """
         self._node = node
-        self._executor = executor
-        self._traffic = traffic
-        self._now = now
+        self._scheduler = scheduler
+        self._links, self._clocks = scheduler.links, scheduler.clocks
         self.graph = ExternalGraph(node)
-        self.waiting = Waiting(node, executor, watched, report, self._awaits)
+        self.expectations = Expectations(node)
+        """What is awaited at present."""
+        self.waiting = Waiting(scheduler, watched, report, self.expectations.include)
         """Waits for other processes."""
         self.began = False
         """Whether the external nodes have received the time."""
+        self.topics: dict[str, ExternalTopic] = {}
+        """The topics of external nodes on which messages are counted, in the order of their delivery."""
+        self.endpoints: frozenset[object] = frozenset()
+        """The publishers and subscriptions of the world that external nodes have discovered."""
         self._complete = False
-        self._expectations = Expectations(node)
-        self._topics: dict[str, ExternalTopic] = {}
-        self._endpoints: frozenset[object] = frozenset()
-        self._before = 0
-        self._sent: tuple[int, ...] = ()
-        executor.isolated = False
-        executor.clocks.enabled = False
+        scheduler.isolated = False
+        self._clocks.enabled = False
 
     # --- Declarations
 
@@ -80,31 +73,31 @@ class Connection:
         Raises:
             ValueError: One of them is no `Answers`, `Every` or `Idle`.
         """
-        self._expectations.add(expected, process)
+        self.expectations.add(expected, process)
         self._complete = False
 
-    def _forget_ended(self) -> None:
+    def forget_ended(self) -> None:
         """Await nothing more from processes that the test has ended."""
-        for name in self._expectations.forget_ended() & self._topics.keys():
-            if left := self._expectations.due(name):
-                self._restart(self._topics[name], left)
+        for name in self.expectations.forget_ended() & self.topics.keys():
+            if left := self.expectations.due(name):
+                self._restart(self.topics[name], left)
                 continue
             # Nothing is due, so what still comes is delivered as it comes.
-            topic = self._topics.pop(name)
-            self._executor.deliveries.held.discard(name)
-            self._executor.unserved.discard(topic.subscription)
+            topic = self.topics.pop(name)
+            self._links.held.discard(name)
+            self._scheduler.unserved.discard(topic.subscription)
             topic.close()
 
     def _restart(self, topic: ExternalTopic, expected: Iterable[Due]) -> None:
         topic.restart()
         for one in expected:
-            one.restart(self._published)
+            one.restart(self.published)
 
     # --- Discovery
 
     def connected(self) -> bool:
         """Return whether all declared nodes have been discovered, and have discovered the world."""
-        return self._complete and self._discovery().endpoints() == self._endpoints
+        return self._complete and self._discovery().endpoints() == self.endpoints
 
     def connect(self, timeout: float) -> None:
         """Wait until the declared nodes are discovered, and have discovered the nodes of the world.
@@ -117,22 +110,22 @@ class Connection:
         Raises:
             LockstepError: They are not in time, a process has ended, or the nodes do not fit.
         """
-        self._executor.clocks.enabled = False
-        self._forget_ended()
+        self._clocks.enabled = False
+        self.forget_ended()
         begin = time.monotonic()
         only_untimed: float | None = None
         while True:
             self.waiting.check_processes()
             self._count_published_topics()
-            known = len(self._topics)
-            missing, untimed = self._discovery().missing(*self._awaited(), self._topics)
+            known = len(self.topics)
+            missing, untimed = self._discovery().missing(*self._awaited(), self.topics)
             if not (missing or untimed):
                 # A node that responds has created its publishers, but they may be discovered later.
                 self.confirm(max(timeout - (time.monotonic() - begin), MIN_CONFIRMATION))
-                if self._expectations.probes():
+                if self.expectations.probes():
                     time.sleep(SETTLING)
                     self._count_published_topics()
-                if len(self._topics) == known:
+                if len(self.topics) == known:
                     break
                 continue
             waited = time.monotonic() - begin
@@ -141,7 +134,7 @@ class Connection:
                 raise LockstepError(self._not_discovered(waited, [*missing, *untimed]))
             self.waiting.serve()
             time.sleep(DISCOVERY_PERIOD)
-        self._endpoints = self._discovery().endpoints()
+        self.endpoints = self._discovery().endpoints()
         self._complete = True
 
     def begin(self) -> None:
@@ -149,36 +142,29 @@ class Connection:
 
         Callbacks are called with what external nodes have published before.
         """
-        for name, topic in self._topics.items():
-            for reader in self._executor.deliveries.readers_of(name):
-                while reader.waits(self._node.context, 0.0):
-                    reader.accept()
-            expected = self._expectations.due(name)
-            if name not in self._executor.deliveries.held or not all(one.started for one in expected):
+        for name, topic in self.topics.items():
+            for link in self._links.to(name):
+                while wait_for_message(self._node.context, link.endpoint, 0.0):
+                    link.accept()
+            expected = self.expectations.due(name)
+            if name not in self._links.held or not all(one.started for one in expected):
                 self._restart(topic, expected)
         self.began = True
-        self._executor.deliveries.held.update(self._topics)
-        self._executor.clocks.enabled = True
-        self._executor.clocks.publish()
-
-    def topics(self) -> list[str]:
-        """Return the topics of external nodes on which messages are counted."""
-        return list(self._topics)
-
-    def _awaits(self, process: ExternalProcess) -> bool:
-        return self._expectations.include(process)
+        self._links.held.update(self.topics)
+        self._clocks.enabled = True
+        self._clocks.publish()
 
     def _awaited(self) -> tuple[list[Due], list[Probe]]:
-        return self._expectations.due(), self._expectations.probes()
+        return self.expectations.due(), self.expectations.probes()
 
     def _discovery(self) -> Discovery:
-        return Discovery(self.graph, self._executor.nodes)
+        return Discovery(self.graph, self._scheduler.nodes)
 
     def _count_published_topics(self) -> None:
         """Subscribe to the declared topics that have an external publisher, and those of idle nodes."""
-        for one in self._expectations.due():
+        for one in self.expectations.due():
             self._subscribe(one.topic)
-        for probe in self._expectations.probes():
+        for probe in self.expectations.probes():
             for name in self.graph.topics_of(probe.name):
                 with suppress(LockstepError):
                     # A type that is not installed here has no subscription in the world, either.
@@ -186,15 +172,15 @@ class Connection:
 
     def _subscribe(self, name: str) -> None:
         infos = self.graph.publishers(name)
-        if infos and name not in self._topics:
-            topic = ExternalTopic(self._node, name, infos, self._traffic)
-            self._executor.unserved.add(topic.subscription)
-            self._topics[name] = topic
+        if infos and name not in self.topics:
+            topic = ExternalTopic(self._node, name, infos, self._links)
+            self._scheduler.unserved.add(topic.subscription)
+            self.topics[name] = topic
             # In the order of the declarations, not of their discovery; then those of idle nodes.
-            declared = [one.topic for one in self._expectations.due()]
-            names = sorted(self._topics, key=lambda one: (one not in declared, one))
-            ordered = dict.fromkeys([one for one in declared if one in self._topics] + names)
-            self._topics = {one: self._topics[one] for one in ordered}
+            declared = [one.topic for one in self.expectations.due()]
+            names = sorted(self.topics, key=lambda one: (one not in declared, one))
+            ordered = dict.fromkeys([one for one in declared if one in self.topics] + names)
+            self.topics = {one: self.topics[one] for one in ordered}
 
     def _not_discovered(self, waited: float, missing: Sequence[str]) -> str:
         topics = ', '.join(self.graph.published_topics()) or 'none'
@@ -219,7 +205,7 @@ class Connection:
         """
         services = {name for name, _ in self._node.get_service_names_and_types()}
         nodes = self._discovery().awaited_nodes(*self._awaited())
-        probes = [Probe(self._node, Idle(name, within=timeout)) for name in sorted(nodes)]
+        probes = [Probe(self._node, name, timeout) for name in sorted(nodes)]
         try:
             known = [probe for probe in probes if probe.service in services]
             for probe in known:
@@ -233,13 +219,13 @@ class Connection:
             for probe in probes:
                 probe.close()
 
-    def _published(self, name: str) -> int:
+    def published(self, name: str) -> int:
         """Return the number of messages on a topic. Those of external nodes count if it is declared."""
-        topic = self._topics.get(name)
-        return self._traffic.count(name) + (topic.count() if topic is not None else 0)
+        topic = self.topics.get(name)
+        return self._links.count(name) + (topic.count() if topic is not None else 0)
 
     def close(self) -> None:
         """End the processes."""
         end_all(self.waiting.processes)
-        for topic in self._topics.values():
+        for topic in self.topics.values():
             topic.close()

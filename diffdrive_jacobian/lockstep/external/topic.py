@@ -10,7 +10,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
-from diffdrive_jacobian.lockstep._report import Traffic
+from diffdrive_jacobian.lockstep._links import Links
 from diffdrive_jacobian.ros.rclpy_internals import message_taker
 
 DEPTH = 1000
@@ -23,14 +23,14 @@ class ExternalTopic:
     Its subscription also receives the messages of the world, whose number is known.
     """
 
-    def __init__(self, node: Node, topic: str, infos: list[TopicEndpointInfo], traffic: Traffic) -> None:
+    def __init__(self, node: Node, topic: str, infos: list[TopicEndpointInfo], links: Links) -> None:
         """Subscribe.
 
         Args:
             node: The node of the subscription.
             topic: Full name of the topic.
             infos: The external publishers of the topic.
-            traffic: Counts the messages of the world.
+            links: Counts the messages of the world.
 
         Raises:
             LockstepError: The type of the topic is not installed, or the world has another one.
@@ -50,10 +50,10 @@ class ExternalTopic:
             types = sorted({info.topic_type for info in everyone})
             raise LockstepError(f'{topic} has several types: {", ".join(types)}') from error
         self._node = node
-        self._traffic = traffic
+        self._links = links
         self._take, self._release = message_taker(self.subscription)
         self._taken = 0
-        self._not_counted = -traffic.count(topic)
+        self._not_counted = -links.count(topic)
         self._messages: list[bytes] = []
         self.delivered = 0
         """Number of those that the nodes of the world have received."""
@@ -63,7 +63,7 @@ class ExternalTopic:
         while (taken := self._take(self.msg_type, True)) is not None:
             self._taken += 1
             self._messages.append(taken[0])
-        return self._taken - self._traffic.count(self.topic_name) - self._not_counted
+        return self._taken - self._links.count(self.topic_name) - self._not_counted
 
     def deliver(self) -> list[bytes]:
         """Return the messages since the last call, the oldest first, and count them as delivered."""

@@ -1,0 +1,337 @@
+"""All links of a world.
+
+Within a process Fast DDS puts a message into the queues of its subscriptions before `publish` returns.
+So whoever observes `Publisher.publish` knows which subscriptions may have received something, and in
+which order. The messages are taken from there directly: an event of the EventsExecutor takes several
+times as long. A further subscription for each topic would cost as much as the run, and change the number
+of subscriptions, which nodes may query.
+
+Messages are not copied, so one that its node modifies after publishing is reported as modified.
+"""
+
+from __future__ import annotations
+
+import inspect
+import threading
+from collections import deque
+from collections.abc import Callable, Container, Iterable, Sequence
+from functools import partial
+from itertools import count
+from typing import Any, NamedTuple
+
+from rclpy.exceptions import InvalidHandle
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.serialization import serialize_message
+from rclpy.subscription import Subscription
+
+from diffdrive_jacobian.lockstep._clock import Agenda, Clocks
+from diffdrive_jacobian.lockstep._gate import Gates, send_unless_destroyed
+from diffdrive_jacobian.lockstep._link import Delivered, Link, Published, Source, Stage, Taken, pass_on
+from diffdrive_jacobian.lockstep._services import Member
+from diffdrive_jacobian.messages.topics import NOT_OF_ROBOTS
+from diffdrive_jacobian.ros.rclpy_internals import message_taker, receives_info, wrap_publish
+
+Filter = Callable[[Source | Link], Stage | None]
+"""Returns the stage of a fault at one end of a link; None: the fault does not affect it."""
+
+
+class SentElsewhere(NamedTuple):
+    """What a publisher, client or service has sent from another thread than that of the nodes."""
+
+    node: Node
+    """The node that has it."""
+    added: bool
+    """Whether the node was added before."""
+    what: str
+    """What it did: 'node /face publishes /cmd_vel'."""
+    thread: str
+    """Name of the thread."""
+
+
+class Links:
+    """The links of a world: who publishes, who receives, and what waits in which order."""
+
+    def __init__(self, agenda: Agenda, gates: Gates, clocks: Clocks) -> None:
+        """Start without links.
+
+        Args:
+            agenda: What happens later.
+            gates: The gates of the nodes.
+            clocks: The clocks of the nodes.
+        """
+        self._agenda, self._gates, self._clocks = agenda, gates, clocks
+        self.pending: deque[Link | None] = deque()
+        """One entry for each message and link. None: a request or a response of a service."""
+        self.held: set[str] = set()
+        """Topics whose messages are not polled: they come from other processes, see `external`."""
+        self.thread = threading.get_ident()
+        """The thread of the nodes."""
+        self.elsewhere: dict[Any, SentElsewhere] = {}
+        """What another thread has sent last, by publisher, client or service."""
+        self.unaffected: set[Publisher] = set()
+        """Publishers of the world itself, whose messages no fault affects."""
+        self._sources: dict[Publisher, Source] = {}
+        self._external: dict[str, Source] = {}
+        self._links: dict[Subscription, Link] = {}
+        self._by_topic: dict[str, list[Link]] = {}
+        self._published: dict[str, list[Published]] = {}
+        self._delivered: dict[str, list[Delivered]] = {}
+        self._polled: list[Link] = []
+        self._filters: list[Filter] = []
+        self._members: Iterable[Node] = ()
+        self._numbers = count(1)
+        self._sending = False
+        self._restore: Callable[[], None] | None = None
+
+    def to(self, topic: str) -> list[Link]:
+        """Return the links of a topic. The list stays up to date."""
+        return self._by_topic.setdefault(topic, [])
+
+    def observers_of_published(self, topic: str) -> list[Published]:
+        """Return the functions that are called after each message of a topic is sent."""
+        return self._published.setdefault(topic, [])
+
+    def observers_of_delivered(self, topic: str) -> list[Delivered]:
+        """Return the functions that are called before each message of a topic is received."""
+        return self._delivered.setdefault(topic, [])
+
+    def filter(self, stage_of: Filter) -> None:
+        """Add the stages of a fault to all links that it affects, now and later."""
+        self._filters.append(stage_of)
+        for link in self._links.values():
+            if (stage := stage_of(link)) is not None:
+                link.add_stage(stage)
+        for source in self._sources.values():
+            if source.owner is not None and (stage := stage_of(source)) is not None:
+                source.stages.append(stage)
+
+    def _stages_of(self, end: Source | Link) -> list[Stage]:
+        found = [stage_of(end) for stage_of in self._filters]
+        return [stage for stage in found if stage is not None]
+
+    # --- Sending
+
+    def start(self, members: Iterable[Node], note_thread: Callable[..., None]) -> None:
+        """Start to observe what is published.
+
+        Args:
+            members: The nodes of the world. It stays up to date.
+            note_thread: Called in other threads, as `Scheduler.note_thread`.
+        """
+        self._members = members
+        links, sources, gates, clocks = self, self._sources, self._gates, self._clocks
+        numbers = self._numbers
+        extend, thread, get_ident = self.pending.extend, self.thread, threading.get_ident
+
+        def sending(publish: Callable[..., None]) -> Callable[..., None]:
+            def send(self: Publisher, msg: Any) -> None:
+                if get_ident() != thread:
+                    topic = self.topic_name
+                    heard = bool(links.to(topic) or links.observers_of_published(topic))
+                    note_thread(self, f'publishes {topic}', heard=heard and topic not in NOT_OF_ROBOTS)
+                source = sources.get(self) or links._source_of(self)
+                if (source.stages or gates.running is not None) and links._divert(self, source, msg):
+                    return
+                publish(self, msg)
+                source.count += 1
+                source.order = next(numbers)
+                source.at = clocks.now
+                source.message = msg
+                extend(source.links)
+                if source.observers:
+                    for observer in source.observers:
+                        observer(self, msg)
+
+            return send
+
+        self._restore = wrap_publish(sending)
+
+    def _source_of(self, publisher: Publisher) -> Source:
+        """Return the source of a publisher that publishes for the first time."""
+        source = self._source(publisher.topic_name, publisher.msg_type)
+        self._sources[publisher] = source
+        self._find_owner(publisher, source)
+        return source
+
+    def _source(self, topic: str, message_type: Any) -> Source:
+        return Source(topic, message_type, self.to(topic), self.observers_of_published(topic))
+
+    def _find_owner(self, publisher: Publisher, source: Source) -> None:
+        for node in self._members:
+            if publisher in node.publishers:
+                source.owner = node
+                source.stages += self._stages_of(source)
+                return
+
+    def _divert(self, publisher: Publisher, source: Source, message: Any) -> bool:
+        """Let a message pass the gate and the stages of its sender.
+
+        Returns:
+            Whether it does. False: it can be sent now.
+        """
+        if self._sending or publisher in self.unaffected:
+            return False
+        data = message if isinstance(message, bytes) else serialize_message(message)
+        send = partial(send_unless_destroyed, self._send, publisher)
+        go_on = partial(pass_on, source.stages, data, self._agenda, send, send)
+        if self._gates.running is not None:
+            self._gates.running.leave(go_on)
+        else:
+            go_on()
+        return True
+
+    def _send(self, publisher: Publisher, data: bytes) -> None:
+        """Send a message that has passed the gate and the stages."""
+        self._sending = True
+        try:
+            publisher.publish(data)
+        finally:
+            self._sending = False
+
+    def note_external(self, source: Any, messages: Sequence[bytes]) -> None:
+        """Count messages from other processes on a topic.
+
+        Args:
+            source: The topic, which takes the place of a publisher: it has its `topic_name` and
+                `msg_type`.
+            messages: The messages, serialized.
+        """
+        name = source.topic_name
+        if name not in self._external:
+            self._external[name] = self._source(name, source.msg_type)
+        record = self._external[name]
+        for message in messages:
+            record.count += 1
+            record.order = next(self._numbers)
+            record.at = self._clocks.now
+            record.message = message
+            for observer in record.observers:
+                observer(source, message)
+
+    # --- Receiving
+
+    def update(self, members: Iterable[Member], without: Container[Subscription] = ()) -> list[Link]:
+        """Serve the present subscriptions of the nodes.
+
+        Args:
+            members: The nodes.
+            without: Subscriptions that are not served.
+
+        Returns:
+            Those that wait for `admit`.
+        """
+        known, self._links = self._links, {}
+        for member in members:
+            for subscription in member.node.subscriptions:
+                if subscription in without:
+                    continue
+                link = known.pop(subscription, None)
+                self._links[subscription] = link or self._link(subscription, member)
+        for link in known.values():
+            link.close()
+        present = set(self._links.values())
+        self._polled = [link for link in self._polled if link in present]
+        for links in self._by_topic.values():
+            links.clear()
+        for link in self._links.values():
+            self.to(link.topic).append(link)
+        for publisher, source in self._sources.items():
+            if source.owner is None:
+                self._find_owner(publisher, source)
+        admitted = set(self._polled)
+        return [link for link in self._links.values() if link not in admitted]
+
+    def _link(self, subscription: Subscription, member: Member) -> Link:
+        """Return a new link to a subscription."""
+        take, release = message_taker(subscription)
+
+        def receive(taken: Taken) -> None:
+            # The callback is looked up for each message, because it may be replaced.
+            callback = subscription.callback
+            result = callback(*taken) if receives_info(subscription) else callback(taken[0])
+            if result is not None and inspect.iscoroutine(result):
+                member.create_task(result)
+
+        link = Link(
+            subscription,
+            member.node,
+            gate=member.gate,
+            agenda=self._agenda,
+            pending=self.pending,
+            observers=self.observers_of_delivered(subscription.topic_name),
+            take=take,
+            receive=receive,
+            release=release,
+        )
+        for stage in self._stages_of(link):
+            link.add_stage(stage)
+        return link
+
+    def drop_destroyed(self, nodes: Iterable[Node]) -> None:
+        """Deliver nothing more to subscriptions that the nodes do not have any more."""
+        present = {subscription for node in nodes for subscription in node.subscriptions}
+        for subscription in self._links.keys() - present:
+            self._links.pop(subscription).close()
+
+    def admit(self, link: Link) -> None:
+        """Deliver the messages that a new subscription has received before, and let it be polled."""
+        while link.deliver():
+            pass
+        self._polled.append(link)
+
+    def poll(self) -> bool:
+        """Deliver one message of each subscription that has any. Return whether there was one.
+
+        rcl itself publishes some messages, for example the status of actions, which nobody can observe.
+        """
+        found = False
+        for link in self._polled:
+            if self.held and link.topic in self.held:
+                continue
+            # As `deliver`, without a call for each.
+            taken = link.take(link.message_type, link.raw)
+            if taken is not None:
+                link.arrive(taken)
+                found = True
+        return found
+
+    def close(self) -> None:
+        """Stop to observe what is published."""
+        if self._restore is not None:
+            self._restore()
+
+    # --- What has happened
+
+    def sources(self) -> list[tuple[Publisher | None, Source]]:
+        """Return all sources with messages, with their publishers. None: other processes."""
+        external = [(None, source) for source in self._external.values()]
+        return [pair for pair in (*self._sources.items(), *external) if pair[1].count]
+
+    def last(self, topic: str) -> Any:
+        """Return the last message of a topic as it was received; None: there is none."""
+        sources = [source for _, source in self.sources() if source.topic == topic]
+        return max(sources, key=lambda source: source.order).received() if sources else None
+
+    def count(self, topic: str) -> int:
+        """Return the number of messages that the nodes of the world have published on a topic."""
+        return sum(source.count for source in self._sources.values() if source.topic == topic)
+
+    def sent_to_others(self) -> int:
+        """Return the number of messages of the publishers that have a subscription elsewhere.
+
+        It changes with every message to another process.
+        """
+        return sum(
+            source.count
+            for publisher, source in self._sources.items()
+            if source.topic not in NOT_OF_ROBOTS and _subscriptions(publisher) > len(source.links)
+        )
+
+
+def _subscriptions(publisher: Publisher) -> int:
+    """Return the number of matched subscriptions of a publisher; 0 if it was destroyed."""
+    try:
+        return int(publisher.get_subscription_count())
+    except InvalidHandle:
+        return 0

@@ -1,0 +1,243 @@
+"""The nodes of a world as the EventsExecutor sees them, with their services and clients.
+
+The EventsExecutor uses their attributes only, not their types. What stands for them here leaves timers
+and messages to the scheduler, awaits coroutines, which the EventsExecutor of Jazzy cannot, and lets
+requests and responses wait at the gate of a node.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias
+
+from rclpy.client import Client
+from rclpy.event_handler import EventHandler
+from rclpy.node import Node
+from rclpy.service import Service
+from rclpy.task import Future, Task
+
+from diffdrive_jacobian.lockstep._clock import Agenda
+from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._gate import Gate, send_unless_destroyed
+from diffdrive_jacobian.lockstep._link import queue_depth
+from diffdrive_jacobian.lockstep._tasks import Facade, Tasks
+
+Responded: TypeAlias = Callable[[Node, Service, Any], None]
+"""Receives a node, its service, and a response, also one that a fault delays."""
+
+
+class Responses:
+    """The responses of all services."""
+
+    def __init__(self, agenda: Agenda) -> None:
+        """Start without delays. `agenda` is where responses wait."""
+        self._agenda = agenda
+        self.observers: list[Responded] = []
+        """Called with each response that a node gives."""
+        self._delays: list[tuple[str, int | None, Callable[[], None]]] = []
+
+    def delay(self, service: str, late: int | None, note: Callable[[], None]) -> Callable[[], None]:
+        """Delay the responses of a service, in addition to other delays. Return what ends that.
+
+        Args:
+            service: Full name of the service.
+            late: The delay (ns). None: they are never sent.
+            note: Called for each response.
+        """
+        delay = service, late, note
+        self._delays.append(delay)
+        return lambda: self._delays.remove(delay)
+
+    def send(self, node: Node, service: Service, response: Any, header: Any) -> None:
+        """Send a response, now or later."""
+        for observe in self.observers:
+            observe(node, service, response)
+        delays = []
+        for name, late, note in self._delays:
+            if name == service.service_name:
+                note()
+                delays.append(late)
+        if None in delays:
+            return
+        if total := sum(late or 0 for late in delays):
+            send = partial(send_unless_destroyed, service.send_response, response, header)
+            self._agenda.at(self._agenda.now + total, send)
+        else:
+            service.send_response(response, header)
+
+
+class Member:
+    """A node of the world.
+
+    For the EventsExecutor it has no timers, subscriptions and guard conditions.
+    """
+
+    timers = subscriptions = guards = ()
+
+    def __init__(
+        self, node: Node, gate: Gate, tasks: Tasks, changed: Callable[[], None], responses: Responses
+    ) -> None:
+        """Take a node.
+
+        Args:
+            node: The node.
+            gate: Its gate.
+            tasks: Where its coroutines wait.
+            changed: Called when the node has created or destroyed an entity.
+            responses: Sends its responses.
+        """
+        self.node = node
+        self.gate = gate
+        self.responses = responses
+        self._tasks = tasks
+        # The node itself keeps a weak reference only.
+        self.facade = Facade(changed, self.create_task)
+        self.executor: Any = None
+        self.services: list[Any] = []
+        self.clients: list[Any] = []
+        self._wrapped: dict[Any, Any] = {}
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.node, name)
+
+    def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
+        """Schedule a function or a coroutine of the node for the current time. Return its future."""
+        return self._tasks.create(self.node, self.gate, callback, args, kwargs)
+
+    def update(self) -> None:
+        """Register new services and clients."""
+        known, self._wrapped = self._wrapped, {}
+        for service in self.node.services:
+            self._wrapped[service] = known.get(service) or _Service(service, self)
+        for client in self.node.clients:
+            self._wrapped[client] = known.get(client) or _Client(client, self.gate)
+        self.services = [self._wrapped[service] for service in self.node.services]
+        self.clients = [self._wrapped[client] for client in self.node.clients]
+
+    def release(self) -> None:
+        """Let the node leave its executor."""
+        self.facade.released = True
+        self.node.executor = None
+
+
+def check_holdable(node: Node) -> None:
+    """Raise LockstepError if a node has callbacks that cannot be held back."""
+    if any(not isinstance(waitable, EventHandler) for waitable in node.waitables):
+        name = node.get_fully_qualified_name()
+        raise LockstepError(f'{name} has an action, which cannot be frozen or slow in lockstep')
+
+
+class _Request(NamedTuple):
+    """A request that waits, instead of a response."""
+
+    request: Any
+    response: Any
+
+
+_IGNORED = object()
+"""Instead of a response: the service was destroyed after the request had arrived."""
+
+
+def _ignore(*_: Any) -> object:
+    """Return no response."""
+    return _IGNORED
+
+
+class _Service:
+    """A service whose callback may be a coroutine. The response is sent when it ends."""
+
+    def __init__(self, service: Service, member: Member) -> None:
+        self._service = service
+        self._member = member
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._service, name)
+
+    @property
+    def callback(self) -> Callable[[Any, Any], Any]:
+        """Function that returns the response of a request.
+
+        The EventsExecutor holds a borrowed reference only: an object that is created here would be freed
+        before it is called.
+        """
+        if self._service not in self._member.node.services:
+            return _ignore
+        if not self._member.gate.free:
+            return _Request
+        callback: Callable[[Any, Any], Any] = self._service.callback
+        return callback
+
+    def send_response(self, response: Any, header: Any) -> None:
+        """Send the result of the callback."""
+        member, service = self._member, self._service
+        if response is _IGNORED:
+            return
+        if isinstance(response, _Request):
+            request = response
+            member.gate.enter(
+                service,
+                service.service_name,
+                lambda: self.send_response(service.callback(*request), header),
+                queue_depth(service.qos_profile),
+            )
+        elif inspect.iscoroutine(response):
+
+            async def answer() -> None:
+                self._send(await response, header)
+
+            member.create_task(answer)
+        else:
+            self._send(response, header)
+
+    def _send(self, response: Any, header: Any) -> None:
+        member = self._member
+        send = partial(member.responses.send, member.node, self._service, response, header)
+        if member.gate.delays_output:
+            member.gate.leave(send)
+        else:
+            send()
+
+
+class _Client:
+    """A client. Its responses wait at the gate of its node."""
+
+    def __init__(self, client: Client, gate: Gate) -> None:
+        self._client = client
+        self._gate = gate
+        self._latest: _Response | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._client, name)
+
+    def get_pending_request(self, sequence_number: int) -> Any:
+        """Return the future of a request."""
+        future = self._client.get_pending_request(sequence_number)
+        if self._gate.free:
+            return future
+        # Kept, in case that the EventsExecutor holds a borrowed reference only.
+        self._latest = _Response(future, self._client, self._gate)
+        return self._latest
+
+
+class _Response:
+    """The future of a request, for the EventsExecutor. Its result waits at a gate."""
+
+    def __init__(self, future: Future, client: Client, gate: Gate) -> None:
+        self._future = future
+        self._client = client
+        self._gate = gate
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._future, name)
+
+    def set_result(self, result: Any) -> None:
+        """Set the result of the future."""
+        client = self._client
+        self._gate.enter(
+            client,
+            client.service_name,
+            partial(self._future.set_result, result),
+            queue_depth(client.qos_profile),
+        )
