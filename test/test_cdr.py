@@ -23,6 +23,7 @@ from geometry_msgs.msg import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nav_msgs.msg import Goals, Odometry
+from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterDescriptor, ParameterEvent
 from rclpy.serialization import deserialize_message, serialize_message
 from rosgraph_msgs.msg import Clock
@@ -30,7 +31,7 @@ from rosidl_parser import definition
 from sensor_msgs.msg import JointState, LaserScan
 from std_msgs.msg import Empty, Float64MultiArray, Header, String
 
-from diffdrive_jacobian.messages.cdr import DecodingError, Reader, Writer
+from diffdrive_jacobian.messages.cdr import DecodingError, LongMessageError, Reader, Writer
 from diffdrive_jacobian.messages.errors import MessageError
 from diffdrive_jacobian.messages.structure import defined
 
@@ -333,6 +334,21 @@ def test_a_huge_length_takes_no_memory():
         assert tracemalloc.get_traced_memory()[1] < 100_000
     finally:
         tracemalloc.stop()
+
+
+def test_a_message_with_very_many_values_is_refused_unless_it_is_only_checked():
+    many = JointState(velocity=[0.5] * 200_001)
+    for message, fields in (
+        (many, ['velocity']),
+        (JointState(name=['a'] * 200_001), []),
+        (ParameterEvent(new_parameters=[ParameterMessage()] * 100_001), ['new_parameters[].value.type']),
+    ):
+        data = serialize_message(message)
+        with pytest.raises(LongMessageError, match='more values than are read'):
+            Reader(type(message), fields)(data)
+        assert Reader(type(message), [], bounded=False)(data) == ()
+    # Numbers that are not asked for take nothing.
+    assert Reader(JointState, ['name'])(serialize_message(many)) == ((),)
 
 
 def test_layouts_of_messages_of_many_sizes_take_little_memory():

@@ -249,6 +249,14 @@ def test_too_many_goals_are_refused_before_they_are_read():
         GOALS.reader(Goals)(bytes(data) + bytes(2001 * 80))
 
 
+def test_goals_without_poses_have_a_stamp_too():
+    message = goals()
+    message.header.stamp.sec = -1
+    route = value_of(GOALS, message)
+    with pytest.raises(MessageError, match='its stamp must have sec of at least 0'):
+        TOPICS['goals'].rows(route, ('left', 'right'))
+
+
 def test_twists_that_are_published_are_those_of_rclpy_byte_for_byte():
     message = twist(0.125, -3.5)
     assert TWIST.writer(Twist())(Command((0.125, -3.5))) == serialize_message(message)

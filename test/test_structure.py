@@ -88,6 +88,13 @@ def test_everything_that_a_definition_can_have():
         ('Two two\n===\nMSG: a_msgs/Two\nOne one', 'a_msgs/One contains itself'),
         ('int8', "a_msgs/One has the line 'int8', which is no field"),
         ('int8 8x', "'int8 8x', which is no field"),
+        ('int8[0] none', 'an array must have at least 1 element'),
+        (f'int8[{"9" * 5000}] many', 'which is no field'),
+        ('int8[\N{ARABIC-INDIC DIGIT THREE}] three', 'which is no field'),
+        (
+            'T0 t\n' + ''.join(f'===\nMSG: a_msgs/T{one}\nT{one + 1} t\n' for one in range(2000)),
+            'nested too deep',
+        ),
     ],
 )
 def test_an_invalid_definition_is_an_error(text, error):

@@ -76,7 +76,7 @@ class MessageDigest:
                 identifier = bytes(value.uuid)
                 number = self._identifiers.setdefault(identifier, len(self._identifiers))
                 return [str(number) if any(identifier) else 'none']
-            case Array(element=Number()):
+            case Array() if hasattr(value, 'tobytes'):
                 return [value.tobytes().hex()]
             case Array(element=element) | Sequence(element=element):
                 values = plain(value)

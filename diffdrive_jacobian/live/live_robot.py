@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -105,8 +106,9 @@ class LiveRobot:
             self.state.truly_moved(seconds(truth.stamp), np.array(truth.pose), truth.twist)
         for topic in SENSORS:
             if topic.followed and (value := followed[topic.name]) is not None:
-                for row in topic.rows(value, self.state.wheel_names):
-                    self.state.readings.update(zip(topic.columns, row.values, strict=True))
+                with suppress(MessageError):
+                    for row in topic.rows(value, self.state.wheel_names):
+                        self.state.readings.update(zip(topic.columns, row.values, strict=True))
         if (wheels := followed['joint_states']) is not None:
             try:
                 self.state.wheels = wheels.speeds(self.state.wheel_names)

@@ -12,5 +12,6 @@ encapsulation.
 from __future__ import annotations
 
 from diffdrive_jacobian.messages.cdr_reader import DecodingError as DecodingError
+from diffdrive_jacobian.messages.cdr_reader import LongMessageError as LongMessageError
 from diffdrive_jacobian.messages.cdr_reader import Reader as Reader
 from diffdrive_jacobian.messages.cdr_writer import Writer as Writer

@@ -36,14 +36,19 @@ _MAX_VALUES = 256
 """Largest number of values of a layout that is kept."""
 _MAX_ELEMENTS = 64
 """Most strings or structures in a sequence that are read one by one. For more, rclpy takes less time."""
-_MAX_WALKED = 100_000
-"""Most strings and structures of one message that are visited one by one. More take seconds."""
+_MAX_READ = 200_000
+"""Most values of a message that are unpacked, and strings and structures that are visited one by one.
+More take seconds, and twenty times their size in memory."""
 _MAX_REMEMBERED = 1024
 """Largest message whose texts are remembered (bytes)."""
 
 
 class DecodingError(MessageError):
     """Bytes that are not a message of the type."""
+
+
+class LongMessageError(DecodingError):
+    """A message has more values than are read."""
 
 
 class _ManyElementsError(DiffdriveError):
@@ -64,6 +69,7 @@ class Reader:
         fields: Values[str],
         *,
         whole: bool = True,
+        bounded: bool = True,
         deserialize: Callable[[bytes, Any], Any] | None = None,
     ) -> None:
         """Compile a reader.
@@ -74,6 +80,7 @@ class Reader:
                 str, to an array or sequence of them a tuple. `len(goals)` gives the length of a
                 sequence, `goals[].pose.position.x` a tuple with that field of each of its elements.
             whole: Whether what follows the last field must be valid too.
+            bounded: Whether to refuse messages with more than 200,000 values and strings to read.
             deserialize: Reads the encapsulations that this class does not, such as parameter lists, and
                 sequences of many strings (`rclpy.serialization.deserialize_message`). None: these
                 encapsulations are invalid. It needs the class.
@@ -89,6 +96,7 @@ class Reader:
         for field in self._fields:
             check_readable(self._type, field)
         self._whole = whole
+        self._budget = _MAX_READ if bounded else math.inf
         self._deserialize = deserialize
         self._layouts: dict[int, _Layout] = {}
 
@@ -102,6 +110,7 @@ class Reader:
 
         Raises:
             DecodingError: The bytes are not a message of this type.
+            LongMessageError: They are, as far as they were read, but have too many values.
         """
         layout = self._layouts.get(len(data))
         if layout is None:
@@ -117,7 +126,7 @@ class Reader:
             return self._read_message(data)
         most = math.inf if self._deserialize is None else _MAX_ELEMENTS
         try:
-            layout = _Walk(data, self._fields, self._whole, most).layout(self._type)
+            layout = _Walk(data, self._fields, self._whole, most, self._budget).layout(self._type)
         except struct.error as error:
             raise self._undecodable() from error
         except _ManyElementsError:
@@ -157,9 +166,12 @@ class _Layout(NamedTuple):
 class _Walk:
     """One pass over a message, which collects its layout. Raises struct.error where the bytes end."""
 
-    def __init__(self, data: bytes, fields: tuple[str, ...], whole: bool, most: float) -> None:
+    def __init__(
+        self, data: bytes, fields: tuple[str, ...], whole: bool, most: float, budget: float
+    ) -> None:
         self._data = data
         self._most = most
+        self._budget = budget
         self._fields = fields
         self._missing = set(fields)
         self._whole = whole
@@ -168,7 +180,6 @@ class _Walk:
         self._format = [f'{self._order}2s']
         self._formatted = 2
         self._values = 1
-        self._walked = 0
         self._lengths = [0]
         self._picks: dict[str, Any] = {field: [] for field in fields if '[]' in field}
         """Where the fields are among the unpacked values: an index, a slice, or a list of them."""
@@ -265,9 +276,7 @@ class _Walk:
             return
         if count > self._most:
             raise _ManyElementsError
-        self._walked += count
-        if self._walked > _MAX_WALKED:
-            raise struct.error('more elements than are read')
+        self._spend(count)
         if isinstance(kind, Text):
             first, wanted = self._values, path in self._missing
             for _ in range(count):
@@ -282,12 +291,19 @@ class _Walk:
     def _numbers(self, kind: Number, count: int, path: str, *, many: bool = False) -> None:
         wanted = path in self._missing
         first = self._values
+        if wanted:
+            self._spend(count)
         if count:
             self._align(kind.size)
         self._take(f'{count}{kind.code}' if wanted else '', count * kind.size)
         if wanted:
             self._values += count
             self._found(path, slice(first, self._values) if many else first)
+
+    def _spend(self, count: int) -> None:
+        self._budget -= count
+        if self._budget < 0:
+            raise LongMessageError('it has more values than are read of one message')
 
     def _text(self, wanted: bool) -> None:
         size = self._length()

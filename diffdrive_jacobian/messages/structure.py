@@ -42,7 +42,8 @@ _NESTED = re.compile(
 _TEXT = re.compile(r'(?P<wide>w?)string(?:<=?(?P<most>\d+)>?)?')
 _CLASS = re.compile(r'(\w+)/(\w+)')
 _LINE = re.compile(
-    r'\s*(?P<type>[A-Za-z][\w/]*(?:<=\d+)?)(?P<nested>\[(?:<=)?\d*\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)'
+    r'\s*(?P<type>[A-Za-z][\w/]*(?:<=\d{1,9})?)(?P<nested>\[(?:<=)?\d{,9}\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)',
+    re.ASCII,
 )
 _SEPARATOR = re.compile(r'^=+\nMSG: (\S+)\n', re.MULTILINE)
 
@@ -137,6 +138,10 @@ class Structure:
         """Return the name of the type, as rosidl has it."""
         return self.name
 
+    def __hash__(self) -> int:
+        """Return the hash of the name: that of all fields would take longer than what it caches."""
+        return hash(self.name)
+
 
 FieldType: TypeAlias = Number | Text | Array | Sequence | Structure
 COUNT = Number('I')
@@ -193,7 +198,10 @@ def defined(name: str, text: str) -> Structure:
     """
     first, *rest = _SEPARATOR.split(text.replace('\r\n', '\n'))
     texts = {_class_name(one): content for one, content in zip(rest[::2], rest[1::2], strict=True)}
-    return _Definitions({**texts, _class_name(name): first}).structure(_class_name(name))
+    try:
+        return _Definitions({**texts, _class_name(name): first}).structure(_class_name(name))
+    except RecursionError as error:
+        raise DefinitionError(f'the definitions in {name} are nested too deep') from error
 
 
 class _Definitions:
@@ -239,6 +247,8 @@ class _Definitions:
         if nested is None:
             return element
         count = nested.strip('[]')
+        if count == '0':
+            raise DefinitionError('an array must have at least 1 element, got 0')
         if count.isdecimal():
             return Array(element, int(count))
         return Sequence(element, _number(count.removeprefix('<=')))

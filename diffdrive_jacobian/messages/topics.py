@@ -123,7 +123,8 @@ def _upper(covariance: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _route(route: codecs.Route, _: Names) -> list[Row]:
-    return [Row(route.time, pose) for pose in route.poses]
+    time = route.time
+    return [Row(time, pose) for pose in route.poses]
 
 
 def _status(status: codecs.Status, _: Names) -> list[Row]:

@@ -25,7 +25,7 @@ from diffdrive_jacobian.bags.known_types import (
     type_hashes,
 )
 from diffdrive_jacobian.calibration.measurements import Recording
-from diffdrive_jacobian.messages.cdr import DecodingError
+from diffdrive_jacobian.messages.cdr import DecodingError, LongMessageError
 from diffdrive_jacobian.messages.codecs import JOINT_STATE, Codec
 from diffdrive_jacobian.messages.errors import MessageError
 from diffdrive_jacobian.reading.calibration_choice import chosen_topic, dimensions_of, wheel_names
@@ -160,6 +160,8 @@ def _read(
             continue
         try:
             sinks[topic].add(received, readers[connection.msgtype](data))
+        except LongMessageError:
+            tally[topic, 'have more values than are read'] += 1
         except DecodingError:
             tally[topic, 'cannot be decoded'] += 1
         except MessageError:

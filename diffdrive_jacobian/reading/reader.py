@@ -28,7 +28,7 @@ from diffdrive_jacobian.bags.known_types import (
     recorded_definition_differs,
     type_hashes,
 )
-from diffdrive_jacobian.messages.cdr import DecodingError
+from diffdrive_jacobian.messages.cdr import DecodingError, LongMessageError
 from diffdrive_jacobian.messages.codecs import Changes, FaultEvent
 from diffdrive_jacobian.messages.errors import MessageError
 from diffdrive_jacobian.messages.topics import READABLE, TOPICS, Topic
@@ -120,6 +120,8 @@ def read_run(
                         (received, stamp or received, row) for stamp, row in topic.rows(value, names)
                     ]
                     rows[topic.series].extend(found)
+            except LongMessageError:
+                tally.refused[connection.topic] += 1
             except DecodingError:
                 tally.undecodable[connection.topic] += 1
             except MessageError:

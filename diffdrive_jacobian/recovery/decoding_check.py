@@ -68,7 +68,7 @@ def _decoder(channel: Channel) -> Decoder | None:
         try:
             found = known(name)
             if found.type_hash == channel.type_hash:
-                return Reader(defined(name, found.text), ())
+                return Reader(defined(name, found.text), (), bounded=False)
         except (UnknownTypeError, DefinitionError, TypeError):
             # The type is not installed, or has what is not read here.
             continue

@@ -20,7 +20,15 @@ from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.control import Arrival
 from diffdrive_jacobian.messages import conversion as messages
-from diffdrive_jacobian.messages.codecs import GOAL_STATUS, MOTION, Motion, Status
+from diffdrive_jacobian.messages.codecs import (
+    GOAL_STATUS,
+    ODOMETRY,
+    STAMP,
+    Codec,
+    Status,
+    pose_fields,
+)
+from diffdrive_jacobian.messages.conversion import from_pose, from_time
 from diffdrive_jacobian.messages.errors import MessageError
 from diffdrive_jacobian.ros.node import THROTTLE
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
@@ -45,6 +53,21 @@ class RobotState(NamedTuple):
     """Whether its twist is not zero."""
     stamp: int
     """Timestamp of the message (ns)."""
+
+
+def _state(sec: int, nanosec: int, v: float, omega: float, *pose: float) -> RobotState:
+    return RobotState(np.array(from_pose(*pose)), (v, omega) != (0.0, 0.0), from_time(sec, nanosec))
+
+
+STATE = Codec(
+    ODOMETRY.type_name,
+    (
+        *(*STAMP, 'twist.twist.linear.x', 'twist.twist.angular.z'),
+        *pose_fields(ODOMETRY.type_name),
+    ),
+    _state,
+)
+"""What a client reads of odometry. The twist only tells whether the robot moves: it may be anything."""
 
 
 class GoalClient(Node):  # type: ignore[misc]
@@ -106,7 +129,7 @@ class GoalClient(Node):  # type: ignore[misc]
             received = ignoring_invalid(GOAL_STATUS, GoalStatus, self._on_status)
             self.create_subscription(GoalStatus, 'goal_status', received, latched, raw=True)
         with explaining_failure(self, Odometry, 'odom'):
-            moved = ignoring_invalid(MOTION, Odometry, self._on_odometry, self._on_invalid_odometry)
+            moved = ignoring_invalid(STATE, Odometry, self._on_odometry, self._on_invalid_odometry)
             self.create_subscription(Odometry, 'odom', moved, 10, raw=True)
         # rclpy reports a name that is too long only here.
         self.resolve_service_name('cancel_goal')
@@ -222,8 +245,8 @@ class GoalClient(Node):  # type: ignore[misc]
         # Other processes may publish, and anything.
         self.get_logger().warning(f'odometry dropped: {error}', throttle_duration_sec=THROTTLE)
 
-    def _on_odometry(self, motion: Motion) -> None:
-        self.robot = RobotState(np.array(motion.pose), motion.twist != (0.0, 0.0), motion.stamp)
+    def _on_odometry(self, state: RobotState) -> None:
+        self.robot = state
         self.seen = self._monotonic()
         if self._send_on_odometry:
             self.send()
