@@ -357,8 +357,8 @@ def test_e_forward_and_inverse_jacobian():
     close(dd.body_to_wheel_jacobian(r, l)[::-1], [[1 / r, -l / (2 * r)], [1 / r, l / (2 * r)]])
 
 
-def test_e_slip_the_local_jacobian_of_three_rows_is_over_the_whole_velocity():
-    # It prints [v, theta_dot] = (3x2) [phi_1_dot, phi_2_dot]: the rows are v_x, v_y = 0, theta_dot.
+def test_e_slip_v_is_the_whole_velocity_with_three_rows_and_v_x_with_two():
+    # It prints [v, theta_dot] for both: the three rows are v_x, v_y = 0, theta_dot.
     local = np.array([[r / 2, r / 2], [0.0, 0.0], [-r / l, r / l]])
     close(dd.wheel_to_world_jacobian(0.0, r, l)[:, ::-1], local)
     v, theta_dot = dd.wheel_to_body(*LEFT_RIGHT[::-1], r, l)

@@ -48,7 +48,7 @@ def arm_ellipses(lengths: ArrayLike = LENGTHS, start: ArrayLike = START, end: Ar
     arm = PlanarArm(lengths)
     line = StraightLine(start, end, speed=0.1)
     q = track_line(arm, arm.inverse_kinematics(start)[1], line).q
-    drawing = Figure(figsize=(5.4, 4.4), layout='constrained')
+    drawing = Figure(figsize=(5.4, 4.7), layout='constrained')
     above, below = drawing.subplots(2, 1, height_ratios=[1.6, 1.0])
     above.set(aspect='equal', xlabel='x [m]', ylabel='y [m]')
     for share, index in enumerate(np.linspace(0, len(q) - 1, SHOWN).astype(int)):
@@ -57,9 +57,12 @@ def arm_ellipses(lengths: ArrayLike = LENGTHS, start: ArrayLike = START, end: Ar
         above.plot(*joints.T, 'o-', color=shade, lw=2.2, ms=5.0, solid_capstyle='round')
         _draw_ellipse(above, joints[-1], iv.velocity_ellipsoid(J), color=BLUE, lw=1.8)
         _draw_ellipse(above, joints[-1], iv.force_ellipsoid(J), color=RED, lw=1.4, ls=DASHED)
-    above.plot([], [], color=BLUE, lw=1.8, label=r'velocities, $|\dot q| \leq 1$')
-    above.plot([], [], color=RED, lw=1.4, ls=DASHED, label=r'forces, $|\tau| \leq 1$')
-    above.legend(loc='upper right')
+    for what, unit, style in (
+        (r'velocities, $|\dot q| \leq 1$ rad/s', 'm/s', {'color': BLUE, 'lw': 1.8}),
+        (r'forces, $|\tau| \leq 1$ N m', 'N', {'color': RED, 'lw': 1.4, 'ls': DASHED}),
+    ):
+        above.plot([], [], label=f'{what} ({SCALE:g} m for 1 {unit})', **style)
+    above.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0))
     above.set(ylim=(-0.35, None))
     above.grid(False)
     sketch.line(above, start, end, color=GREY, lw=0.8)

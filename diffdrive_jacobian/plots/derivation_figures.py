@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 OMEGA_1, OMEGA_2 = 8.0, 18.0
 """Speeds of the wheels in the figures (rad/s)."""
+PALE_BLUE = '#85BFE0'
 SECONDS = 0.2
 """Velocities are drawn as the way that is made in this time (s)."""
 
@@ -80,9 +81,12 @@ def figure_2(r: float = 0.033, L: float = 0.16) -> Figure:
     sketch.angle(axes, C, 1.05 * L, 0.0, theta, r'$\theta$')
     q_dot = diff_drive.wheel_to_world_jacobian(theta, r, L) @ [OMEGA_2, OMEGA_1]
     sketch.arrow(axes, C, 1.6 * L * e_f, color=GREY, lw=0.8)
-    sketch.arrow(axes, C, SECONDS * q_dot[:2], '$v_C$', (8.0, -9.0), color=BLUE, lw=2.6)
-    sketch.arrow(axes, C, 0.32 * L * e_f, '$e_f$', (-6.0, 10.0), lw=2.0)
-    sketch.arrow(axes, C, 0.32 * L * e_l, '$e_l$', (12.0, 2.0), lw=2.0)
+    # v_C is along e_f, so it is wide and pale, below it.
+    v_C = SECONDS * q_dot[:2]
+    sketch.arrow(axes, C, v_C, color=PALE_BLUE, lw=4.5, mutation_scale=17.0)
+    sketch.label(axes, '$v_C$', C + v_C, (10.0, -12.0), color=BLUE)
+    sketch.arrow(axes, C, 0.32 * L * e_f, '$e_f$', (-8.0, 13.0), lw=1.6)
+    sketch.arrow(axes, C, 0.32 * L * e_l, '$e_l$', (12.0, 2.0), lw=1.6)
     sketch.point(axes, C_1, '$C_1$', (-8.0, 18.0))
     sketch.point(axes, C_2, '$C_2$', (14.0, -16.0))
     sketch.point(axes, C, '$C$', (-11.0, -9.0))

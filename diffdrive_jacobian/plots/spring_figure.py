@@ -49,13 +49,15 @@ def spring(gamma: float = GAMMA, step: float = STEP) -> Figure:
     drawing, axes = sketch.canvas(7.2, (-0.45, 2.75), (-0.3, 1.75))
     after = arm.joint_positions(q + step * torques)
     _draw_arm(axes, after, color=GREY, lw=1.4, ls=DASHED)
+    # Its tip is on the spring.
+    axes.plot(*after[-1], 's', color=GREY, mec='white', ms=9.0, zorder=4)
     sketch.label(axes, r'$q + \delta_q$', (after[1] + after[2]) / 2.0, (28.0, -4.0))
     _draw_arm(axes, arm.joint_positions(q), color=INK, lw=3.0)
-    turns = 0.3 + 1.2 * np.abs(torques) / np.abs(torques).max()
+    turns = 0.3 + 0.7 * np.abs(torques) / np.abs(torques).max()
     for joint, (at, half) in enumerate(
         zip(arm.joint_positions(q), np.copysign(turns, torques), strict=False), 1
     ):
-        _draw_turn(axes, at, 0.2, half, 2.3, f'$Q_{joint}$', BLUE)
+        _draw_turn(axes, at, 0.2, half, 2.45, f'$Q_{joint}$', BLUE)
     # The wrench: beside the spring the pull, and the twist.
     aside = 0.13 * np.array([-W[1], W[0]]) / np.hypot(*W[:2])
     sketch.arrow(axes, pose[:2] + aside, 0.6 * W[:2], r'$\gamma t$', (14.0, 4.0), color=RED, lw=2.4)
