@@ -62,6 +62,21 @@ def test_a_two_links_near_a_singularity_ask_for_impossible_speeds_and_damping_bo
     assert np.all(damped[1:] <= 0.1 / (2.0 * factor[1:]))
 
 
+def test_a_slip_entries_for_velocities_across_the_arm_stay_finite_near_a_singularity():
+    # It lets each entry of J^-1 grow. With the arm along x only the column of the velocity along x does.
+    arm = PlanarArm([0.5, 0.4])
+    inverse = iv.adjugate_inverse(arm.jacobian([[0.0, 1e-3], [0.0, 1e-6]]))
+    assert np.all(np.abs(inverse[1, :, 0]) > 900.0 * np.abs(inverse[0, :, 0]))
+    close(inverse[..., 1], [[2.0, -2.0], [2.0, -2.0]], 1e-9)
+
+
+def test_a_slip_twists_become_wheel_speeds_by_the_inverse_of_equation_8():
+    u = [0.5, 2.356]
+    J_w = dd.wheel_to_body_jacobian(r, l)
+    close(dd.body_to_wheel(*u, r, l), np.linalg.inv(J_w) @ u, 1e-12)
+    assert np.linalg.norm(J_w @ u) < 0.4 < 15.0 < np.linalg.norm(dd.body_to_wheel(*u, r, l))
+
+
 # --- B: lecture slides, "Mobile Robot Jacobians"
 
 

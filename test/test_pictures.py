@@ -12,7 +12,7 @@ import pytest
 from matplotlib.text import Text
 
 from diffdrive_jacobian import plots
-from diffdrive_jacobian.plots import rendering, style
+from diffdrive_jacobian.plots import legs_figure, rendering, style
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.plot_jacobian import main
 
@@ -97,6 +97,19 @@ def test_the_axle_centre_is_half_way_between_the_wheel_centres_and_faces_forward
     assert len(from_C) == 4  # the heading, v_C, e_f, e_l
     along = [vector @ (C_1 - C_2) / np.linalg.norm(vector) / 0.3 for vector in from_C]
     np.testing.assert_allclose(along, [0.0, 0.0, 0.0, -1.0], atol=1e-12)
+
+
+def test_the_columns_of_the_wheel_cancel_at_the_ground_and_the_feet_stand_on_it():
+    (axes,) = plots.wheel(r=0.5).axes
+    arrows = [one for one in axes.texts if one.arrow_patch is not None]
+    at_ground = [np.subtract(one.xy, one.xyann) for one in arrows if np.allclose(one.xyann, [1.0, 0.0])]
+    assert len(at_ground) == 2
+    np.testing.assert_allclose(np.sum(at_ground, axis=0), 0.0, atol=1e-12)
+    (axes,) = plots.legs().axes
+    drawn = [one.get_xydata() for one in axes.lines if len(one.get_xydata()) == 3]
+    np.testing.assert_allclose([leg[-1] for leg in drawn], legs_figure.FEET)
+    lengths = np.linalg.norm(np.diff(drawn, axis=1), axis=-1)
+    np.testing.assert_allclose(lengths, np.broadcast_to(legs_figure.LEG.lengths, (2, 2)))
 
 
 def test_every_picture_is_public_and_in_the_documentation(folder, capsys):

@@ -16,11 +16,13 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.plots.damping_figure import damping
     from diffdrive_jacobian.plots.derivation_figures import figure_1, figure_2, figure_3, figure_4
     from diffdrive_jacobian.plots.geometry_figure import geometry
+    from diffdrive_jacobian.plots.legs_figure import legs
     from diffdrive_jacobian.plots.lie_bracket_figure import lie_bracket
     from diffdrive_jacobian.plots.null_space_figure import null_space
     from diffdrive_jacobian.plots.parking_figure import parking
     from diffdrive_jacobian.plots.spring_figure import spring
     from diffdrive_jacobian.plots.velocity_ellipses_figure import velocity_ellipses
+    from diffdrive_jacobian.plots.wheel_figure import wheel
 
 __all__ = [
     'PICTURES',
@@ -31,6 +33,7 @@ __all__ = [
     'figure_3',
     'figure_4',
     'geometry',
+    'legs',
     'lie_bracket',
     'null_space',
     'parking',
@@ -39,6 +42,7 @@ __all__ = [
     'spring',
     'sweep_figure',
     'velocity_ellipses',
+    'wheel',
 ]
 _PICTURES = {
     'geometry': ('geometry_figure', 'the robot from above with its symbols, and the point at d (B, E)'),
@@ -50,6 +54,8 @@ _PICTURES = {
         'velocity_ellipses_figure',
         'velocities of the axle, a line, and of points at d, a circle at L/2 (B)',
     ),
+    'legs': ('legs_figure', 'a body on two legs: base, hips, knees and the sense of their angles (C)'),
+    'wheel': ('wheel_figure', 'a point of a wheel, phi = 0 on top, and the columns of its Jacobian (C)'),
     'spring': ('spring_figure', 'the spring that pulls and twists an arm to its desired pose (D)'),
     'arm_ellipses': ('arm_ellipses_figure', 'velocity and force ellipses of an arm along a motion (D)'),
     'figure_1': ('derivation_figures', 'figure 1 of E: the robot along the x axis'),

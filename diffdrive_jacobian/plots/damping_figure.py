@@ -25,7 +25,7 @@ SPEED = 0.1
 
 
 @picture
-def damping(lengths: ArrayLike = (1.0, 0.7), threshold: float = 0.45, maximum: float = 0.1) -> Figure:
+def damping(lengths: ArrayLike = (0.5, 0.4), threshold: float = 0.1, maximum: float = 0.05) -> Figure:
     """Draw where the damping of two links acts: lambda in the workspace, joint speeds and errors.
 
     Args:
@@ -39,11 +39,15 @@ def damping(lengths: ArrayLike = (1.0, 0.7), threshold: float = 0.45, maximum: f
     from matplotlib.figure import Figure
 
     arm = PlanarArm(lengths)
-    drawing = Figure(figsize=(8.2, 3.5), layout='constrained')
+    drawing = Figure(figsize=(8.4, 3.7), layout='constrained')
     grid = drawing.add_gridspec(2, 2, width_ratios=[1.15, 1.0])
     _draw_workspace(drawing, drawing.add_subplot(grid[:, 0]), arm, threshold, maximum)
     speeds = drawing.add_subplot(grid[0, 1])
     _draw_over_bend(speeds, drawing.add_subplot(grid[1, 1], sharex=speeds), arm, threshold, maximum)
+    l_1, l_2 = arm.lengths
+    links = f'$l_1$ = {l_1:g} m, $l_2$ = {l_2:g} m'
+    chosen = rf'$w_0$ = {threshold:g} m², $\lambda_{{max}}$ = {maximum:g} m'
+    drawing.suptitle(f'{links};  {chosen}', fontsize=9.5)
     return drawing
 
 
@@ -62,13 +66,22 @@ def _draw_workspace(
     for angles, joint, text, offset in (
         ([0.9, 0.06], 1, 'stretched', (-34.0, 2.0)),
         ([2.7, 1.4], 2, 'bent:\nnot damped', (22.0, -22.0)),
-        ([-0.9, 3.0], 1, 'folded', (28.0, -2.0)),
+        ([-0.9, 3.0], 1, 'folded', (26.0, 8.0)),
     ):
         joints = arm.joint_positions(angles)
         sketch.line(axes, *joints, color=BLUE, lw=2.6, marker='o', ms=5.0, solid_capstyle='round')
         sketch.label(axes, text, joints[joint], offset, fontsize=9.5)
     axes.set(aspect='equal', title='where the tip is damped', xlabel='x [m]', ylabel='y [m]')
-    axes.set(xticks=[-1.0, 0.0, 1.0], yticks=[-1.0, 0.0, 1.0])
+    # The outer ring is thin: a part of it, larger.
+    reach = float(np.sum(arm.lengths))
+    part = axes.inset_axes((0.58, 0.02, 0.38, 0.22), xlim=(0.94 * reach, 1.005 * reach))
+    part.set(ylim=np.array([-0.02, 0.02]) * reach, xticks=[], yticks=[])
+    part.grid(visible=False)
+    part.spines[:].set_visible(True)
+    part.contourf(tip[..., 0], tip[..., 1], factor, levels, cmap='Greys', vmax=1.5 * maximum)
+    axes.indicate_inset_zoom(part, edgecolor=GREY)
+    axes.locator_params(nbins=5)
+    axes.set(xlim=(-1.05 * reach, 1.1 * reach), ylim=(-1.45 * reach, 1.05 * reach))
 
 
 def _draw_over_bend(
@@ -102,7 +115,8 @@ def _draw_over_bend(
             degrees, 0, 1, where=factor > 0.0, color='#e8e8e8', transform=axes.get_xaxis_transform()
         )
     errors.text(90.0, 55.0, 'no damping:\n$w \\geq w_0$', ha='center', va='center')
-    errors.text(6.0, 88.0, r'$w < w_0$', va='center')
+    for middle in (15.0, 165.0):
+        speeds.text(middle, 0.065, r'$w < w_0$', ha='center', va='bottom')
 
 
 def _damping(

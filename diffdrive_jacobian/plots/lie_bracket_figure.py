@@ -69,12 +69,12 @@ def _draw_from_above(axes: Axes, corners: NDArray[np.float64]) -> None:
     sketch.label(axes, '1', (start + ahead)[:2] / 2.0, (0.0, 9.0), color=BLUE)
     sketch.label(axes, '3', (turned + back)[:2] / 2.0, (6.0, -9.0), color=BLUE)
     sketch.angle(axes, back[:2], 0.11, back[2], end[2], '4', color=BLUE)
-    sketch.arrow(axes, start[:2], (end - start)[:2], color=RED, lw=2.4, zorder=6)
+    sketch.arrow(axes, start[:2], (end - start)[:2], color=RED, lw=3.2, mutation_scale=18.0, zorder=6)
     sketch.label(axes, 'gap', (start + end)[:2] / 2.0, (18.0, 0.0), color=RED)
     bracket = A * B * diff_drive.lie_bracket(0.0)[:2]
     sketch.arrow(axes, start[:2], bracket, lw=1.2, ls=DASHED)
-    sketch.label(axes, '$ab\\,[g_1, g_2]$', bracket, (-4.0, -10.0), fontsize=9.5)
-    axes.set(title='from above', xlabel='x [m]', ylabel='y [m]')
+    sketch.label(axes, '$ab\\,[g_1, g_2]$', bracket, (0.0, -17.0), fontsize=9.5)
+    axes.set(title=f'from above: a = {A:g} m, b = {B:g} rad', xlabel='x [m]', ylabel='y [m]')
     axes.set_aspect('equal', adjustable='datalim')
     axes.margins(0.15)
 
@@ -93,7 +93,7 @@ def _draw_poses(axes: Axes, corners: NDArray[np.float64]) -> None:
     for edge, first, last, offset in zip(EDGES, flat[:-1], flat[1:], offsets, strict=True):
         sketch.arrow(axes, first, last - first, color=BLUE)
         sketch.label(axes, edge, (first + last) / 2.0, offset, color=BLUE, fontsize=9.5)
-    sketch.arrow(axes, flat[0], flat[-1] - flat[0], color=RED, lw=2.4, zorder=6)
+    sketch.arrow(axes, flat[0], flat[-1] - flat[0], color=RED, lw=3.2, mutation_scale=16.0, zorder=6)
     text = r'gap $\approx ab\,[g_1, g_2]$'
     sketch.label(axes, text, flat[-1], (-6.0, -14.0), color=RED, fontsize=9.5)
     axes.set(title=r'over the poses $(x, y, \theta)$', aspect='equal')
@@ -106,11 +106,11 @@ def _draw_order(axes: Axes) -> None:
     size = np.geomspace(1e-2, 1.0, 50)
     gap = parallelogram(size, size)[-1]
     bracket = size[:, np.newaxis] ** 2 * diff_drive.lie_bracket(0.0)
-    axes.loglog(size, np.linalg.norm(gap, axis=-1), color=RED, lw=2.2, label='gap')
+    axes.loglog(size, np.linalg.norm(gap, axis=-1), color=RED, lw=3.6, label='gap')
     axes.loglog(size, size**2, color='black', lw=1.0, ls=DASHED, label='$ab$, the bracket')
     axes.loglog(
         size, np.linalg.norm(gap - bracket, axis=-1), color=GREY, lw=1.8, ls=':', label='difference'
     )
-    axes.set(title='of second order', xlabel='$a = b$ [m, rad]', ylabel='[m]')
-    axes.set(xticks=[0.01, 0.1, 1.0], yticks=10.0 ** np.arange(-6.0, 1.0))
-    axes.legend(loc='lower right')
+    axes.set(title='of second order', xlabel='$a = b$ [m, rad]', ylabel='length [m]')
+    axes.set(xticks=[0.01, 0.1, 1.0], yticks=10.0 ** np.arange(-6.0, 1.0), ylim=(1e-7, 1e3))
+    axes.legend(loc='upper left')

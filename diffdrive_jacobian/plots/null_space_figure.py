@@ -42,8 +42,8 @@ def null_space() -> Figure:
     """
     from matplotlib.figure import Figure
 
-    drawing = Figure(figsize=(8.8, 3.2), layout='constrained')
-    at_rest, around, clearance = drawing.subplots(1, 3)
+    drawing = Figure(figsize=(8.6, 3.3), layout='constrained')
+    at_rest, around, clearance = drawing.subplots(1, 3, width_ratios=[1.0, 1.15, 0.9])
     _draw_at_rest(at_rest)
     without, avoiding = tracked(avoid=False), tracked(avoid=True)
     _draw_around(around, without, avoiding)
@@ -76,24 +76,29 @@ def self_motion(steps: int = 800) -> NDArray[np.float64]:
 
 def _draw_at_rest(axes: Axes) -> None:
     track = self_motion()
-    shown = track[::130]
+    shown = track[::200]
     for shade, q in zip(np.linspace(0.75, 0.0, len(shown)), shown, strict=True):
         _draw_arm(axes, q, color=str(shade))
     sketch.point(axes, ARM.forward_kinematics(START)[:2], 'tip', (14.0, -6.0), color=RED)
+    first, last = ARM.joint_positions(shown[[0, -1]])
+    sketch.label(axes, 'first', first[1], (0.0, 11.0), fontsize=9.5)
+    sketch.label(axes, 'last', last[2], (0.0, 11.0), fontsize=9.5)
     axes.set(title=r'tip at rest: $\dot q = N \dot q_0$', xlabel='x [m]', ylabel='y [m]')
     axes.set_aspect('equal', adjustable='datalim')
 
 
 def _draw_around(axes: Axes, without: Tracking, avoiding: Tracking) -> None:
     tip = ARM.forward_kinematics(START)[:2]
-    sketch.line(axes, tip, END, color=RED, lw=1.4, ls=':')
-    _draw_arm(axes, START, color='0.75')
-    _draw_arm(axes, without.q[-1], color=GREY, ls=DASHED)
-    _draw_arm(axes, avoiding.q[-1], color=BLUE)
-    axes.plot(*OBSTACLE, 'X', color=INK, ms=10.0, zorder=5)
-    sketch.label(axes, 'obstacle', OBSTACLE, (-4.0, 14.0))
-    axes.set(title='past an obstacle', xlabel='x [m]', ylabel='y [m]')
-    axes.set_aspect('equal', adjustable='datalim')
+    sketch.line(axes, tip, END, color=RED, lw=1.4, label='line of the tip')
+    nearest = int(np.argmin(ARM.clearance(without.q, OBSTACLE)))
+    _draw_arm(axes, START, color='0.75', lw=4.0, label='start')
+    _draw_arm(axes, without.q[nearest], color=GREY, ls=':', label='without, nearest')
+    _draw_arm(axes, without.q[-1], color=GREY, ls=DASHED, label='without, end')
+    _draw_arm(axes, avoiding.q[-1], color=BLUE, label='away from it, end')
+    axes.plot(*OBSTACLE, 'X', color=INK, ms=8.0, zorder=5, label='obstacle', ls='none')
+    axes.set(title='past an obstacle', xlabel='x [m]', ylabel='y [m]', aspect='equal')
+    axes.set(xlim=(-0.35, 1.0), ylim=(-0.08, 1.5), xticks=[0.0, 0.5, 1.0], yticks=[0.0, 0.5])
+    axes.legend(loc='upper center', fontsize=8.0, labelspacing=0.3)
 
 
 def _draw_clearance(axes: Axes, without: Tracking, avoiding: Tracking) -> None:
@@ -104,11 +109,11 @@ def _draw_clearance(axes: Axes, without: Tracking, avoiding: Tracking) -> None:
         avoiding.times,
         ARM.clearance(avoiding.q, OBSTACLE),
         color=BLUE,
-        label=r'$J^+ \dot x + N k \nabla d$',
+        label=r'$J^+ \dot x + N k \nabla c$',
     )
-    axes.set(title='distance $d$ from it', xlabel='time [s]', ylabel='[m]')
-    axes.set(xticks=[0.0, 2.0, 4.0, 6.0], ylim=(0.0, 0.45))
-    axes.legend(loc='best')
+    axes.set(title='clearance $c$', xlabel='time [s]', ylabel='$c$ [m]')
+    axes.set(xticks=[0.0, 2.0, 4.0, 6.0], ylim=(0.0, 0.55))
+    axes.legend(loc='upper center')
 
 
 def _draw_arm(axes: Axes, q: NDArray[np.float64] | tuple[float, ...], **style: object) -> None:

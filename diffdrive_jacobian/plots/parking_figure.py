@@ -10,7 +10,7 @@ import numpy as np
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.numerics.checks import array
 from diffdrive_jacobian.plots import sketch
-from diffdrive_jacobian.plots.sketch import BLUE, DASHED, GREY, RED
+from diffdrive_jacobian.plots.sketch import BLUE, GREY, RED
 from diffdrive_jacobian.plots.style import picture
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ MOTIONS = (
 """The motions: twist (m/s, rad/s) and duration (s)."""
 STANDING = 1e-9
 """Largest change of a pose that is no motion (m, rad)."""
-OUTLINES = 24
+OUTLINES = 8
 """How many outlines of the moving robot are drawn."""
 PARKED = ((0.29, 0.55), (-0.37, -0.08))
 """From where to where along x two other robots are parked (m)."""
@@ -56,7 +56,7 @@ def parking(poses: ArrayLike | None = None) -> Figure:
         sketch.outline(axes, box, fc='#dddddd', hatch='//', ec=GREY)
     places = _places(driven)
     for pose in driven[:: max(len(driven) // OUTLINES, 1)]:
-        sketch.outline(axes, sketch.placed(L * sketch.BODY, pose), ec='#cccccc', lw=0.6)
+        sketch.outline(axes, sketch.placed(L * sketch.BODY, pose), ec='#999999', lw=0.8)
     for pose in (driven[0], driven[-1]):
         sketch.robot(axes, pose, R, L)
     parts = [driven[first : last + 1, :2] for first, last in pairwise(places)]
@@ -70,7 +70,8 @@ def parking(poses: ArrayLike | None = None) -> Figure:
         left = 12.0 * np.array([-along[1], along[0]]) / np.hypot(*along)
         sketch.label(axes, str(number), part[middle], (left[0], left[1]), color=BLUE, zorder=6)
     start, end = driven[0, :2], driven[-1, :2]
-    sketch.arrow(axes, start, end - start, color=RED, ls=DASHED, lw=1.4)
+    # Between the wheels: on the axles it would not be seen.
+    sketch.arrow(axes, start + 0.36 * (end - start), 0.28 * (end - start), color=RED, lw=2.6)
     sketch.label(
         axes, 'no motion\nin this direction', (start + end) / 2.0, (-52.0, 0.0), color=RED, fontsize=9.5
     )
