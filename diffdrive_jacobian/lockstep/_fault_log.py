@@ -13,7 +13,6 @@ from std_msgs.msg import String
 
 from diffdrive_jacobian.time_units import NANOSECONDS, in_seconds
 
-"""Topic of the events."""
 MAX_EVENTS = 200
 """Largest number of events of one fault. Later ones are omitted, except its end with the totals."""
 MAX_REPORTED = 20

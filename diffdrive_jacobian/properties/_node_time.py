@@ -11,7 +11,7 @@ from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 ROUNDING = 1e-9
-"""Tolerance on times (s)."""
+"""Tolerance on times (s) and distances (m)."""
 
 
 class ReactionTime:
