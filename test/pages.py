@@ -71,6 +71,9 @@ PARAMETERS: dict[str, type[NodeParameters]] = {
 }
 PATIENCE = 240.0
 """How long a block may run, or a process beside it may take to print something (s)."""
+TYPING = 2.0
+"""Time in which a person goes to the next terminal (s). Processes that have just started find each other one
+after the other: a recorder that hears the odometry already may miss the first command."""
 BLOCK = re.compile(
     r'(?P<notes>(?:^<!-- (?:test|output)[^\n]*-->\n+)*)^```(?P<language>\w*)\n(?P<code>.*?)^```$',
     re.MULTILINE | re.DOTALL,
@@ -166,6 +169,8 @@ class Session:
         with ExitStack() as stack:
             for line in beside:
                 stack.enter_context(Background(line, self._directory, self._environment))
+            if 'processes' in block.notes:
+                time.sleep(TYPING)
             output, code = self._completed(command, block)
         expected = int(block.notes.get('exit', 0))
         assert code == expected, (
