@@ -72,8 +72,8 @@ PARAMETERS: dict[str, type[NodeParameters]] = {
 PATIENCE = 240.0
 """How long a block may run, or a process beside it may take to print something (s)."""
 TYPING = 2.0
-"""Time in which a person goes to the next terminal (s). Processes that have just started find each other one
-after the other: a recorder that hears the odometry already may miss the first command."""
+"""Time in which a person goes to the next terminal (s). Processes that have just started find each other
+one after the other: a recorder that hears the odometry already may miss the first command."""
 BLOCK = re.compile(
     r'(?P<notes>(?:^<!-- (?:test|output)[^\n]*-->\n+)*)^```(?P<language>\w*)\n(?P<code>.*?)^```$',
     re.MULTILINE | re.DOTALL,
