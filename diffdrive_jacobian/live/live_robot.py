@@ -57,7 +57,14 @@ class LiveRobot:
     """Follows one robot, and does what the page asks for."""
 
     def __init__(
-        self, node: Node, session: Session, namespace: str, names: dict[str, str], *, polled: bool
+        self,
+        node: Node,
+        session: Session,
+        namespace: str,
+        names: dict[str, str],
+        *,
+        polled: bool,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Subscribe to the topics of a robot.
 
@@ -67,11 +74,12 @@ class LiveRobot:
             namespace: Namespace of the robot, `/` or `/NAME`.
             names: Names of topics without namespace, from the usual ones.
             polled: As for `Latest`.
+            clock: Returns the time in which the robot publishes (s): simulated time may stand.
 
         Raises:
             ParameterError: A topic has another type in this process.
         """
-        self._node, self._session = node, session
+        self._node, self._session, self._clock = node, session, clock
         self.state = RobotState(namespace)
         self.topics = RobotTopics(node, namespace, names, polled=polled)
         self.topics.listen(GOAL_STATUS, 'goal_status', self._on_status, latched=True)
@@ -84,7 +92,7 @@ class LiveRobot:
         # Before they are needed, so that they are discovered by then.
         self._services = {name: TriggerLink(node, self.topics.full(name)) for name in SERVICES}
         self._frame = ''
-        self._seen = self._commanded = time.monotonic()
+        self._seen = self._commanded = clock()
         self._sent, self._stamp = -math.inf, 0
         self.on_end: Callable[[GoalEnd], None] | None = None
         """Receives the end of each goal that was sent. None: nothing does."""
@@ -92,13 +100,13 @@ class LiveRobot:
     @property
     def silence(self) -> float:
         """Time since the last odometry (s)."""
-        return time.monotonic() - self._seen
+        return self._clock() - self._seen
 
     # --- Messages
 
     def poll(self) -> None:
         """Take the latest messages."""
-        now = time.monotonic()
+        now = self._clock()
         followed = {name: latest.take() for name, latest in self.topics.followed.items()}
         if followed['odom'] is not None:
             self._on_odometry(followed['odom'], now)

@@ -59,6 +59,7 @@ class LivePage(Node):  # type: ignore[misc]
         super().__init__(NAME, context=context, start_parameter_services=False)
         self._session, self._polled, self._pacing = session, polled, pacing
         self._goal_ended = goal_ended
+        self._robot_time = time.monotonic if pacing is None else pacing.now
         self.robots: dict[str, LiveRobot] = {}
         """Robots by namespace."""
         self._names = {
@@ -171,7 +172,12 @@ class LivePage(Node):  # type: ignore[misc]
             return
         try:
             self.robots[namespace] = LiveRobot(
-                self, self._session, namespace, self._names, polled=self._polled
+                self,
+                self._session,
+                namespace,
+                self._names,
+                polled=self._polled,
+                clock=self._robot_time,
             )
             self.robots[namespace].on_end = self._goal_ended
         except ParameterError as error:

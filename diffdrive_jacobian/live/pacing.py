@@ -24,6 +24,10 @@ class Pacing:
         self._simulated = self._wait = 0.0
         self._anchor: tuple[float, float] | None = None
 
+    def now(self) -> float:
+        """Return the simulated time at which it was asked last whether time may advance (s)."""
+        return self._simulated
+
     def obey(self, command: Pause | Step | SetSpeed) -> None:
         """Do what a page asks for."""
         self._anchor = None
