@@ -27,6 +27,7 @@ from diffdrive_jacobian.diagnosis.lasting import Interleaving, LastingFault
 from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.codecs import Codec
 from diffdrive_jacobian.messages.integers import integer_warning
+from diffdrive_jacobian.messages.names import type_name
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, changed
 from diffdrive_jacobian.ros import parameters as ros_parameters
 from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
@@ -35,7 +36,7 @@ from diffdrive_jacobian.ros.rate_limit import RateLimit
 from diffdrive_jacobian.ros.rclpy_internals import declare_qos, log_info, time_reader
 from diffdrive_jacobian.ros.serialization import decoding
 from diffdrive_jacobian.ros.shared_graph import MAX_AGE, SharedGraph
-from diffdrive_jacobian.ros.topic_errors import explaining_failure, type_name
+from diffdrive_jacobian.ros.topic_errors import explaining_failure
 from diffdrive_jacobian.ros.type_mismatches import TypeMismatches
 
 P = TypeVar('P', bound=NodeParameters)
