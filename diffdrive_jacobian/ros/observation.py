@@ -60,7 +60,6 @@ def observe(
     Raises:
         UserError: The ROS arguments or the environment are invalid.
     """
-    signals = signals or Signals()
     # Names of nodes that begin with _ are hidden.
     name = f'_doctor_{os.getpid()}'
     with (
@@ -69,7 +68,7 @@ def observe(
     ):
         observer = runner.add(lambda: Observer(name, context=context))
         start = time.monotonic()
-        runner.spin(lambda: time.monotonic() - start >= seconds or signals.count > 0)
+        runner.spin(lambda: False, timeout=seconds, signals=signals)
         return observer.describe(time.monotonic() - start)
 
 
