@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import Twist
 from lockstep_nodes import QUICK, make_complete
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.node import Node
 
-from diffdrive_jacobian.live import hand
+from diffdrive_jacobian.control.controller import KP, KV
+from diffdrive_jacobian.live import hand, settings
 from diffdrive_jacobian.live import node as live_node
 from diffdrive_jacobian.live.commands import (
     CancelGoal,
@@ -258,6 +262,51 @@ def test_parameters_are_set_and_refusals_are_shown(driven):
     assert driven.settings()['controller/kp']['value'] == 5.0
 
 
+class Driver(Node):
+    """The driver of a robot, with descriptors of its own."""
+
+    def __init__(self):
+        super().__init__('driver')
+        self.odometry = self.create_publisher(Odometry, 'odom', 10)
+        self.create_timer(0.02, lambda: self.odometry.publish(Odometry()))
+        self.declare('max_wheel_velocity', 20.0, (2.0, 120.0))
+        self.declare('wheel_travel_variance', 0.001, None)
+
+    def declare(self, name, value, served):
+        ranges = [FloatingPointRange(from_value=served[0], to_value=served[1])] if served else []
+        self.declare_parameter(name, value, ParameterDescriptor(floating_point_range=ranges))
+
+
+def test_the_sliders_have_the_ranges_that_a_driver_serves(live):
+    driver = live.world.add(Driver())
+
+    def slider(name):
+        row = live.settings()[f'robot/{name}']
+        return row['low'], row['high']
+
+    live.until(lambda: live.robot() and len(live.settings()) == 2)
+    live.until(lambda: slider('max_wheel_velocity') == (2.0, 120.0))
+    # It serves no range: the usual one.
+    assert slider('wheel_travel_variance') == (0.0, 0.002)
+    driver.declare('unrelated', 1.0, (0.0, 1.0))
+    live.send(SetParameter('/', 'robot/max_wheel_velocity', 130.0))
+    live.until(lambda: live.texts)
+    assert 'max_wheel_velocity refused: ' in live.texts[0]
+    live.pass_time(0.1)
+    assert live.settings()['robot/max_wheel_velocity']['value'] == 20.0
+    assert len(live.settings()) == 2
+
+
+def test_the_nodes_of_this_package_have_all_sliders_with_the_usual_ranges(driven):
+    driven.pass_time(0.1)
+    (robot,) = driven.node.robots.values()
+    # What they serve are all valid values, which are too many for a slider.
+    assert robot.links['controller'].ranges['kp'] == (0.0, KP.bounds[1])
+    ranges = {key: (row['low'], row['high']) for key, row in driven.settings().items()}
+    usual = {one.key: (one.low, one.high) for one in settings.offered((KP, KV))}
+    assert ranges == usual
+
+
 def test_changes_of_others_are_followed(driven):
     controller = next(node for node in driven.world.nodes if isinstance(node, GoToGoal))
     from rclpy.parameter import Parameter
@@ -322,10 +371,10 @@ def test_a_node_that_changes_its_name_leaves_nothing_behind(driven):
     for number in range(5):
         robot.use_nodes({'robot': f'/robot_{number}', 'controller': f'/controller_{number}'})
         refused = []
-        robot.links['robot'].set('x', 1.0, lambda *answer, to=refused: to.append(answer))
+        robot.links['robot'].set('x', 1.0, refused.append)
     assert len(list(driven.node.clients)) <= before + 2 * 3
     robot.use_nodes({'robot': '/virtual_robot'})
-    assert refused == [(False, '/robot_4 is gone')]
+    assert refused == ['/robot_4 is gone']
     robot.destroy()
     assert not list(driven.node.clients)
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
+from std_srvs.srv import Trigger
 
 from diffdrive_jacobian.control import Gain
 from diffdrive_jacobian.live import settings
@@ -27,11 +28,10 @@ from diffdrive_jacobian.live.commands import (
 )
 from diffdrive_jacobian.live.goal_progress import GoalEnd
 from diffdrive_jacobian.live.hand import STANDSTILL, Act, HandDriving
-from diffdrive_jacobian.live.parameter_link import ParameterLink
+from diffdrive_jacobian.live.parameter_link import PATIENCE, ParameterLink
 from diffdrive_jacobian.live.robot_state import RobotState
 from diffdrive_jacobian.live.robot_topics import RobotTopics
 from diffdrive_jacobian.live.session import Session
-from diffdrive_jacobian.live.trigger_link import TriggerLink
 from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, POSE, Motion, Route, Status
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
 from diffdrive_jacobian.messages.covariances import from_covariance
@@ -39,6 +39,7 @@ from diffdrive_jacobian.messages.errors import MessageError
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.ros.remote_goal import ignores_heading
+from diffdrive_jacobian.ros.service_client import ServiceClient
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS, seconds
 
@@ -90,7 +91,10 @@ class LiveRobot:
         """Parameters by role."""
         self.hand = HandDriving()
         # Before they are needed, so that they are discovered by then.
-        self._services = {name: TriggerLink(node, self.topics.full(name)) for name in SERVICES}
+        self._services = {}
+        for name in SERVICES:
+            full = self.topics.full(name)
+            self._services[name] = ServiceClient(node, Trigger, full, patience=PATIENCE, server=full)
         self._frame = ''
         self._seen = self._commanded = clock()
         self._sent, self._stamp = -math.inf, 0
@@ -226,14 +230,23 @@ class LiveRobot:
             self._warn(str(error))
             return
 
-        def answer(successful: bool, reason: str) -> None:
-            if not successful:
-                self._session.notify(f'{setting.name} refused: {reason}', 'error')
+        def refused(reason: str) -> None:
+            self._session.notify(f'{setting.name} refused: {reason}', 'error')
 
-        link.set(setting.name, value, answer)
+        link.set(setting.name, value, refused)
 
     def _call(self, service: str) -> None:
-        self._services[service].call(lambda reason: self._warn(f'{SERVICES[service]}: {reason}'))
+        def failed(reason: str) -> None:
+            self._warn(f'{SERVICES[service]}: {reason}')
+
+        def answered(response: Any) -> None:
+            if not response.success:
+                failed(printable(response.message, 300))
+
+        if self._services[service].ready:
+            self._services[service].call(Trigger.Request(), answered, failed)
+        else:
+            failed(f'there is no service {self.topics.full(service)}')
 
     def _warn(self, text: str) -> None:
         self._session.notify(text, 'warning')
@@ -300,7 +313,8 @@ class LiveRobot:
     def settings(self) -> list[dict[str, Any]]:
         """Return the settings for the page."""
         values = {role: link.values for role, link in self.links.items()}
-        return settings.shown(values, self._gains())
+        ranges = {role: link.ranges for role, link in self.links.items()}
+        return settings.shown(values, self._gains(), ranges)
 
     def _gains(self) -> tuple[Gain, ...]:
         """Return the gains of the controller that is chosen."""

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import time
+import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from diffdrive_jacobian.live.settings import Range
 from diffdrive_jacobian.recording.parameter_query import ParameterQuery
+from diffdrive_jacobian.ros.service_client import ServiceClient, ignore
 from diffdrive_jacobian.text import printable
 
 PATIENCE = 3.0
 """Longest wait for the answer of a node (s)."""
-Answer = Callable[[bool, str], None]
-"""Receives whether a value was accepted, and the reason if not."""
 
 
 class ParameterLink:
@@ -32,58 +33,61 @@ class ParameterLink:
         self.target = target
         self.values: dict[str, Any] = {}
         """Values by name, as far as they are known."""
-        self._node = node
-        self._query = ParameterQuery(node, target, self.values.update, lambda trouble: None)
-        self._client: Any = None
-        self._waiting: list[tuple[float, Any, Answer]] = []
+        self.ranges: dict[str, Range] = {}
+        """Ranges of doubles by name, as far as their descriptors have one."""
+        self._known: set[str] = set()
+        self._undescribed: list[str] = []
+        self._query = ParameterQuery(node, target, self.changed, ignore)
+        client = partial(ServiceClient, node, patience=PATIENCE, server=printable(target))
+        self._describe = client(DescribeParameters, f'{target}/describe_parameters')
+        self._set = client(SetParameters, f'{target}/set_parameters')
 
     def advance(self) -> None:
         """Ask, and check for answers that are late; to be called often."""
         self._query.advance()
-        now = time.monotonic()
-        late = [one for one in self._waiting if now - one[0] > PATIENCE]
-        for one in late:
-            self._waiting.remove(one)
-            self._client.remove_pending_request(one[1])
-            one[2](False, f'{printable(self.target)} did not answer within {PATIENCE:g} s')
+        if self._undescribed and self._describe.ready:
+            names, self._undescribed = self._undescribed, []
+            request = DescribeParameters.Request(names=names)
+            self._describe.call(request, partial(self._on_descriptors, names), ignore)
+        self._describe.advance()
+        self._set.advance()
 
     def destroy(self) -> None:
         """Destroy the clients. Who waits for an answer gets a refusal."""
-        self._query.destroy()
-        for _, _, answer in self._waiting:
-            answer(False, f'{printable(self.target)} is gone')
-        if self._client is not None:
-            self._node.destroy_client(self._client)
+        for client in (self._query, self._describe, self._set):
+            client.destroy()
 
     def changed(self, values: Mapping[str, Any]) -> None:
-        """Take new values from a parameter event."""
+        """Take values from the node itself or from a parameter event."""
         self.values.update(values)
+        new = [name for name, value in values.items() if isinstance(value, float)]
+        self._undescribed += [name for name in new if name not in self._known]
+        self._known.update(new)
 
-    def set(self, name: str, value: float | str | bool, answer: Answer) -> None:
+    def set(self, name: str, value: float | str | bool, on_refusal: Callable[[str], object]) -> None:
         """Set a parameter.
 
         Args:
             name: Name of the parameter.
             value: The value.
-            answer: Called once.
+            on_refusal: Receives the reason if the node does not accept it.
         """
-        if self._client is None:
-            self._client = self._node.create_client(SetParameters, f'{self.target}/set_parameters')
-        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
-        future = self._client.call_async(request)
-        waiting = (time.monotonic(), future, answer)
-        self._waiting.append(waiting)
 
-        def on_done(done: Any) -> None:
-            if waiting not in self._waiting:
-                return
-            self._waiting.remove(waiting)
-            if done.cancelled() or done.exception() is not None or not done.result().results:
-                answer(False, 'the answer cannot be read')
-                return
-            result = done.result().results[0]
-            if result.successful:
+        def on_response(response: Any) -> None:
+            result = next(iter(response.results), None)
+            if result is None:
+                on_refusal('its answer cannot be read')
+            elif result.successful:
                 self.values[name] = value
-            answer(bool(result.successful), printable(result.reason, 300))
+            else:
+                on_refusal(printable(result.reason, 300))
 
-        future.add_done_callback(on_done)
+        parameter = Parameter(name, value=value).to_parameter_msg()
+        self._set.call(SetParameters.Request(parameters=[parameter]), on_response, on_refusal)
+
+    def _on_descriptors(self, names: list[str], response: Any) -> None:
+        # A node that lacks one of the parameters sends no descriptors at all.
+        for name, descriptor in zip(names, response.descriptors, strict=False):
+            for one in descriptor.floating_point_range[:1]:
+                if -math.inf < one.from_value < one.to_value < math.inf:
+                    self.ranges[name] = one.from_value, one.to_value

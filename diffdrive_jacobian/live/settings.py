@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Any, Literal
 
 from diffdrive_jacobian.control import ControllerError, Gain, controller_names, find_controller
@@ -14,9 +15,12 @@ from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.parameters.declaration import specifications
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
+from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.text import printable
 
 Role = Literal['controller', 'robot']
+Range = tuple[float, float]
+"""Smallest and largest value."""
 MAX_CHOICES = 32
 """Largest number of controllers that are offered."""
 
@@ -36,11 +40,21 @@ class Setting:
     hint: str
     """What happens when it changes."""
     low: float = 0.0
-    """Range of the slider. The field beside it takes other values, too; the node decides."""
+    """Usual range, for the slider. The field beside it takes other values, too; the node decides."""
     high: float = 1.0
+    declared: Range | None = None
+    """Range that a node of this package serves, which is too wide for a slider. None: it serves none."""
     unit: str = ''
     kind: Literal['number', 'limit', 'choice', 'flag'] = 'number'
     """`limit`: a number, or NaN for none."""
+
+    def slider(self, served: Range | None) -> Range:
+        """Return the range of the slider for a node that serves a range in its descriptor.
+
+        A node of this package serves all valid values, of which the usual ones are shown. Another node
+        knows better.
+        """
+        return (self.low, self.high) if served is None or served == self.declared else served
 
     @property
     def key(self) -> str:
@@ -64,7 +78,7 @@ class Setting:
         raise SettingError(f'{self.name} cannot be {printable(repr(value), 40)}')
 
 
-SETTINGS = (
+_OFFERED = (
     Setting(role='controller', name='controller', label='Control law', kind='choice',
             hint='How goal and pose become v and ω'),
     Setting(role='controller', name='use_goal_heading', label='Goal heading', kind='flag',
@@ -80,6 +94,11 @@ SETTINGS = (
     Setting(role='robot', name='wheel_travel_variance', label='Wheel noise', unit='m', low=0.0,
             high=0.002, hint='Variance per distance: how fast the uncertainty region grows'),
 )  # fmt: skip
+_DECLARED = {
+    'controller': specifications(GoToGoalParameters),
+    'robot': specifications(VirtualRobotParameters),
+}
+SETTINGS = [replace(one, declared=_DECLARED[one.role][one.name][1].range) for one in _OFFERED]
 """What the page offers besides the gains. A node is asked for those that it has."""
 
 
@@ -117,6 +136,7 @@ def offered(gains: Iterable[Gain]) -> list[Setting]:
             unit=gain.unit,
             low=gain.usual[0],
             high=gain.usual[1],
+            declared=(gain.bounds[0] if gain.above is None else gain.above, gain.bounds[1]),
         )
         for gain in gains
     ]
@@ -135,12 +155,17 @@ def find(key: str, gains: Iterable[Gain]) -> Setting:
     raise SettingError(f'there is no setting {printable(key, 40)}')
 
 
-def shown(values: Mapping[str, Mapping[str, Any]], gains: Iterable[Gain]) -> list[dict[str, Any]]:
+def shown(
+    values: Mapping[str, Mapping[str, Any]],
+    gains: Iterable[Gain],
+    ranges: Mapping[str, Mapping[str, Range]] = MappingProxyType({}),
+) -> list[dict[str, Any]]:
     """Return the settings that nodes have, with their values, for the page.
 
     Args:
         values: Parameters by role.
         gains: Gains of the controller.
+        ranges: Ranges that the nodes serve in the descriptors of their parameters, by role.
     """
     found = []
     for setting in offered(gains):
@@ -148,14 +173,15 @@ def shown(values: Mapping[str, Mapping[str, Any]], gains: Iterable[Gain]) -> lis
         expected = {'choice': str, 'flag': bool}.get(setting.kind, float)
         if not isinstance(value, expected):
             continue
+        low, high = setting.slider(ranges.get(setting.role, {}).get(setting.name))
         row = {
             'key': setting.key,
             'label': setting.label,
             'hint': setting.hint,
             'unit': setting.unit,
             'kind': setting.kind,
-            'low': setting.low,
-            'high': setting.high,
+            'low': low,
+            'high': high,
             'value': rounded(value)
             if isinstance(value, float)
             else value[:64]

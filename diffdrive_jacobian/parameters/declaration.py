@@ -56,6 +56,15 @@ class Specification:
             words.append('or .nan for none')
         return ' '.join(words)
 
+    @property
+    def range(self) -> tuple[float, float] | None:
+        """Range in the descriptor. None: there is none, as where it would reject NaN."""
+        low = self.low if self.above is None else self.above
+        if low is None or self.high in (None, math.inf) or self.nan_is_none:
+            return None
+        assert self.high is not None
+        return low, self.high
+
     def permits(self, value: Any) -> bool:
         """Return whether a value of the right type is allowed."""
         if self.choices:

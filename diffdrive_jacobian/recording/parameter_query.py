@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -13,6 +12,8 @@ from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
+
+from diffdrive_jacobian.ros.service_client import ServiceClient
 
 PATIENCE = 5.0
 """Longest time for each answer of a node (s)."""
@@ -47,22 +48,18 @@ class ParameterQuery:
             on_values: Called once with the values by name that were received.
             on_trouble: Called at most once, before that, with a description of what is missing.
         """
-        self._node = node
-        self._target = target
         self._on_values = on_values
         self._on_trouble = on_trouble
         self._values: dict[str, Any] = {}
         self._missing: list[str] = []
         self._waiting: list[list[str]] = []
         self._size = 0
-        self._deadline: float | None = None
-        self._done = False
-        self._clients: list[Any] = []
+        self._asked = self._done = False
+        self._clients: list[ServiceClient] = []
         try:
-            self._list = node.create_client(ListParameters, f'{target}/list_parameters')
-            self._clients.append(self._list)
-            self._get = node.create_client(GetParameters, f'{target}/get_parameters')
-            self._clients.append(self._get)
+            for service_type, name in ((ListParameters, 'list'), (GetParameters, 'get')):
+                service = f'{target}/{name}_parameters'
+                self._clients.append(ServiceClient(node, service_type, service, patience=PATIENCE))
         except (RuntimeError, NameValidationException) as error:
             self._finish(f'its services cannot be called: {_short(error)}')
 
@@ -70,30 +67,17 @@ class ParameterQuery:
         """Send the request if the services are available, and end on a timeout; to be called often."""
         if self._done:
             self.destroy()
-        elif self._deadline is None:
-            if self._list.service_is_ready() and self._get.service_is_ready():
-                self._call(self._list, ListParameters.Request(), self._on_names)
-        elif time.monotonic() > self._deadline:
-            self._finish(f'it did not answer within {PATIENCE:g} s')
+        elif not self._asked and all(client.ready for client in self._clients):
+            self._asked = True
+            self._clients[0].call(ListParameters.Request(), self._on_names, self._finish)
+        for client in self._clients:
+            client.advance()
 
     def destroy(self) -> None:
         """Destroy the clients; nothing is called any more."""
         self._done = True
         while self._clients:
-            self._node.destroy_client(self._clients.pop())
-
-    def _call(self, client: Any, request: Any, on_answer: Callable[[Any], None]) -> None:
-        self._deadline = time.monotonic() + PATIENCE
-        client.call_async(request).add_done_callback(partial(self._on_done, on_answer))
-
-    def _on_done(self, on_answer: Callable[[Any], None], future: Any) -> None:
-        if self._done:
-            # The answer is too late.
-            return
-        if future.cancelled() or future.exception() is not None:
-            self._finish(f'its answer cannot be read: {_short(future.exception())}')
-        else:
-            on_answer(future.result())
+            self._clients.pop().destroy()
 
     def _on_names(self, response: Any) -> None:
         names = list(dict.fromkeys(response.result.names))
@@ -109,7 +93,8 @@ class ParameterQuery:
             self._finish('')
             return
         names = self._waiting.pop()
-        self._call(self._get, GetParameters.Request(names=names), partial(self._on_answer, names))
+        request = GetParameters.Request(names=names)
+        self._clients[1].call(request, partial(self._on_answer, names), self._finish)
 
     def _on_answer(self, names: list[str], response: Any) -> None:
         if len(response.values) == len(names):
@@ -138,6 +123,8 @@ class ParameterQuery:
         self._values[name] = found
 
     def _finish(self, trouble: str) -> None:
+        if self._done:
+            return
         self._done = True
         self._missing += [name for names in self._waiting for name in names]
         self._waiting.clear()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -32,6 +33,7 @@ from diffdrive_jacobian.messages.codecs import STAMP
 from diffdrive_jacobian.messages.names import full_name, node_of, type_name
 from diffdrive_jacobian.messages.topics import CLOCK
 from diffdrive_jacobian.ros.runner import ros_context, running
+from diffdrive_jacobian.ros.service_client import ServiceClient, ignore
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -81,7 +83,7 @@ class Observer(Node):  # type: ignore[misc]
         self._received: dict[str, _Received] = {}
         self._simulated = _ClockReceived()
         self._use_sim_time: dict[str, bool] = {}
-        self._parameter_clients: dict[str, Any] = {}
+        self._parameter_clients: dict[str, ServiceClient] = {}
         self._asked: set[str] = set()
         self.create_timer(PERIOD, self._look)
 
@@ -96,12 +98,14 @@ class Observer(Node):  # type: ignore[misc]
         for name in self._names()[:MAX_NODES]:
             service = f'{name}/get_parameters'
             if name not in self._parameter_clients and '/_' not in name and _is_valid(service):
-                self._parameter_clients[name] = self.create_client(GetParameters, service)
+                self._parameter_clients[name] = ServiceClient(
+                    self, GetParameters, service, patience=math.inf
+                )
         for name, client in self._parameter_clients.items():
-            if name not in self._asked and client.service_is_ready():
+            if name not in self._asked and client.ready:
                 self._asked.add(name)
-                future = client.call_async(GetParameters.Request(names=['use_sim_time']))
-                future.add_done_callback(partial(self._on_answer, name))
+                request = GetParameters.Request(names=['use_sim_time'])
+                client.call(request, partial(self._on_answer, name), ignore)
 
     def _subscribe(self, topic: str, kind: str) -> None:
         stamp = _stamp_reader(RECEIVED[kind], STAMP) if RECEIVED[kind] in STAMPED else None
@@ -113,8 +117,8 @@ class Observer(Node):  # type: ignore[misc]
             callback = self._simulated.add
         self.create_subscription(RECEIVED[kind], topic, callback, profile, raw=True)
 
-    def _on_answer(self, name: str, future: Any) -> None:
-        values = future.result().values
+    def _on_answer(self, name: str, response: Any) -> None:
+        values = response.values
         # 1: PARAMETER_BOOL
         if len(values) == 1 and values[0].type == 1:
             self._use_sim_time[name] = values[0].bool_value

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from itertools import pairwise
@@ -52,17 +51,13 @@ def descriptor(specification: Specification, default: Any) -> ParameterDescripto
         read_only=specification.read_only,
         additional_constraints=f'must be {constraint}' if constraint else '',
     )
-    low = specification.low if specification.above is None else specification.above
-    if low is None or specification.high in (None, math.inf) or specification.nan_is_none:
+    if specification.range is None:
         return result
+    low, high = specification.range
     if isinstance(default, float):
-        result.floating_point_range = [
-            FloatingPointRange(from_value=float(low), to_value=float(specification.high))
-        ]
+        result.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
     else:
-        result.integer_range = [
-            IntegerRange(from_value=int(low), to_value=int(specification.high), step=1)
-        ]
+        result.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
     return result
 
 

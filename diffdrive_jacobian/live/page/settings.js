@@ -25,7 +25,7 @@ export class Settings {
     const robot = this.model.selected, rows = (robot && this.model.settings[robot.name]) ?? [];
     byId('settings').hidden = !rows.length;
     setText(byId('settings').firstElementChild, this.model.recorded ? 'Parameters, as recorded' : 'Parameters');
-    const layout = `${robot?.name} ${rows.map((row) => `${row.key} ${row.choices ?? ''}`).join(';')}`;
+    const layout = `${robot?.name} ${rows.map((row) => `${row.key} ${row.choices ?? ''} ${row.low} ${row.high}`).join(';')}`;
     if (layout !== this.shown) {
       this.shown = layout;
       this.rows.clear();

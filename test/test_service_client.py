@@ -1,0 +1,114 @@
+"""Each call of a service ends once: with a response, or with the reason why there is none."""
+
+from __future__ import annotations
+
+import pytest
+from rclpy.node import Node
+from rclpy.task import Future
+from std_srvs.srv import Trigger
+
+from diffdrive_jacobian.ros.service_client import ServiceClient
+
+PATIENCE = 3.0
+
+
+class Server(Node):
+    """Answers a request, or keeps it until the test answers."""
+
+    def __init__(self):
+        super().__init__('server')
+        self.answer = Future()
+        self.create_service(Trigger, 'serve', self._serve)
+
+    async def _serve(self, request, response):
+        response.message = await self.answer
+        return response
+
+
+@pytest.fixture
+def server(lockstep):
+    return lockstep.add(Server())
+
+
+@pytest.fixture
+def client(lockstep, server):
+    """A client in world time, and what became of its calls."""
+
+    def world_time():
+        return lockstep.world_time / 1e9
+
+    found = ServiceClient(
+        lockstep.node, Trigger, 'serve', patience=PATIENCE, server='/server', monotonic=world_time
+    )
+    found.ends = []
+
+    def call():
+        found.call(Trigger.Request(), lambda one: found.ends.append(one.message), found.ends.append)
+        lockstep.settle()
+
+    found.send = call
+    return found
+
+
+def pass_time(lockstep, client, seconds):
+    lockstep.run_for(seconds)
+    client.advance()
+
+
+def test_a_response_ends_the_call(lockstep, server, client):
+    assert client.ready
+    client.send()
+    pass_time(lockstep, client, PATIENCE - 0.1)
+    assert client.ends == []
+    server.answer.set_result('served')
+    pass_time(lockstep, client, PATIENCE + 0.1)
+    assert client.ends == ['served']
+
+
+def test_a_late_response_is_ignored(lockstep, server, client):
+    client.send()
+    pass_time(lockstep, client, PATIENCE + 0.1)
+    assert client.ends == ['/server did not answer within 3 s']
+    server.answer.set_result('served')
+    pass_time(lockstep, client, 1.0)
+    assert len(client.ends) == 1
+
+
+def test_each_call_has_its_own_time(lockstep, client):
+    client.send()
+    pass_time(lockstep, client, 2.0)
+    client.send()
+    pass_time(lockstep, client, 2.0)
+    assert len(client.ends) == 1
+    pass_time(lockstep, client, 2.0)
+    assert len(client.ends) == 2
+
+
+def test_calls_end_with_the_client(lockstep, server, client):
+    client.send()
+    client.destroy()
+    server.answer.set_result('served')
+    lockstep.run_for(0.1)
+    assert client.ends == ['/server is gone']
+
+
+@pytest.mark.parametrize(
+    ('end', 'why'),
+    [
+        (lambda future: future.cancel(), 'its answer cannot be read: canceled'),
+        (
+            lambda future: future.set_exception(RuntimeError('broken\x1b, at /somewhere/rcl.c:12')),
+            'its answer cannot be read: broken\\x1b',
+        ),
+    ],
+)
+def test_a_response_that_cannot_be_read(lockstep, client, end, why):
+    client.send()
+    (future,) = client._calls
+    end(future)
+    lockstep.settle()
+    assert client.ends == [why]
+
+
+def test_without_a_server_it_is_not_ready(lockstep):
+    assert not ServiceClient(lockstep.node, Trigger, 'nobody', patience=PATIENCE).ready
