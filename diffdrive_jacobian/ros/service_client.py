@@ -22,7 +22,7 @@ def ignore(_: str) -> None:
 
 
 class ServiceClient:
-    """A client of a service, each of whose calls ends: with a response, or a reason why there is none."""
+    """A client of a service. Each call ends with a response, or with a reason why there is none."""
 
     def __init__(
         self,
