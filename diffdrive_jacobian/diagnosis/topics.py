@@ -12,10 +12,13 @@ from diffdrive_jacobian.diagnosis.description import (
     Quality,
 )
 from diffdrive_jacobian.messages.names import base_name
-from diffdrive_jacobian.messages.topics import CLOCK, OF_EVERY_NODE, SAME_NAMES, TOPICS, Topic
+from diffdrive_jacobian.messages.topic_faults import ALTERNATING, SEVERAL, UNPUBLISHED, UNREAD
+from diffdrive_jacobian.messages.topics import TOPICS, Topic
 from diffdrive_jacobian.text import listed
 
 _UNKNOWN = Topic(name='')
+COMMANDS = ('cmd_vel', 'joint_command')
+"""Topics that must have a subscription."""
 
 
 def _known(topic: str) -> Topic:
@@ -29,8 +32,7 @@ def check_topics(graph: Graph) -> Iterator[Finding]:
     for topic in graph.topics():
         yield from _check_types(graph, topic)
         yield from _check_quality(graph, topic)
-        yield from _check_number_of_publishers(graph, topic)
-        yield from _check_missing(graph, topic)
+        yield from _check_ends(graph, topic)
 
 
 def _check_names(graph: Graph) -> Iterator[Finding]:
@@ -125,47 +127,20 @@ def _changed_policy(reason: str) -> str:
     }.get(reason.split(':')[0], 'POLICY:=VALUE')
 
 
-def _check_number_of_publishers(graph: Graph, topic: str) -> Iterator[Finding]:
-    nodes = [one.node for one in graph.publishers(topic)]
-    known = _known(topic)
-    if len(nodes) < 2 or topic == CLOCK:
-        return
-    if known.if_several:
-        yield Finding(f'{listed(nodes)} publish {topic}', known.if_several)
-    elif known.name == 'cmd_vel':
-        yield Finding(
-            f'{listed(nodes)} publish {topic}: the robot follows the last command of either',
-            'drive by hand only while no goal is active, or use a multiplexer such as twist_mux',
-            problem=False,
-        )
-
-
-def _check_missing(graph: Graph, topic: str) -> Iterator[Finding]:
-    publishers = graph.publishers(topic)
+def _check_ends(graph: Graph, topic: str) -> Iterator[Finding]:
+    known, publishers = _known(topic), [one.node for one in graph.publishers(topic)]
     # A node that listens to what it publishes itself, as go_to_goal may, does not act on it.
-    subscriptions = [
-        one
-        for one in graph.subscriptions(topic)
-        if one.node not in {publisher.node for publisher in publishers}
-    ]
-    known = _known(topic)
-    if topic in OF_EVERY_NODE:
-        return
-    if publishers and not subscriptions and known.if_unread:
-        yield Finding(
-            f'{listed([one.node for one in publishers])} publishes {topic}, but nobody subscribes to it',
-            f'{known.if_unread} {SAME_NAMES.format(known.name)}'
-            f'{_namesake(graph, topic, publishes=False)}',
-            # Tools that publish goals come and go.
-            problem=known.name in ('cmd_vel', 'joint_command'),
-        )
-    if subscriptions and not publishers and known.if_unpublished:
-        yield Finding(
-            f'{listed([one.node for one in subscriptions])} subscribes to {topic}, but nobody publishes '
-            'it',
-            f'{known.if_unpublished} {SAME_NAMES.format(known.name)}'
-            f'{_namesake(graph, topic, publishes=True)}',
-        )
+    subscriptions = [one.node for one in graph.subscriptions(topic) if one.node not in publishers]
+    for fault in (SEVERAL, ALTERNATING, UNREAD, UNPUBLISHED):
+        remedy = fault.remedy(known)
+        if remedy and fault.present(len(publishers), len(subscriptions)):
+            missing_end = fault in (UNREAD, UNPUBLISHED)
+            yield Finding(
+                fault.found(topic, publishers, subscriptions),
+                remedy + (_namesake(graph, topic, publishes=not publishers) if missing_end else ''),
+                # Tools that publish goals come and go.
+                problem=fault.problem and (fault is not UNREAD or known.name in COMMANDS),
+            )
 
 
 def _namesake(graph: Graph, topic: str, *, publishes: bool) -> str:

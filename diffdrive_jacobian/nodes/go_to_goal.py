@@ -26,11 +26,12 @@ from diffdrive_jacobian.messages.codecs import (
     Command,
 )
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
+from diffdrive_jacobian.messages.topic_faults import SEVERAL, UNREAD
 from diffdrive_jacobian.nodes.goal import Goal, GoalIdentifiers, read_goal
 from diffdrive_jacobian.nodes.other_drivers import OtherDrivers
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.ros import serialization
-from diffdrive_jacobian.ros.graph_faults import several_publishers, unread
+from diffdrive_jacobian.ros.graph_faults import topic_check
 from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.text import printable
@@ -92,9 +93,13 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._watchdog = Watchdog(self, self._on_stale_odometry)
         self._others = OtherDrivers(self, self._cmd_vel, self._on_other_driver)
         self._configure()
-        self.watch(unread(self._cmd_vel, 'cmd_vel', lambda: self._others.subscriptions))
-        self.watch(several_publishers(self, 'odom'))
-        self.watch(several_publishers(self, 'goal_status'))
+
+        def readers() -> int:
+            return int(self._cmd_vel.get_subscription_count()) - self._others.subscriptions
+
+        self.watch(topic_check(self, UNREAD, 'cmd_vel', readers))
+        self.watch(topic_check(self, SEVERAL, 'odom'))
+        self.watch(topic_check(self, SEVERAL, 'goal_status'))
         self.announce(subscribed=['goal_pose', 'goals'], publishing=['cmd_vel'])
 
     @property

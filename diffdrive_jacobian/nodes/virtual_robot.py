@@ -41,15 +41,14 @@ from diffdrive_jacobian.messages.codecs import (
 )
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.covariances import from_covariance
+from diffdrive_jacobian.messages.topic_faults import GOALS_LOST, SEVERAL, UNPUBLISHED
 from diffdrive_jacobian.nodes.command_time import command_time
 from diffdrive_jacobian.nodes.condition import Condition
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.ros.graph_faults import (
     ALTERNATION_PATIENCE,
     alternating_commands,
-    goals_without_controller,
-    several_publishers,
-    unpublished,
+    topic_check,
 )
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import change_timer_period, log_info
@@ -91,18 +90,19 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self._commands = numbers
         if self.parameters.command_interface == 'wheels':
             source = 'joint_command'
-            wheels = self.subscribe(
+            self.subscribe(
                 JointState, source, self._on_joint_command, codec=JOINT_STATE, numbers=numbers
             )
-            self.watch(unpublished(self, wheels, source))
+            self.watch(topic_check(self, UNPUBLISHED, source))
         else:
             stamped = self.parameters.enable_stamped_cmd_vel
             kind, codec = (TwistStamped, TWIST_STAMPED) if stamped else (Twist, TWIST)
             apply = partial(self._apply, codec.value)
             self.subscribe(kind, source, apply, codec=codec, numbers=numbers)
         self.watch(alternating_commands(self, source, numbers), ALTERNATION_PATIENCE)
-        self.watch(several_publishers(self, 'odom'))
-        self.watch(goals_without_controller(self, 'goal_pose', 'goals'))
+        self.watch(topic_check(self, SEVERAL, 'odom'))
+        lost = [topic_check(self, GOALS_LOST, name) for name in ('goal_pose', 'goals')]
+        self.watch(lambda: next(filter(None, (check() for check in lost)), None))
         self.subscribe(
             PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, codec=POSE_WITH_COVARIANCE
         )

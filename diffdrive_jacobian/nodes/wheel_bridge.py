@@ -20,9 +20,10 @@ from diffdrive_jacobian.messages.codecs import (
     Wheels,
 )
 from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.messages.topic_faults import UNREAD
 from diffdrive_jacobian.nodes.command_time import command_time
 from diffdrive_jacobian.parameters.wheel_bridge import WheelBridgeParameters
-from diffdrive_jacobian.ros.graph_faults import ALTERNATION_PATIENCE, alternating_commands, unread
+from diffdrive_jacobian.ros.graph_faults import ALTERNATION_PATIENCE, alternating_commands, topic_check
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.time_units import nanoseconds
@@ -50,7 +51,8 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         stamped = parameters.enable_stamped_cmd_vel
         kind, self._codec = (TwistStamped, TWIST_STAMPED) if stamped else (Twist, TWIST)
         self.subscribe(kind, 'cmd_vel', self._on_command, codec=self._codec, numbers=numbers)
-        self.watch(unread(self._joint_command, 'joint_command'))
+        readers = self._joint_command.get_subscription_count
+        self.watch(topic_check(self, UNREAD, 'joint_command', readers))
         self.watch(alternating_commands(self, 'cmd_vel', numbers), ALTERNATION_PATIENCE)
         self._last = 0
         self._moving = False
