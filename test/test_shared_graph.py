@@ -189,22 +189,28 @@ def test_an_idle_driver_that_came_later_is_found(create, queries):
     assert drivers.subscriptions == 1
 
 
-def test_a_mismatch_is_compared_again_until_it_is_gone(create, queries, capfd, monkeypatch):
+def test_other_types_are_reported_once_until_they_are_gone(create, queries, capfd, monkeypatch):
     controller = create(GoToGoal, 'a')
     check(controller)
     queries.clear()
-    matching = controller._graph.refresh()
-    kinds = {'/a/cmd_vel': ['geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistStamped']}
-    matching.types.update(kinds)
-    # A matching graph is not compared again.
+    # Where the types match, no endpoint is looked at.
     check(controller, times=2)
     assert queries == {}
-    controller._types._matching = None
-    infos = controller.get_publishers_info_by_topic('/a/cmd_vel')
-    infos[0].topic_type = 'geometry_msgs/msg/TwistStamped'
+    infos = [info for _ in range(2) for info in controller.get_publishers_info_by_topic('/a/cmd_vel')]
+    kinds = [f'geometry_msgs/msg/{name}' for name in ('Twist', 'TwistStamped', 'Vector3')]
+    for info, other in zip(infos, kinds[1:], strict=True):
+        info.topic_type = other
+    controller._graph.refresh().types['/a/cmd_vel'] = kinds
     monkeypatch.setattr(controller, 'get_subscriptions_info_by_topic', lambda _: infos)
-    check(controller)
-    assert capfd.readouterr().err.count('but this node publishes it as geometry_msgs/msg/Twist') == 1
-    infos.clear()
-    check(controller, times=2)
-    assert controller._types._matching is matching
+
+    def reports():
+        check(controller)
+        said = capfd.readouterr().err
+        return [said.count(f'/a/cmd_vel as {kind}, but this node publishes it as') for kind in kinds]
+
+    assert reports() == [0, 1, 1]
+    assert reports() == [0, 0, 0]
+    found = infos.pop()
+    assert reports() == [0, 1, 0]
+    infos.append(found)
+    assert reports() == [0, 1, 1]

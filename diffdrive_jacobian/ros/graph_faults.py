@@ -12,7 +12,7 @@ from typing import TypeAlias
 from rclpy.node import Node
 
 from diffdrive_jacobian.diagnosis.lasting import Interleaving
-from diffdrive_jacobian.messages.names import node_of
+from diffdrive_jacobian.messages.names import node_of, type_name
 from diffdrive_jacobian.messages.topic_faults import ALTERNATING, TopicFault
 from diffdrive_jacobian.messages.topics import TOPICS
 from diffdrive_jacobian.ros.shared_graph import SharedGraph
@@ -22,6 +22,8 @@ Check: TypeAlias = Callable[[], str | None]
 
 ALTERNATION_PATIENCE = 3
 """Number of checks with alternating commands before that is reported: a driver may take over."""
+TYPE_PATIENCE = 3
+"""Number of checks with another type before that is reported: the name of its node may come later."""
 MIN_FALLS = 2
 """Number of falls of the sequence numbers within a second that no restarted publisher explains."""
 
@@ -58,6 +60,37 @@ def alternating_commands(node: Node, name: str, commands: Interleaving) -> Check
     """
     several = topic_check(node, ALTERNATING, name)
     return lambda: several() if commands.falls() >= MIN_FALLS else None
+
+
+def wrong_type(node: Node, name: str, message: type, *, subscribed: bool) -> Check:
+    """Return a check whether other nodes use a topic with other types, which ROS does not report.
+
+    Args:
+        node: The node that publishes the topic or is subscribed to it.
+        name: Name of the topic as the node gives it, before it is remapped.
+        message: Type of its messages.
+        subscribed: Whether the node is subscribed. Otherwise it publishes.
+    """
+    graph, topic, wanted = SharedGraph(node), node.resolve_topic_name(name), type_name(message)
+    they_do, this_does = ('publishes', 'subscribes to') if subscribed else ('subscribes to', 'publishes')
+
+    def check() -> str | None:
+        if graph.types().get(topic) in (None, [wanted]):
+            return None
+        ends = node.get_publishers_info_by_topic if subscribed else node.get_subscriptions_info_by_topic
+        others = {one.topic_type: printable(node_of(one)) for one in ends(topic)}
+        lines = []
+        for theirs, other in sorted(others.items()):
+            twists = 'Twist' in wanted and 'Twist' in theirs
+            hint = '; enable_stamped_cmd_vel selects Twist or TwistStamped' if twists else ''
+            if theirs != wanted:
+                lines.append(
+                    f'{other} {they_do} {topic} as {printable(theirs)}, but this node {this_does} it as '
+                    f'{wanted}: no message will arrive{hint}'
+                )
+        return '\n'.join(lines) or None
+
+    return check
 
 
 def publishers_of(node: Node, topic: str, *, others: bool = False) -> list[str]:

@@ -27,9 +27,9 @@ from diffdrive_jacobian.diagnosis.lasting import Interleaving, LastingFault
 from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.codecs import Codec
 from diffdrive_jacobian.messages.integers import integer_warning
-from diffdrive_jacobian.messages.names import type_name
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, changed
 from diffdrive_jacobian.ros import parameters as ros_parameters
+from diffdrive_jacobian.ros.graph_faults import TYPE_PATIENCE, wrong_type
 from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
@@ -37,7 +37,6 @@ from diffdrive_jacobian.ros.rclpy_internals import declare_qos, log_info, time_r
 from diffdrive_jacobian.ros.serialization import decoding
 from diffdrive_jacobian.ros.shared_graph import MAX_AGE, SharedGraph
 from diffdrive_jacobian.ros.topic_errors import explaining_failure
-from diffdrive_jacobian.ros.type_mismatches import TypeMismatches
 
 P = TypeVar('P', bound=NodeParameters)
 
@@ -87,9 +86,8 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         self.add_on_set_parameters_callback(self._validate_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         self._graph = SharedGraph(self)
-        self._types = TypeMismatches(self)
         self._checks_without_clock = 0
-        self._faults: list[tuple[LastingFault, Callable[[], str | None]]] = []
+        self._faults: list[tuple[LastingFault, Callable[[], str | None], bool]] = []
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(WATCH_PERIOD, lambda: self._check_graph(MAX_AGE), clock=steady)
 
@@ -104,7 +102,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         Raises:
             ParameterError: The topic has another type in this process, or `qos_overrides` are invalid.
         """
-        self._types.add(topic, type_name(message), subscribed=False)
+        self.watch(wrong_type(self, topic, message, subscribed=False), TYPE_PATIENCE, error=True)
         profile = QoSProfile(depth=10)
         if latched:
             profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
@@ -145,7 +143,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         def dropped(error: DecodingError) -> None:
             self.get_logger().warning(f'{topic} dropped: {error}', throttle_duration_sec=THROTTLE)
 
-        self._types.add(topic, type_name(message), subscribed=True)
+        self.watch(wrong_type(self, topic, message, subscribed=True), TYPE_PATIENCE, error=True)
         profile = QoSProfile(depth=10)
         if codec is not None:
             callback = decoding(message, codec.fields, callback, dropped, numbers)
@@ -175,14 +173,17 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         self.resolve_service_name(name)
         return self.create_service(service, name, callback)
 
-    def watch(self, check: Callable[[], str | None], patience: int = FAULT_PATIENCE) -> None:
-        """Check for a fault once a second of wall time, and warn when it has lasted.
+    def watch(
+        self, check: Callable[[], str | None], patience: int = FAULT_PATIENCE, *, error: bool = False
+    ) -> None:
+        """Check for a fault once a second of wall time, and log it when it has lasted.
 
         Args:
             check: Returns a description of the fault with its remedy. None: there is none.
             patience: Number of consecutive checks with the same fault before it is reported.
+            error: Whether it is an error. Otherwise it is a warning.
         """
-        self._faults.append((LastingFault(patience), check))
+        self._faults.append((LastingFault(patience), check, error))
 
     def warn_of_integers(self, what: str, *values: float) -> None:
         """Warn, throttled, if a value is an integer that was assigned to a field of floats.
@@ -254,11 +255,14 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
 
     def _check_graph(self, max_age: float = 0.0) -> None:
         self._check_clock()
-        snapshot = self._graph.refresh(max_age)
-        for fault, check in self._faults:
-            if report := fault.check(check()):
+        self._graph.refresh(max_age)
+        for fault, check, error in self._faults:
+            report = fault.check(check())
+            # The level of a line of code cannot change in rclpy.
+            if report and error:
+                self.get_logger().error(report)
+            elif report:
                 self.get_logger().warning(report)
-        self._types.check(snapshot)
 
     def _check_clock(self) -> None:
         if self.now() != 0:
