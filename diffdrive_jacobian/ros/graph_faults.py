@@ -11,10 +11,10 @@ from typing import TypeAlias
 
 from rclpy.node import Node
 
-from diffdrive_jacobian.diagnosis.lasting import Interleaving
 from diffdrive_jacobian.messages.names import node_of, type_name
 from diffdrive_jacobian.messages.topic_faults import ALTERNATING, TopicFault
 from diffdrive_jacobian.messages.topics import TOPICS
+from diffdrive_jacobian.ros.lasting import Interleaving
 from diffdrive_jacobian.ros.shared_graph import SharedGraph
 from diffdrive_jacobian.text import printable
 
