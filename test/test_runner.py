@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import sys
+from contextlib import contextmanager
 
 import pytest
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
 
+from diffdrive_jacobian.lockstep.runner import running_in_lockstep
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.ros.guarded_executor import GuardedExecutor
 from diffdrive_jacobian.ros.runner import UserError, make_executor, ros_context, running
+from diffdrive_jacobian.signals import Signals
 
 
 def test_isolated_nodes_have_the_events_executor_and_others_the_guarded_one(ros):
@@ -58,6 +61,44 @@ def test_loop_ends_when_its_condition_holds_or_ros_shuts_down(isolated):
         assert runner.spin(lambda: len(ticks) == 3)
         node.create_timer(0.01, context.try_shutdown)
         assert not runner.spin(lambda: False)
+
+
+@contextmanager
+def real_time():
+    with ros_context(['test']) as context, running(context, isolated=True) as runner:
+        yield runner
+
+
+@pytest.mark.parametrize('create', [real_time, lambda: running_in_lockstep(['--ros-args'])])
+def test_loop_ends_after_a_time_or_on_a_signal_that_is_new(create):
+    signals, calls = Signals(), []
+
+    def never():
+        calls.append(1)
+        return False
+
+    with create() as runner:
+        runner.add(lambda: VirtualRobot(context=runner.context))
+        start = runner.seconds()
+        assert not runner.spin(never, timeout=0.3, signals=signals)
+        assert runner.seconds() - start > 0.3
+        # The condition comes first, also when the time is over.
+        assert runner.spin(lambda: True, timeout=-1.0)
+        signals.count = 1
+        calls.clear()
+        assert not runner.spin(never, signals=signals)
+        assert calls == [1]
+        start = runner.seconds()
+        assert not runner.spin(never, timeout=0.3, signals=signals, handled=1)
+        assert runner.seconds() - start > 0.3
+
+        def second():
+            signals.count += len(calls) == 3
+            return never()
+
+        calls.clear()
+        assert not runner.spin(second, signals=signals, handled=1)
+        assert len(calls) == 4
 
 
 def test_every_node_is_stopped_before_any_is_destroyed():

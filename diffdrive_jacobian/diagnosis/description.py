@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from diffdrive_jacobian.messages.topics import OF_EVERY_NODE
 
@@ -31,6 +32,18 @@ class Quality:
     """Longest period between two messages (ns)."""
     lease: int = INFINITE
     """Lease duration of the liveliness (ns)."""
+
+    @classmethod
+    def of(cls, profile: Any) -> Quality:
+        """Return the policies of a profile of rclpy. What is not given there is 0 or the default."""
+        liveliness = profile.liveliness.name
+        return cls(
+            reliability=profile.reliability.name,
+            durability=profile.durability.name,
+            liveliness='AUTOMATIC' if liveliness == 'SYSTEM_DEFAULT' else liveliness,
+            deadline=profile.deadline.nanoseconds or INFINITE,
+            lease=profile.liveliness_lease_duration.nanoseconds or INFINITE,
+        )
 
 
 @dataclass(frozen=True, slots=True)

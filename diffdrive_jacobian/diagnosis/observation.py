@@ -261,17 +261,10 @@ def _stamp_reader(kind: type, fields: tuple[str, ...]) -> Callable[[bytes], int]
 
 
 def _endpoint(info: Any, topic: str, publishes: bool) -> Endpoint:
-    quality = info.qos_profile
     return Endpoint(
         node=printable(node_of(info)),
         topic=printable(topic),
         kind=printable(info.topic_type),
         publishes=publishes,
-        quality=Quality(
-            reliability=quality.reliability.name,
-            durability=quality.durability.name,
-            liveliness=quality.liveliness.name,
-            deadline=quality.deadline.nanoseconds,
-            lease=quality.liveliness_lease_duration.nanoseconds,
-        ),
+        quality=Quality.of(info.qos_profile),
     )

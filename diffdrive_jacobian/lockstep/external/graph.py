@@ -10,13 +10,13 @@ from rclpy.publisher import Publisher
 from rclpy.qos import (
     DurabilityPolicy,
     LivelinessPolicy,
-    QoSCompatibility,
     QoSProfile,
-    qos_check_compatible,
 )
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from diffdrive_jacobian.diagnosis.description import Quality
+from diffdrive_jacobian.diagnosis.topics import mismatch
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep.external.expectations import Due
 from diffdrive_jacobian.lockstep.external.waiting import Probe
@@ -106,18 +106,7 @@ class ExternalGraph:
 
 def compatible(offered: QoSProfile, requested: QoSProfile) -> bool:
     """Return whether a publisher and a subscription with these profiles are matched."""
-    lease = offered.liveliness_lease_duration
-    # What is not given is 0 in a profile, and infinite in the graph, to which rmw compares it.
-    offered = QoSProfile(
-        depth=1,
-        reliability=offered.reliability,
-        durability=offered.durability,
-        deadline=offered.deadline if offered.deadline.nanoseconds else Infinite,
-        liveliness=offered.liveliness or LivelinessPolicy.AUTOMATIC,
-        liveliness_lease_duration=lease if lease.nanoseconds else Infinite,
-    )
-    compatibility, _ = qos_check_compatible(offered, requested)
-    return bool(compatibility != QoSCompatibility.ERROR)
+    return not mismatch(Quality.of(offered), Quality.of(requested))
 
 
 def qos_name(profile: QoSProfile) -> str:
