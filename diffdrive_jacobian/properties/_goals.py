@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from rclpy.publisher import Publisher
 
-from diffdrive_jacobian.messages.codecs import GOALS, POSE
+from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, POSE, Status
 from diffdrive_jacobian.properties._messages import (
     FieldReader,
     Pose,
@@ -46,6 +46,15 @@ def read_goal(message_type: type, message: Any, seconds: float) -> Goal | None:
             return None
         pose = [column[-1] for column in columns]
     return Goal(planar(*pose), seconds, (int(sec), int(nanosec)))
+
+
+_read_status = FieldReader(lambda _: GOAL_STATUS.fields).read
+
+
+def read_status(message_type: type, message: Any) -> Status | None:
+    """Return the status in a GoalStatus; None: the bytes are invalid."""
+    fields = _read_status(message_type, message)
+    return None if fields is None else GOAL_STATUS.value(*map(int, fields))
 
 
 class Motion:
