@@ -26,7 +26,7 @@ from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 from diffdrive_jacobian.ros import node, serialization
-from diffdrive_jacobian.ros.rate_limit import RateLimit
+from diffdrive_jacobian.ros.rate_limit import TokenBucket
 
 MEGABYTE = 1_000_000 * 'f'
 FLOOD = 200
@@ -43,8 +43,8 @@ def lines(capfd, text):
     return [line for line in capfd.readouterr().err.splitlines() if text in line]
 
 
-def test_rate_limit_is_a_token_bucket():
-    limit = RateLimit(3, 0.5)
+def test_a_token_bucket_permits_a_burst_and_then_a_rate():
+    limit = TokenBucket(3, 0.5)
     assert [limit.permits(10.0) for _ in range(5)] == [True, True, True, False, False]
     assert [limit.permits(10.25), limit.permits(10.5), limit.permits(10.5)] == [False, True, False]
     assert [limit.permits(99.0) for _ in range(4)] == [True, True, True, False]

@@ -18,7 +18,6 @@ from diffdrive_jacobian.live.goal_progress import GoalProgress
 from diffdrive_jacobian.live.hand import CANCEL_PATIENCE, DEAD_MAN, Act, HandDriving
 from diffdrive_jacobian.live.pacing import Pacing
 from diffdrive_jacobian.live.quantities import chain, errors, region, rounded
-from diffdrive_jacobian.live.rate import TokenBucket
 from diffdrive_jacobian.live.robot_state import RobotState
 from diffdrive_jacobian.live.session import MAX_COMMANDS, MAX_NOTICES, Session, Snapshot
 from diffdrive_jacobian.live.trail import MAX_POINTS, SPACING, Trail
@@ -322,14 +321,6 @@ def test_commands_and_notices_are_bounded():
     assert len(session.notices_after(0)) == MAX_NOTICES
     session.leave(page)
     assert not session.watched
-
-
-def test_a_rate_with_a_burst():
-    bucket = TokenBucket(rate=10.0, burst=3.0, now=0.0)
-    assert [bucket.permits(0.0) for _ in range(4)] == [True, True, True, False]
-    assert bucket.permits(0.1)
-    assert not bucket.permits(0.1)
-    assert sum(bucket.permits(100.0) for _ in range(10)) == 3
 
 
 # --- Settings

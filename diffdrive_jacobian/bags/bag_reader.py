@@ -199,13 +199,3 @@ def find_damage(path: Path) -> str:
     except BagError as error:
         return error.why if isinstance(error, DamagedBagError) else ''
     return ''
-
-
-def base_name(topic: str) -> str:
-    """Return a topic's name without its namespace."""
-    return topic.rsplit('/', 1)[-1]
-
-
-def namespace_of(name: str) -> str:
-    """Return the namespace of a fully qualified name of a topic or node, such as `/` or `/robot1`."""
-    return name.rpartition('/')[0] or '/'

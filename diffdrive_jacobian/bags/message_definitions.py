@@ -9,7 +9,6 @@ directory of the same prefix holds the .msg file. All of that is checked without
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.messages.names import import_type
 from diffdrive_jacobian.text import printable
 
 DELIMITER = '=' * 80
@@ -81,7 +81,7 @@ def message_class(name: str) -> Any:
     package, message = _split(name)
     _file(package, message, '.msg')
     try:
-        found = getattr(importlib.import_module(f'{package}.msg'), message)
+        found = import_type(name)
     except (ImportError, AttributeError) as error:
         raise UnknownTypeError(f'the Python code of {name} is not installed') from error
     # Code of other packages can raise any exception.

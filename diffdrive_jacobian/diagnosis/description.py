@@ -104,8 +104,3 @@ class Graph:
     def subscriptions(self, topic: str) -> list[Endpoint]:
         """Return the subscriptions to a topic."""
         return [one for one in self.endpoints if one.topic == topic and not one.publishes]
-
-
-def base_name(topic: str) -> str:
-    """Return the name of a topic without its namespace."""
-    return topic.rsplit('/', 1)[-1]

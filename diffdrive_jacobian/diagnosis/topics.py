@@ -10,8 +10,8 @@ from diffdrive_jacobian.diagnosis.description import (
     Finding,
     Graph,
     Quality,
-    base_name,
 )
+from diffdrive_jacobian.messages.names import base_name
 from diffdrive_jacobian.messages.topics import CLOCK, OF_EVERY_NODE, SAME_NAMES, TOPICS, Topic
 from diffdrive_jacobian.text import listed
 

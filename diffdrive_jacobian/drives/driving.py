@@ -34,6 +34,7 @@ from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.recording.selection import Selection
 from diffdrive_jacobian.ros.goal_client import GoalClient
 from diffdrive_jacobian.ros.node_runner import NodeRunner
+from diffdrive_jacobian.ros.rate_limit import TokenBucket
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.time_units import nanoseconds
@@ -212,7 +213,7 @@ def drive_in(
     client.send_on_odometry()
     started = runner.seconds()
 
-    def over() -> bool:
+    def ended() -> bool:
         discover()
         if client.robot is not None and not client.ended:
             index = controller.waypoint
@@ -221,28 +222,26 @@ def drive_in(
                 client.index = min(index, len(goals) - 1)
             seconds = runner.seconds() - started
             progress.driving(seconds, client.index, client.distance, wheels.speeds)
-        return bool(client.ended or signals.count or runner.seconds() - started > timeout)
+        return client.ended
 
-    runner.spin(over)
+    runner.spin(ended, timeout=timeout, signals=signals)
     seconds, status = runner.seconds() - started, client.status
     client.withdraw()
     reason = 'interrupted' if signals.count else 'timeout'
     if not client.ended:
         controller.stop(reason)
     settled = robot.now() + nanoseconds(SETTLING)
-    before = signals.count
-    patience = runner.seconds() + STOP_PATIENCE + 1.0 / robot.parameters.publish_rate
 
-    def settled_or_late() -> bool:
+    def stands() -> bool:
         discover()
         if controller.waypoint is not None:
             # The goals were received only now.
             controller.stop(reason)
         state = client.robot
-        still = state is not None and state.stamp >= settled and not state.moving
-        return bool(still or runner.seconds() > patience or signals.count > before)
+        return state is not None and state.stamp >= settled and not state.moving
 
-    runner.spin(settled_or_late)
+    patience = STOP_PATIENCE + 1.0 / robot.parameters.publish_rate
+    runner.spin(stands, timeout=patience, signals=signals, handled=signals.count)
     client.index = len(goals) - 1
     true_distance = math.nan
     if robot.parameters.drift() is not None:
@@ -291,12 +290,10 @@ def recorder_of(runner: NodeRunner, recording: Recording | None) -> Callable[[],
     if recording is None:
         return lambda: None
     recorder = runner.add(lambda: Recorder(Selection(), recording, context=runner.context))
-    discovered = -math.inf
+    discovery = TokenBucket(1, DISCOVERY_PERIOD)
 
     def discover() -> None:
-        nonlocal discovered
-        if runner.seconds() - discovered >= DISCOVERY_PERIOD:
-            discovered = runner.seconds()
+        if discovery.permits(runner.seconds()):
             recorder.discover()
 
     discover()

@@ -17,6 +17,7 @@ from diffdrive_jacobian.live.live_robot import LiveRobot
 from diffdrive_jacobian.live.pacing import Pacing
 from diffdrive_jacobian.live.session import Session, Snapshot
 from diffdrive_jacobian.messages.codecs import PARAMETER_EVENT, Changes
+from diffdrive_jacobian.messages.names import base_name, full_name, is_named, namespace_of, node_of
 from diffdrive_jacobian.messages.topics import PARAMETER_EVENTS, TOPICS
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
@@ -63,9 +64,7 @@ class LivePage(Node):  # type: ignore[misc]
         self.robots: dict[str, LiveRobot] = {}
         """Robots by namespace."""
         self._names = {
-            topic: self.resolve_topic_name(topic).rpartition('/')[2]
-            for topic in TOPICS
-            if '/' not in topic
+            topic: base_name(self.resolve_topic_name(topic)) for topic in TOPICS if '/' not in topic
         }
         self._refused: set[str] = set()
         self._unshown: list[str] = []
@@ -145,9 +144,8 @@ class LivePage(Node):  # type: ignore[misc]
         types = dict(self.get_topic_names_and_types())
         self._unshown = []
         for topic, kinds in types.items():
-            namespace, _, name = topic.rpartition('/')
-            if name == self._names['odom'] and 'nav_msgs/msg/Odometry' in kinds:
-                self._add(namespace or '/')
+            if base_name(topic) == self._names['odom'] and 'nav_msgs/msg/Odometry' in kinds:
+                self._add(namespace_of(topic))
         for namespace, robot in list(self.robots.items()):
             publishers = self._nodes(robot.topics.full('odom'))
             if not publishers and robot.silence > LOST:
@@ -164,7 +162,7 @@ class LivePage(Node):  # type: ignore[misc]
     def _add(self, namespace: str) -> None:
         if namespace in self.robots or namespace in self._refused:
             return
-        if not self._nodes(f'{namespace.rstrip("/")}/{self._names["odom"]}'):
+        if not self._nodes(full_name(namespace, self._names['odom'])):
             # Only somebody who listens, or the publisher's node is not discovered yet.
             return
         if len(self.robots) >= MAX_ROBOTS:
@@ -190,11 +188,7 @@ class LivePage(Node):  # type: ignore[misc]
 
     def _nodes(self, topic: str) -> list[str]:
         """Return the nodes that publish a topic."""
-        return [
-            f'{one.node_namespace.rstrip("/")}/{one.node_name}'
-            for one in self.get_publishers_info_by_topic(topic)
-            if not one.node_name.startswith('_')
-        ]
+        return [node_of(one) for one in self.get_publishers_info_by_topic(topic) if is_named(one)]
 
     def _on_parameter_event(self, changes: Changes) -> None:
         for robot in self.robots.values():

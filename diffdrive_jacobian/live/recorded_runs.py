@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.bags.bag_reader import BagError, base_name, namespace_of, open_bag
+from diffdrive_jacobian.bags.bag_reader import BagError, open_bag
 from diffdrive_jacobian.messages.covariances import from_covariance
 from diffdrive_jacobian.messages.errors import MessageError
+from diffdrive_jacobian.messages.names import base_name, namespace_of
 from diffdrive_jacobian.messages.topics import TOPICS
 from diffdrive_jacobian.reading.reader import read_run
 from diffdrive_jacobian.reading.run import Run, Series

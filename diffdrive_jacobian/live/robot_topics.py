@@ -20,6 +20,7 @@ from diffdrive_jacobian.bags.message_definitions import message_class
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.codecs import TWIST, Codec, Command
 from diffdrive_jacobian.messages.errors import MessageError
+from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.messages.topics import TOPICS
 from diffdrive_jacobian.ros.rclpy_internals import Polled, waiting_messages
 from diffdrive_jacobian.ros.serialization import MAX_SIZE, ignoring_invalid
@@ -109,7 +110,7 @@ class RobotTopics:
 
     def full(self, name: str) -> str:
         """Return the fully qualified name of a topic or service of the robot."""
-        return f'{self._namespace.rstrip("/")}/{self._names.get(name, name)}'
+        return full_name(self._namespace, self._names.get(name, name))
 
     def listen(
         self, codec: Codec[V], topic: str, callback: Callable[[V], None], *, latched: bool

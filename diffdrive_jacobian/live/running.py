@@ -48,7 +48,7 @@ def watch_nodes(*, ros_arguments: Sequence[str], port: int, signals: Signals, re
     ):
         page = runner.add(lambda: LivePage(session, context, polled=True))
         try:
-            runner.spin(lambda: signals.count > 0)
+            runner.spin(lambda: False, signals=signals)
         finally:
             page.stop()
 

@@ -21,8 +21,8 @@ from websockets.http11 import Request, Response
 from diffdrive_jacobian.live.access import HEADERS, Access, Refusal
 from diffdrive_jacobian.live.commands import MAX_SIZE, CommandError, parse
 from diffdrive_jacobian.live.files import page_files
-from diffdrive_jacobian.live.rate import TokenBucket
 from diffdrive_jacobian.live.session import Page, Session
+from diffdrive_jacobian.ros.rate_limit import TokenBucket
 
 ADDRESS = '127.0.0.1'
 PERIOD = 0.04
@@ -202,7 +202,7 @@ class LiveServer:
                 await asyncio.sleep(PERIOD)
 
     async def _receive(self, connection: ServerConnection, page: Page) -> None:
-        limit = TokenBucket(COMMAND_RATE, COMMAND_BURST, time.monotonic())
+        limit = TokenBucket(COMMAND_BURST, 1.0 / COMMAND_RATE)
         invalid = 0
         async for text in connection:
             if not limit.permits(time.monotonic()):

@@ -20,6 +20,7 @@ from diffdrive_jacobian.lockstep._fault_log import FaultLog, Hits, totals
 from diffdrive_jacobian.lockstep._gate import Gate
 from diffdrive_jacobian.lockstep._link import Link, Source, Stage
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
+from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.messages.topics import CLOCK
 from diffdrive_jacobian.time_units import in_seconds, nanoseconds
 
@@ -249,7 +250,7 @@ class Injection:
 
     def full_name(self, node: str) -> str:
         """Return the fully qualified name of a node, in the namespace of the test by default."""
-        return full_name(node, self.world.node)
+        return absolute_name(node, self.world.node)
 
     def gate(self, node: str) -> Gate:
         """Return the gate of a node, which is expected to be there some time.
@@ -362,6 +363,6 @@ class Injection:
         return stage
 
 
-def full_name(node: str, base: Node) -> str:
+def absolute_name(node: str, base: Node) -> str:
     """Return the fully qualified name of a node, in the namespace of another one by default."""
-    return node if node.startswith('/') else f'{base.get_namespace().rstrip("/")}/{node}'
+    return node if node.startswith('/') else full_name(base.get_namespace(), node)

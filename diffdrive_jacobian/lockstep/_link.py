@@ -11,18 +11,18 @@ receive.
 
 from __future__ import annotations
 
-import sys
 from collections import deque
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, TypeAlias
 
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 
 from diffdrive_jacobian.lockstep._clock import Agenda
 from diffdrive_jacobian.lockstep._gate import Gate
+from diffdrive_jacobian.ros.rclpy_internals import queue_depth
 
 Stage: TypeAlias = Callable[[bytes], Iterable[tuple[int, bytes]]]
 """Receives a serialized message, returns those that leave the stage instead, with their delays (ns)."""
@@ -253,11 +253,6 @@ class Link:
 
 def _take_nothing(*_: Any) -> None:
     """Take nothing."""
-
-
-def queue_depth(profile: QoSProfile) -> int:
-    """Return the largest number of messages that wait in a queue."""
-    return sys.maxsize if profile.history == HistoryPolicy.KEEP_ALL else max(profile.depth, 1)
 
 
 def is_latched(endpoint: Any) -> bool:

@@ -13,8 +13,9 @@ from diffdrive_jacobian.lockstep._link import is_latched
 from diffdrive_jacobian.lockstep._nodes import Nodes
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.lockstep._simulated_time import SimulatedTime
-from diffdrive_jacobian.lockstep.external.graph import compatible, node_name, qos_name
+from diffdrive_jacobian.lockstep.external.graph import compatible, qos_name
 from diffdrive_jacobian.lockstep.external.others import Isolated
+from diffdrive_jacobian.messages.names import node_of, type_name
 from diffdrive_jacobian.ros.rclpy_internals import SERVICES_OF_RCLPY
 
 LISTENING_DEPTH = 1000
@@ -71,7 +72,7 @@ class Messaging:
             self._check_compatible(topic, publisher)
             if subscriptions == 0 and not latched:
                 raise LockstepError(
-                    f'{publisher.topic_name} has no subscription of type {_type_name(type(message))}\n'
+                    f'{publisher.topic_name} has no subscription of type {type_name(type(message))}\n'
                     f'{self._report()}'
                 )
             self._check_all_served(publisher.topic_name)
@@ -89,11 +90,11 @@ class Messaging:
         offered = publisher.qos_profile
         for info in self._node.get_subscriptions_info_by_topic(given):
             requested = info.qos_profile
-            if info.topic_type == _type_name(publisher.msg_type) and not compatible(offered, requested):
+            if info.topic_type == type_name(publisher.msg_type) and not compatible(offered, requested):
                 volatile = offered.durability != DurabilityPolicy.TRANSIENT_LOCAL
                 hint = ': publish(..., latched=True)' if volatile and is_latched(info) else ''
                 raise LockstepError(
-                    f'{publisher.topic_name} is subscribed to by {node_name(info)} with the quality of '
+                    f'{publisher.topic_name} is subscribed to by {node_of(info)} with the quality of '
                     f'service {qos_name(requested)}, and published with {qos_name(offered)}, which does '
                     f'not reach it{hint}\n{self._report()}'
                 )
@@ -153,7 +154,7 @@ class Messaging:
         others = Isolated() if self._is_served(name) else self._time.others
         others.await_service(name)
         services = dict(self._node.get_service_names_and_types())
-        wanted = _type_name(service_type, 'srv')
+        wanted = type_name(service_type)
         if wanted not in services.get(name, []):
             known = ', '.join(other for other, kinds in services.items() if not _is_of_rclpy(kinds))
             raise LockstepError(
@@ -187,17 +188,13 @@ class Messaging:
             name = self._node.resolve_topic_name(topic)
             types = dict(self._node.get_topic_names_and_types()).get(name, [])
             raise LockstepError(
-                f'{name} is of type {", ".join(types) or "unknown"}, not {_type_name(args[0])}'
+                f'{name} is of type {", ".join(types) or "unknown"}, not {type_name(args[0])}'
             ) from error
 
 
 def _is_message(value: Any) -> bool:
     """Return whether a value is a message: an object of a generated class."""
     return not isinstance(value, type) and hasattr(value, 'get_fields_and_field_types')
-
-
-def _type_name(interface: Any, kind: str = 'msg') -> str:
-    return f'{interface.__module__.split(".")[0]}/{kind}/{interface.__name__}'
 
 
 def _is_of_rclpy(types: list[str]) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from rclpy.node import Node
@@ -47,9 +47,5 @@ class LockstepRunner(NodeRunner):
         """
         self._world.add(node)
 
-    def _spin(self, until: Callable[[], bool]) -> bool:
-        # The condition is checked once at each simulated time.
-        self._world.settle()
-        while not until():
-            self._world.step()
-        return True
+    def _spin_once(self) -> None:
+        self._world.step()

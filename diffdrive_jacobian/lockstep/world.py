@@ -25,7 +25,7 @@ from diffdrive_jacobian.lockstep._errors import InitializedError, LockstepError,
 from diffdrive_jacobian.lockstep._fault_log import FaultEvent
 from diffdrive_jacobian.lockstep._faults import Faults
 from diffdrive_jacobian.lockstep._guard import Guard
-from diffdrive_jacobian.lockstep._injection import Fault, full_name
+from diffdrive_jacobian.lockstep._injection import Fault, absolute_name
 from diffdrive_jacobian.lockstep._messaging import Messaging
 from diffdrive_jacobian.lockstep._nodes import Nodes
 from diffdrive_jacobian.lockstep._properties import Properties, Property
@@ -244,7 +244,7 @@ class Lockstep:
         """
         self._check_open()
         nodes = {node.get_fully_qualified_name(): node for node in self._scheduler.nodes}
-        full = full_name(name, self.node)
+        full = absolute_name(name, self.node)
         if full not in nodes:
             raise LockstepError(f'there is no node {full}; nodes: {", ".join(nodes)}')
         return nodes[full]

@@ -6,7 +6,6 @@ description of a message. None of it needs rclpy.
 
 from __future__ import annotations
 
-import importlib
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from functools import cache
 from typing import Any, TypeAlias
 
 from diffdrive_jacobian.messages.errors import MessageError
+from diffdrive_jacobian.messages.names import import_type
 
 _CODES = {
     'boolean': '?',
@@ -181,7 +181,7 @@ def _of_class(name: str, text: str) -> FieldType:
         return Sequence(_of_class(name, found['sequence']), _number(found['most']))
     if found := _CLASS.fullmatch(text):
         # Fields of messages are messages; those of services and actions too.
-        return structure(getattr(importlib.import_module(f'{found[1]}.msg'), found[2]))
+        return structure(import_type(f'{found[1]}/msg/{found[2]}'))
     raise TypeError(f'field {name} must have a type of ROS 2, got {text}')
 
 

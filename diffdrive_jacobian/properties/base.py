@@ -12,6 +12,7 @@ from rclpy.publisher import Publisher
 from diffdrive_jacobian.faults.expression import Expression
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep.world import Lockstep
+from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.numerics.fields import Text
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -40,7 +41,7 @@ class Property(Expression, ABC):
         """Return the name of a topic or service with the namespace of this property."""
         if not self.namespace or name.startswith('/'):
             return name
-        return f'{self.namespace.rstrip("/")}/{name}'
+        return full_name(self.namespace, name)
 
 
 class Watch:

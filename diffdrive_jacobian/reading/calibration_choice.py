@@ -9,8 +9,9 @@ from typing import Any
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
-from diffdrive_jacobian.bags.bag_reader import BagError, base_name
+from diffdrive_jacobian.bags.bag_reader import BagError
 from diffdrive_jacobian.messages.conversion import quoted
+from diffdrive_jacobian.messages.names import base_name
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 
 NO_REFERENCE = ('odom', 'goal_pose', 'initialpose', 'start_pose')

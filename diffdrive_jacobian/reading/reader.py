@@ -16,9 +16,7 @@ from diffdrive_jacobian.bags.bag_reader import (
     BagError,
     DamagedBagError,
     ReadingInterruptedError,
-    base_name,
     messages,
-    namespace_of,
     open_bag,
     recorded_parameters,
     stored_connections,
@@ -31,6 +29,7 @@ from diffdrive_jacobian.bags.known_types import (
 from diffdrive_jacobian.messages.cdr import DecodingError, LongMessageError
 from diffdrive_jacobian.messages.codecs import Changes, FaultEvent
 from diffdrive_jacobian.messages.errors import MessageError
+from diffdrive_jacobian.messages.names import base_name, namespace_of
 from diffdrive_jacobian.messages.topics import READABLE, TOPICS, Topic
 from diffdrive_jacobian.reading.run import Run, Series
 from diffdrive_jacobian.text import printable
@@ -41,7 +40,6 @@ __all__ = [
     'ReadingInterruptedError',
     'Run',
     'Series',
-    'base_name',
     'messages',
     'open_bag',
     'read_run',

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -17,6 +18,7 @@ from diffdrive_jacobian.messages.topics import OF_EVERY_NODE
 from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording, RecordingError
 from diffdrive_jacobian.recording.selection import Selection
+from diffdrive_jacobian.ros.rate_limit import TokenBucket
 from diffdrive_jacobian.ros.runner import ros_context, running
 from diffdrive_jacobian.signals import Signals
 
@@ -158,35 +160,26 @@ def _receive(
         running(context, isolated=False, with_info=True) as runner,
     ):
         recorder = runner.add(lambda: Recorder(selection, recording, with_info=True, context=context))
-        discovered = -DISCOVERY_PERIOD
+        discovery = TokenBucket(1, DISCOVERY_PERIOD)
 
-        def over() -> bool:
-            nonlocal discovered
-            now = time.monotonic()
-            if now - discovered >= DISCOVERY_PERIOD:
-                discovered = now
+        def failed() -> bool:
+            if discovery.permits(time.monotonic()):
                 recorder.discover()
                 on_status(_status(recorder, recording))
-            late = max_duration is not None and now - recording.started >= max_duration
-            return bool(signals.count or late or recording.error)
+            return recording.error is not None
 
-        if runner.spin(over) and recording.error is None:
-            recorder.end()
-            before, ended, told = signals.count, time.monotonic(), False
-
-            def drained() -> bool:
-                nonlocal told
-                if recorder.drained():
-                    return True
-                if recorder.awaited and not told and time.monotonic() - ended > WAIT_SHOWN:
-                    told = True
-                    on_wait(recorder.awaited)
-                if signals.count > before:
-                    recorder.give_up('a second signal ended the wait for late messages')
-                    return True
-                return False
-
-            runner.spin(drained)
+        left = math.inf if max_duration is None else recording.started + max_duration - time.monotonic()
+        if runner.spin(failed, timeout=left, signals=signals) or not context.ok():
+            return
+        recorder.end()
+        before = signals.count
+        drained = runner.spin(recorder.drained, timeout=WAIT_SHOWN, signals=signals, handled=before)
+        if not drained:
+            if recorder.awaited and signals.count == before:
+                on_wait(recorder.awaited)
+            drained = runner.spin(recorder.drained, signals=signals, handled=before)
+        if not drained and signals.count > before:
+            recorder.give_up('a second signal ended the wait for late messages')
 
 
 def _status(recorder: Recorder, recording: Recording) -> Status:

@@ -17,6 +17,7 @@ from rclpy.qos import ReliabilityPolicy
 
 from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Record, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
+from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.recording.parameter_query import ParameterQuery
 from diffdrive_jacobian.recording.reception import (
@@ -333,7 +334,7 @@ class Recorder(Node):  # type: ignore[misc]
     # --- Parameters of the nodes that are recorded
 
     def _ask_for_parameters(self, namespace: str, name: str) -> None:
-        node = f'{namespace.rstrip("/")}/{name}'
+        node = full_name(namespace, name)
         # The name of a node may be discovered later than its topics.
         if name.startswith('_') or node in self._queries or node == self.get_fully_qualified_name():
             return

@@ -9,7 +9,8 @@ from rclpy.expand_topic_name import expand_topic_name
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
-from diffdrive_jacobian.bags.bag_reader import BagError, base_name, namespace_of
+from diffdrive_jacobian.bags.bag_reader import BagError
+from diffdrive_jacobian.messages.names import base_name, namespace_of
 from diffdrive_jacobian.ros.rclpy_internals import reason
 from diffdrive_jacobian.time_units import NANOSECONDS
 

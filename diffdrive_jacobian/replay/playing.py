@@ -178,6 +178,21 @@ def describe_too_few(counts: dict[str, int], readers: int) -> str:
     )
 
 
+class _Unchanged:
+    """Measures for how long a value has not changed."""
+
+    def __init__(self) -> None:
+        self._value: object = None
+        self._since = 0.0
+
+    def seconds(self, value: object) -> float:
+        """Return the time since the first call with this value (s)."""
+        now = time.monotonic()
+        if value != self._value:
+            self._value, self._since = value, now
+        return now - self._since
+
+
 class _Session:
     """The stages of a replay."""
 
@@ -191,55 +206,46 @@ class _Session:
 
     def wait_for_discovery(self, patience: float) -> None:
         """Wait, at most so long (s), until each topic has a subscription and no more are discovered."""
-        started = quiet = time.monotonic()
-        counts: dict[str, int] = {}
+        unchanged = _Unchanged()
 
-        def over() -> bool:
-            nonlocal quiet, counts
-            now, found = time.monotonic(), self._player.readers()
-            if found != counts:
-                quiet, counts = now, found
-            complete = min(counts.values()) > 0 and now - quiet >= MATCH_QUIET
+        def complete() -> bool:
+            counts = self._player.readers()
+            quiet = unchanged.seconds(counts)
             without = ', '.join(topic for topic, count in counts.items() if not count)
             self._progress.waiting(
                 f'no subscription to {without} (starting after {patience:g} s without it)'
                 if without
                 else 'further subscriptions may be discovered'
             )
-            return bool(complete or now - started >= patience or self._signals.count)
+            return not without and quiet >= MATCH_QUIET
 
-        self._runner.spin(over)
+        self._runner.spin(complete, timeout=patience, signals=self._signals)
 
     def wait_for_readers(self, readers: int, timeout: float) -> bool:
         """Wait until each topic has so many subscriptions; return False after a time (s) or a signal."""
-        deadline = time.monotonic() + timeout
-        complete = False
 
-        def over() -> bool:
-            nonlocal complete
+        def complete() -> bool:
             missing = _too_few(self._player, readers)
-            complete = not missing
             if missing:
                 self._progress.waiting(describe_too_few(missing, readers))
-            return bool(complete or self._signals.count or time.monotonic() > deadline)
+            return not missing
 
-        self._runner.spin(over)
-        return complete
+        return self._runner.spin(complete, timeout=timeout, signals=self._signals)
 
     def play(self) -> bool:
         """Play the bag; return whether it was played to its end."""
         player = self._player
         self._progress.started(seconds(player.end - player.start))
 
-        def over() -> bool:
+        def done() -> bool:
             if self._progress.toggled():
                 player.toggle()
             self._progress.playing(seconds(player.position - player.start), paused=player.paused)
-            return bool(player.done or self._signals.count)
+            return player.done
 
         try:
             player.begin()
-            self._runner.spin(over)
+            self._runner.spin(done, signals=self._signals)
         finally:
             self._progress.ended()
         return player.done
@@ -253,18 +259,15 @@ class _Session:
         Returns:
             The topics with subscriptions that have not.
         """
-        deadline = time.monotonic() + (seconds or math.inf)
-        missing: list[str] = []
 
-        def over() -> bool:
-            nonlocal missing
-            missing = self._player.unacknowledged()
-            if missing:
+        def complete() -> bool:
+            if missing := self._player.unacknowledged():
                 topics = ', '.join(missing)
                 self._progress.waiting(
                     f'not all subscriptions to {topics} have acknowledged all messages'
                 )
-            return bool(not missing or self._signals.count or time.monotonic() > deadline)
+            return not missing
 
-        self._runner.spin(over)
-        return missing
+        if self._runner.spin(complete, timeout=seconds or math.inf, signals=self._signals):
+            return []
+        return self._player.unacknowledged()

@@ -18,6 +18,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from diffdrive_jacobian.bags.bag_reader import BagError, messages
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, message_class
 from diffdrive_jacobian.messages.conversion import set_time
+from diffdrive_jacobian.messages.names import node_of
 from diffdrive_jacobian.replay.lateness import Lateness
 from diffdrive_jacobian.replay.playback import NODE, NothingToPlayError, Playback
 from diffdrive_jacobian.ros.qos import publisher_profile
@@ -127,7 +128,7 @@ class Replayer(Node):  # type: ignore[misc]
         found = {}
         for publisher in self._publishers_by_connection.values():
             infos = self.get_publishers_info_by_topic(publisher.topic_name)
-            names = [f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in infos]
+            names = [node_of(info) for info in infos]
             others = sorted(name for name in names if name != ours)
             if others:
                 found[publisher.topic_name] = others

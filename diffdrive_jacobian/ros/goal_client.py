@@ -30,6 +30,7 @@ from diffdrive_jacobian.messages.codecs import (
 )
 from diffdrive_jacobian.messages.conversion import from_pose, from_time
 from diffdrive_jacobian.messages.errors import MessageError
+from diffdrive_jacobian.messages.names import is_named, node_of
 from diffdrive_jacobian.ros.node import THROTTLE
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
 from diffdrive_jacobian.ros.topic_errors import explaining_failure
@@ -201,7 +202,7 @@ class GoalClient(Node):  # type: ignore[misc]
         """
         topic = self.resolve_topic_name('goal_status')
         return {
-            bytes(info.endpoint_gid): ''.join(map(_full_name, _nodes([info])))
+            bytes(info.endpoint_gid): node_of(info) if is_named(info) else ''
             for info in self.get_publishers_info_by_topic(topic)
         }
 
@@ -264,18 +265,9 @@ def driven_offset(values: Mapping[str, Any]) -> float:
     return offset if math.isfinite(offset) else 0.0
 
 
-def _nodes(endpoints: Iterable[Any]) -> set[tuple[str, str]]:
-    """Return the nodes of endpoints. The name of a node may be discovered later than its topics."""
-    return {
-        (endpoint.node_namespace, endpoint.node_name)
-        for endpoint in endpoints
-        if not endpoint.node_name.startswith('_')
-    }
-
-
-def _full_name(node: tuple[str, str]) -> str:
-    namespace, name = node
-    return f'{namespace.rstrip("/")}/{name}'
+def _nodes(endpoints: Iterable[Any]) -> set[str]:
+    """Return the names of the nodes of endpoints, as far as they are known."""
+    return {node_of(endpoint) for endpoint in endpoints if is_named(endpoint)}
 
 
 def loss(

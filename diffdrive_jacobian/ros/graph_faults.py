@@ -15,6 +15,7 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from diffdrive_jacobian.diagnosis.lasting import Interleaving
+from diffdrive_jacobian.messages.names import node_of
 from diffdrive_jacobian.messages.topics import SAME_NAMES, TOPICS
 from diffdrive_jacobian.ros.shared_graph import SharedGraph
 from diffdrive_jacobian.text import listed, printable
@@ -127,7 +128,7 @@ def publishers_of(node: Node, topic: str, *, others: bool = False) -> list[str]:
         others: Whether to leave out one publisher of the node itself.
     """
     infos = node.get_publishers_info_by_topic(topic)
-    names = sorted(printable(f'{one.node_namespace.rstrip("/")}/{one.node_name}') for one in infos)
+    names = sorted(printable(node_of(one)) for one in infos)
     own = node.get_fully_qualified_name()
     if others and own in names:
         names.remove(own)

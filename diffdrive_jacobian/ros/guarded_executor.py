@@ -26,12 +26,12 @@ from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.task import Task
 
-from diffdrive_jacobian.ros.rate_limit import RateLimit
+from diffdrive_jacobian.ros.rate_limit import TokenBucket
 from diffdrive_jacobian.ros.rclpy_internals import (
     entity_count,
     execute_ready,
     has_tasks,
-    queue_depth,
+    longest_queue,
     requires_wait_set,
 )
 
@@ -100,7 +100,7 @@ class GuardedExecutor:
         """Time on the SingleThreadedExecutor until the nodes move back (s)."""
         self._moved = self._next_tasks = 0.0
         self._episode = self._logged = False
-        self._limit = RateLimit(LOG_BURST, LOG_PERIOD)
+        self._limit = TokenBucket(LOG_BURST, LOG_PERIOD)
 
     @property
     def fair(self) -> bool:
@@ -215,7 +215,7 @@ class GuardedExecutor:
         """
         # Without entities, when all nodes were destroyed, there is no message either.
         round_size = max(1, sum(map(entity_count, self._nodes)))
-        return self._handled > round_size * max(map(queue_depth, self._nodes))
+        return self._handled > round_size * max(map(longest_queue, self._nodes))
 
     def _run_tasks(self) -> None:
         """Execute the tasks that are in the queue of the EventsExecutor."""

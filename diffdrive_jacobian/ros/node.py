@@ -27,15 +27,16 @@ from diffdrive_jacobian.diagnosis.lasting import Interleaving, LastingFault
 from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.codecs import Codec
 from diffdrive_jacobian.messages.integers import integer_warning
+from diffdrive_jacobian.messages.names import type_name
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, changed
 from diffdrive_jacobian.ros import parameters as ros_parameters
 from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
 from diffdrive_jacobian.ros.input_guard import guard_inputs
-from diffdrive_jacobian.ros.rate_limit import RateLimit
+from diffdrive_jacobian.ros.rate_limit import TokenBucket
 from diffdrive_jacobian.ros.rclpy_internals import declare_qos, log_info, time_reader
 from diffdrive_jacobian.ros.serialization import decoding
 from diffdrive_jacobian.ros.shared_graph import MAX_AGE, SharedGraph
-from diffdrive_jacobian.ros.topic_errors import explaining_failure, type_name
+from diffdrive_jacobian.ros.topic_errors import explaining_failure
 from diffdrive_jacobian.ros.type_mismatches import TypeMismatches
 
 P = TypeVar('P', bound=NodeParameters)
@@ -81,7 +82,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
         guard_inputs(self)
         self.now: Callable[[], int] = time_reader(self.get_clock())
         """Return the time of the node's clock (ns); 0: simulated time has not started."""
-        self._event_limits: dict[str, RateLimit] = {}
+        self._event_limits: dict[str, TokenBucket] = {}
         self.add_pre_set_parameters_callback(self._convert_parameters)
         self.add_on_set_parameters_callback(self._validate_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
@@ -210,7 +211,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
             self.get_logger().warning(text)
 
     def _may_log(self, event: str) -> bool:
-        limit = self._event_limits.setdefault(event, RateLimit(EVENT_BURST, EVENT_PERIOD))
+        limit = self._event_limits.setdefault(event, TokenBucket(EVENT_BURST, EVENT_PERIOD))
         return limit.permits(time.monotonic())
 
     def parameters_changed(self, previous: P) -> None:

@@ -4,12 +4,14 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import TypeVar
 
 from rclpy.context import Context
 from rclpy.exceptions import NameValidationException, ParameterException
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 
@@ -19,6 +21,7 @@ from diffdrive_jacobian.ros.fastdds_profiles import withdraw
 from diffdrive_jacobian.ros.node import ParameterizedNode
 from diffdrive_jacobian.ros.parameters import report_unknown
 from diffdrive_jacobian.ros.rclpy_internals import RCLError, reason
+from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
 
 N = TypeVar('N', bound=Node)
@@ -59,27 +62,57 @@ class NodeRunner(ABC):
         self._add(node)
         return node
 
-    def spin(self, until: Callable[[], bool]) -> bool:
-        """Execute callbacks until a condition is true.
+    def spin(
+        self,
+        until: Callable[[], bool],
+        *,
+        timeout: float = math.inf,
+        signals: Signals | None = None,
+        handled: int = 0,
+    ) -> bool:
+        """Execute callbacks until a condition is true, for a time, or until a signal is caught.
 
         Args:
-            until: The condition. It is called often.
+            until: The condition. It is called often: before the first callback, in real time after each
+                one, in lockstep at each simulated time.
+            timeout: Longest time (s).
+            signals: Counter of the signals that end it. None: no signal does.
+            handled: Number of these signals that were caught before and do not end it.
 
         Returns:
-            Whether the condition became true. False: the context was shut down before.
+            Whether the condition became true. False also if the context was shut down before.
         """
         if not self._unknown_reported:
             self._unknown_reported = True
             report_unknown([node for node in self._nodes if isinstance(node, ParameterizedNode)])
-        return self._spin(until)
+        deadline = self.seconds() + timeout
+        self.settle()
+        try:
+            while not until():
+                if signals is not None and signals.count > handled:
+                    return False
+                if deadline < math.inf and self.seconds() > deadline:
+                    return False
+                self._spin_once()
+        except ExternalShutdownException:
+            return False
+        return True
+
+    @abstractmethod
+    def settle(self) -> None:
+        """Execute the callbacks that are due in lockstep. No time passes."""
 
     @abstractmethod
     def _add(self, node: Node) -> None:
         """Execute the callbacks of a node from now on."""
 
     @abstractmethod
-    def _spin(self, until: Callable[[], bool]) -> bool:
-        """Do what `spin` describes."""
+    def _spin_once(self) -> None:
+        """Wait for a callback for a short time and execute it, or let the simulated time advance once.
+
+        Raises:
+            ExternalShutdownException: The context was shut down.
+        """
 
 
 def created(create: Callable[[], N]) -> N:

@@ -29,9 +29,9 @@ from diffdrive_jacobian.diagnosis.description import (
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader
 from diffdrive_jacobian.messages.codecs import CLOCK as CLOCK_TIME
 from diffdrive_jacobian.messages.codecs import STAMP
+from diffdrive_jacobian.messages.names import full_name, node_of, type_name
 from diffdrive_jacobian.messages.topics import CLOCK
 from diffdrive_jacobian.ros.runner import ros_context, running
-from diffdrive_jacobian.ros.topic_errors import type_name
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -60,7 +60,6 @@ def observe(
     Raises:
         UserError: The ROS arguments or the environment are invalid.
     """
-    signals = signals or Signals()
     # Names of nodes that begin with _ are hidden.
     name = f'_doctor_{os.getpid()}'
     with (
@@ -69,7 +68,7 @@ def observe(
     ):
         observer = runner.add(lambda: Observer(name, context=context))
         start = time.monotonic()
-        runner.spin(lambda: time.monotonic() - start >= seconds or signals.count > 0)
+        runner.spin(lambda: False, timeout=seconds, signals=signals)
         return observer.describe(time.monotonic() - start)
 
 
@@ -132,7 +131,7 @@ class Observer(Node):  # type: ignore[misc]
 
     def _names(self) -> list[str]:
         """Return the fully qualified names of the other nodes, repeated if several have one."""
-        names = [_full_name(namespace, name) for name, namespace in self.get_node_names_and_namespaces()]
+        names = [full_name(namespace, name) for name, namespace in self.get_node_names_and_namespaces()]
         return sorted(name for name in names if name != self.get_fully_qualified_name())
 
     def describe(self, seconds: float) -> Graph:
@@ -260,7 +259,7 @@ def _stamp_reader(kind: type, fields: tuple[str, ...]) -> Callable[[bytes], int]
 def _endpoint(info: Any, topic: str, publishes: bool) -> Endpoint:
     quality = info.qos_profile
     return Endpoint(
-        node=printable(_full_name(info.node_namespace, info.node_name)),
+        node=printable(node_of(info)),
         topic=printable(topic),
         kind=printable(info.topic_type),
         publishes=publishes,
@@ -272,7 +271,3 @@ def _endpoint(info: Any, topic: str, publishes: bool) -> Endpoint:
             lease=quality.liveliness_lease_duration.nanoseconds,
         ),
     )
-
-
-def _full_name(namespace: str, name: str) -> str:
-    return f'{namespace.rstrip("/")}/{name}'

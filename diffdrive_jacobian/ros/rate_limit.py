@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 
-class RateLimit:
-    """A token bucket: `burst` events at once, then one for each `period`."""
+class TokenBucket:
+    """Permits `burst` events at once, then one for each `period`."""
 
-    def __init__(self, burst: int, period: float) -> None:
+    def __init__(self, burst: float, period: float) -> None:
         """Start with a full bucket.
 
         Args:

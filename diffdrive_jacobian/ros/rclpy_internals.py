@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import ctypes
 import inspect
-import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import redirect_stderr
@@ -644,18 +643,18 @@ def entity_count(node: Node) -> int:
     return sum(len(list(entities)) for entities in lists)
 
 
-def queue_depth(node: Node) -> float:
-    """Return the number of messages in the longest queue of a node (inf: it has no limit).
+def queue_depth(profile: QoSProfile) -> int:
+    """Return the largest number of messages that wait in a queue (sys.maxsize: it has no limit)."""
+    return sys.maxsize if profile.history == HistoryPolicy.KEEP_ALL else max(profile.depth, 1)
+
+
+def longest_queue(node: Node) -> int:
+    """Return the largest number of messages that wait in a queue of a node.
 
     Queues inside waitables, such as those of actions, are taken to have the default depth of rclpy.
     """
-    depths = [
-        math.inf if profile.history == HistoryPolicy.KEEP_ALL else profile.depth
-        for profile in (
-            entity.qos_profile for entity in (*node.subscriptions, *node.services, *node.clients)
-        )
-    ]
-    return float(max([*depths, qos_profile_default.depth]))
+    entities = (*node.subscriptions, *node.services, *node.clients)
+    return max(map(queue_depth, [*(one.qos_profile for one in entities), qos_profile_default]))
 
 
 def requires_wait_set(node: Node) -> bool:

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from itertools import pairwise
 
 import rclpy
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import get_logger_level, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -193,21 +193,16 @@ class Runner(NodeRunner):
         """Return the monotonic time (s)."""
         return time.monotonic()
 
+    def settle(self) -> None:
+        """Do nothing: in real time callbacks are executed when they are due."""
+
     def _add(self, node: Node) -> None:
         if not isinstance(node, ParameterizedNode):
             guard_inputs(node)
         self._executor.add_node(node)
 
-    def _spin(self, until: Callable[[], bool]) -> bool:
-        # The condition is checked after every callback and at least every CHECK_PERIOD. Whether the
-        # context was shut down is checked by the executor.
-        spin_once = self._executor.spin_once
-        try:
-            while not until():
-                spin_once(timeout_sec=CHECK_PERIOD)
-        except ExternalShutdownException:
-            return False
-        return True
+    def _spin_once(self) -> None:
+        self._executor.spin_once(timeout_sec=CHECK_PERIOD)
 
     def close(self) -> None:
         """Stop the nodes while they can still publish, then destroy them."""

@@ -8,6 +8,7 @@ from itertools import chain
 
 from rclpy.node import Node
 
+from diffdrive_jacobian.messages.names import type_name
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.ros.rclpy_internals import parameter_overrides, reason
 from diffdrive_jacobian.text import printable
@@ -36,12 +37,6 @@ def explaining_failure(node: Node, message: type, topic: str) -> Iterator[None]:
         if explanation is None:
             raise
         raise ParameterError(explanation) from error
-
-
-def type_name(message: type) -> str:
-    """Return the name of a message type as it is in the graph: package/msg/Name."""
-    package = message.__module__.split('.')[0]
-    return f'{package}/msg/{message.__name__}'
 
 
 def _explanation(node: Node, message: type, topic: str, error: Exception) -> str | None:

@@ -6,6 +6,7 @@ from typing import Any
 
 from rclpy.node import Node
 
+from diffdrive_jacobian.messages.names import node_of
 from diffdrive_jacobian.ros.shared_graph import SharedGraph, Snapshot
 from diffdrive_jacobian.text import printable
 
@@ -68,7 +69,7 @@ class TypeMismatches:
 
     def _report(self, mismatch: tuple[str, str, str], other: Any, subscribed: bool) -> None:
         name, wanted, theirs = mismatch
-        node = printable(f'{other.node_namespace.rstrip("/")}/{other.node_name}')
+        node = printable(node_of(other))
         they_do, this_does = (
             ('publishes', 'subscribes to') if subscribed else ('subscribes to', 'publishes')
         )

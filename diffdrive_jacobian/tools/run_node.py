@@ -85,7 +85,7 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
             with long_lived():
                 node = runner.add(lambda: create(context=context))
             warn_of_unused_files(name, ros, [node.get_fully_qualified_name()])
-            runner.spin(lambda: signals.count > 0)
+            runner.spin(lambda: False, signals=signals)
     except UserError as error:
         return _cli.complain(name, error)
     return _cli.DONE

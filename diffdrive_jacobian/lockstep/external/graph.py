@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from typing import Any
 
 from rclpy.duration import Infinite
 from rclpy.node import Node
@@ -21,6 +20,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep.external.expectations import Due
 from diffdrive_jacobian.lockstep.external.waiting import Probe
+from diffdrive_jacobian.messages.names import node_of, type_name
 from diffdrive_jacobian.messages.topics import CLOCK, NOT_OF_ROBOTS, OF_EVERY_NODE
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -63,14 +63,14 @@ class ExternalGraph:
 
     def subscribed_nodes(self, topic: str) -> set[str]:
         """Return the names of the external nodes that are subscribed to a topic."""
-        return {node_name(info) for info in self.subscriptions(topic)}
+        return {node_of(info) for info in self.subscriptions(topic)}
 
     def topics_of(self, node: str) -> list[str]:
         """Return the topics that an external node publishes, without those of every node."""
         return [
             name
             for name in self.published_topics()
-            if any(node_name(info) == node for info in self.publishers(name))
+            if any(node_of(info) == node for info in self.publishers(name))
         ]
 
     def unmatched_publisher(self, publisher: Publisher) -> Iterator[str]:
@@ -136,16 +136,6 @@ def qos_name(profile: QoSProfile) -> str:
     return ', '.join(words)
 
 
-def node_name(info: TopicEndpointInfo) -> str:
-    """Return the full name of the node of an endpoint."""
-    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-
-
-def type_name(message_type: Any) -> str:
-    """Return the name of a message type: 'nav_msgs/msg/Odometry'."""
-    return f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
-
-
 class Discovery:
     """The endpoints of the world and those of external nodes."""
 
@@ -167,7 +157,7 @@ class Discovery:
     def awaited_nodes(self, expected: Sequence[Due], probes: Sequence[Probe]) -> set[str]:
         """Return the names of the external nodes from which something is awaited."""
         infos = [info for one in expected for info in self._graph.publishers(one.topic)]
-        return {node_name(info) for info in infos} | {probe.name for probe in probes}
+        return {node_of(info) for info in infos} | {probe.name for probe in probes}
 
     def missing(
         self, expected: Sequence[Due], probes: Sequence[Probe], topics: Collection[str]
@@ -183,11 +173,11 @@ class Discovery:
             LockstepError: Another process publishes /clock.
         """
         if others := self._graph.publishers(CLOCK):
-            raise LockstepError(f'{node_name(others[0])} publishes {CLOCK}, which only lockstep may do')
+            raise LockstepError(f'{node_of(others[0])} publishes {CLOCK}, which only lockstep may do')
         found = [text for one in expected for text in self._missing_topics(one)]
         found += [f'no external node provides {probe.service}' for probe in probes if not probe.ready()]
         found += self._unmatched(topics)
-        timed = {node_name(info) for info in self._graph.subscriptions(CLOCK)}
+        timed = {node_of(info) for info in self._graph.subscriptions(CLOCK)}
         untimed = [
             f'{name} is not subscribed to {CLOCK}: its parameter use_sim_time must be true'
             for name in sorted(self.awaited_nodes(expected, probes) - timed)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import Any
 
 from rclpy.node import Node
@@ -11,6 +10,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep._links import Links
+from diffdrive_jacobian.messages.names import import_type
 from diffdrive_jacobian.ros.rclpy_internals import message_taker
 
 DEPTH = 1000
@@ -95,8 +95,7 @@ def _import_type(name: str, topic: str) -> Any:
     Raises:
         LockstepError: It is not installed.
     """
-    package, _, message = name.split('/')
     try:
-        return getattr(importlib.import_module(f'{package}.msg'), message)
+        return import_type(name)
     except (ImportError, AttributeError) as error:
         raise LockstepError(f'the type {name} of {topic} is not installed') from error

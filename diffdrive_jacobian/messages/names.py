@@ -1,0 +1,54 @@
+"""Names of ROS: of nodes, of topics, and of types."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+
+def full_name(namespace: str, name: str) -> str:
+    """Return the fully qualified name of a node, topic or service, such as `/robot1/odom`."""
+    return f'{namespace.rstrip("/")}/{name}'
+
+
+def base_name(name: str) -> str:
+    """Return a name without its namespace."""
+    return name.rpartition('/')[2]
+
+
+def namespace_of(name: str) -> str:
+    """Return the namespace of a fully qualified name, such as `/` or `/robot1`."""
+    return name.rpartition('/')[0] or '/'
+
+
+def node_of(endpoint: Any) -> str:
+    """Return the fully qualified name of the node of an endpoint, as the graph describes it."""
+    return full_name(endpoint.node_namespace, endpoint.node_name)
+
+
+def is_named(endpoint: Any) -> bool:
+    """Return whether an endpoint belongs to a node with a known name that is not hidden.
+
+    The name of a node may be discovered later than its topics; until then it begins with `_` as well.
+    """
+    return not endpoint.node_name.startswith('_')
+
+
+def type_name(interface: type) -> str:
+    """Return the name of a class of messages or services, such as `nav_msgs/msg/Odometry`."""
+    package, kind, *_ = interface.__module__.split('.')
+    return f'{package}/{kind}/{interface.__name__}'
+
+
+def import_type(name: str) -> Any:
+    """Import the class of a type by its name.
+
+    Args:
+        name: `package/msg/Name`. It must be trusted: the package is imported.
+
+    Raises:
+        ImportError: The package has no Python code.
+        AttributeError: The package has no such type.
+    """
+    package, kind, interface = name.split('/')
+    return getattr(import_module(f'{package}.{kind}'), interface)
