@@ -33,7 +33,7 @@ from diffdrive_jacobian.properties import (
     StopsAfterLostOdometry,
     end_of_faults,
 )
-from diffdrive_jacobian.ros.remote_goal import ANSWER_PATIENCE, Result, send_goal_in
+from diffdrive_jacobian.ros.remote_goal import ANSWER_PATIENCE, Result, send_goal
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.testing import explore, fault_schedules, goals, poses, times
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -186,9 +186,9 @@ def client(world, case):
 
         timer = world.node.create_timer(case['interrupted'] + 1e-3, interrupt)
     patience, timeout = 2.0, case['timeout']
-    result = send_goal_in(
-        LockstepRunner(world),
+    result = send_goal(
         [float(value) for value in case['goal']],
+        runner=LockstepRunner(world),
         patience=patience,
         timeout=timeout,
         signals=signals,

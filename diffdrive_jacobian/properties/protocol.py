@@ -16,7 +16,7 @@ from diffdrive_jacobian.numerics.fields import Name, Names
 from diffdrive_jacobian.properties._messages import FieldReader
 from diffdrive_jacobian.properties.base import Property, Watch
 
-_NAMES = {state: state.name for state in GoalState if state}
+_NAMES: dict[int, str] = {state: state.name for state in GoalState if state}
 _STATUS_FIELDS = (
     'status',
     'goal_info.goal_id.uuid',

@@ -250,15 +250,15 @@ def _routes(run: Run) -> list[tuple[range, FollowedGoal[range]]]:
         )
     ]
     follower: GoalFollower[range] = GoalFollower()
-    begin, *ends = [*np.searchsorted(statuses.received, received).tolist(), len(reports)]
-    for report in reports[:begin]:
+    answered: list[int] = np.searchsorted(statuses.received, received).tolist()
+    answered.append(len(reports))
+    for report in reports[: answered[0]]:
         follower.reported(*report)
     stamps, followed = _stamps(run, goals), []
-    for route, end in zip(routes, ends, strict=True):
+    for route, (begin, end) in zip(routes, pairwise(answered), strict=True):
         followed.append((route, follower.sent(route, stamps[route.start])))
         for report in reports[begin:end]:
             follower.reported(*report)
-        begin = end
     return [pair for pair in followed if pair[1].fate is not Fate.REFUSED]
 
 
