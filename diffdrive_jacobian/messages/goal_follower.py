@@ -140,7 +140,8 @@ class GoalFollower(Generic[G]):
             earlier = followed.earlier
             if earlier is not None and not earlier.state.ended:
                 # The later one is accepted or refused first.
-                return followed if state in (GoalState.ACCEPTED, GoalState.ABORTED) else earlier
+                refused = state is GoalState.ABORTED and not followed.state.ended
+                return followed if refused or state is GoalState.ACCEPTED else earlier
             if not (stamp == UNSTAMPED and followed.state.ended and state.active):
                 return followed
         followed = FollowedGoal(None, stamp)
