@@ -11,7 +11,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep.world import Lockstep
-from diffdrive_jacobian.messages.goal_follower import UNSTAMPED, FollowedGoal, GoalFollower
+from diffdrive_jacobian.messages.goal_follower import FollowedGoal, GoalFollower
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
 from diffdrive_jacobian.numerics.fields import Name
@@ -84,15 +84,13 @@ class _DueGoalWatch(Watch):
         self._followers: defaultdict[Node, GoalFollower[Goal]] = defaultdict(GoalFollower)
         self._received: dict[Node, FollowedGoal[Goal]] = {}
         self._moved = self.seconds
-        self._motion = Motion(self._on_motion)
         world.expect(*map(required.resolved, required.goals))
         for topic in required.goals:
             world.on_delivered(required.resolved(topic), self._on_goal)
         self._commands = world.node.resolve_topic_name(required.resolved(required.commands))
         world.expect(self._commands)
         world.on_published(self._commands, lambda publisher, _: self.check_observable(publisher))
-        world.expect(required.resolved(required.odom))
-        self._odom = world.on_published(required.resolved(required.odom), self._motion.on_odometry)
+        self._motion = Motion(world, required.resolved(required.odom), self._on_motion)
         world.on_published(required.resolved(required.status), self._on_status)
         world.on_response(required.resolved(required.cancel), self._on_cancel)
 
@@ -100,13 +98,7 @@ class _DueGoalWatch(Watch):
         goal = read_goal(message_type, message, self.seconds)
         if goal is None or not any(one.topic_name == self._commands for one in node.publishers):
             return
-        follower = self._followers[node]
-        followed = follower.newest
-        if followed is not None and _is_copy(followed, goal):
-            followed.goal = goal
-        else:
-            followed = follower.sent(goal, goal.stamp)
-        self._received[node] = followed
+        self._received[node] = self._followers[node].sent(goal, goal.stamp)
         self.note(f'{self.name_of(node)} received a goal at {goal.pose}')
 
     def _on_cancel(self, node: Node, _: Any) -> None:
@@ -157,20 +149,7 @@ class _DueGoalWatch(Watch):
         return goal.seconds, 'the goal was received'
 
     def _where(self, node: Node, goal: Goal) -> str:
-        pose = self._motion.pose
-        if pose is None:
-            return f'there was no odometry on {self._odom}'
-        return (
-            f'the robot is {pose.distance(goal.pose):.6g} m from the goal of {self.name_of(node)} at '
-            f'{goal.pose}: {pose}, {self._motion.twist}'
-        )
-
-
-def _is_copy(followed: FollowedGoal[Goal], goal: Goal) -> bool:
-    """Return whether a goal is the message again that is followed: a controller may ignore it."""
-    known = followed.goal
-    same = known is not None and known._replace(seconds=goal.seconds) == goal
-    return same and goal.stamp != UNSTAMPED and not followed.state.ended
+        return self._motion.where(goal, f' of {self.name_of(node)}')
 
 
 class _ArrivesWatch(_DueGoalWatch):

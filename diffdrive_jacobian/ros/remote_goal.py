@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import Enum, auto
@@ -213,7 +213,7 @@ class _Session:
 
     def run(self, patience: float, timeout: float, *, follow: bool, heading_matters: bool) -> GoalResult:
         client, signals = self._client, self._signals
-        obstacle = self._await_controller(patience)
+        obstacle = self._wait(patience, client.obstacle)
         if obstacle is not None:
             if signals.count:
                 return self._result(Result.INTERRUPTED)
@@ -228,7 +228,8 @@ class _Session:
             if heading_matters:
                 self._learn_parameters(liveness)
             return self._result(Result.SENT if acknowledged else Result.UNCONFIRMED)
-        if not self._await_answer(liveness):
+        missing = f'no answer on {client.resolve_topic_name("goal_status")}'
+        if self._wait(ANSWER_PATIENCE, lambda: None if client.status else missing, liveness):
             if signals.count:
                 return self._cancel(Result.INTERRUPTED)
             return self._result(Result.NO_ANSWER)
@@ -246,15 +247,31 @@ class _Session:
         """Execute callbacks, and yield the time (s) often, for a time (s) or until a signal."""
         return self._runner.turns(timeout=seconds, signals=self._signals)
 
-    def _await_controller(self, patience: float) -> str | None:
-        """Wait until the goal can be sent. Return what is missing after a time (s); None: nothing."""
-        obstacle = None
-        for _ in self._turns(patience):
-            obstacle = self._client.obstacle()
-            if obstacle is None:
+    def _wait(
+        self,
+        seconds: float,
+        missing: Callable[[], str | None],
+        liveness: Liveness | None = None,
+    ) -> str | None:
+        """Wait until nothing is missing, for a time (s) or until a signal, and report what is.
+
+        Args:
+            seconds: Longest time (s).
+            missing: Returns what is missing; None: nothing.
+            liveness: Sends requests meanwhile.
+
+        Returns:
+            What is missing at the end; None: nothing.
+        """
+        reason = None
+        for _ in self._turns(seconds):
+            if liveness is not None:
+                liveness.silence()
+            reason = missing()
+            if reason is None:
                 break
-            self._progress.waiting(obstacle)
-        return obstacle
+            self._progress.waiting(reason)
+        return reason
 
     def _await_acknowledgement(self) -> bool:
         """Wait until the goal is acknowledged by every subscription; return whether it is."""
@@ -266,26 +283,13 @@ class _Session:
             self._progress.waiting(f'not every subscription to {topic} has acknowledged the goal')
         return True
 
-    def _await_answer(self, liveness: Liveness) -> bool:
-        """Wait for the first status of the goal; return whether there is one."""
-        topic = self._client.resolve_topic_name('goal_status')
-        for _ in self._turns(ANSWER_PATIENCE):
-            liveness.silence()
-            self._progress.waiting(f'no answer on {topic}')
-            if self._client.status is not GoalState.UNKNOWN:
-                return True
-        return False
-
     def _learn_parameters(self, liveness: Liveness) -> None:
         """Wait until the controller has reported which point of the robot it drives.
 
         If the heading of the goal matters, report a controller that ignores it.
         """
-        for _ in self._turns(PARAMETER_PATIENCE):
-            liveness.silence()
-            self._progress.waiting('the controller has not reported its parameters')
-            if liveness.answered:
-                break
+        missing = 'the controller has not reported its parameters'
+        self._wait(PARAMETER_PATIENCE, lambda: None if liveness.answered else missing, liveness)
         self._use(liveness)
         for name, values in sorted(liveness.values.items()):
             if ignores_heading(values):
@@ -357,9 +361,9 @@ class _Session:
         distance = self._distance()
         client.cancel()
         for _ in self._runner.turns(timeout=ANSWER_PATIENCE, signals=signals, handled=signals.count):
-            self._progress.waiting('the controller has not confirmed that it canceled')
             if client.ended:
                 break
+            self._progress.waiting('the controller has not confirmed that it canceled')
         return self._result(result, distance=distance, canceled=client.ended)
 
     def _distance(self) -> float | None:
