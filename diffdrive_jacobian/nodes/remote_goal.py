@@ -14,19 +14,19 @@ from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.messages.goal_status import GoalState
-from diffdrive_jacobian.ros import standstill
-from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
-from diffdrive_jacobian.ros.goal_client import (
+from diffdrive_jacobian.nodes import standstill
+from diffdrive_jacobian.nodes.goal_client import (
     DRIVEN_POINT_PARAMETERS,
     SILENCE,
     GoalClient,
     duplicates,
     loss,
 )
+from diffdrive_jacobian.nodes.standstill import Standstill
+from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
 from diffdrive_jacobian.ros.liveness import Liveness
 from diffdrive_jacobian.ros.node_runner import NodeRunner
 from diffdrive_jacobian.ros.runner import ros_context, running
-from diffdrive_jacobian.ros.standstill import Standstill
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
 
