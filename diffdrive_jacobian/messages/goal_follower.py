@@ -139,9 +139,12 @@ class GoalFollower(Generic[G]):
         if followed is not None:
             earlier = followed.earlier
             if earlier is not None and not earlier.state.ended:
-                # The later one is accepted or refused first.
-                refused = state is GoalState.ABORTED and not followed.state.ended
-                return followed if refused or state is GoalState.ACCEPTED else earlier
+                # The later one is accepted or refused first. If it was refused, the controller repeats
+                # the state of the earlier one.
+                answers = state in (GoalState.ACCEPTED, GoalState.ABORTED)
+                if followed.state.ended:
+                    answers = state is GoalState.ACCEPTED is not earlier.state
+                return followed if answers else earlier
             if not (stamp == UNSTAMPED and followed.state.ended and state.active):
                 return followed
         followed = FollowedGoal(None, stamp)
