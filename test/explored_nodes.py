@@ -22,7 +22,7 @@ from diffdrive_jacobian.lockstep.runner import LockstepRunner
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.codecs import ODOMETRY
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
-from diffdrive_jacobian.nodes.remote_goal import ANSWER_PATIENCE, Result, send_goal_in
+from diffdrive_jacobian.nodes.remote_goal import ANSWER_PATIENCE, Result, send_goal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.properties import (
@@ -186,9 +186,9 @@ def client(world, case):
 
         timer = world.node.create_timer(case['interrupted'] + 1e-3, interrupt)
     patience, timeout = 2.0, case['timeout']
-    result = send_goal_in(
-        LockstepRunner(world),
+    result = send_goal(
         [float(value) for value in case['goal']],
+        runner=LockstepRunner(world),
         patience=patience,
         timeout=timeout,
         signals=signals,

@@ -44,7 +44,7 @@ def test_goals_that_were_withdrawn_are_not_sent(ros):
     client.withdraw()
     talk.publish(odometry(0.5, 0.0, 0.0))
     ros.until(lambda: client.robot is not None, 'odometry is received')
-    assert client._message is None
+    assert client._follower.newest is None
 
 
 def test_a_single_goal_has_the_frame_and_a_status(ros):

@@ -190,21 +190,21 @@ def test_a_goal_that_is_replaced_and_one_that_is_refused():
 def test_the_end_of_each_goal_is_reported_once():
     goal = GoalProgress()
     goal.sent(np.array([[1.0, 0.0, 0.0]]), (1, 0))
-    goal.reported(GoalState.EXECUTING, (1, 0))
-    assert not goal.has_ended()
-    goal.reported(GoalState.SUCCEEDED, (1, 0))
-    assert [goal.has_ended(), goal.has_ended()] == [True, False]
-    # Replaced by others that are refused. The controller keeps to the first ones.
+
+    def ends(state, stamp):
+        changed = goal.reported(state, stamp)
+        return changed is not None and changed.fate.is_end
+
+    assert not ends(GoalState.EXECUTING, (1, 0))
+    assert ends(GoalState.SUCCEEDED, (1, 0))
+    assert not ends(GoalState.SUCCEEDED, (1, 0))
     goal.sent(np.array([[2.0, 0.0, 0.0]]), (2, 0))
-    assert not goal.has_ended()
-    goal.reported(GoalState.ABORTED, (2, 0))
-    assert goal.has_ended()
+    assert ends(GoalState.ABORTED, (2, 0))
     goal.sent(np.array([[3.0, 0.0, 0.0]]), (3, 0))
+    assert not ends(GoalState.ACCEPTED, (3, 0))
     goal.sent(np.array([[4.0, 0.0, 0.0]]), (4, 0))
-    goal.reported(GoalState.CANCELED, (3, 0))
-    assert not goal.has_ended()
-    goal.reported(GoalState.CANCELED, (4, 0))
-    assert goal.has_ended()
+    assert not ends(GoalState.CANCELED, (3, 0))
+    assert ends(GoalState.CANCELED, (4, 0))
 
 
 # --- Numbers

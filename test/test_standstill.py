@@ -6,9 +6,9 @@ import argparse
 
 import numpy as np
 import pytest
-from action_msgs.msg import GoalStatus
 from nav_msgs.msg import Odometry
 
+from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.nodes import standstill
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.goal_client import GoalClient
@@ -78,12 +78,12 @@ def test_a_goal_of_a_robot_that_does_not_move_is_reported(monkeypatch):
         result = session.run(10.0, 10.0, follow=True, heading_matters=False)
     assert seconds == [0.3]
     assert (result.result, result.canceled) == (Result.INTERRUPTED, True)
-    assert result.status == GoalStatus.STATUS_CANCELED
+    assert result.status is GoalState.CANCELED
 
 
 def test_the_report_does_not_claim_that_an_unknown_robot_was_stopped(capsys):
     options = argparse.Namespace(timeout=7.0, wait=10.0, x=1.0, y=1.0)
-    values = {'result': Result.TIMEOUT, 'topic': '/goal_pose', 'status': GoalStatus.STATUS_CANCELED}
+    values = {'result': Result.TIMEOUT, 'topic': '/goal_pose', 'status': GoalState.CANCELED}
     unknown = GoalResult(**values, canceled=True)
     assert send_goal._report(unknown, options) == [
         'not arrived within --timeout 7 s',

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from diffdrive_jacobian.bags.run import Run, Series
 from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
+from diffdrive_jacobian.messages.goal_follower import Fate, FollowedGoal, GoalFollower, Stamp
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
@@ -75,7 +76,7 @@ def trace(run: Run) -> Trace:
     targets[goal >= 0] = run.goals.values[goal[goal >= 0]]
     dx, dy = targets[:, 0] - x, targets[:, 1] - y
     to_goal = targets[:, :2] - _driven_points(run)
-    last = [route[-1] for route in _routes(run)]
+    last = [route[-1] for route, _ in _routes(run)]
     counts = _over_time(run, lambda now: heading_counts(now.of_node('go_to_goal')))
     return Trace(
         run=run,
@@ -159,18 +160,17 @@ def _progress(run: Run, breaks: Indices) -> tuple[Indices, NDArray[np.bool_]]:
     goal, reached = np.full(len(seen), -1), np.zeros(len(seen), dtype=bool)
     known = len(run.goal_status) > 0 or bool(run.of_node('go_to_goal'))
     routes = _routes(run)
-    for index, route in enumerate(routes):
-        begun = run.goals.received[route.start]
-        until = run.goals.received[routes[index + 1].start] if index + 1 < len(routes) else _NEVER
-        states, times = _statuses(run, begun, until)
+    begins = [run.goals.received[route.start] for route, _ in routes]
+    for (route, followed), begun, until in zip(routes, begins, [*begins, _NEVER][1:], strict=True):
+        state = followed.state
         here, end = np.searchsorted(seen, [begun, until]).tolist()
         stop = end
-        if len(states) and states[-1] in (GoalState.CANCELED, GoalState.ABORTED):
-            stop = min(stop, int(np.searchsorted(seen, times[-1], side='right')))
-        succeeded = times[states == GoalState.SUCCEEDED]
+        if state in (GoalState.CANCELED, GoalState.ABORTED):
+            stop = min(stop, int(np.searchsorted(seen, followed.since, side='right')))
+        succeeded = state is GoalState.SUCCEEDED
         for target in route[:-1]:
             next_here = _first_within(run, places, target, here, stop)
-            if next_here is None and here < stop and (len(succeeded) or not known):
+            if next_here is None and here < stop and (succeeded or not known):
                 next_here = here + int(np.argmin(_distances(run, places[here:stop], target)))
             goal[here : stop if next_here is None else next_here] = target
             if next_here is None:
@@ -180,15 +180,15 @@ def _progress(run: Run, breaks: Indices) -> tuple[Indices, NDArray[np.bool_]]:
             last, begin = route[-1], here
             goal[begin:stop] = last
             within = _within(run, places[begin:stop], last)
-            if len(succeeded):
-                here += _arrival(within, int(np.searchsorted(seen, succeeded[-1])) - begin)
-            elif within.any() and not len(states):
+            if succeeded:
+                here += _arrival(within, int(np.searchsorted(seen, followed.since)) - begin)
+            elif within.any() and followed.fate is Fate.WAITING:
                 here += int(np.argmax(within))
             else:
                 # The node still drives to it, even if the robot was near it once.
                 continue
             over = breaks[(breaks > here) & (breaks <= stop)]
-            if not len(succeeded):
+            if not succeeded:
                 # A robot that had left the goal again only passed it.
                 over = over[within[over - 1 - begin]]
             stop = min([stop, *over.tolist()])
@@ -233,22 +233,44 @@ def _arrival(within: Mask, success: int) -> int:
     return min(int(outside[-1]) + 1 if len(outside) else 0, success)
 
 
-def _routes(run: Run) -> list[range]:
-    """Find which goals came in one message; those that the node refused are left out."""
-    goals = run.goals
+def _routes(run: Run) -> list[tuple[range, FollowedGoal[range]]]:
+    """Find which goals came in one message, and follow them; those that were refused are left out."""
+    goals, statuses = run.goals, run.goal_status
     together = (np.diff(goals.received) == 0) & (np.diff(goals.stamps) == 0)
     edges = [0, *(np.flatnonzero(~together) + 1).tolist(), len(goals)]
-    routes = [range(*pair) for pair in pairwise(edges) if len(range(*pair))]
-    accepted = []
-    for index, route in enumerate(routes):
-        if len(route) > MAX_WAYPOINTS:
-            # These came in several messages at the same time, of which the last one counts.
-            route = route[-MAX_WAYPOINTS:]
-        until = goals.received[route.stop] if index + 1 < len(routes) else _NEVER
-        states, _ = _statuses(run, goals.received[route.start], until)
-        if not len(states) or states[0] != GoalState.ABORTED:
-            accepted.append(route)
-    return accepted
+    # Too many came in several messages at the same time, of which the last one counts.
+    routes = [range(*pair)[-MAX_WAYPOINTS:] for pair in pairwise(edges) if len(range(*pair))]
+    received = goals.received[[route.start for route in routes]]
+    reports = [
+        *zip(
+            statuses.values[:, 0].astype(int).tolist(),
+            _stamps(run, statuses),
+            statuses.received.tolist(),
+            strict=True,
+        )
+    ]
+    follower: GoalFollower[range] = GoalFollower()
+    answered: list[int] = np.searchsorted(statuses.received, received).tolist()
+    answered.append(len(reports))
+    for report in reports[: answered[0]]:
+        follower.reported(*report)
+    stamps, followed = _stamps(run, goals), []
+    for route, (begin, end) in zip(routes, pairwise(answered), strict=True):
+        followed.append((route, follower.sent(route, stamps[route.start])))
+        for report in reports[begin:end]:
+            follower.reported(*report)
+    return [pair for pair in followed if pair[1].fate is not Fate.REFUSED]
+
+
+def _stamps(run: Run, series: Series) -> list[Stamp]:
+    """Return the stamps of goals or of their statuses; UNSTAMPED for those that are no stamps."""
+    stamped = run.goal_status.stamps != run.goal_status.received
+    known = (series.stamps != series.received) | np.isin(
+        # They may have been received at the time of their stamp.
+        series.stamps,
+        run.goal_status.stamps[stamped],
+    )
+    return [divmod(stamp, NANOSECONDS) for stamp in np.where(known, series.stamps, 0).tolist()]
 
 
 def _driven_points(run: Run) -> Array:
@@ -270,12 +292,6 @@ def _driven_offset(run: Run) -> float:
         return 0.0
     default = controller.driven_offset(controller.defaults)
     return run.number_of_node('go_to_goal', controller.offset, default)
-
-
-def _statuses(run: Run, begin: int, end: int) -> tuple[Array, NDArray[np.int64]]:
-    """Return the goal states recorded from `begin` until before `end` (ns), and their times."""
-    first, last = np.searchsorted(run.goal_status.received, [begin, end])
-    return run.goal_status.values[first:last, 0], run.goal_status.received[first:last]
 
 
 def heading_counts(parameters: Mapping[str, Any]) -> bool:

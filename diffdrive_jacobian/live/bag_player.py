@@ -194,14 +194,13 @@ class _Film:
         run, trace, goal = self.robot.run, self.robot.trace, self._state.goal
         number = int(trace.goal[index])
         if number < 0:
-            goal.goals, goal.index, goal.state = None, 0, GoalState.UNKNOWN
+            goal.replay(None, 0, GoalState.UNKNOWN)
             return
         stamp = run.goals.received[number]
         route = np.flatnonzero(run.goals.received == stamp)
-        goal.goals = run.goals.values[route]
-        goal.index = int(np.searchsorted(route, number))
         reached = bool(np.isnan(trace.bearing_error[index]))
-        goal.state = GoalState.SUCCEEDED if reached else GoalState.EXECUTING
+        state = GoalState.SUCCEEDED if reached else GoalState.EXECUTING
+        goal.replay(run.goals.values[route], int(np.searchsorted(route, number)), state)
 
     def settings(self) -> list[dict[str, Any]]:
         """Return the recorded parameters that the page shows."""

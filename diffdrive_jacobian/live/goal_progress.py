@@ -9,14 +9,17 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.control import Arrival
 from diffdrive_jacobian.live.quantities import rounded
+from diffdrive_jacobian.messages.goal_follower import (
+    UNSTAMPED,
+    Fate,
+    FollowedGoal,
+    GoalFollower,
+    Stamp,
+)
 from diffdrive_jacobian.messages.goal_status import GoalState
 
-ACTIVE = (GoalState.ACCEPTED, GoalState.EXECUTING, GoalState.CANCELING)
-"""States in which a controller drives to a goal."""
-ENDED = (GoalState.SUCCEEDED, GoalState.CANCELED, GoalState.ABORTED)
-"""States of a goal that no controller drives to any more."""
-MAX_KNOWN = 8
-"""Number of earlier goals that are kept, in case the later ones are refused."""
+Goals = NDArray[np.float64]
+"""`[x, y, theta]` of each, shape (n, 3) (m, m, rad)."""
 
 
 class GoalEnd(NamedTuple):
@@ -25,7 +28,7 @@ class GoalEnd(NamedTuple):
     robot: str
     """Namespace of the robot, `/` or `/NAME`."""
     state: GoalState
-    """One of `ENDED`."""
+    """SUCCEEDED, CANCELED or ABORTED."""
     goal: NDArray[np.float64]
     """`[x, y, theta]` of the goal that was driven to last, shape (3,) (m, m, rad)."""
     pose: NDArray[np.float64] | None
@@ -41,23 +44,28 @@ class GoalProgress:
 
     def __init__(self) -> None:
         """Start without goals."""
-        self.goals: NDArray[np.float64] | None = None
-        """`[x, y, theta]` of each, shape (n, 3) (m, m, rad). None: unknown."""
         self.index = 0
         """Index of the goal that is driven to."""
-        self.state = GoalState.UNKNOWN
-        """State of the last goal that has a status."""
-        self._stamp: tuple[int, int] | None = None
-        self._ended: tuple[int, int] | None = None
-        self._newest: tuple[int, int] | None = None
-        self._answered = False
-        self._early: tuple[tuple[int, int], GoalState] | None = None
-        self._known: dict[tuple[int, int], NDArray[np.float64]] = {}
+        self._follower: GoalFollower[Goals] = GoalFollower()
+        self._shown: FollowedGoal[Goals] | None = None
+
+    @property
+    def goals(self) -> Goals | None:
+        """The goals that were sent last, or that the controller has reported since. None: unknown."""
+        return None if self._shown is None else self._shown.goal
+
+    @property
+    def state(self) -> GoalState:
+        """Their state. While they wait for an answer, that of the goals before, if they are active."""
+        shown, driving = self._shown, self._follower.driving
+        if shown is None:
+            return GoalState.UNKNOWN
+        return driving.state if driving is not None and shown.fate is Fate.WAITING else shown.state
 
     @property
     def active(self) -> bool:
         """Whether a controller drives the robot to a goal."""
-        return self.state in ACTIVE
+        return self.state.active
 
     @property
     def current(self) -> NDArray[np.float64] | None:
@@ -74,53 +82,44 @@ class GoalProgress:
         """Whether the goal that is driven to is the last one."""
         return self.goals is not None and self.index == len(self.goals) - 1
 
-    def remaining(self, *, fresh: bool = False) -> NDArray[np.float64]:
+    def remaining(self, *, fresh: bool = False) -> Goals:
         """Return the goals that are not reached yet, shape (n, 3).
 
         Args:
             fresh: Whether they were sent just now: they count although no status is known yet.
         """
-        if self.goals is None or not (self.active or (fresh and not self._answered)):
+        waiting = fresh and self._shown is not None and self._shown.fate is Fate.WAITING
+        if self.goals is None or not (self.active or waiting):
             return np.empty((0, 3))
         return self.goals[self.index :]
 
-    def sent(self, goals: NDArray[np.float64], stamp: tuple[int, int]) -> None:
+    def sent(self, goals: Goals, stamp: Stamp) -> None:
         """Take goals that somebody has sent, with their stamp."""
-        if not len(goals) or (stamp == self._stamp and any(stamp)):
+        shown = self._shown
+        if shown is not None and shown.goal is not None and shown.stamp == stamp != UNSTAMPED:
             # Those that this program has sent come back by their topic.
             return
-        self.goals, self.index, self._stamp, self._answered = goals, 0, stamp, False
-        self._known[stamp], self._newest = goals, stamp
-        while len(self._known) > MAX_KNOWN:
-            del self._known[next(iter(self._known))]
-        if self._early is not None and self._early[0] == stamp:
-            # The status overtook the goal.
-            self.state, self._answered = self._early[1], True
+        if len(goals):
+            self._show(self._follower.sent(goals, stamp))
 
-    def reported(self, state: GoalState, stamp: tuple[int, int]) -> None:
-        """Take a status of a controller, with the stamp of its goal."""
-        self._early = stamp, state
-        if self._stamp is not None and stamp != self._stamp:
-            if state in ACTIVE:
-                # The goals after them were refused, or they were sent before this program listened.
-                self.goals, self.index, self._stamp = self._known.get(stamp), 0, stamp
-            elif self.active:
-                # The end of goals that were replaced by the present ones.
-                return
-        self.state, self._answered = state, True
+    def reported(self, status: int, stamp: Stamp) -> FollowedGoal[Goals] | None:
+        """Take a status of a controller, with the stamp of its goal.
 
-    def has_ended(self) -> bool:
-        """Return whether the latest goals have ended. True only once for each of them.
-
-        Goals that were replaced by others do not count.
+        Returns:
+            The goals of which something else became. None: there are none.
         """
-        own = self._early is not None and self._early[0] == self._stamp
-        # Unless the newest ones were refused.
-        own &= self._newest in (self._stamp, self._ended)
-        if not own or self.state not in ENDED or self.goals is None or self._ended == self._stamp:
-            return False
-        self._ended = self._stamp
-        return True
+        changed = self._follower.reported(status, stamp)
+        driving = self._follower.driving
+        if driving is not None and (driving.stamp == stamp or changed is self._shown):
+            # The goals after them were refused, or they were sent before this program listened.
+            self._show(driving)
+        elif self._shown is None:
+            self._shown = changed
+        return changed
+
+    def replay(self, goals: Goals | None, index: int, state: GoalState) -> None:
+        """Show recorded goals and their state."""
+        self._shown, self.index = FollowedGoal(goals, UNSTAMPED, state), index
 
     def moved(self, pose: NDArray[np.float64], arrival: Arrival) -> None:
         """Take a pose of the robot, `[x, y, theta]`: a waypoint may be reached."""
@@ -140,3 +139,7 @@ class GoalProgress:
             'goals': None if self.goals is None else rounded(self.goals),
             'index': self.index,
         }
+
+    def _show(self, followed: FollowedGoal[Goals]) -> None:
+        if followed is not self._shown:
+            self._shown, self.index = followed, 0

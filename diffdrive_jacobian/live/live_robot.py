@@ -145,18 +145,15 @@ class LiveRobot:
         self.state.goal.sent(goals.reshape(-1, 3), route.stamp)
 
     def _on_status(self, one: Status) -> None:
-        if one.status not in set(GoalState):
+        changed = self.state.goal.reported(one.status, one.stamp)
+        # The latched status of a goal that was sent before is no news.
+        if changed is None or changed.goal is None or not changed.fate.is_end:
             return
-        goal = self.state.goal
-        before = goal.state
-        goal.reported(GoalState(one.status), one.stamp)
-        if goal.has_ended() and self.on_end is not None:
+        if self.on_end is not None:
             # Where the robot is by now.
             self.poll()
-            self.on_end(self.state.goal_end())
-        # The latched status of a goal that was sent before is no news.
-        known = goal.goals is not None
-        if known and goal.state is GoalState.ABORTED and before is not GoalState.ABORTED:
+            self.on_end(self.state.goal_end(changed))
+        if changed.state is GoalState.ABORTED:
             self._session.notify(
                 'the controller refused or aborted the goal: its log says why', 'warning'
             )

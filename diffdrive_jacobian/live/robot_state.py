@@ -17,9 +17,10 @@ from diffdrive_jacobian.control import Arrival, LawError
 from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.live import quantities
-from diffdrive_jacobian.live.goal_progress import GoalEnd, GoalProgress
+from diffdrive_jacobian.live.goal_progress import GoalEnd, GoalProgress, Goals
 from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.live.trail import JUMP, Trail
+from diffdrive_jacobian.messages.goal_follower import FollowedGoal
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
@@ -127,16 +128,16 @@ class RobotState:
         heading = heading_counts(values)
         return Arrival(xy_tolerance=max(tolerance, 0.0), use_heading=heading, offset=offset)
 
-    def goal_end(self) -> GoalEnd:
-        """Return the end of the goals that have just ended, and where the robot is."""
-        state, goals = self.goal.state, self.goal.goals
-        assert goals is not None
-        goal = goals[-1 if state is GoalState.SUCCEEDED else self.goal.index]
+    def goal_end(self, ended: FollowedGoal[Goals]) -> GoalEnd:
+        """Return the end of known goals that have just ended, and where the robot is."""
+        assert ended.goal is not None
+        index = self.goal.index if ended.goal is self.goal.goals else 0
+        goal = ended.goal[-1 if ended.state is GoalState.SUCCEEDED else index]
         distance, true_distance = (
             math.nan if pose is None else quantities.errors(pose, goal, self.arrival.offset)[0]
             for pose in (self.pose, self.truth)
         )
-        return GoalEnd(self.name, state, goal, self.pose, distance, true_distance)
+        return GoalEnd(self.name, ended.state, goal, self.pose, distance, true_distance)
 
     def moved(
         self,

@@ -15,3 +15,30 @@ class GoalState(IntEnum):
     SUCCEEDED = 4
     CANCELED = 5
     ABORTED = 6
+
+    @property
+    def active(self) -> bool:
+        """Whether the controller drives to the goal."""
+        return self in ACTIVE
+
+    @property
+    def ended(self) -> bool:
+        """Whether the controller does not drive to the goal any more."""
+        return self in ENDED
+
+    @property
+    def word(self) -> str:
+        """What a user reads: 'arrived', and otherwise the name in lower case."""
+        return 'arrived' if self is GoalState.SUCCEEDED else self.name.lower()
+
+
+ACTIVE = (GoalState.ACCEPTED, GoalState.EXECUTING, GoalState.CANCELING)
+ENDED = (GoalState.SUCCEEDED, GoalState.CANCELED, GoalState.ABORTED)
+FOLLOWING = {
+    GoalState.UNKNOWN: (GoalState.ACCEPTED, GoalState.ABORTED),
+    GoalState.ACCEPTED: (*ACTIVE, GoalState.CANCELED, GoalState.ABORTED),
+    GoalState.EXECUTING: (GoalState.EXECUTING, GoalState.CANCELING, *ENDED),
+    GoalState.CANCELING: (GoalState.CANCELING, *ENDED),
+    **dict.fromkeys(ENDED, ()),
+}
+"""What may follow each state. UNKNOWN: the goal has had no status. ABORTED may come first: refused."""

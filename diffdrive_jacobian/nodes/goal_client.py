@@ -30,6 +30,8 @@ from diffdrive_jacobian.messages.codecs import (
 )
 from diffdrive_jacobian.messages.conversion import from_pose, from_time
 from diffdrive_jacobian.messages.errors import MessageError
+from diffdrive_jacobian.messages.goal_follower import GoalFollower
+from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.messages.names import is_named, node_of
 from diffdrive_jacobian.ros.node import THROTTLE
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
@@ -39,8 +41,6 @@ SILENCE = 3.0
 """A controller that has not answered for this long was killed or hangs (s)."""
 DRIVEN_POINT_PARAMETERS = ('controller', 'offset')
 """Parameters of a controller that determine which point of the robot it drives."""
-ENDED = (GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED)
-"""Status of goals that are not driven to any more."""
 MESSAGES: dict[str, type] = {'goal_pose': PoseStamped, 'goals': Goals}
 """Topic of goals to its type."""
 
@@ -112,7 +112,6 @@ class GoalClient(Node):  # type: ignore[misc]
         """Index of the goal that is being driven to."""
         self.arrival = Arrival()
         """Determines which point of the robot is to arrive. The default is the axle centre."""
-        self.status = GoalStatus.STATUS_UNKNOWN
         self.robot: RobotState | None = None
         """State in the last odometry. None: no odometry was received."""
         self._monotonic = monotonic
@@ -122,7 +121,7 @@ class GoalClient(Node):  # type: ignore[misc]
         self._readers = readers
         self._topic = topic
         self._send_on_odometry = False
-        self._message: PoseStamped | Goals | None = None
+        self._follower: GoalFollower[NDArray[np.float64]] = GoalFollower()
         with explaining_failure(self, MESSAGES[topic], topic):
             self._publisher = self.create_publisher(MESSAGES[topic], topic, 10)
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -146,9 +145,15 @@ class GoalClient(Node):  # type: ignore[misc]
         return float(self.arrival.distance(*self.robot.pose, *self.goals[self.index, :2]))
 
     @property
+    def status(self) -> GoalState:
+        """Last status of the goals."""
+        sent = self._follower.newest
+        return GoalState.UNKNOWN if sent is None else sent.state
+
+    @property
     def ended(self) -> bool:
         """Whether the controller has finished with the goals, in whatever way."""
-        return self.status in ENDED
+        return self.status.ended
 
     # --- Goals
 
@@ -158,7 +163,9 @@ class GoalClient(Node):  # type: ignore[misc]
         message = self._goals()
         messages.set_time(message.header.stamp, self.get_clock().now().nanoseconds)
         message.header.frame_id = self._frame
-        self._message = message
+        # The latched status of an older goal with this stamp is none of these.
+        self._follower = GoalFollower()
+        self._follower.sent(self.goals, (message.header.stamp.sec, message.header.stamp.nanosec))
         self._publisher.publish(message)
         self.seen = self._monotonic()
 
@@ -235,12 +242,7 @@ class GoalClient(Node):  # type: ignore[misc]
     # --- Messages
 
     def _on_status(self, one: Status) -> None:
-        if self._message is None:
-            return
-        stamp = self._message.header.stamp
-        # The status of an older goal is latched and comes first.
-        if one.stamp == (stamp.sec, stamp.nanosec):
-            self.status = one.status
+        self._follower.reported(one.status, one.stamp)
 
     def _on_invalid_odometry(self, error: MessageError) -> None:
         # Other processes may publish, and anything.

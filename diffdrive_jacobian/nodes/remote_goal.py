@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Any, Protocol
 
 import numpy as np
-from action_msgs.msg import GoalStatus
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from diffdrive_jacobian.control.controllers import BUILT_IN
+from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.nodes import standstill
 from diffdrive_jacobian.nodes.goal_client import (
     DRIVEN_POINT_PARAMETERS,
@@ -22,6 +22,7 @@ from diffdrive_jacobian.nodes.goal_client import (
     duplicates,
     loss,
 )
+from diffdrive_jacobian.nodes.standstill import Standstill
 from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
 from diffdrive_jacobian.ros.liveness import Liveness
 from diffdrive_jacobian.ros.node_runner import NodeRunner
@@ -75,8 +76,8 @@ class GoalResult:
     result: Result
     topic: str
     """Fully qualified name of the topic on which the goal is published."""
-    status: int = GoalStatus.STATUS_UNKNOWN
-    """Last status that the controller reported, as in action_msgs/GoalStatus."""
+    status: GoalState = GoalState.UNKNOWN
+    """Last status that the controller reported."""
     distance: float | None = None
     """Distance from the driven point to the goal at the end (m). None: no odometry was received."""
     reason: str = ''
@@ -87,7 +88,7 @@ class GoalResult:
     @property
     def arrived(self) -> bool:
         """Whether the robot arrived at the goal."""
-        return self.result is Result.ENDED and self.status == GoalStatus.STATUS_SUCCEEDED
+        return self.result is Result.ENDED and self.status is GoalState.SUCCEEDED
 
     @property
     def acknowledged(self) -> bool:
@@ -119,105 +120,6 @@ class RemoteProgress(Protocol):
         """Receive that the robot has not moved for so long (s) with the goal, once per standstill."""
 
 
-def send_goal(
-    goal: ArrayLike,
-    *,
-    frame: str = '',
-    readers: int = 1,
-    patience: float = PATIENCE,
-    timeout: float = math.inf,
-    follow: bool = True,
-    heading_matters: bool = False,
-    ros_arguments: Sequence[str] = (),
-    signals: Signals | None = None,
-    progress: RemoteProgress | None = None,
-) -> GoalResult:
-    """Send a goal to a controller in another process, and follow it until it has ended.
-
-    Args:
-        goal: `[x, y, theta]`, shape (3,) (m, m, rad).
-        frame: Frame of the goal. Empty: the frame of the odometry.
-        readers: Number of subscriptions that goal_pose must have before the goal is sent.
-        patience: Longest wait for the controller and for the subscriptions (s).
-        timeout: Time after which the goal is canceled (s).
-        follow: Whether to wait for the end. Otherwise for the acknowledgement only.
-        heading_matters: Whether to report a controller that ignores the heading of the goal.
-        ros_arguments: ROS arguments of the node.
-        signals: Counter of the signals that cancel the goal. None: no signal does.
-        progress: Receives the progress. None: nothing does.
-
-    Raises:
-        UserError: The ROS arguments are invalid.
-        ValueError: `goal` has another shape.
-    """
-    with (
-        # The acknowledgement is what is waited for then.
-        nullcontext() if follow else fast_heartbeats(),
-        ros_context([NAME, *ros_arguments]) as context,
-        running(context, isolated=False) as runner,
-    ):
-        return send_goal_in(
-            runner,
-            goal,
-            frame=frame,
-            readers=readers,
-            patience=patience,
-            timeout=timeout,
-            follow=follow,
-            heading_matters=heading_matters,
-            signals=signals,
-            progress=progress,
-        )
-
-
-def send_goal_in(
-    runner: NodeRunner,
-    goal: ArrayLike,
-    *,
-    frame: str = '',
-    readers: int = 1,
-    patience: float = PATIENCE,
-    timeout: float = math.inf,
-    follow: bool = True,
-    heading_matters: bool = False,
-    signals: Signals | None = None,
-    progress: RemoteProgress | None = None,
-) -> GoalResult:
-    """Send a goal as `send_goal` does, in a runner that exists: in real time or in lockstep.
-
-    Args:
-        runner: Runs the node, and may run others.
-        goal: As for `send_goal`, as the other arguments.
-        frame: Frame of the goal.
-        readers: Number of subscriptions that goal_pose must have.
-        patience: Longest wait for the controller and for the subscriptions (s).
-        timeout: Time after which the goal is canceled (s).
-        follow: Whether to wait for the end.
-        heading_matters: Whether to report a controller that ignores the heading.
-        signals: Counter of the signals that cancel the goal.
-        progress: Receives the progress.
-
-    Raises:
-        UserError: The node cannot be created.
-        ValueError: `goal` has another shape.
-    """
-    goals = np.asarray(goal, dtype=np.float64)[np.newaxis]
-    client = runner.add(
-        lambda: GoalClient(
-            NAME,
-            goals,
-            runner.context,
-            topic='goal_pose',
-            frame=frame,
-            readers=readers,
-            monotonic=runner.seconds,
-            start_parameter_services=False,
-        )
-    )
-    session = _Session(client, runner, signals or Signals(), progress or _Silent())
-    return session.run(patience, timeout, follow=follow, heading_matters=heading_matters)
-
-
 class _Silent:
     """A progress that is not shown."""
 
@@ -237,6 +139,65 @@ class _Silent:
         pass
 
 
+def send_goal(
+    goal: ArrayLike,
+    *,
+    runner: NodeRunner | None = None,
+    frame: str = '',
+    readers: int = 1,
+    patience: float = PATIENCE,
+    timeout: float = math.inf,
+    follow: bool = True,
+    heading_matters: bool = False,
+    ros_arguments: Sequence[str] = (),
+    signals: Signals | None = None,
+    progress: RemoteProgress | None = None,
+) -> GoalResult:
+    """Send a goal to a controller in another process, and follow it until it has ended.
+
+    Args:
+        goal: `[x, y, theta]`, shape (3,) (m, m, rad).
+        runner: Runs the node, in real time or in lockstep, and may run others. None: a new one does.
+        frame: Frame of the goal. Empty: the frame of the odometry.
+        readers: Number of subscriptions that goal_pose must have before the goal is sent.
+        patience: Longest wait for the controller and for the subscriptions (s).
+        timeout: Time after which the goal is canceled (s).
+        follow: Whether to wait for the end. Otherwise for the acknowledgement only.
+        heading_matters: Whether to report a controller that ignores the heading of the goal.
+        ros_arguments: ROS arguments of the node; those of `runner`, if it is given.
+        signals: Counter of the signals that cancel the goal. None: no signal does.
+        progress: Receives the progress. None: nothing does.
+
+    Raises:
+        UserError: The ROS arguments are invalid, or the node cannot be created.
+        ValueError: `goal` has another shape, or `ros_arguments` are given with `runner`.
+    """
+    if runner is not None and ros_arguments:
+        raise ValueError('ros_arguments are those of the runner, if one is given')
+    with ExitStack() as stack:
+        if runner is None:
+            if not follow:
+                # The acknowledgement is what is waited for.
+                stack.enter_context(fast_heartbeats())
+            context = stack.enter_context(ros_context([NAME, *ros_arguments]))
+            runner = stack.enter_context(running(context, isolated=False))
+        used, goals = runner, np.asarray(goal, dtype=np.float64)[np.newaxis]
+        client = used.add(
+            lambda: GoalClient(
+                NAME,
+                goals,
+                used.context,
+                topic='goal_pose',
+                frame=frame,
+                readers=readers,
+                monotonic=used.seconds,
+                start_parameter_services=False,
+            )
+        )
+        session = _Session(client, used, signals or Signals(), progress or _Silent())
+        return session.run(patience, timeout, follow=follow, heading_matters=heading_matters)
+
+
 class _Session:
     """The exchange with a controller about one goal."""
 
@@ -247,54 +208,72 @@ class _Session:
         self._runner = runner
         self._signals = signals
         self._progress = progress
-        self._lost: str | None = None
         self._duplicates: dict[str, float] = {}
         self._warned: set[str] = set()
-        self._standstill = standstill.Standstill()
 
     def run(self, patience: float, timeout: float, *, follow: bool, heading_matters: bool) -> GoalResult:
         client, signals = self._client, self._signals
-        if not self._spin(patience, self._ready):
+        obstacle = self._wait(patience, client.obstacle)
+        if obstacle is not None:
             if signals.count:
                 return self._result(Result.INTERRUPTED)
-            return self._result(Result.NOT_SENT, reason=client.obstacle() or '')
+            return self._result(Result.NOT_SENT, reason=obstacle)
         controllers = client.controllers()
         client.send()
         names = sorted(set(controllers.values()) - {''})
         parameters = HEADING_PARAMETERS if heading_matters else DRIVEN_POINT_PARAMETERS
         liveness = Liveness(client, names, parameters, self._runner.seconds)
         if not follow:
-            acknowledged = self._confirmed()
+            acknowledged = self._await_acknowledgement()
             if heading_matters:
                 self._learn_parameters(liveness)
             return self._result(Result.SENT if acknowledged else Result.UNCONFIRMED)
-
-        def accepted() -> bool:
-            liveness.silence()
-            self._progress.waiting(f'no answer on {client.resolve_topic_name("goal_status")}')
-            return bool(client.status != GoalStatus.STATUS_UNKNOWN)
-
-        if not self._spin(ANSWER_PATIENCE, accepted):
+        missing = f'no answer on {client.resolve_topic_name("goal_status")}'
+        if self._wait(ANSWER_PATIENCE, lambda: None if client.status else missing, liveness):
             if signals.count:
                 return self._cancel(Result.INTERRUPTED)
             return self._result(Result.NO_ANSWER)
         self._learn_parameters(liveness)
-        self._follow(liveness, controllers, timeout)
+        lost = self._follow(liveness, controllers, timeout)
         if client.ended:
             return self._result(Result.ENDED)
-        if self._lost is not None:
+        if lost is not None:
             # A controller that only hangs receives it when it resumes: nobody follows the goal then.
             client.cancel()
-            return self._result(Result.LOST, reason=self._lost)
+            return self._result(Result.LOST, reason=lost)
         return self._cancel(Result.INTERRUPTED if signals.count else Result.TIMEOUT)
 
-    def _ready(self) -> bool:
-        obstacle = self._client.obstacle()
-        if obstacle is not None:
-            self._progress.waiting(obstacle)
-        return obstacle is None
+    def _turns(self, seconds: float) -> Iterator[float]:
+        """Execute callbacks, and yield the time (s) often, for a time (s) or until a signal."""
+        return self._runner.turns(timeout=seconds, signals=self._signals)
 
-    def _confirmed(self) -> bool:
+    def _wait(
+        self,
+        seconds: float,
+        missing: Callable[[], str | None],
+        liveness: Liveness | None = None,
+    ) -> str | None:
+        """Wait until nothing is missing, for a time (s) or until a signal, and report what is.
+
+        Args:
+            seconds: Longest time (s).
+            missing: Returns what is missing; None: nothing.
+            liveness: Sends requests meanwhile.
+
+        Returns:
+            What is missing at the end; None: nothing.
+        """
+        reason = None
+        for _ in self._turns(seconds):
+            if liveness is not None:
+                liveness.silence()
+            reason = missing()
+            if reason is None:
+                break
+            self._progress.waiting(reason)
+        return reason
+
+    def _await_acknowledgement(self) -> bool:
         """Wait until the goal is acknowledged by every subscription; return whether it is."""
         deadline = self._runner.seconds() + ANSWER_PATIENCE
         while not self._client.confirmed(CONFIRMATION_PERIOD):
@@ -309,13 +288,8 @@ class _Session:
 
         If the heading of the goal matters, report a controller that ignores it.
         """
-
-        def known() -> bool:
-            liveness.silence()
-            self._progress.waiting('the controller has not reported its parameters')
-            return liveness.answered
-
-        self._spin(PARAMETER_PATIENCE, known)
+        missing = 'the controller has not reported its parameters'
+        self._wait(PARAMETER_PATIENCE, lambda: None if liveness.answered else missing, liveness)
         self._use(liveness)
         for name, values in sorted(liveness.values.items()):
             if ignores_heading(values):
@@ -326,46 +300,45 @@ class _Session:
         for name in sorted(liveness.values)[:1]:
             self._client.set_controller_parameters(liveness.values[name])
 
-    def _follow(self, liveness: Liveness, controllers: Mapping[bytes, str], timeout: float) -> None:
-        """Wait until the goal has ended or the controller is lost, for a time (s) or until a signal."""
-        client = self._client
-        queried = self._runner.seconds()
-        reported = False
-        present = controllers
+    def _follow(
+        self, liveness: Liveness, controllers: Mapping[bytes, str], timeout: float
+    ) -> str | None:
+        """Wait until the goal has ended, for a time (s) or until a signal.
 
-        def over() -> bool:
-            nonlocal queried, reported, present
-            now = self._runner.seconds()
+        Returns:
+            Why the controller is lost. None: it is not.
+        """
+        client = self._client
+        topic = client.resolve_topic_name('odom')
+        queried, present = self._runner.seconds(), controllers
+        motion = Standstill()
+        silent_robot = False
+        for now in self._turns(timeout):
             missing = now - client.seen > ANSWER_PATIENCE
-            if missing and not reported:
-                self._progress.no_odometry(client.resolve_topic_name('odom'), ANSWER_PATIENCE)
-            reported = missing
+            if missing and not silent_robot:
+                self._progress.no_odometry(topic, ANSWER_PATIENCE)
+            silent_robot = missing
             silence = liveness.silence()
             # They may change while the robot drives.
             self._use(liveness)
-            if client.robot is not None and not missing:
+            if client.robot is None:
+                self._progress.waiting(f'no odometry on {topic}')
+            elif not missing:
                 self._progress.driving(client.distance)
-                self._watch_motion(client.robot.pose, now)
-            elif client.robot is None:
-                self._progress.waiting(f'no odometry on {client.resolve_topic_name("odom")}')
+                if client.status is not GoalState.EXECUTING:
+                    motion.reset()
+                elif motion.update(client.robot.pose, now):
+                    self._progress.standing(standstill.PATIENCE)
             if client.ended:
-                return True
+                break
             if now - queried >= DISCOVERY_PERIOD:
                 queried, present = now, client.controllers()
             partial_silence = liveness.partial_silence()
-            self._lost = loss(controllers, present, silence, partial_silence)
-            if self._lost is None:
-                self._warn_of_duplicates(duplicates(controllers, present), partial_silence, now)
-            return self._lost is not None
-
-        self._spin(timeout, over)
-
-    def _watch_motion(self, pose: NDArray[np.float64], now: float) -> None:
-        """Report a robot that does not move while the controller drives it."""
-        if self._client.status != GoalStatus.STATUS_EXECUTING:
-            self._standstill.reset()
-        elif self._standstill.update(pose, now):
-            self._progress.standing(standstill.PATIENCE)
+            lost = loss(controllers, present, silence, partial_silence)
+            if lost is not None:
+                return lost
+            self._warn_of_duplicates(duplicates(controllers, present), partial_silence, now)
+        return None
 
     def _warn_of_duplicates(
         self, names: Sequence[str], partial_silence: Mapping[str, float], now: float
@@ -387,14 +360,10 @@ class _Session:
         client, signals = self._client, self._signals
         distance = self._distance()
         client.cancel()
-        before = signals.count
-        deadline = self._runner.seconds() + ANSWER_PATIENCE
-
-        def over() -> bool:
+        for _ in self._runner.turns(timeout=ANSWER_PATIENCE, signals=signals, handled=signals.count):
+            if client.ended:
+                break
             self._progress.waiting('the controller has not confirmed that it canceled')
-            return client.ended or signals.count > before or self._runner.seconds() > deadline
-
-        self._runner.spin(over)
         return self._result(result, distance=distance, canceled=client.ended)
 
     def _distance(self) -> float | None:
@@ -417,19 +386,6 @@ class _Session:
             reason=reason,
             canceled=canceled,
         )
-
-    def _spin(self, seconds: float, until: Callable[[], bool]) -> bool:
-        """Spin until a condition is true; return False after a time (s) or a signal."""
-        deadline = self._runner.seconds() + seconds
-        reached = False
-
-        def over() -> bool:
-            nonlocal reached
-            reached = until()
-            return reached or self._signals.count > 0 or self._runner.seconds() > deadline
-
-        self._runner.spin(over)
-        return reached
 
 
 def ignores_heading(values: Mapping[str, Any]) -> bool:

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 from rclpy.publisher import Publisher
 
-from diffdrive_jacobian.messages.codecs import GOALS, POSE
+from diffdrive_jacobian.lockstep.world import Lockstep
+from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, POSE, Status
 from diffdrive_jacobian.properties._messages import (
     FieldReader,
     Pose,
@@ -48,17 +49,27 @@ def read_goal(message_type: type, message: Any, seconds: float) -> Goal | None:
     return Goal(planar(*pose), seconds, (int(sec), int(nanosec)))
 
 
+_read_status = FieldReader(lambda _: GOAL_STATUS.fields).read
+
+
+def read_status(message_type: type, message: Any) -> Status | None:
+    """Return the status in a GoalStatus; None: the bytes are invalid."""
+    fields = _read_status(message_type, message)
+    return None if fields is None else GOAL_STATUS.value(*map(int, fields))
+
+
 class Motion:
     """The last pose and twist in the odometry of a robot."""
 
-    def __init__(self, changed: Callable[[Pose, Twist], None]) -> None:
-        """Start without odometry. `changed` is called with each pose and its twist."""
+    def __init__(self, world: Lockstep, topic: str, changed: Callable[[Pose, Twist], None]) -> None:
+        """Observe a topic of odometry. `changed` is called with each pose and its twist."""
         self.pose: Pose | None = None
         self.twist: Twist | None = None
         self._changed = changed
+        world.expect(topic)
+        self.topic = world.on_published(topic, self._on_odometry)
 
-    def on_odometry(self, publisher: Publisher, message: Any) -> None:
-        """Read an Odometry message."""
+    def _on_odometry(self, publisher: Publisher, message: Any) -> None:
         self.pose = read_pose(publisher.msg_type, message)
         self.twist = read_twist(publisher.msg_type, message)
         if self.pose is not None and self.twist is not None:
@@ -69,3 +80,12 @@ class Motion:
         """Whether the robot stands still."""
         twist = self.twist
         return twist is not None and (abs(twist.v) <= STANDING.v and abs(twist.omega) <= STANDING.omega)
+
+    def where(self, goal: Goal | None, of: str = '') -> str:
+        """Return where the robot is, relative to a goal, `of` what."""
+        if self.pose is None or goal is None:
+            return f'there was no odometry on {self.topic}'
+        distance = self.pose.distance(goal.pose)
+        return (
+            f'the robot is {distance:.6g} m from the goal{of} at {goal.pose}: {self.pose}, {self.twist}'
+        )

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from dataclasses import dataclass, field
 from typing import Any
 
-from action_msgs.msg import GoalStatus
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep.world import Lockstep
+from diffdrive_jacobian.messages.goal_follower import FollowedGoal, GoalFollower
+from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
 from diffdrive_jacobian.numerics.fields import Name
-from diffdrive_jacobian.properties._goals import Goal, Motion, read_goal
-from diffdrive_jacobian.properties._messages import FieldReader, Pose, Twist
+from diffdrive_jacobian.properties._goals import Goal, Motion, read_goal, read_status
+from diffdrive_jacobian.properties._messages import Pose, Twist
 from diffdrive_jacobian.properties._node_time import ROUNDING, end_of_faults
 from diffdrive_jacobian.properties.base import Watch
 from diffdrive_jacobian.properties.goals import GoalProperty
@@ -79,21 +81,16 @@ class _DueGoalWatch(Watch):
     def __init__(self, required: DueGoalProperty, world: Lockstep) -> None:
         super().__init__(world)
         self._required = required
-        self._goals: dict[Node, Goal] = {}
-        self._ended: dict[Node, Goal] = {}
+        self._followers: defaultdict[Node, GoalFollower[Goal]] = defaultdict(GoalFollower)
+        self._received: dict[Node, FollowedGoal[Goal]] = {}
         self._moved = self.seconds
-        self._motion = Motion(self._on_motion)
-        self._read_status = FieldReader(
-            lambda _: ('status', 'goal_info.stamp.sec', 'goal_info.stamp.nanosec')
-        ).read
         world.expect(*map(required.resolved, required.goals))
         for topic in required.goals:
             world.on_delivered(required.resolved(topic), self._on_goal)
         self._commands = world.node.resolve_topic_name(required.resolved(required.commands))
         world.expect(self._commands)
         world.on_published(self._commands, lambda publisher, _: self.check_observable(publisher))
-        world.expect(required.resolved(required.odom))
-        self._odom = world.on_published(required.resolved(required.odom), self._motion.on_odometry)
+        self._motion = Motion(world, required.resolved(required.odom), self._on_motion)
         world.on_published(required.resolved(required.status), self._on_status)
         world.on_response(required.resolved(required.cancel), self._on_cancel)
 
@@ -101,42 +98,31 @@ class _DueGoalWatch(Watch):
         goal = read_goal(message_type, message, self.seconds)
         if goal is None or not any(one.topic_name == self._commands for one in node.publishers):
             return
-        self._goals[node] = goal
+        self._received[node] = self._followers[node].sent(goal, goal.stamp)
         self.note(f'{self.name_of(node)} received a goal at {goal.pose}')
 
     def _on_cancel(self, node: Node, _: Any) -> None:
-        if self._goals.pop(node, None) is not None:
+        if self._received.pop(node, None) is not None:
             self.note('canceled')
 
     def _on_status(self, publisher: Publisher, message: Any) -> None:
-        node, fields = self.world.node_of(publisher), self._read_status(publisher.msg_type, message)
-        if node is None or fields is None:
-            return
-        status, stamp = int(fields[0]), (int(fields[1]), int(fields[2]))
-        if status in (GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED):
-            goal = self._goals.get(node)
-            if goal is not None and goal.stamp == stamp:
-                self._ended[node] = self._goals.pop(node)
-        elif status == GoalStatus.STATUS_ACCEPTED:
-            # Goals with equal stamps: what has ended was the one before.
-            ended = self._ended.pop(node, None)
-            if ended is not None and ended.stamp == stamp and node not in self._goals:
-                self._goals[node] = ended
+        node, status = self.world.node_of(publisher), read_status(publisher.msg_type, message)
+        if node is not None and status is not None:
+            self._followers[node].reported(status.status, status.stamp)
 
     def _on_motion(self, pose: Pose, _: Twist) -> None:
         if not self._motion.stands:
             self._moved = self.seconds
-        elif self._goals:
-            for node, goal in list(self._goals.items()):
-                if pose.distance(goal.pose) <= self._required.tolerance:
-                    # Steps of time may be long: this may be too late.
-                    self._check()
-                    self._goals.pop(node, None)
+            return
+        for node, goal in self._due():
+            if pose.distance(goal.pose) <= self._required.tolerance:
+                # Steps of time may be long: this may be too late.
+                self._check()
+                self._received.pop(node, None)
 
     def check(self) -> str | None:
         """Return what is violated; None: nothing."""
-        if self._goals:
-            self._check()
+        self._check()
         return self._found
 
     def _check(self) -> None:
@@ -144,10 +130,16 @@ class _DueGoalWatch(Watch):
         raise NotImplementedError
 
     def _due(self) -> list[tuple[Node, Goal]]:
+        if not self._received:
+            return []
         nodes = self.world.nodes
-        for node in [node for node in self._goals if node not in nodes]:
-            del self._goals[node]
-        return list(self._goals.items())
+        return [
+            (node, followed.goal)
+            for node, followed in self._received.items()
+            if followed.goal is not None
+            and followed.state not in (GoalState.CANCELED, GoalState.ABORTED)
+            and node in nodes
+        ]
 
     def _begin(self, goal: Goal) -> tuple[float, str]:
         """Return when the time for a goal begins, and what happened then."""
@@ -157,13 +149,7 @@ class _DueGoalWatch(Watch):
         return goal.seconds, 'the goal was received'
 
     def _where(self, node: Node, goal: Goal) -> str:
-        pose = self._motion.pose
-        if pose is None:
-            return f'there was no odometry on {self._odom}'
-        return (
-            f'the robot is {pose.distance(goal.pose):.6g} m from the goal of {self.name_of(node)} at '
-            f'{goal.pose}: {pose}, {self._motion.twist}'
-        )
+        return self._motion.where(goal, f' of {self.name_of(node)}')
 
 
 class _ArrivesWatch(_DueGoalWatch):

@@ -63,12 +63,10 @@ class _PublishedGoalWatch(Watch):
     def __init__(self, required: GoalProperty, world: Lockstep) -> None:
         super().__init__(world)
         self.goal: Goal | None = None
-        self.motion = Motion(self.on_motion)
         world.expect(*map(required.resolved, required.goals))
         for topic in required.goals:
             world.on_published(required.resolved(topic), self._on_goal)
-        world.expect(required.resolved(required.odom))
-        self.odom = world.on_published(required.resolved(required.odom), self.motion.on_odometry)
+        self.motion = Motion(world, required.resolved(required.odom), self.on_motion)
         world.on_response(required.resolved(required.cancel), self._on_cancel)
 
     def _on_goal(self, publisher: Publisher, message: Any) -> None:
@@ -85,13 +83,7 @@ class _PublishedGoalWatch(Watch):
 
     def where(self) -> str:
         """Return where the robot is, relative to the goal."""
-        if self.motion.pose is None or self.goal is None:
-            return f'there was no odometry on {self.odom}'
-        distance = self.motion.pose.distance(self.goal.pose)
-        return (
-            f'the robot is {distance:.6g} m from the goal at {self.goal.pose}: '
-            f'{self.motion.pose}, {self.motion.twist}'
-        )
+        return self.motion.where(self.goal)
 
 
 class _ReachesWatch(_PublishedGoalWatch):

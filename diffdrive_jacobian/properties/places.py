@@ -13,8 +13,7 @@ from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.plausibility import MAX_POSITION
 from diffdrive_jacobian.numerics.checks import NotNegativeOrInfinite
 from diffdrive_jacobian.numerics.fields import Name
-from diffdrive_jacobian.properties._goals import Motion
-from diffdrive_jacobian.properties._messages import Pose, Twist
+from diffdrive_jacobian.properties._messages import Pose, Twist, read_pose, read_twist
 from diffdrive_jacobian.properties._node_time import ROUNDING
 from diffdrive_jacobian.properties.base import Property, Watch
 
@@ -70,17 +69,15 @@ class _PlaceWatch(Watch):
     def __init__(self, required: PlaceProperty, world: Lockstep) -> None:
         super().__init__(world)
         self._required = required
-        self._motion = Motion(self._on_motion)
         world.expect(required.resolved(required.odom))
         self._odom = world.on_published(required.resolved(required.odom), self._on_odometry)
 
     def _on_odometry(self, publisher: Publisher, message: Any) -> None:
-        self._motion.on_odometry(publisher, message)
-        if self._motion.pose is None:
+        pose = read_pose(publisher.msg_type, message)
+        twist = read_twist(publisher.msg_type, message)
+        if pose is None or twist is None:
             self.found(f'{self._odom}: bytes that are no Odometry')
-
-    def _on_motion(self, pose: Pose, twist: Twist) -> None:
-        if (allowed := self._required.violation(pose, twist)) is not None:
+        elif (allowed := self._required.violation(pose, twist)) is not None:
             self.found(f'{self._odom}: {pose}, {twist}; allowed: {allowed}')
         elif self._found is None:
             self.note(self._odom, ': ', pose, ', ', twist)

@@ -4,42 +4,19 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
-from action_msgs.msg import GoalStatus
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep.world import Lockstep
+from diffdrive_jacobian.messages.goal_follower import Stamp
+from diffdrive_jacobian.messages.goal_status import FOLLOWING, GoalState
 from diffdrive_jacobian.numerics.fields import Name, Names
 from diffdrive_jacobian.properties._messages import FieldReader
 from diffdrive_jacobian.properties.base import Property, Watch
 
-_NAMES = {
-    GoalStatus.STATUS_ACCEPTED: 'ACCEPTED',
-    GoalStatus.STATUS_EXECUTING: 'EXECUTING',
-    GoalStatus.STATUS_CANCELING: 'CANCELING',
-    GoalStatus.STATUS_SUCCEEDED: 'SUCCEEDED',
-    GoalStatus.STATUS_CANCELED: 'CANCELED',
-    GoalStatus.STATUS_ABORTED: 'ABORTED',
-}
-_ACTIVE = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING, GoalStatus.STATUS_CANCELING)
-_TERMINAL = (GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED)
-_FOLLOWING = {
-    None: (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_ABORTED),
-    GoalStatus.STATUS_ACCEPTED: (
-        *_ACTIVE,
-        GoalStatus.STATUS_CANCELED,
-        GoalStatus.STATUS_ABORTED,
-    ),
-    GoalStatus.STATUS_EXECUTING: (
-        GoalStatus.STATUS_EXECUTING,
-        GoalStatus.STATUS_CANCELING,
-        *_TERMINAL,
-    ),
-    GoalStatus.STATUS_CANCELING: (GoalStatus.STATUS_CANCELING, *_TERMINAL),
-}
-"""What may follow a status of a goal. None: it has had no status."""
+_NAMES: dict[int, str] = {state: state.name for state in GoalState if state}
 _STATUS_FIELDS = (
     'status',
     'goal_info.goal_id.uuid',
@@ -47,7 +24,6 @@ _STATUS_FIELDS = (
     'goal_info.stamp.nanosec',
 )
 _STAMP_FIELDS = ('header.stamp.sec', 'header.stamp.nanosec')
-_Stamp: TypeAlias = tuple[int, int]
 
 
 class _Goal(NamedTuple):
@@ -55,7 +31,7 @@ class _Goal(NamedTuple):
 
     publisher: Publisher
     uuid: bytes
-    stamp: _Stamp
+    stamp: Stamp
 
 
 @dataclass(frozen=True, repr=False)
@@ -92,9 +68,9 @@ class _StatusWatch(Watch):
         super().__init__(world)
         self._read = FieldReader(lambda _: _STATUS_FIELDS).read
         self._read_stamp = FieldReader(lambda _: _STAMP_FIELDS).read
-        self._last: dict[_Goal, int] = {}
+        self._last: dict[_Goal, GoalState] = {}
         self._active: dict[Publisher, _Goal] = {}
-        self._received: Counter[tuple[Node, _Stamp]] = Counter()
+        self._received: Counter[tuple[Node, Stamp]] = Counter()
         self._answered: Counter[_Goal] = Counter()
         world.expect(protocol.resolved(protocol.topic))
         self._topic = world.on_published(protocol.resolved(protocol.topic), self._on_status)
@@ -120,40 +96,40 @@ class _StatusWatch(Watch):
         self.note(self._topic, ': ', _NAMES.get(status, status), ' of ', name)
 
     def _check(self, goal: _Goal, status: int, name: str) -> None:
-        last = self._last.get(goal)
-        if last is None or self._is_new(goal, last):
-            last = None
+        last = self._last.get(goal, GoalState.UNKNOWN)
+        if last is GoalState.UNKNOWN or self._is_new(goal, last):
+            last = GoalState.UNKNOWN
             received = self._received[self.world.node_of(goal.publisher), goal.stamp]
             self._answered[goal] = min(self._answered[goal] + 1, received)
         if status in _NAMES:
-            self._last[goal] = status
-            self._check_active(goal, status, name)
-        if last in _TERMINAL:
+            self._last[goal] = GoalState(status)
+            self._check_active(goal, GoalState(status), name)
+        if last.ended:
             self.found(
                 f'{self._topic}: {_NAMES.get(status, status)} of {name}, which was '
-                f'{_NAMES[last]} already; allowed: nothing after that'
+                f'{last.name} already; allowed: nothing after that'
             )
-        elif status not in _FOLLOWING[last]:
-            before = 'as its first status' if last is None else f'after {_NAMES[last]}'
-            allowed = ', '.join(_NAMES[one] for one in _FOLLOWING[last])
+        elif status not in FOLLOWING[last]:
+            before = f'after {last.name}' if last else 'as its first status'
+            allowed = ', '.join(one.name for one in FOLLOWING[last])
             self.found(
                 f'{self._topic}: {_NAMES.get(status, status)} of {name} {before}; allowed: {allowed}'
             )
 
-    def _is_new(self, goal: _Goal, last: int) -> bool:
+    def _is_new(self, goal: _Goal, last: GoalState) -> bool:
         """Return whether a goal without an identifier was received again after its terminal status."""
         received = self._received[self.world.node_of(goal.publisher), goal.stamp]
-        return last in _TERMINAL and not any(goal.uuid) and received > self._answered[goal]
+        return last.ended and not any(goal.uuid) and received > self._answered[goal]
 
-    def _check_active(self, goal: _Goal, status: int, name: str) -> None:
+    def _check_active(self, goal: _Goal, status: GoalState, name: str) -> None:
         active = self._active.get(goal.publisher)
-        if status in _TERMINAL:
+        if status.ended:
             if active == goal:
                 del self._active[goal.publisher]
             return
-        if active not in (None, goal) and status == GoalStatus.STATUS_ACCEPTED:
+        if active not in (None, goal) and status is GoalState.ACCEPTED:
             self.found(
                 f'{self._topic}: ACCEPTED of {name}, while the goal before is '
-                f'{_NAMES[self._last[active]]}; allowed: after its terminal status'
+                f'{self._last[active].name}; allowed: after its terminal status'
             )
         self._active[goal.publisher] = goal

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from action_msgs.msg import GoalStatus
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep.world import Lockstep
+from diffdrive_jacobian.messages.goal_follower import UNSTAMPED, Stamp
+from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.numerics.fields import Name
-from diffdrive_jacobian.properties._messages import FieldReader
+from diffdrive_jacobian.properties._goals import read_status
 from diffdrive_jacobian.properties.base import Property, Watch
 
 
@@ -39,23 +40,17 @@ class NoStaleGoals(Property):
 class _StaleGoalWatch(Watch):
     def __init__(self, required: NoStaleGoals, world: Lockstep) -> None:
         super().__init__(world)
-        self._read = FieldReader(
-            lambda _: ('status', 'goal_info.stamp.sec', 'goal_info.stamp.nanosec')
-        ).read
-        self._newest: dict[Publisher, tuple[int, int]] = {}
+        self._newest: dict[Publisher, Stamp] = {}
         self._clock = world.now
         world.expect(required.resolved(required.topic))
         self._topic = world.on_published(required.resolved(required.topic), self._on_status)
 
     def _on_status(self, publisher: Publisher, message: Any) -> None:
-        fields = self._read(publisher.msg_type, message)
-        if fields is None or fields[0] != GoalStatus.STATUS_ACCEPTED:
+        status = read_status(publisher.msg_type, message)
+        if status is None or status.status != GoalState.ACCEPTED or status.stamp == UNSTAMPED:
             return
         self._follow_clock()
-        stamp = int(fields[1]), int(fields[2])
-        newest = self._newest.get(publisher, (0, 0))
-        if stamp == (0, 0):
-            return
+        stamp, newest = status.stamp, self._newest.get(publisher, UNSTAMPED)
         if stamp <= newest:
             self.found(
                 f'{self._topic}: ACCEPTED of the goal with stamp {_text(stamp)} s, after one with stamp '
@@ -75,5 +70,5 @@ class _StaleGoalWatch(Watch):
         self._clock = self.world.now
 
 
-def _text(stamp: tuple[int, int]) -> str:
+def _text(stamp: Stamp) -> str:
     return f'{stamp[0]}.{stamp[1]:09d}'

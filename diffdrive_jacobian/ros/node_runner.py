@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 from rclpy.context import Context
@@ -62,6 +62,42 @@ class NodeRunner(ABC):
         self._add(node)
         return node
 
+    def turns(
+        self,
+        *,
+        timeout: float = math.inf,
+        signals: Signals | None = None,
+        handled: int = 0,
+    ) -> Iterator[float]:
+        """Execute callbacks, and yield often, for a time or until a signal is caught.
+
+        It yields before the first callback, in real time after each one and several times a second, in
+        lockstep at each simulated time. It also ends when the context is shut down.
+
+        Args:
+            timeout: Longest time (s).
+            signals: Counter of the signals that end it. None: no signal does.
+            handled: Number of these signals that were caught before and do not end it.
+
+        Yields:
+            The time of the nodes, as `seconds` (s).
+        """
+        if not self._unknown_reported:
+            self._unknown_reported = True
+            report_unknown([node for node in self._nodes if isinstance(node, ParameterizedNode)])
+        deadline = self.seconds() + timeout
+        self.settle()
+        while True:
+            yield self.seconds()
+            if signals is not None and signals.count > handled:
+                return
+            if deadline < math.inf and self.seconds() > deadline:
+                return
+            try:
+                self._spin_once()
+            except ExternalShutdownException:
+                return
+
     def spin(
         self,
         until: Callable[[], bool],
@@ -70,33 +106,19 @@ class NodeRunner(ABC):
         signals: Signals | None = None,
         handled: int = 0,
     ) -> bool:
-        """Execute callbacks until a condition is true, for a time, or until a signal is caught.
+        """Execute callbacks until a condition is true, or as `turns` ends.
 
         Args:
-            until: The condition. It is called often: before the first callback, in real time after each
-                one, in lockstep at each simulated time.
-            timeout: Longest time (s).
-            signals: Counter of the signals that end it. None: no signal does.
-            handled: Number of these signals that were caught before and do not end it.
+            until: The condition. It is called often: as often as `turns` yields.
+            timeout: As for `turns`, as the other arguments.
+            signals: Counter of the signals that end it.
+            handled: Number of these signals that do not end it.
 
         Returns:
-            Whether the condition became true. False also if the context was shut down before.
+            Whether the condition became true.
         """
-        if not self._unknown_reported:
-            self._unknown_reported = True
-            report_unknown([node for node in self._nodes if isinstance(node, ParameterizedNode)])
-        deadline = self.seconds() + timeout
-        self.settle()
-        try:
-            while not until():
-                if signals is not None and signals.count > handled:
-                    return False
-                if deadline < math.inf and self.seconds() > deadline:
-                    return False
-                self._spin_once()
-        except ExternalShutdownException:
-            return False
-        return True
+        turns = self.turns(timeout=timeout, signals=signals, handled=handled)
+        return any(until() for _ in turns)
 
     @abstractmethod
     def settle(self) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from diffdrive_jacobian.errors import UserError
+from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.tools import _cli
@@ -104,7 +105,7 @@ def _report(result: GoalResult, options: argparse.Namespace) -> list[str]:
         Result.SENT: f'sent: goal ({options.x:g}, {options.y:g}) on {result.topic}',
         Result.NO_ANSWER: f'no answer: the controller published no goal_status within '
         f'{ANSWER_PATIENCE:g} s',
-        Result.ENDED: f'{_end(result)}{where}{_hint(result)}',
+        Result.ENDED: f'{result.status.word}{where}{_hint(result)}',
         Result.LOST: f'lost: {result.reason}{where}',
         Result.TIMEOUT: f'not arrived within --timeout {options.timeout:g} s{where}',
         Result.INTERRUPTED: 'interrupted: nothing was sent' if result.canceled is None else '',
@@ -115,28 +116,20 @@ def _report(result: GoalResult, options: argparse.Namespace) -> list[str]:
     if not result.canceled:
         stopped = 'the controller has not confirmed that it canceled: the robot may still drive'
     elif result.distance is None:
-        stopped = f'{_end(result)}: no odometry was received, so it is not known whether a robot drove'
+        stopped = (
+            f'{result.status.word}: no odometry was received, so it is not known whether a robot drove'
+        )
     else:
-        stopped = f'{_end(result)}: the robot was stopped'
+        stopped = f'{result.status.word}: the robot was stopped'
     return [line, stopped] if line else [stopped]
-
-
-def _end(result: GoalResult) -> str:
-    from action_msgs.msg import GoalStatus
-
-    return {
-        GoalStatus.STATUS_SUCCEEDED: 'arrived',
-        GoalStatus.STATUS_CANCELED: 'canceled',
-        GoalStatus.STATUS_ABORTED: 'aborted',
-    }.get(result.status, '')
 
 
 def _hint(result: GoalResult) -> str:
     return {
-        'aborted': " (the controller's log says why)",
-        'canceled': ' (by another process, by commands of another node, replaced by another goal, or '
-        'because the controller was shut down)',
-    }.get(_end(result), '')
+        GoalState.ABORTED: " (the controller's log says why)",
+        GoalState.CANCELED: ' (by another process, by commands of another node, replaced by another '
+        'goal, or because the controller was shut down)',
+    }.get(result.status, '')
 
 
 def _parser() -> _cli.Parser:

@@ -1,0 +1,176 @@
+"""The follower of goals agrees with what the controller did, for every short sequence of events."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import pytest
+
+from diffdrive_jacobian.messages.goal_follower import MAX_KNOWN, UNSTAMPED, Fate, GoalFollower
+from diffdrive_jacobian.messages.goal_status import ACTIVE, ENDED, FOLLOWING, GoalState
+
+ACCEPTED, EXECUTING = GoalState.ACCEPTED, GoalState.EXECUTING
+SUCCEEDED, CANCELED, ABORTED = ENDED
+A, B, C = (1, 0), (2, 0), (3, 0)
+
+
+class Controller:
+    """What a controller does with its goals, 0, 1, 2, ..., and which statuses it publishes."""
+
+    def __init__(self):
+        self.fates = []
+        self.active = None
+        self.executing = False
+        self.published = []
+
+    def take(self, event):
+        """Let something happen; return the statuses that are published, `(goal, state)`."""
+        self.published = []
+        if event == 'goal':
+            if self.active is not None:
+                self._end(CANCELED, Fate.REPLACED)
+            self.active, self.executing = len(self.fates), False
+            self.fates.append(Fate.ACTIVE)
+            self.published.append((self.active, ACCEPTED))
+        elif event == 'bad goal':
+            self.published.append((len(self.fates), ABORTED))
+            self.fates.append(Fate.REFUSED)
+            if self.active is not None:
+                self.published.append((self.active, EXECUTING if self.executing else ACCEPTED))
+        elif self.active is not None:
+            if event == 'odometry' and not self.executing:
+                self.executing = True
+                self.published.append((self.active, EXECUTING))
+            elif event == 'arrival':
+                self._end(SUCCEEDED, Fate.SUCCEEDED)
+            elif event == 'cancel':
+                self._end(CANCELED, Fate.CANCELED)
+            elif event == 'overflow':
+                self._end(ABORTED, Fate.ABORTED)
+        return self.published
+
+    def _end(self, state, fate):
+        self.published.append((self.active, state))
+        self.fates[self.active], self.active = fate, None
+
+
+EVENTS = ('goal', 'bad goal', 'odometry', 'arrival', 'cancel', 'overflow')
+
+
+def followed(events, *, stamped=True, early=False):
+    """Yield a controller and the goals as followed, after each event.
+
+    Args:
+        events: What happens.
+        stamped: Whether goals have different stamps.
+        early: Whether the statuses of a goal are received before it.
+    """
+    controller, follower, goals = Controller(), GoalFollower(), []
+    for event in events:
+        statuses = controller.take(event)
+        number = len(goals)
+        stamp = (number + 1, 0) if stamped else UNSTAMPED
+        sent = 'goal' in event
+        if sent and not early:
+            goals.append(follower.sent(number, stamp))
+        for goal, state in statuses:
+            follower.reported(state, (goal + 1, 0) if stamped else UNSTAMPED)
+        if sent and early:
+            goals.append(follower.sent(number, stamp))
+        yield controller, follower, goals
+
+
+@pytest.mark.parametrize('length', range(1, 5))
+def test_every_goal_has_the_fate_that_the_controller_gave_it(length):
+    for events in product(EVENTS, repeat=length):
+        for controller, follower, goals in followed(events):
+            driving = None if follower.driving is None else follower.driving.goal
+            assert driving == controller.active, events
+            assert [one.fate for one in goals] == controller.fates, events
+
+
+@pytest.mark.parametrize('length', range(1, 5))
+def test_statuses_may_be_received_before_their_goal(length):
+    for events in product(EVENTS, repeat=length):
+        for controller, follower, goals in followed(events, early=True):
+            driving = None if follower.driving is None else follower.driving.goal
+            assert driving == controller.active, events
+            # When the older goal ended, nothing was known of the later one.
+            fates = [Fate.CANCELED if one is Fate.REPLACED else one for one in controller.fates]
+            assert [one.fate for one in goals] == fates, events
+
+
+@pytest.mark.parametrize('length', range(1, 5))
+def test_goals_without_a_stamp_are_followed_in_their_order(length):
+    for events in product(EVENTS, repeat=length):
+        for controller, follower, goals in followed(events, stamped=False):
+            driving = None if follower.driving is None else follower.driving.goal
+            assert driving == controller.active, events
+            assert [one.fate for one in goals] == controller.fates, events
+
+
+@pytest.mark.parametrize(
+    ('events', 'expected'),
+    [
+        # A latched status of a goal that nobody here has sent.
+        ([(SUCCEEDED, A)], {}),
+        ([(EXECUTING, A)], {}),
+        # The latched status of another goal without a stamp is not that of a new one.
+        ([(SUCCEEDED, UNSTAMPED), ('x', UNSTAMPED)], {'x': Fate.WAITING}),
+        ([('x', UNSTAMPED), (EXECUTING, UNSTAMPED), (SUCCEEDED, UNSTAMPED), ('y', UNSTAMPED)],
+         {'x': Fate.SUCCEEDED, 'y': Fate.WAITING}),
+        # Its status is received before the next goal without a stamp.
+        ([('x', UNSTAMPED), (SUCCEEDED, UNSTAMPED), (ACCEPTED, UNSTAMPED), ('y', UNSTAMPED)],
+         {'x': Fate.SUCCEEDED, 'y': Fate.ACTIVE}),
+        # A status was lost.
+        ([('x', A), (EXECUTING, A)], {'x': Fate.ACTIVE}),
+        ([('x', A), (EXECUTING, A), ('y', B), (EXECUTING, B)], {'x': Fate.REPLACED, 'y': Fate.ACTIVE}),
+        ([('x', A), (CANCELED, A)], {'x': Fate.CANCELED}),
+        # Statuses that are no news, late, or of nobody.
+        ([('x', A), (0, A), (77, A), (-1, A)], {'x': Fate.WAITING}),
+        ([('x', A), (EXECUTING, A), (EXECUTING, B)], {'x': Fate.REPLACED}),
+        ([('x', A), (ACCEPTED, A), (CANCELED, A), (ACCEPTED, A)], {'x': Fate.ACTIVE}),
+        # The controller drives to the first goal until it answers the second one.
+        ([('x', A), (ACCEPTED, A), ('y', B), (SUCCEEDED, A)], {'x': Fate.SUCCEEDED, 'y': Fate.WAITING}),
+        ([('x', A), (ACCEPTED, A), ('y', B), (ABORTED, A)], {'x': Fate.REPLACED, 'y': Fate.WAITING}),
+        ([('x', A), (ACCEPTED, A), ('y', B), (ABORTED, B), (ABORTED, A)],
+         {'x': Fate.ABORTED, 'y': Fate.REFUSED}),
+        # Equal stamps: a goal that is replaced may be reported as ABORTED, too.
+        ([('x', A), (EXECUTING, A), ('y', A), (ABORTED, A), (ACCEPTED, A)],
+         {'x': Fate.REPLACED, 'y': Fate.ACTIVE}),
+        ([('x', A), (EXECUTING, A), ('y', A), (ABORTED, A), (EXECUTING, A)],
+         {'x': Fate.ACTIVE, 'y': Fate.REFUSED}),
+    ],
+)  # fmt: skip
+def test_fates(events, expected):
+    follower, goals = GoalFollower(), {}
+    for one, stamp in events:
+        if isinstance(one, str):
+            goals[one] = follower.sent(one, stamp)
+        else:
+            follower.reported(one, stamp)
+    assert {name: goal.fate for name, goal in goals.items()} == expected
+
+
+def test_each_change_of_a_fate_is_returned_once():
+    follower = GoalFollower()
+    goal = follower.sent('goal', A)
+    states = [ACCEPTED, ACCEPTED, EXECUTING, SUCCEEDED, SUCCEEDED]
+    changes = [follower.reported(state, A, time) for time, state in enumerate(states)]
+    assert changes == [goal, None, None, goal, None]
+    assert (goal.state, goal.since) == (SUCCEEDED, 4)
+
+
+def test_only_the_last_stamps_are_remembered():
+    follower = GoalFollower()
+    for second in range(10 * MAX_KNOWN):
+        follower.reported(EXECUTING, (second, 0))
+        follower.sent(second, (second, 1))
+    assert len(follower._goals) == MAX_KNOWN
+    assert follower.reported(SUCCEEDED, (10 * MAX_KNOWN - 1, 1)) is follower.newest
+
+
+def test_states_are_either_active_or_ended():
+    assert {*ACTIVE, *ENDED, GoalState.UNKNOWN} == set(GoalState) == set(FOLLOWING)
+    assert all(state.active != state.ended for state in GoalState if state)
+    assert not any(FOLLOWING[state] for state in ENDED)
