@@ -1,7 +1,9 @@
-"""Quality of service of recorded topics: the numbers in a journal, and rosbags' objects."""
+"""Quality of service of recorded topics: numbers, rosbags' objects, and the text in a file."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from io import StringIO
 from typing import Any
 
 from rosbags.interfaces import (
@@ -12,6 +14,8 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
+from rosbags.rosbag2.metadata import dump_qos_v9
+from ruamel.yaml import YAML
 
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -54,6 +58,13 @@ def from_rosbags(profile: Qos) -> dict[str, Any]:
         'liveliness': profile.liveliness.value,
         'liveliness_lease_duration': _nanoseconds(profile.liveliness_lease_duration),
     }
+
+
+def to_text(profiles: Iterable[dict[str, Any]]) -> str:
+    """Return profiles as rosbag2 writes them to MCAP files (YAML)."""
+    stream = StringIO()
+    YAML(typ='safe').dump(dump_qos_v9([to_rosbags(one) for one in profiles]), stream)
+    return stream.getvalue()
 
 
 def is_valid(fields: dict[str, Any]) -> bool:

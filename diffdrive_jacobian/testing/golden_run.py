@@ -6,7 +6,6 @@ import shlex
 from collections import defaultdict
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from rclpy.serialization import deserialize_message
 
 from diffdrive_jacobian.bags.bag_reader import BagError, custom_data, messages, open_bag
 from diffdrive_jacobian.bags.bag_writer import build_bag
-from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
+from diffdrive_jacobian.bags.journal import Channel, Message, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
 from diffdrive_jacobian.bags.qos import from_rosbags
 from diffdrive_jacobian.errors import DiffdriveError
@@ -194,9 +193,8 @@ def _store(bag: Path, target: Path, omitted: set[str]) -> None:
             for number, one in enumerate(connections)
         }
         texts = [Text(key, value) for key, value in custom_data(reader).items()]
-        records: list[Record] = [*channels.values(), *texts]
-        records += [
+        data = [
             Message(channels[connection.id].id, time, data)
             for connection, time, data in messages(reader, connections)
         ]
-    build_bag(partial(iter, records), target, 'mcap', replace=True, compressed=True)
+    build_bag(channels.values(), [*texts, *data], target, 'mcap', replace=True, compressed=True)

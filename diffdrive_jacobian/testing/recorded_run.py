@@ -6,7 +6,7 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
-from diffdrive_jacobian.bags.journal import journal_of
+from diffdrive_jacobian.bags.files import journal_of
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.plots.run_figure import draw
 from diffdrive_jacobian.reading import BagError, read_run
