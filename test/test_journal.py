@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_recover import LATCHED
 
 from diffdrive_jacobian.bags import journal, mcap
+from diffdrive_jacobian.bags.bounded_reader import parse_bounded_qos
 from diffdrive_jacobian.bags.files import journal_of
 from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
 from diffdrive_jacobian.recovery.salvage_mcap import Topic, read_mcap
@@ -20,10 +22,6 @@ CHANNELS = range(3)
 TIMES = st.integers(0, 2**63 - 1)
 MESSAGES = st.builds(Message, st.sampled_from(CHANNELS), TIMES, st.binary(max_size=60))
 TEXTS = st.builds(Text, st.text(), st.text())
-PROFILE = {
-    **{'history': 1, 'depth': 10, 'reliability': 1, 'durability': 2, 'deadline': 0, 'lifespan': 0},
-    **{'liveliness': 1, 'liveliness_lease_duration': 2**63 - 1},
-}
 
 
 def described(number, depth=10):
@@ -33,7 +31,7 @@ def described(number, depth=10):
         type_name='a_msgs/msg/A',
         definition='int32 a\n',
         type_hash='RIHS01_0',
-        qos=({**PROFILE, 'depth': depth},),
+        qos=(LATCHED._replace(depth=depth),),
     )
 
 
@@ -151,10 +149,10 @@ def test_a_large_message_has_a_chunk_of_its_own(tmp_path, monkeypatch):
     """A reader that refuses it still reads the others."""
     monkeypatch.setattr(journal, 'BLOCK', 1000)
     messages = [Message(0, 1, bytes(size)) for size in (10, 2000, 10, 600, 600, 10)]
-    data = written([messages])
+    data = written([[*messages[:2], described(0, depth=7), *messages[2:]]])
     assert read(data) == (messages, [])
     sizes = [end - start for start, end in zip(ends(data), ends(data)[1:], strict=False)]
-    assert [round(size, -2) for size in sizes[1:]] == [100, 2100, 1400, 100]
+    assert [round(size, -2) for size in sizes[1:]] == [100, 2100, 1700, 100]
 
 
 def test_profiles_that_are_offered_later_are_those_of_the_same_topic(tmp_path):
@@ -162,7 +160,8 @@ def test_profiles_that_are_offered_later_are_those_of_the_same_topic(tmp_path):
     found = list(read_mcap(BytesIO(data), pytest.fail, lambda doubt: None))
     topics = [one for one in found if isinstance(one, Topic) and one.name == '/topic_0']
     assert len({one.id for one in topics}) == len(topics) == 2
-    assert 'depth: 7' in topics[1].qos
+    profiles = [parse_bounded_qos(one.qos) for one in topics]
+    assert profiles == [[LATCHED._replace(depth=depth)] for depth in (10, 7)]
     assert [one.channel for one in found if isinstance(one, Message)] == [one.id for one in topics]
 
 

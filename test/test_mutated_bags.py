@@ -15,6 +15,7 @@ from rclpy.serialization import serialize_message
 from ros_messages import goal, joint_command, twist
 from ruamel.yaml import YAML
 from test_reading import SECOND, changed, odom, write_bag
+from test_recover import LATCHED
 
 from diffdrive_jacobian.bags import mcap
 from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
@@ -188,17 +189,13 @@ CHUNK_HEAD = 40
 
 def channel(number, topic, name):
     known = definition(name)
-    profile = {
-        **{'history': 1, 'depth': 10, 'reliability': 1, 'durability': 2, 'deadline': 0},
-        **{'lifespan': 0, 'liveliness': 1, 'liveliness_lease_duration': 0},
-    }
     return Channel(
         id=number,
         topic=topic,
         type_name=name,
         definition=known.text,
         type_hash=known.type_hash,
-        qos=(profile,),
+        qos=(LATCHED,),
     )
 
 

@@ -23,7 +23,6 @@ from diffdrive_jacobian.bags.files import is_journal
 from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
 from diffdrive_jacobian.bags.limits import MAX_MESSAGE
 from diffdrive_jacobian.bags.metadata import ROOT
-from diffdrive_jacobian.bags.qos import to_rosbags
 from diffdrive_jacobian.bags.scratch import REPLACED, scratch_directory, scratch_prefix
 from diffdrive_jacobian.bags.storage import STORAGES as STORAGES
 from diffdrive_jacobian.bags.storage import BagWriter
@@ -183,7 +182,7 @@ def _write(
                 channel.type_name,
                 msgdef=channel.definition,
                 rihs01=channel.type_hash,
-                offered_qos_profiles=[to_rosbags(fields) for fields in channel.qos],
+                offered_qos_profiles=channel.qos,
             )
             for channel in channels.values()
         }

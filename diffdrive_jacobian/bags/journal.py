@@ -19,10 +19,14 @@ import threading
 import zlib
 from contextlib import suppress
 from dataclasses import dataclass, field
+from io import StringIO
 from pathlib import Path
-from typing import Any
 
-from diffdrive_jacobian.bags import mcap, qos
+from rosbags.interfaces import Qos
+from rosbags.rosbag2.metadata import dump_qos_v9
+from ruamel.yaml import YAML
+
+from diffdrive_jacobian.bags import mcap
 from diffdrive_jacobian.bags.files import JOURNAL
 
 PARAMETERS = 'parameters of '
@@ -52,8 +56,8 @@ class Channel:
     type_name: str
     definition: str
     type_hash: str
-    qos: tuple[dict[str, Any], ...] = ()
-    """The QoS profiles that its publishers offered, with the keys of rosbag2."""
+    qos: tuple[Qos, ...] = ()
+    """The distinct profiles that its publishers offered."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,9 +127,11 @@ def _attachment(entry: Text) -> bytes:
 def _topic(number: int, channel: Channel) -> bytes:
     """Return the records that describe a topic and its type."""
     schema, index = mcap.number(number, 2), mcap.number(number, 2)
+    profiles = StringIO()
+    YAML(typ='safe').dump(dump_qos_v9(list(channel.qos)), profiles)
     texts = (channel.type_name, 'ros2msg', channel.definition)
     extra = {
-        'offered_qos_profiles': qos.to_text(channel.qos),
+        'offered_qos_profiles': profiles.getvalue(),
         'topic_type_hash': channel.type_hash,
     }
     return mcap.record(mcap.SCHEMA, schema, *map(mcap.text, texts)) + mcap.record(
@@ -179,8 +185,8 @@ class JournalWriter:
                 self._topics += 1
                 self._numbers[record.id] = self._topics
                 described = _topic(self._topics, record)
-                self._chunks[-1].add(described)
                 size = len(described)
+                self._chunk(size).add(described)
             else:
                 self._records.append(_attachment(record))
                 size = len(self._records[-1])
@@ -188,16 +194,20 @@ class JournalWriter:
             self.waiting += OVERHEAD + size
 
     def _add_message(self, message: Message) -> int:
-        """Add a message to the last chunk, or to a new one, and return its size."""
+        """Add a message, and return its size."""
         length, stamp = mcap.MESSAGE_HEAD.size + len(message.data), message.stamp
         number = self._messages + 1
         channel = self._numbers[message.channel]
         head = _MESSAGE.pack(mcap.MESSAGE, length, channel, number, stamp, stamp)
         self._messages = number
-        if self._chunks[-1].size >= BLOCK or length > BLOCK:
-            self._chunks.append(_Chunk())
-        self._chunks[-1].add_message(head, message.data, stamp)
+        self._chunk(length).add_message(head, message.data, stamp)
         return mcap.HEAD.size + length
+
+    def _chunk(self, size: int) -> _Chunk:
+        """Return the chunk of the next record, which has this size."""
+        if self._chunks[-1].size >= BLOCK or size > BLOCK:
+            self._chunks.append(_Chunk())
+        return self._chunks[-1]
 
     def flush(self) -> None:
         """Write all records to the operating system, where they survive the end of the process.

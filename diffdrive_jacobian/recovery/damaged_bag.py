@@ -13,9 +13,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from rosbags.interfaces import Qos
 from rosbags.rosbag2 import ReaderError
 
-from diffdrive_jacobian.bags import qos
 from diffdrive_jacobian.bags.bag_writer import STORAGES
 from diffdrive_jacobian.bags.bounded_reader import parse_bounded_qos
 from diffdrive_jacobian.bags.files import (
@@ -353,10 +353,17 @@ def _payload(data: bytes, budget: Budget) -> bytes | None:
     return data if len(data) > 4 and data[0] == 0 and data[1] <= LAST_ENCAPSULATION else None
 
 
-def _profiles(text: str) -> tuple[dict[str, Any], ...]:
-    """Return offered profiles that a bag can store from the text of rosbag2, () if it is invalid."""
+def _profiles(text: str) -> list[Qos]:
+    """Return the offered profiles in the text of rosbag2 that are valid."""
     try:
-        profiles = [qos.from_rosbags(one) for one in parse_bounded_qos(text)]
-        return tuple(one for one in profiles if qos.is_valid(one))
+        profiles = parse_bounded_qos(text)
     except (ReaderError, LookupError, TypeError, ValueError, AttributeError, *YAML_ERRORS):
-        return ()
+        return []
+    return [
+        one._replace(avoid_ros_namespace_conventions=False)
+        for one in profiles
+        if all(
+            type(number) is int and 0 <= number < 2**63
+            for number in (one.depth, *one.deadline, *one.lifespan, *one.liveliness_lease_duration)
+        )
+    ]

@@ -156,7 +156,7 @@ def read_mcap(file: BinaryIO, note: Note, doubt: Note) -> Iterator[Found]:
         pass
     file.seek(good)
     if good == size and opcode != mcap.FOOTER:
-        doubt('it does not end as it should: what its writer had not written by then is not in it')
+        doubt('it has no end: what its writer had not written yet is not in it')
     elif opcode != mcap.FOOTER or file.read(len(mcap.MAGIC) + 1) != mcap.MAGIC:
         note(f'it is cut off: the last {size - good} of its {size} bytes are not a complete record')
     check.finish()

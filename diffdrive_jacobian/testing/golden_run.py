@@ -15,7 +15,6 @@ from diffdrive_jacobian.bags.bag_reader import BagError, custom_data, messages, 
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import Channel, Message, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
-from diffdrive_jacobian.bags.qos import from_rosbags
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.messages.topics import CLOCK, OF_EVERY_NODE, TRANSFORMS
 from diffdrive_jacobian.numerics.fields import between
@@ -188,7 +187,7 @@ def _store(bag: Path, target: Path, omitted: set[str]) -> None:
                 type_name=one.msgtype,
                 definition=definition(one.msgtype).text,
                 type_hash=one.digest,
-                qos=tuple(from_rosbags(qos) for qos in getattr(one.ext, 'offered_qos_profiles', ())),
+                qos=tuple(getattr(one.ext, 'offered_qos_profiles', ())),
             )
             for number, one in enumerate(connections)
         }
