@@ -30,10 +30,10 @@ from diffdrive_jacobian.bags.journal import (
     Text,
 )
 from diffdrive_jacobian.bags.limits import MAX_MESSAGE
+from diffdrive_jacobian.bags.salvage_mcap import Topic, read_mcap
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.plots.output_files import names_by_time
 from diffdrive_jacobian.recording.journal_thread import CAPACITY, JournalThread
-from diffdrive_jacobian.recovery.salvage_mcap import Topic, read_mcap
 from diffdrive_jacobian.text import printable
 
 MAX_REASON = 500
