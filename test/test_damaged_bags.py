@@ -22,7 +22,8 @@ from test_reading import SECOND, odom, start, write_bag
 
 from diffdrive_jacobian.bags import metadata
 from diffdrive_jacobian.bags.bag_writer import build_bag
-from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, JournalWriter, Message, Text, journal_of
+from diffdrive_jacobian.bags.files import journal_of
+from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, JournalWriter, Message, Text
 from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.bags.metadata import MetadataError, check_connections, check_metadata
 from diffdrive_jacobian.bags.run_reader import read_run
@@ -366,12 +367,11 @@ def test_parameters_that_are_none_are_left_out_by_recover_run(tmp_path, capsys, 
         id=0, topic='/odom', type_name=known.name, definition=known.text, type_hash=known.type_hash
     )
     records = [
-        channel,
         Text(f'{PARAMETERS}/robot', text),
         Text(f'{PARAMETERS}/other', '{"kp": 3.0}'),
         *(Message(0, i * SECOND, serialize_message(odom(0, 0, 0, seconds=i))) for i in (1, 2)),
     ]
-    build_bag(lambda: records, tmp_path / 'bag', 'mcap')
+    build_bag([channel], records, tmp_path / 'bag', 'mcap')
     code, _, err = run(capsys, 'plot_run', tmp_path / 'bag')
     assert code == 2
     assert 'parameters of /robot' in err
@@ -472,7 +472,7 @@ def test_a_journal_beside_a_missing_bag_is_named(tmp_path, capsys, monkeypatch, 
     code, _, err = run(capsys, tool, 'my crash')
     assert code == 2
     assert 'there is no bag my crash, but the journal of an interrupted recording' in err
-    assert "`recover_run 'my crash.journal'` makes the bag of it" in err
+    assert "`recover_run 'my crash.journal.mcap'` makes the bag of it" in err
 
 
 @pytest.mark.parametrize('tool', ['plot_run', 'replay_run'])

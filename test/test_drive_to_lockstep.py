@@ -177,7 +177,7 @@ def test_a_full_disk_is_reported(tmp_path, capsys, monkeypatch):
     said = capsys.readouterr()
     assert 'drive_to: error: the recording was aborted: No space left on device' in said.err
     assert said.out.splitlines()[-1] == 'recorded in part: bag'
-    assert (tmp_path / 'bag.journal').exists()
+    assert (tmp_path / 'bag.journal.mcap').exists()
 
 
 def test_a_stuck_callback_fails_and_the_recording_is_kept(tmp_path, capsys, monkeypatch):

@@ -465,7 +465,7 @@ def test_recordings_go_to_the_directory_of_the_option_and_replace_those_of_befor
         pytester.runpytest_inprocess(*OPTIONS).assert_outcomes(failed=1)
         assert sorted(path.name for path in place.iterdir()) == ['run', 'run.png']
         # As a test leaves it that was killed.
-        (place / 'run.journal').touch()
+        (place / 'run.journal.mcap').touch()
     monkeypatch.delenv('FAIL')
     pytester.runpytest_inprocess(*OPTIONS).assert_outcomes(passed=1)
     assert not place.exists()

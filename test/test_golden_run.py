@@ -144,7 +144,7 @@ class Recorded:
         ]
         records = [Message(number, time, serialize_message(one)) for number, time, one in messages]
         self.bag = bag
-        build_bag(lambda: [*channels, *records], bag, 'mcap', replace=True)
+        build_bag(channels, records, bag, 'mcap', replace=True)
 
     def finish(self):
         return self.bag

@@ -64,7 +64,7 @@ def test_messages_of_another_definition_are_reported_and_not_misread(tmp_path, s
         )
     ]
     data = [Message(0, SECOND, serialize_message(odom(1.0, 2.0, 0.5)))]
-    build_bag(lambda: [*channels, *data], tmp_path / 'bag', storage)
+    build_bag(channels, data, tmp_path / 'bag', storage)
     run = read_run(tmp_path / 'bag')
     assert len(run.odometry) == 0
     assert run.skipped == {'/odom': 1}

@@ -7,7 +7,6 @@ import os
 import random
 import shutil
 import sqlite3
-import struct
 import zlib
 from contextlib import suppress
 
@@ -16,9 +15,10 @@ from rclpy.serialization import serialize_message
 from ros_messages import goal, joint_command, twist
 from ruamel.yaml import YAML
 from test_reading import SECOND, changed, odom, write_bag
+from test_recover import LATCHED
 
-from diffdrive_jacobian.bags import NotABagError, NothingToSaveError, recover
-from diffdrive_jacobian.bags.journal import MAGIC, JournalError, read_journal
+from diffdrive_jacobian.bags import NotABagError, NothingToSaveError, mcap, recover
+from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
 from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.bags.run_reader import BagError, read_run
 from diffdrive_jacobian.bags.time_series import commanded, limits, measured
@@ -27,7 +27,7 @@ from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.plots.run_figure import LABELS
 
-TYPED = (BagError, JournalError, NotABagError, NothingToSaveError, ParameterError)
+TYPED = (BagError, NotABagError, NothingToSaveError, ParameterError)
 VALUES = (
     *(None, True, 0, -1, 1, 7, 2**31, 2**63 - 1, 2**63, -(2**63), 10**30, 0.5, -0.0, 1e308),
     *(float('nan'), float('inf'), '', 'x', '/odom', '3', '\0', '\x1b[2J', 'a/b/c/d', '../..', 'é' * 300),
@@ -182,95 +182,107 @@ def test_mutated_cells_of_sqlite(bags, tmp_path):
 
 # --- Journals
 
-
-def frame(kind, payload):
-    return struct.pack('<cII', kind, len(payload), zlib.crc32(payload, ord(kind))) + payload
+CHUNK_HEAD = 40
+"""Length of the fields of a chunk before its records."""
 
 
 def channel(number, topic, name):
     known = definition(name)
-    return {
-        **{'id': number, 'topic': topic, 'type_name': name},
-        **{'definition': known.text, 'type_hash': known.type_hash},
-        'qos': [
-            {
-                **{'history': 1, 'depth': 10, 'reliability': 1, 'durability': 2, 'deadline': 0},
-                **{'lifespan': 0, 'liveliness': 1, 'liveliness_lease_duration': 0},
-            }
-        ],
-    }
+    return Channel(
+        id=number,
+        topic=topic,
+        type_name=name,
+        definition=known.text,
+        type_hash=known.type_hash,
+        qos=(LATCHED,),
+    )
 
 
-def journal_records():
-    """Return the records of a journal: kind, and content (JSON) or channel, time and data."""
-    yield b'T', {'key': 'storage', 'value': 'mcap'}
-    yield b'T', {'key': 'parameters of /go_to_goal', 'value': json.dumps({'kp': 3.0})}
-    yield b'C', channel(0, '/odom', 'nav_msgs/msg/Odometry')
-    yield b'C', channel(1, '/cmd_vel', 'geometry_msgs/msg/Twist')
+def write_journal(path, records):
+    writer = JournalWriter(path)
+    for record in records:
+        writer.add(record)
+    writer.flush()
+    writer.close()
+
+
+def journal_records(path):
+    """Return the records of a journal, without their heads: those outside of its chunk, those in it."""
+    records = [
+        Text('storage', 'mcap'),
+        Text('parameters of /go_to_goal', json.dumps({'kp': 3.0})),
+        channel(0, '/odom', 'nav_msgs/msg/Odometry'),
+        channel(1, '/cmd_vel', 'geometry_msgs/msg/Twist'),
+    ]
     for index in range(3):
         stamp = (1 + index) * SECOND
-        yield b'M', [0, stamp, serialize_message(odom(index, 0, 0, seconds=1 + index))]
-        yield b'M', [1, stamp, serialize_message(twist(0.5, 0.0))]
+        records.append(Message(0, stamp, serialize_message(odom(index, 0, 0, seconds=1 + index))))
+        records.append(Message(1, stamp, serialize_message(twist(0.5, 0.0))))
+    write_journal(path, records)
+    *outside, (_, chunk) = records_of(path.read_bytes()[len(mcap.MAGIC) :])
+    return outside, records_of(chunk[CHUNK_HEAD:])
 
 
-COUNT = len(list(journal_records()))
+def records_of(data):
+    found = []
+    while data:
+        opcode, length = mcap.HEAD.unpack_from(data)
+        end = mcap.HEAD.size + length
+        found.append([opcode, data[mcap.HEAD.size : end]])
+        data = data[end:]
+    return found
 
 
-def packed(kind, content):
-    if kind != b'M':
-        return json.dumps(content).encode()
-    number, stamp, data = content
-    return struct.pack('<Hq', number, stamp) + data
+def joined(outside, inside):
+    """Return a file in which all checksums are right."""
+    data = b''.join(mcap.record(*one) for one in inside)
+    size, crc = mcap.number(len(data), 8), mcap.number(zlib.crc32(data), 4)
+    chunk = (bytes(16), size, crc, mcap.text(''), size, data)
+    whole = [mcap.MAGIC]
+    for opcode, payload in outside:
+        right = mcap.number(zlib.crc32(payload[:-4]), 4)
+        payload = payload[:-4] + right if opcode == mcap.ATTACHMENT else payload
+        whole.append(mcap.record(opcode, payload))
+    return b''.join([*whole, mcap.record(mcap.CHUNK, *chunk)])
 
 
 def test_mutated_records_of_journals(tmp_path):
     chance = random.Random('journal')
-    path = tmp_path / 'run.journal'
+    good = journal_records(tmp_path / 'good.journal.mcap')
+    path = tmp_path / 'run.journal.mcap'
     results = []
-    for number in range(14):
-        records = [[kind, packed(kind, content)] for kind, content in journal_records()]
+    for number in range(30):
+        outside, inside = ([list(one) for one in part] for part in good)
         for _ in range(chance.choice((1, 1, 2, 3))):
+            records = chance.choice((outside, inside, inside))
             index = chance.randrange(len(records))
-            kind, content = list(journal_records())[index % COUNT]
+            payload = records[index][1]
             what = chance.random()
-            if what < 0.1:
-                records[index][0] = chance.choice((b'C', b'T', b'M'))
-            elif what < 0.2:
-                records[index][1] = chance.choice(
-                    (b'', b'{', b'[' * 5000, b'null', b'3', b'"\\ud800"', b'\xff', chance.randbytes(50))
-                )
+            if what < 0.2:
+                records[index][0] = chance.choice(mcap.OPCODES)
             elif what < 0.3:
+                records[index][1] = chance.choice((b'', b'\xff', chance.randbytes(50), payload[:-3]))
+            elif what < 0.4:
                 records.insert(index, list(chance.choice(records)))
-            elif kind == b'M':
-                content[0] = chance.choice((0, 1, 2, 65535))
-                content[1] = chance.choice((0, -1, 2**63 - 1, -(2**63), content[1]))
-                content[2] = chance.choice((b'', b'\0', b'\0\1\0\0', chance.randbytes(300), content[2]))
-                records[index] = [kind, packed(kind, content)]
             else:
-                whole = [content]
-                mutate(whole, chance)
-                if chance.random() < 0.2 and isinstance(content, dict):
-                    content[chance.choice(list(content) or ['x'])] = '\ud800'
-                records[index] = [kind, json.dumps(whole[0] if whole else None).encode()]
-        path.write_bytes(MAGIC + b''.join(frame(*one) for one in records))
-        results.append(attempt(lambda: list(read_journal(path))))
-        check(path, tmp_path, number)
+                place = chance.randrange(len(payload) - 1)
+                value = chance.choice((b'\0', b'\xff', b'\xed\xa0\x80', chance.randbytes(2)))
+                records[index][1] = payload[:place] + value + payload[place + len(value) :]
+        path.write_bytes(joined(outside, inside))
+        assert not check(path, tmp_path, number)
+        results.append(attempt(recover, path, tmp_path / f'recovered{number}'))
     assert {True, False} <= set(results)
 
 
-@pytest.mark.parametrize('kind', [b'C', b'T'])
-@pytest.mark.parametrize(
-    'payload', [b'', b'{', b'null', b'[1]', b'{}', b'{"key": 3, "value": "x"}', b'[' * 5000, b'\xff']
-)
-def test_an_invalid_record_with_a_right_checksum_is_left_out(tmp_path, kind, payload):
-    good = [frame(one, packed(one, content)) for one, content in journal_records()]
-    path = tmp_path / 'run.journal'
-    path.write_bytes(MAGIC + b''.join([*good[:6], frame(kind, payload), *good[6:]]))
-    with pytest.raises(JournalError, match=r'run\.journal is damaged at byte \d+: '):
-        list(read_journal(path))
+@pytest.mark.parametrize('opcode', [mcap.SCHEMA, mcap.CHANNEL, mcap.MESSAGE])
+@pytest.mark.parametrize('payload', [b'', b'\xff', b'\1\0', 40 * b'\xff'])
+def test_an_invalid_record_with_a_right_checksum_is_reported(tmp_path, opcode, payload):
+    outside, inside = journal_records(tmp_path / 'good.journal.mcap')
+    path = tmp_path / 'run.journal.mcap'
+    path.write_bytes(joined(outside, [*inside[:8], [opcode, payload], *inside[8:]]))
     report = recover(path)
-    assert report.lost[0].startswith('run.journal: 1 records are invalid, the first: the record at byte')
-    assert report.summary.topics == {'/odom': 3, '/cmd_vel': 3}
+    assert any('of a chunk are not complete records' in one or 'no known' in one for one in report.lost)
+    assert report.summary.messages >= 4
 
 
 def test_mutated_messages(tmp_path):
@@ -292,13 +304,12 @@ def test_mutated_messages(tmp_path):
 
 def write_raw(path, messages):
     names = {topic: type(message) for _, topic, message in sent()}
-    journal = path.with_name(f'{path.name}.journal')
-    with open(journal, 'wb') as file:
-        file.write(MAGIC)
-        for number, (topic, kind) in enumerate(names.items()):
-            name = f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}'
-            file.write(frame(b'C', json.dumps(channel(number, topic, name)).encode()))
-        for topic, stamp, data in messages:
-            file.write(frame(b'M', packed(b'M', [list(names).index(topic), stamp, data])))
+    journal = path.with_name(f'{path.name}.journal.mcap')
+    channels = {
+        topic: channel(number, topic, f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}')
+        for number, (topic, kind) in enumerate(names.items())
+    }
+    data = [Message(channels[topic].id, stamp, data) for topic, stamp, data in messages]
+    write_journal(journal, [*channels.values(), *data])
     recover(journal, path)
     return path

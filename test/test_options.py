@@ -276,9 +276,9 @@ def test_a_bag_replaces_another_one_only_if_asked(robots, tmp_path):
     from diffdrive_jacobian.bags.journal import Text
 
     target = tmp_path / 'run'
-    build_bag(lambda: [Text('a', 'old')], target, 'mcap')
+    build_bag([], [Text('a', 'old')], target, 'mcap')
     with pytest.raises(FileExistsError, match='exists already'):
-        build_bag(lambda: [Text('a', 'new')], target, 'mcap')
+        build_bag([], [Text('a', 'new')], target, 'mcap')
     before = (target / 'metadata.yaml').read_text()
 
     def failing():
@@ -286,15 +286,17 @@ def test_a_bag_replaces_another_one_only_if_asked(robots, tmp_path):
         raise OSError('the disk is full')
 
     with pytest.raises(OSError, match='the disk is full'):
-        build_bag(failing, target, 'mcap', replace=True)
+        build_bag([], failing(), target, 'mcap', replace=True)
     assert (target / 'metadata.yaml').read_text() == before
-    build_bag(lambda: [Text('a', 'new')], target, 'sqlite3', replace=True)
+    build_bag([], [Text('a', 'new')], target, 'sqlite3', replace=True)
     assert 'new' in (target / 'metadata.yaml').read_text()
     assert sorted(one.name for one in target.iterdir()) == ['metadata.yaml', 'run.db3']
     assert list(tmp_path.iterdir()) == [target]
 
 
-@pytest.mark.parametrize('content', [(), ('notes.txt',), ('metadata.yaml', 'thesis.tex')])
+@pytest.mark.parametrize(
+    'content', [(), ('notes.txt',), ('metadata.yaml', 'thesis.tex'), ('other.journal.mcap',)]
+)
 def test_a_directory_that_is_no_bag_is_never_replaced(tmp_path, content):
     from diffdrive_jacobian.recording.record import open_recording
 

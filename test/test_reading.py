@@ -60,7 +60,7 @@ def write_bag(path, sent, *, parameters=None, storage='mcap'):
         received = round(seconds * SECOND)
         data.append(Message(channels[topic, name].id, received, serialize_message(message)))
     texts = [Text(PARAMETERS + node, json.dumps(values)) for node, values in (parameters or {}).items()]
-    build_bag(lambda: [*channels.values(), *texts, *data], path, storage)
+    build_bag(channels.values(), [*texts, *data], path, storage)
     return path
 
 
@@ -378,7 +378,7 @@ def test_a_message_that_cannot_be_decoded_is_skipped_and_counted(tmp_path, data)
         id=0, topic='/odom', type_name=known.name, definition=known.text, type_hash=known.type_hash
     )
     good = Message(0, SECOND, serialize_message(odom(1, 2, 0)))
-    build_bag(lambda: [channel, good, Message(0, SECOND, data), good], tmp_path / 'bag', 'mcap')
+    build_bag([channel], [good, Message(0, SECOND, data), good], tmp_path / 'bag', 'mcap')
     run = read_run(tmp_path / 'bag')
     assert run.odometry.values[:, 0].tolist() == [1.0, 1.0]
     assert run.skipped == {'/odom': 1}
@@ -387,7 +387,7 @@ def test_a_message_that_cannot_be_decoded_is_skipped_and_counted(tmp_path, data)
 
 @pytest.mark.parametrize('text', ['', '{', '[1, 2]', '3'])
 def test_parameters_that_are_none_are_told(tmp_path, text):
-    build_bag(lambda: [Text(f'{PARAMETERS}/robot', text)], tmp_path / 'bag', 'mcap')
+    build_bag([], [Text(f'{PARAMETERS}/robot', text)], tmp_path / 'bag', 'mcap')
     with pytest.raises(BagError, match='bag'):
         read_run(tmp_path / 'bag')
 

@@ -18,8 +18,9 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 from std_msgs.msg import Header, String
+from test_recover import read_journal
 
-from diffdrive_jacobian.bags.journal import JournalWriter, Message, read_journal
+from diffdrive_jacobian.bags.journal import JournalWriter, Message
 from diffdrive_jacobian.recording.record import Status
 from diffdrive_jacobian.ros.runner import discovery_off, ros_context
 from diffdrive_jacobian.signals import Signals
@@ -109,7 +110,7 @@ def test_the_bag_contains_the_messages_that_were_sent(world, bag, storage):
         assert _digest(found[f'/{topic}']) == _digest(sent)
     told = metadata(bag)
     assert (told['version'], told['storage_identifier'], told['message_count']) == (9, storage, 602)
-    assert not bag.with_name('bag.journal').exists()
+    assert not bag.with_name('bag.journal.mcap').exists()
     assert recorder.last_line.startswith(f'{bag} is complete: 602 messages in ')
     store = get_typestore(Stores.ROS2_JAZZY)
     with Reader(bag) as reader:
@@ -144,7 +145,7 @@ def test_a_latched_message_is_recorded_beside_a_publisher_that_is_not_latched(wo
 
 def _arrived(bag, messages):
     """Whether so many messages are in the journal."""
-    journal = bag.with_name('bag.journal')
+    journal = bag.with_name('bag.journal.mcap')
     # To parse it in each round would take all the time that there is.
     if not journal.exists() or journal.stat().st_size < messages * 50:
         return False
@@ -174,7 +175,8 @@ def test_parameters_of_the_nodes_are_kept(world, bag):
     world.start('virtual_robot', '--ros-args', '-p', 'wheel_radius:=0.05')
     recorder = world.start('record_run', '-o', str(bag))
     world.harness.until(
-        lambda: b'parameters of /virtual_robot' in _bytes(bag.with_name('bag.journal')), 'parameters'
+        lambda: b'parameters of /virtual_robot' in _bytes(bag.with_name('bag.journal.mcap')),
+        'parameters',
     )
     recorder.signal(signal.SIGINT)
     assert recorder.exit() == 0
@@ -252,7 +254,7 @@ def test_topics_are_selected_and_time_is_limited(world, bag):
     [
         (['-o', 'taken'], 'cannot record to taken: taken exists already'),
         (['-o', 'nowhere/bag'], 'cannot record to nowhere/bag: no such file or directory'),
-        (['-o', 'begun'], 'recover_run begun.journal writes the bag'),
+        (['-o', 'begun'], 'recover_run begun.journal.mcap writes the bag'),
         (['-e', '('], "must be a regular expression, got '('"),
         (['-s', 'rosbag1'], 'invalid choice'),
         (['--max-duration', '-1'], 'must be positive'),
@@ -265,7 +267,7 @@ def test_wrong_arguments_are_reported_and_no_file_is_changed(
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'taken').mkdir()
-    JournalWriter(tmp_path / 'begun.journal').close()
+    JournalWriter(tmp_path / 'begun.journal.mcap').close()
     before = sorted(tmp_path.iterdir())
     with pytest.raises(SystemExit) as caught:
         raise SystemExit(record_run.main(arguments, Signals()))

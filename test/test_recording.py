@@ -15,22 +15,23 @@ from pathlib import Path
 
 import pytest
 from ruamel.yaml import YAML
+from test_recover import read_journal
 
 from diffdrive_jacobian import bounded_yaml
 from diffdrive_jacobian.bags import bag_reader, bounded_reader, journal, limits
 from diffdrive_jacobian.bags import bag_writer as building
 from diffdrive_jacobian.bags.bag_reader import open_bag
+from diffdrive_jacobian.bags.bounded_reader import BoundedReader
+from diffdrive_jacobian.bags.files import journal_of
 from diffdrive_jacobian.bags.journal import (
     LEFT_OUT,
     PARAMETERS,
     Channel,
     Message,
     Text,
-    journal_of,
-    read_journal,
 )
 from diffdrive_jacobian.bags.message_definitions import definition
-from diffdrive_jacobian.bags.storage import BagReader, BagWriter, StoragePlugin
+from diffdrive_jacobian.bags.storage import BagWriter, StoragePlugin
 from diffdrive_jacobian.recording import recording as recordings
 from diffdrive_jacobian.recording.journal_thread import JournalThread
 from diffdrive_jacobian.recording.recording import LOST, MAX_LEFT_OUT, Recording, RecordingError
@@ -70,7 +71,7 @@ def add_all(recording, *records):
 
 def content(bag):
     """The messages of a bag in their order."""
-    reader = BagReader(bag)
+    reader = BoundedReader(bag)
     reader.open()
     try:
         return [bytes(data) for _, _, data in reader.messages(reader.connections)]
@@ -79,10 +80,10 @@ def content(bag):
 
 
 def custom_data(bag):
-    reader = BagReader(bag)
+    reader = BoundedReader(bag)
     reader.open()
     try:
-        return dict(reader.metadata.custom)
+        return dict(reader.storage.metadata.custom)
     finally:
         reader.close()
 
@@ -179,11 +180,28 @@ def test_the_journal_stays_if_the_bag_reads_back_otherwise(tmp_path, monkeypatch
     recording = Recording(tmp_path / 'run', storage)
     add_all(recording, channel(), *messages(20))
     with pytest.raises(
-        RecordingError, match=r'what was read back .* recover_run .*run\.journal'
+        RecordingError, match=r'what was read back .* recover_run .*run\.journal\.mcap'
     ) as caught:
         recording.finish()
     assert caught.value.summary is None
-    assert os.listdir(tmp_path) == ['run.journal']
+    assert os.listdir(tmp_path) == ['run.journal.mcap']
+
+
+def test_the_journal_stays_if_it_was_altered_on_the_disk(tmp_path):
+    recording = Recording(tmp_path / 'run', 'mcap')
+    add_all(recording, channel(), *messages(20))
+    until(lambda: recording.journal.waiting == 0, 'all is written')
+    path = journal_of(tmp_path / 'run')
+    place = path.read_bytes().index(messages(20)[7].data)
+    with open(path, 'r+b') as file:
+        file.seek(place + 10)
+        file.write(b'!')
+    with pytest.raises(
+        RecordingError, match=r'is damaged: its messages may be altered.* is kept'
+    ) as caught:
+        recording.finish()
+    assert caught.value.summary.messages == 20
+    assert path.exists()
 
 
 def test_a_folder_of_the_user_stays(tmp_path):
@@ -352,7 +370,7 @@ def test_finish_raises_if_the_bag_cannot_be_written(tmp_path):
     add_all(recording, channel(), *messages(10))
     (tmp_path / 'run').write_text('somebody else came first')
     with pytest.raises(
-        RecordingError, match=r'run exists already.*recover_run .*run\.journal'
+        RecordingError, match=r'run exists already.*recover_run .*run\.journal\.mcap'
     ) as caught:
         recording.finish()
     assert caught.value.summary is None
@@ -369,7 +387,7 @@ def _replace(folder):
 
 
 def _rename(folder):
-    journal_of(folder / 'run').rename(folder / 'elsewhere.journal')
+    journal_of(folder / 'run').rename(folder / 'elsewhere.journal.mcap')
 
 
 def _remove_folder(folder):
@@ -421,9 +439,9 @@ def test_discarding_keeps_a_file_of_another_process(tmp_path):
 def test_the_thread_syncs(tmp_path, monkeypatch):
     synced, sync = [], os.fsync
     monkeypatch.setattr(journal.os, 'fsync', lambda descriptor: synced.append(sync(descriptor)))
-    writer = journal.JournalWriter(tmp_path / 'x.journal')
+    writer = journal.JournalWriter(tmp_path / 'x.journal.mcap')
     thread = JournalThread(writer)
-    thread.add(messages(1)[0])
+    thread.add(channel())
     until(lambda: synced, 'it is synced')
     thread.close()
     writer.close()
@@ -463,9 +481,9 @@ def test_a_topic_that_is_left_out_is_reported_after_a_crash(tmp_path, capsys):
         lambda: any(isinstance(one, Text) and one.key == LEFT_OUT for one in read_journal(noted)),
         'noted',
     )
-    shutil.copy(noted, tmp_path / 'crashed.journal')
+    shutil.copy(noted, tmp_path / 'crashed.journal.mcap')
     recording.discard()
-    recover_run([str(tmp_path / 'crashed.journal')], Signals())
+    recover_run([str(tmp_path / 'crashed.journal.mcap')], Signals())
     assert 'lost: /odom was not recorded: it has several types' in capsys.readouterr().out
 
 
@@ -484,7 +502,9 @@ def test_custom_data_that_readers_would_refuse_stays_in_the_journal(
         for index in range(4)
     }
     add_all(recording, channel(), *messages(3), *(Text(*one) for one in large.items()))
-    with pytest.raises(RecordingError, match=r'robot_3.*too large.*run\.journal is kept') as caught:
+    with pytest.raises(
+        RecordingError, match=r'robot_3.*too large.*run\.journal\.mcap is kept'
+    ) as caught:
         recording.finish()
     assert caught.value.summary.messages == 3
     with open_bag(tmp_path / 'run') as reader:
@@ -505,9 +525,17 @@ def test_a_message_that_readers_would_refuse_stays_in_the_journal(
     for module in (bounded_reader, limits):
         monkeypatch.setattr(module, 'MAX_RECORD', 5_000_000)
     for module in (building, recordings):
-        monkeypatch.setattr(module, 'MAX_MESSAGE', 3_000_000, raising=False)
+        monkeypatch.setattr(module, 'MAX_MESSAGE', 3_000_000)
+    monkeypatch.setattr(journal, 'BLOCK', 1_000_000)
     recording = Recording(tmp_path / 'run', storage)
-    add_all(recording, channel(), *messages(1), *messages(2, size=6_000_000), *messages(1))
+    add_all(
+        recording,
+        channel(),
+        *messages(1),
+        *messages(1, size=4_000_000),
+        *messages(1, size=6_000_000),
+        *messages(1),
+    )
     with pytest.raises(RecordingError, match=r'/cmd_vel: 2 messages larger than 3\.0 MB') as caught:
         recording.finish()
     summary = caught.value.summary
@@ -517,7 +545,9 @@ def test_a_message_that_readers_would_refuse_stays_in_the_journal(
         assert len(list(bag_reader.messages(reader, reader.connections))) == 2
     arguments = [str(journal_of(tmp_path / 'run')), '-o', str(tmp_path / 'again')]
     assert recover_run(arguments, Signals()) == 1
-    assert '/cmd_vel: 2 messages larger than 3.0 MB' in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert '/cmd_vel: 1 messages larger than 3.0 MB' in out
+    assert 'it unpacks to 6.0 MB; at most 5.0 MB are read' in out
 
 
 @pytest.mark.parametrize('storage', STORAGES)

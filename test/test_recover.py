@@ -14,8 +14,10 @@ import pytest
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
-from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text, journal_of
+from diffdrive_jacobian.bags.files import journal_of
+from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Text
 from diffdrive_jacobian.bags.message_definitions import definition
+from diffdrive_jacobian.bags.salvage_mcap import read_mcap
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.recover_run import main
 
@@ -102,6 +104,12 @@ def write_journal(bag, messages, storage='mcap'):
     writer.flush()
     writer.close()
     return writer.path
+
+
+def read_journal(path):
+    """Give what is in a journal so far: topics, messages and custom data."""
+    with open(path, 'rb') as file:
+        return list(read_mcap(file, lambda loss: None, lambda doubt: None))
 
 
 def read_bag(path):
@@ -272,7 +280,7 @@ def test_a_write_ahead_log(tmp_path, capsys, messages):
 # --- The journal of record_run
 
 
-@pytest.mark.parametrize('given', ['run', 'run.journal'])
+@pytest.mark.parametrize('given', ['run', 'run.journal.mcap'])
 @pytest.mark.parametrize('storage', PLUGINS)
 def test_a_journal(tmp_path, capsys, messages, storage, given):
     journal = write_journal(tmp_path / 'run', messages, storage)
@@ -281,7 +289,7 @@ def test_a_journal(tmp_path, capsys, messages, storage, given):
     before = contents(tmp_path)
     code, out, err = recover(capsys, tmp_path / given)
     assert (code, err) == (0, '')
-    assert 'lost: run.journal is cut off: its last 3 bytes are not a record' in out
+    assert 'lost: run.journal.mcap: it is cut off: the last 3 of its ' in out
     assert read_bag(tmp_path / 'run') == messages
     assert (tmp_path / 'run' / ('run.mcap' if storage == 'mcap' else 'run.db3')).exists()
     assert contents(tmp_path) == before
@@ -291,13 +299,13 @@ def test_an_empty_journal(tmp_path, capsys):
     write_journal(tmp_path / 'run', [])
     code, out, err = recover(capsys, tmp_path / 'run')
     assert (code, out) == (1, '')
-    assert err == f'recover_run: {tmp_path}/run.journal holds no message that can be saved\n'
-    assert os.listdir(tmp_path) == ['run.journal']
+    assert err == f'recover_run: {tmp_path}/run.journal.mcap holds no message that can be saved\n'
+    assert os.listdir(tmp_path) == ['run.journal.mcap']
 
 
 def test_losses_that_the_recorder_noted_are_reported(tmp_path, capsys):
     """They are in the custom data, and a bag with them is not one without losses."""
-    writer = JournalWriter(tmp_path / 'run.journal')
+    writer = JournalWriter(tmp_path / 'run.journal.mcap')
     known = definition('geometry_msgs/msg/Twist')
     writer.add(Text('messages lost', '{"/odom": 12}'))
     writer.add(
@@ -313,7 +321,7 @@ def test_losses_that_the_recorder_noted_are_reported(tmp_path, capsys):
     writer.add(Text('messages lost', '{"/odom": 12, "/cmd_vel": 3}'))
     writer.flush()
     writer.close()
-    code, out, _ = recover(capsys, tmp_path / 'run.journal')
+    code, out, _ = recover(capsys, tmp_path / 'run.journal.mcap')
     assert code == 0
     assert 'lost: 3 messages on /cmd_vel while it was recorded\n' in out
     assert 'lost: 12 messages on /odom while it was recorded\n' in out

@@ -34,13 +34,14 @@ def test_what_is_no_bag(tmp_path, capsys):
     (tmp_path / 'empty').mkdir()
     (tmp_path / 'other').mkdir()
     (tmp_path / 'other' / 'notes.txt').write_text('no bag')
-    (tmp_path / 'fake.journal').write_text('no journal')
+    (tmp_path / 'others').mkdir()
+    write_journal(tmp_path / 'others' / 'run', [])
     for name, words in {
-        'nothing': ('there is no bag', 'nothing.journal'),
+        'nothing': ('there is no bag', 'nothing.journal.mcap'),
+        'others': ('holds neither .mcap nor .db3 files',),
         'empty': ('is an empty folder',),
         'other': ('holds neither .mcap nor .db3 files',),
-        'other/notes.txt': ('is neither MCAP nor SQLite nor a journal',),
-        'fake.journal': ('is not a journal',),
+        'other/notes.txt': ('is neither MCAP nor SQLite',),
     }.items():
         assert_refused(capsys, tmp_path, [tmp_path / name], 2, *words)
 

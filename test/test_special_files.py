@@ -51,7 +51,7 @@ def test_data_file(bag, kind):
         recover(bag)
 
 
-@pytest.mark.parametrize('name', ['run', 'run.mcap', 'run.db3', 'run.journal'])
+@pytest.mark.parametrize('name', ['run', 'run.mcap', 'run.db3', 'run.journal.mcap'])
 def test_whole_bag(tmp_path, name):
     os.mkfifo(tmp_path / name)
     for function in (read_run, recover):
@@ -62,7 +62,7 @@ def test_whole_bag(tmp_path, name):
 
 
 def test_journal_beside_a_missing_bag(tmp_path):
-    os.mkfifo(tmp_path / 'run.journal')
+    os.mkfifo(tmp_path / 'run.journal.mcap')
     for function in (read_run, recover):
         with pytest.raises((BagError, NotABagError), match='there is no bag'):
             function(tmp_path / 'run')

@@ -168,7 +168,7 @@ def test_a_bag_is_recovered_without_ros(tmp_path, bag):
 
 def test_a_journal_is_recovered_without_ros(tmp_path):
     """Of types that are not known the messages are saved, and reported as not checked."""
-    writer = JournalWriter(tmp_path / 'run.journal')
+    writer = JournalWriter(tmp_path / 'run.journal.mcap')
     mine = Channel(
         id=0, topic='/x', type_name='a_msgs/msg/A', definition='int32 a\n', type_hash='RIHS01_0'
     )
@@ -183,7 +183,7 @@ def test_a_journal_is_recovered_without_ros(tmp_path):
         writer.add(record)
     writer.flush()
     writer.close()
-    ended = run('recover_run', tmp_path / 'run.journal')
+    ended = run('recover_run', tmp_path / 'run.journal.mcap')
     assert (ended.returncode, ended.stderr) == (0, '')
     assert 'the 1 messages on /x were not checked' in ended.stdout
     assert '1 of 2 messages on /odom cannot be decoded' in ended.stdout

@@ -13,8 +13,8 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
 from diffdrive_jacobian.bags.bounded_reader import BoundedReader
-from diffdrive_jacobian.bags.files import is_recoverable
-from diffdrive_jacobian.bags.journal import PARAMETERS, journal_of
+from diffdrive_jacobian.bags.files import is_recoverable, journal_of
+from diffdrive_jacobian.bags.journal import PARAMETERS
 from diffdrive_jacobian.bags.metadata import (
     MetadataError,
     check_connections,

@@ -7,7 +7,7 @@ import os
 import sqlite3
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from io import StringIO
@@ -19,10 +19,10 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 from ruamel.yaml import YAML
 
 from diffdrive_jacobian.bags.bag_reader import BagError, DamagedBagError, messages, open_bag
+from diffdrive_jacobian.bags.files import is_journal
 from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
 from diffdrive_jacobian.bags.limits import MAX_MESSAGE
 from diffdrive_jacobian.bags.metadata import ROOT
-from diffdrive_jacobian.bags.qos import to_rosbags
 from diffdrive_jacobian.bags.scratch import REPLACED, scratch_directory, scratch_prefix
 from diffdrive_jacobian.bags.storage import STORAGES as STORAGES
 from diffdrive_jacobian.bags.storage import BagWriter
@@ -96,13 +96,16 @@ def _is_nothing_but_a_bag(path: Path) -> bool:
         return False
     files = list(path.iterdir())
     return bool(files) and all(
-        file.is_file() and (file.name == 'metadata.yaml' or file.suffix in BAG_SUFFIXES)
+        file.is_file()
+        and (file.name == 'metadata.yaml' or file.suffix in BAG_SUFFIXES)
+        and not is_journal(file)
         for file in files
     )
 
 
 def build_bag(
-    records: Callable[[], Iterable[Record]],
+    channels: Iterable[Channel],
+    records: Iterable[Record],
     target: Path,
     storage: str,
     *,
@@ -114,7 +117,8 @@ def build_bag(
     Messages and custom data that exceed the limits of the readers are left out.
 
     Args:
-        records: Returns all records, with each call from the beginning.
+        channels: The topics, each with all its profiles.
+        records: The messages and the custom data. Channels among them are not used.
         target: The bag's directory.
         storage: `mcap` or `sqlite3`.
         replace: Whether it may replace another bag, which stays until the new one is complete.
@@ -125,11 +129,10 @@ def build_bag(
         OSError: It cannot be written, or is not read back as it was written. It is removed then.
     """
     check_target(target, storage, replace=replace)
-    channels = {record.id: record for record in records() if isinstance(record, Channel)}
     with scratch_directory(target) as scratch:
         # The directory has the final name, after which rosbags names the files.
         bag = scratch / target.name
-        summary, written = _write(records(), channels, bag, storage, compressed)
+        summary, written = _write(records, {one.id: one for one in channels}, bag, storage, compressed)
         if _contents(bag) != written:
             raise OSError(errno.EIO, 'what was read back from it is not what was written to it')
         for path in bag.iterdir():
@@ -179,7 +182,7 @@ def _write(
                 channel.type_name,
                 msgdef=channel.definition,
                 rihs01=channel.type_hash,
-                offered_qos_profiles=[to_rosbags(fields) for fields in channel.qos],
+                offered_qos_profiles=channel.qos,
             )
             for channel in channels.values()
         }
@@ -208,15 +211,20 @@ def _write(
             raise OSError(errno.EIO, str(error)) from error
         raise
     topics = {channel.topic: content.counts[channel.topic] for channel in channels.values()}
-    left_out = [
-        f'{printable(topic)}: {number} messages larger than {format_size(MAX_MESSAGE)}'
-        for topic, number in sorted(too_large.items())
-    ]
+    left_out = describe_too_large(too_large)
     left_out += [f'{printable(key)}: metadata.yaml would be too large' for key in unwritten]
     summary = Summary(
         messages=sum(topics.values()), topics=topics, start=start, end=end, left_out=tuple(left_out)
     )
     return summary, content
+
+
+def describe_too_large(messages: Mapping[str, int]) -> list[str]:
+    """Return descriptions of messages, counted by topic, that readers would refuse."""
+    return [
+        f'{printable(topic)}: {number} messages larger than {format_size(MAX_MESSAGE)}'
+        for topic, number in sorted(messages.items())
+    ]
 
 
 def _too_large(texts: dict[str, str], connections: Iterable[Connection]) -> list[str]:

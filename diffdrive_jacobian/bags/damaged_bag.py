@@ -1,4 +1,4 @@
-"""Reading of what is left of a damaged bag or a journal, as the records of a journal."""
+"""Reading of what is left of a damaged bag or a journal: topics, messages and custom data."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import shutil
 import sqlite3
 import tempfile
 from collections import Counter
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from contextlib import closing, suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from rosbags.interfaces import Qos
 from rosbags.rosbag2 import ReaderError
 
-from diffdrive_jacobian.bags import qos
 from diffdrive_jacobian.bags.bag_writer import STORAGES
 from diffdrive_jacobian.bags.bounded_reader import parse_bounded_qos
 from diffdrive_jacobian.bags.files import (
@@ -32,7 +32,6 @@ from diffdrive_jacobian.bags.journal import (
     Message,
     Record,
     Text,
-    read_journal,
 )
 from diffdrive_jacobian.bags.limits import UNPACK_ERRORS, Budget, unpack_file, unpack_message
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError
@@ -54,7 +53,6 @@ class DamagedBag:
 
     Attributes:
         files: The data files, in their order.
-        kind: `mcap`, `sqlite3` or `journal`.
         storage: Storage of a new bag that is like the old one, `mcap` or `sqlite3`.
         message_count: Number of messages according to metadata.yaml; None: it has none.
         lost: Descriptions of what could not be read; complete after all records were read.
@@ -75,8 +73,7 @@ class DamagedBag:
         """
         self.path = path
         self.files = bag_files(path)
-        self.kind = file_kind(self.files[0])
-        self.storage = 'mcap' if self.kind == 'journal' else self.kind
+        self.storage = file_kind(self.files[0])
         self.lost: list[str] = []
         self.unchecked: list[str] = []
         self.left_out: dict[str, str] = {}
@@ -101,13 +98,6 @@ class DamagedBag:
         self.lost += [f'metadata.yaml: {self._problem}'] if self._problem else []
         self.unchecked, self.left_out = [], {}
         self._seen: Counter[str] = Counter()
-        if self.kind == 'journal':
-            self.unchecked.append('what record_run had not written when it ended is not in its journal')
-            if unread := (yield from self._of_journal()):
-                self.lost.append(
-                    f'{self.path.name} is cut off: its last {unread} bytes are not a record'
-                )
-            return
         for text in _custom_data(self._metadata):
             yield from self._text(text)
         channels: dict[tuple[str, str], Channel] = {}
@@ -184,60 +174,6 @@ class DamagedBag:
             pass
         return f'{name} is missing'
 
-    def _of_journal(self) -> Generator[Record, None, int]:
-        invalid: list[str] = []
-        budget = Budget(self.path.stat().st_size)
-        records = read_journal(self.path, invalid.append)
-        channels: dict[tuple[str, str], Channel] = {}
-        ids: dict[int, tuple[tuple[str, str], int | None]] = {}
-        faults: Counter[str] = Counter()
-        while True:
-            try:
-                record = next(records)
-            except StopIteration as end:
-                if invalid:
-                    faults[f'records are invalid, the first: {invalid[0]}'] = len(invalid)
-                self.lost += [f'{self.path.name}: {count} {what}' for what, count in faults.items()]
-                return int(end.value)
-            if isinstance(record, Text):
-                if record.key == 'storage' and record.value in STORAGES:
-                    self.storage = record.value
-                yield from self._text(record)
-            elif isinstance(record, Channel):
-                key = record.topic, record.type_name
-                if ids.setdefault(record.id, (key, None))[0] != key:
-                    faults['descriptions of a topic have the number of another topic'] += 1
-                elif (channel := self._of_journal_channel(record, channels)) is not None:
-                    ids[record.id] = key, channel.id
-                    yield channel
-            elif record.channel not in ids:
-                faults['messages belong to no known topic'] += 1
-            elif not 0 <= record.stamp < 2**63 or _payload(record.data, budget) is None:
-                faults['messages are not CDR, or have an invalid time'] += 1
-            elif (to := ids[record.channel][1]) is not None:
-                yield replace(record, channel=to)
-
-    def _of_journal_channel(
-        self, channel: Channel, channels: dict[tuple[str, str], Channel]
-    ) -> Channel | None:
-        """Return the channel to write, with all profiles so far; None: the topic is left out."""
-        topic = Topic(
-            channel.id,
-            channel.topic,
-            channel.type_name,
-            'cdr',
-            '',
-            channel.type_hash,
-            channel.definition,
-        )
-        known = self._channel(topic, channels)
-        if known is None:
-            return None
-        profiles = [one for one in channel.qos if qos.is_valid(one) and one not in known.qos]
-        key = channel.topic, channel.type_name
-        channels[key] = replace(known, qos=(*known.qos, *profiles))
-        return channels[key]
-
     def _text(self, text: Text) -> Iterator[Text]:
         """Yield custom data, unless no reader would accept it."""
         try:
@@ -271,14 +207,19 @@ class DamagedBag:
                     for text in _custom_data(metadata):
                         yield from self._text(text)
                     continue
+                if isinstance(one, Text):
+                    if one.key == 'storage' and one.value in STORAGES:
+                        self.storage = one.value
+                    yield from self._text(one)
+                    continue
                 if isinstance(one, Topic):
-                    new = (one.name, one.type_name) not in channels
+                    known = channels.get((one.name, one.type_name))
                     channel = self._channel(one, channels)
                     ids[one.id] = None if channel is None else channel.id
                     names[one.id] = one.name
                     if one.type_hash:
                         self._hashes[one.name, one.type_name] = one.type_hash
-                    if channel is not None and new:
+                    if channel is not None and channel != known:
                         yield channel
                     continue
                 self._seen[names.get(one.channel, '')] += 1
@@ -295,7 +236,7 @@ class DamagedBag:
         self.lost += [f'{name}: {count} messages {what}' for what, count in faults.items()]
 
     def _channel(self, topic: Topic, channels: dict[tuple[str, str], Channel]) -> Channel | None:
-        """Return a topic's channel; None: it is left out."""
+        """Return a topic's channel, with all profiles so far; None: it is left out."""
         key = topic.name, topic.type_name
         if key not in channels and topic.name not in self.left_out:
             try:
@@ -313,8 +254,10 @@ class DamagedBag:
                 type_name=topic.type_name,
                 definition=text,
                 type_hash=type_hash,
-                qos=_profiles(topic.qos),
             )
+        if (channel := channels.get(key)) is not None:
+            profiles = [one for one in _profiles(topic.qos) if one not in channel.qos]
+            channels[key] = replace(channel, qos=(*channel.qos, *profiles))
         return channels.get(key)
 
 
@@ -410,9 +353,17 @@ def _payload(data: bytes, budget: Budget) -> bytes | None:
     return data if len(data) > 4 and data[0] == 0 and data[1] <= LAST_ENCAPSULATION else None
 
 
-def _profiles(text: str) -> tuple[dict[str, Any], ...]:
-    """Return offered profiles from the text of rosbag2, () if it is invalid."""
+def _profiles(text: str) -> list[Qos]:
+    """Return the offered profiles in the text of rosbag2 that are valid."""
     try:
-        return tuple(qos.from_rosbags(one) for one in parse_bounded_qos(text))
+        profiles = parse_bounded_qos(text)
     except (ReaderError, LookupError, TypeError, ValueError, AttributeError, *YAML_ERRORS):
-        return ()
+        return []
+    return [
+        one._replace(avoid_ros_namespace_conventions=False)
+        for one in profiles
+        if all(
+            type(number) is int and 0 <= number < 2**63
+            for number in (one.depth, *one.deadline, *one.lifespan, *one.liveliness_lease_duration)
+        )
+    ]

@@ -6,15 +6,15 @@ import re
 import stat
 from pathlib import Path
 
-from diffdrive_jacobian.bags.journal import JOURNAL, MAGIC, journal_of
+from diffdrive_jacobian.bags import mcap
 from diffdrive_jacobian.errors import DiffdriveError
 
-MCAP_MAGIC = b'\x89MCAP0\r\n'
+JOURNAL = '.journal.mcap'
+"""Ends the name of a journal, after the name of the bag."""
 SQLITE_MAGIC = b'SQLite format 3\0'
 ZSTD = '.zstd'
-DATA_KINDS = ('mcap', 'sqlite3')
-_KINDS = {'.mcap': 'mcap', '.db3': 'sqlite3', JOURNAL: 'journal'}
-_MAGICS = {MCAP_MAGIC: 'mcap', SQLITE_MAGIC: 'sqlite3', MAGIC: 'journal'}
+_KINDS = {'.mcap': 'mcap', '.db3': 'sqlite3'}
+_MAGICS = {mcap.MAGIC: 'mcap', SQLITE_MAGIC: 'sqlite3'}
 
 
 class NotARegularFileError(DiffdriveError, OSError):
@@ -23,6 +23,16 @@ class NotARegularFileError(DiffdriveError, OSError):
 
 class NotABagError(DiffdriveError):
     """A path holds nothing of a bag."""
+
+
+def journal_of(bag: Path) -> Path:
+    """Return the path of a bag's journal, which exists while it is recorded and after a crash."""
+    return bag.with_name(bag.name + JOURNAL)
+
+
+def is_journal(path: Path) -> bool:
+    """Return whether a file is a journal by its name."""
+    return path.name.endswith(JOURNAL)
 
 
 def check_regular(path: Path) -> None:
@@ -40,7 +50,7 @@ def file_kind(path: Path) -> str:
     """Return what a file is by its first bytes, or, as these may be damaged, by its name.
 
     Returns:
-        `mcap`, `sqlite3`, `journal`, or empty for anything else.
+        `mcap`, `sqlite3`, or empty for anything else.
     """
     with open(path, 'rb') as file:
         begin = file.read(len(SQLITE_MAGIC))
@@ -63,7 +73,7 @@ def bag_files(path: Path) -> list[Path]:
     """
     if path.is_file():
         if not file_kind(path):
-            raise NotABagError(f'{path} is neither MCAP nor SQLite nor a journal of record_run')
+            raise NotABagError(f'{path} is neither MCAP nor SQLite')
         return [path]
     if not path.is_dir():
         if path.exists():
@@ -72,7 +82,8 @@ def bag_files(path: Path) -> list[Path]:
     present = set(path.iterdir())
     # A file whose compression was interrupted exists twice.
     files = [one for one in present if one.is_file() and one.with_suffix('') not in present - {one}]
-    files = [one for one in files if file_kind(one) in DATA_KINDS]
+    # A journal beside is of another recording.
+    files = [one for one in files if file_kind(one) and not is_journal(one)]
     if not files:
         what = 'holds neither .mcap nor .db3 files' if present else 'is an empty folder'
         raise NotABagError(f'{path} {what}: it is not a bag')

@@ -1,85 +1,50 @@
-"""Journals: what a recorder has received, on the disk almost at once, readable up to the last record.
+"""Journals: what a recorder has received, on the disk almost at once, readable up to the last message.
 
 A bag is complete only when it is closed. A recorder that is killed loses its index, its metadata and up
 to a whole chunk of messages. So messages are written to a journal first, in the order in which they were
 received. The bag is written from it at the end, or by recover_run after a crash.
 
-Layout: the magic, then records. A record has its kind (1 byte), the length of the payload (u32), its
-CRC-32 (u32) and the payload, all little-endian. A record that was cut off or damaged ends the journal.
+A journal is an MCAP file without an end: it has no index. A chunk with a checksum is written several
+times a second. Each message has its number, so that a gap is noticed. Custom data are in attachments,
+which have checksums of their own.
 """
 
 from __future__ import annotations
 
 import fcntl
-import json
 import os
-import re
 import struct
 import tempfile
 import threading
 import zlib
-from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass
-from functools import partial
+from dataclasses import dataclass, field
+from io import StringIO
 from pathlib import Path
-from typing import Any, BinaryIO
 
-from diffdrive_jacobian.errors import DiffdriveError
-from diffdrive_jacobian.numerics.fields import Check, integer, sequence, short, text
-from diffdrive_jacobian.text import printable
+from rosbags.interfaces import Qos
+from rosbags.rosbag2.metadata import dump_qos_v9
+from ruamel.yaml import YAML
 
-JOURNAL = '.journal'
-"""Ends the name of a journal, after the name of the bag."""
+from diffdrive_jacobian.bags import mcap
+from diffdrive_jacobian.bags.files import JOURNAL
+
 PARAMETERS = 'parameters of '
 """Followed by a node's name, the key of the custom data that holds its parameters as JSON."""
 LOST = 'messages lost'
 """Key of the custom data with the number of messages that are known to be missing, by topic, as JSON."""
 LEFT_OUT = 'topics left out'
 """Key of the custom data with the reasons why topics were not recorded, by topic, as JSON."""
-MAGIC = b'\x89ddjournal1\r\n\x1a\n'
-_HEAD = struct.Struct('<cII')
-_MESSAGE = struct.Struct('<Hq')
-_CONNECTION, _DATA, _TEXT = b'C', b'M', b'T'
+LIBRARY = 'diffdrive_jacobian journal'
+"""The writer of a journal, according to its header."""
+CUSTOM_DATA = 'application/x-rosbag2-custom-data'
+"""Media type of the attachments with custom data. Their names are the keys."""
 BLOCK = 8 << 20
-"""Approximate number of bytes per write."""
+"""Approximate size of the largest chunk (bytes). A message that is larger has a chunk of its own."""
 OVERHEAD = 250
 """Approximate memory of a record without its payload (bytes)."""
-_SURROGATE = re.compile('[\ud800-\udfff]')
-
-
-def _unicode(name: str, value: Any) -> str:
-    found: str = text(name, value)
-    if _SURROGATE.search(found):
-        raise ValueError(f'{name} must be valid Unicode, got {short(found, repr)}')
-    return found
-
-
-def _profiles(name: str, value: Any) -> tuple[dict[str, Any], ...]:
-    for profile in sequence(name, value):
-        if not isinstance(profile, dict) or not all(type(one) is int for one in profile.values()):
-            raise ValueError(f'{name} must hold maps of integers, got {short(profile, repr)}')
-    return tuple(value)
-
-
-_TEXT_FIELDS: dict[str, Check] = {'key': _unicode, 'value': _unicode}
-_CHANNEL_FIELDS: dict[str, Check] = {
-    'id': partial(integer, low=0, high=2**16 - 1),
-    'topic': _unicode,
-    'type_name': _unicode,
-    'definition': _unicode,
-    'type_hash': _unicode,
-    'qos': _profiles,
-}
-
-
-def journal_of(bag: Path) -> Path:
-    """Return the path of a bag's journal, which exists while it is recorded and after a crash."""
-    return bag.with_name(bag.name + JOURNAL)
-
-
-class JournalError(DiffdriveError):
-    """A file is not a journal, or a record in it is invalid."""
+_MESSAGE = struct.Struct('<BQHIQQ')
+_CHUNK = struct.Struct('<BQQQQIIQ')
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -91,8 +56,8 @@ class Channel:
     type_name: str
     definition: str
     type_hash: str
-    qos: tuple[dict[str, Any], ...] = ()
-    """The QoS profiles that its publishers offered, with the keys of rosbag2."""
+    qos: tuple[Qos, ...] = ()
+    """The distinct profiles that its publishers offered."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +67,8 @@ class Message:
     channel: int
     stamp: int
     data: bytes
+    number: int = field(default=0, compare=False)
+    """Its number in the file from which it was read; 0: it has none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +80,63 @@ class Text:
 
 
 Record = Channel | Message | Text
+
+
+class _Chunk:
+    """Messages and descriptions of topics that are not written yet."""
+
+    def __init__(self) -> None:
+        self.size = 0
+        self._pieces: list[bytes] = []
+        self._start, self._end = 2**64 - 1, 0
+
+    def add(self, described: bytes) -> None:
+        self._pieces.append(described)
+        self.size += len(described)
+
+    def add_message(self, head: bytes, data: bytes, stamp: int) -> None:
+        # The data is kept as it is: large messages are not copied before they are written.
+        self._pieces += (head, data)
+        self.size += len(head) + len(data)
+        self._start = min(self._start, stamp)
+        self._end = max(self._end, stamp)
+
+    def pack(self) -> bytes:
+        """Return the record."""
+        checksum = 0
+        for piece in self._pieces:
+            checksum = zlib.crc32(piece, checksum)
+        length = _CHUNK.size - mcap.HEAD.size + self.size
+        start = min(self._start, self._end)
+        # Not compressed: the name of the compression is empty.
+        fields = (mcap.CHUNK, length, start, self._end, self.size, checksum, 0, self.size)
+        return b''.join((_CHUNK.pack(*fields), *self._pieces))
+
+
+def _header() -> bytes:
+    return mcap.MAGIC + mcap.record(mcap.HEADER, mcap.text('ros2'), mcap.text(LIBRARY))
+
+
+def _attachment(entry: Text) -> bytes:
+    times, data = bytes(16), entry.value.encode()
+    size = mcap.number(len(data), 8)
+    content = b''.join((times, mcap.text(entry.key), mcap.text(CUSTOM_DATA), size, data))
+    return mcap.record(mcap.ATTACHMENT, content, mcap.number(zlib.crc32(content), 4))
+
+
+def _topic(number: int, channel: Channel) -> bytes:
+    """Return the records that describe a topic and its type."""
+    schema, index = mcap.number(number, 2), mcap.number(number, 2)
+    profiles = StringIO()
+    YAML(typ='safe').dump(dump_qos_v9(list(channel.qos)), profiles)
+    texts = (channel.type_name, 'ros2msg', channel.definition)
+    extra = {
+        'offered_qos_profiles': profiles.getvalue(),
+        'topic_type_hash': channel.type_hash,
+    }
+    return mcap.record(mcap.SCHEMA, schema, *map(mcap.text, texts)) + mcap.record(
+        mcap.CHANNEL, index, schema, mcap.text(channel.topic), mcap.text('cdr'), mcap.texts(extra)
+    )
 
 
 class JournalWriter:
@@ -132,33 +156,58 @@ class JournalWriter:
         with suppress(OSError):
             fcntl.flock(self._file, fcntl.LOCK_EX)
         self._lock = threading.Lock()
-        self._pending = [MAGIC]
-        self.waiting = len(MAGIC)
+        # Records that cannot be in a chunk.
+        self._records = [_header()]
+        self._chunks = [_Chunk()]
+        self._numbers: dict[int, int] = {}
+        self._topics = self._messages = 0
+        self.waiting = len(self._records[0])
         """Memory held by records that are not yet written, or being written (bytes)."""
-        self._written = 0
-        self._synced = 0
-        self._added = len(MAGIC)
+        self._added = self.waiting
+        self._frames = self._written = self._synced = 0
 
     @property
     def size(self) -> int:
         """Bytes of all records so far, written or not."""
-        return self._added
+        return self._added + self._frames
 
     def add(self, record: Record) -> None:
-        """Append a record; it is written by `flush`."""
-        if isinstance(record, Message):
-            kind, payload = _DATA, record.data
-            start = _MESSAGE.pack(record.channel, record.stamp)
-        else:
-            kind = _CONNECTION if isinstance(record, Channel) else _TEXT
-            payload, start = json.dumps(asdict(record)).encode(), b''
-        checksum = zlib.crc32(payload, zlib.crc32(start, ord(kind)))
-        head = _HEAD.pack(kind, len(start) + len(payload), checksum) + start
+        """Append a record; it is written by `flush`.
+
+        Raises:
+            KeyError: The channel of a message was not added.
+        """
         with self._lock:
-            # The payload is kept as it is: large messages are not copied before they are written.
-            self._pending += (head, payload)
-            self._added += len(head) + len(payload)
-            self.waiting += OVERHEAD + len(payload)
+            if isinstance(record, Message):
+                size = self._add_message(record)
+            elif isinstance(record, Channel):
+                # With other profiles it is another channel of MCAP, of the same topic.
+                self._topics += 1
+                self._numbers[record.id] = self._topics
+                described = _topic(self._topics, record)
+                size = len(described)
+                self._chunk(size).add(described)
+            else:
+                self._records.append(_attachment(record))
+                size = len(self._records[-1])
+            self._added += size
+            self.waiting += OVERHEAD + size
+
+    def _add_message(self, message: Message) -> int:
+        """Add a message, and return its size."""
+        length, stamp = mcap.MESSAGE_HEAD.size + len(message.data), message.stamp
+        number = self._messages + 1
+        channel = self._numbers[message.channel]
+        head = _MESSAGE.pack(mcap.MESSAGE, length, channel, number, stamp, stamp)
+        self._messages = number
+        self._chunk(length).add_message(head, message.data, stamp)
+        return mcap.HEAD.size + length
+
+    def _chunk(self, size: int) -> _Chunk:
+        """Return the chunk of the next record, which has this size."""
+        if self._chunks[-1].size >= BLOCK or size > BLOCK:
+            self._chunks.append(_Chunk())
+        return self._chunks[-1]
 
     def flush(self) -> None:
         """Write all records to the operating system, where they survive the end of the process.
@@ -167,18 +216,27 @@ class JournalWriter:
             OSError: The disk is full or was removed. What was not written is dropped.
         """
         with self._lock:
-            pending, self._pending = self._pending, []
+            records, self._records = self._records, []
+            chunks, self._chunks = self._chunks, [_Chunk()]
             waiting = self.waiting
         try:
-            for block in _blocks(pending):
-                data = memoryview(block)
-                while data:
-                    written = os.write(self._file.fileno(), data)
-                    self._written += written
-                    data = data[written:]
+            self._write(b''.join(records))
+            # The memory of each is freed while the rest is being written.
+            chunks.reverse()
+            while chunks:
+                if (chunk := chunks.pop()).size:
+                    self._frames += _CHUNK.size
+                    self._write(chunk.pack())
         finally:
             with self._lock:
                 self.waiting -= waiting
+
+    def _write(self, content: bytes) -> None:
+        data = memoryview(content)
+        while data:
+            written = os.write(self._file.fileno(), data)
+            self._written += written
+            data = data[written:]
 
     def sync(self) -> None:
         """Wait until all flushed records are on the disk, where they survive a power cut.
@@ -216,7 +274,8 @@ class JournalWriter:
         path = Path(os.path.abspath(self.path))
         folders = (*path.parents, Path(tempfile.gettempdir()))
         folder = next(one for one in folders if one.is_dir() and os.access(one, os.W_OK))
-        handle, name = tempfile.mkstemp(path.suffix, f'{path.stem[:50]}_rescued_', folder)
+        bag = path.name.removesuffix(JOURNAL)
+        handle, name = tempfile.mkstemp(JOURNAL, f'{bag[:50]}_rescued_', folder)
         with open(handle, 'wb') as copy:
             # The content of a removed file can still be read.
             while data := os.pread(descriptor, BLOCK, copy.tell()):
@@ -230,22 +289,6 @@ class JournalWriter:
         self._file.close()
 
 
-def _blocks(pieces: list[bytes]) -> Iterator[bytes]:
-    """Yield bytes joined to blocks of about BLOCK, since each write to a slow disk takes long."""
-    block: list[bytes] = []
-    size = 0
-    for index, piece in enumerate(pieces):
-        # The memory is freed while the rest is being written.
-        pieces[index] = b''
-        block.append(piece)
-        size += len(piece)
-        if size >= BLOCK:
-            yield b''.join(block)
-            block, size = [], 0
-    if block:
-        yield b''.join(block)
-
-
 def is_being_written(path: Path) -> bool:
     """Return whether the process that writes a journal is still running, as far as it has a lock."""
     with open(path, 'rb') as file:
@@ -257,85 +300,3 @@ def is_being_written(path: Path) -> bool:
             # The file system has no locks.
             return False
     return False
-
-
-def read_journal(path: Path, note: Callable[[str], None] | None = None) -> Generator[Record, None, int]:
-    """Read a journal up to its end, or to what was cut off or damaged.
-
-    Args:
-        path: The journal.
-        note: Is called with a description of each record whose content is invalid although its checksum
-            is right; the record is left out. By default it is an error.
-
-    Returns:
-        The records; the generator's value is how many bytes at the end could not be read.
-
-    Raises:
-        JournalError: The file is not a journal, or a record's content is invalid.
-        OSError: It cannot be read.
-    """
-    with open(path, 'rb') as file:
-        size = os.fstat(file.fileno()).st_size
-        if file.read(len(MAGIC)) != MAGIC:
-            raise JournalError(f'{path} is not a journal of record_run')
-        end = file.tell()
-        while (raw := _read_record(file, size - end)) is not None:
-            begin, end = end, file.tell()
-            try:
-                record = _parsed(*raw)
-            except JournalError as error:
-                if note is None:
-                    raise JournalError(f'{path} is damaged at byte {begin}: {error}') from error
-                note(f'the record at byte {begin} is invalid: {error}')
-                continue
-            yield record
-        return size - end
-
-
-def _read_record(file: BinaryIO, left: int) -> tuple[bytes, bytes] | None:
-    """Return kind and payload of the next record; None: there is none, or it is damaged."""
-    head = file.read(_HEAD.size)
-    if len(head) < _HEAD.size:
-        return None
-    kind, length, checksum = _HEAD.unpack(head)
-    # Reading a damaged length could take gigabytes of memory.
-    if kind not in (_CONNECTION, _DATA, _TEXT) or _HEAD.size + length > left:
-        return None
-    payload = file.read(length)
-    if len(payload) < length or zlib.crc32(payload, ord(kind)) != checksum:
-        return None
-    if kind == _DATA and length < _MESSAGE.size:
-        return None
-    return kind, payload
-
-
-def _parsed(kind: bytes, payload: bytes) -> Record:
-    """Return a record.
-
-    Raises:
-        JournalError: The payload is not what `JournalWriter` writes.
-    """
-    if kind == _DATA:
-        channel, stamp = _MESSAGE.unpack_from(payload)
-        return Message(channel, stamp, payload[_MESSAGE.size :])
-    try:
-        content = json.loads(payload)
-    except (ValueError, RecursionError) as error:
-        raise JournalError(f'its content is not JSON: {printable(error)}') from error
-    if kind == _TEXT:
-        return Text(**_fields(content, _TEXT_FIELDS))
-    return Channel(**_fields(content, _CHANNEL_FIELDS))
-
-
-def _fields(content: object, checks: dict[str, Check]) -> dict[str, Any]:
-    """Return a JSON object after a check of its fields.
-
-    Raises:
-        JournalError: It has other fields, or a field is invalid.
-    """
-    if not isinstance(content, dict) or content.keys() != checks.keys():
-        raise JournalError(f'it must have the fields {", ".join(checks)}, got {short(content, repr)}')
-    try:
-        return {name: check(name, content[name]) for name, check in checks.items()}
-    except ValueError as error:
-        raise JournalError(str(error)) from error

@@ -14,9 +14,9 @@ from diffdrive_jacobian.bags.bag_reader import find_damage
 from diffdrive_jacobian.bags.bag_writer import Summary, build_bag
 from diffdrive_jacobian.bags.damaged_bag import DamagedBag
 from diffdrive_jacobian.bags.decoding_check import DecodingCheck
+from diffdrive_jacobian.bags.files import JOURNAL, is_journal, journal_of
 from diffdrive_jacobian.bags.files import NotABagError as NotABagError
 from diffdrive_jacobian.bags.journal import (
-    JOURNAL,
     LEFT_OUT,
     LOST,
     Channel,
@@ -24,7 +24,6 @@ from diffdrive_jacobian.bags.journal import (
     Record,
     Text,
     is_being_written,
-    journal_of,
 )
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.text import printable
@@ -90,7 +89,6 @@ def recover(
         NotABagError: There is nothing like a bag.
         UncheckedError: Nothing is missing as far as could be checked, which is not all.
         NothingToSaveError: The bag is complete, or not a message can be read.
-        JournalError: The journal is not one of record_run.
         FileExistsError: The new bag exists, and is not to be replaced or is the old one.
         OSError: The old bag cannot be read, or the new one not be written.
         RecoveryInterruptedError: `interrupted` returned True.
@@ -99,12 +97,12 @@ def recover(
         what = journal_of(what)
     with tempfile.TemporaryDirectory(prefix='recover_run_') as scratch:
         old = DamagedBag(what, Path(scratch))
-        target = output or _default_target(what, old.kind)
+        target = output or _default_target(what)
         if target.exists() and not replace:
             raise FileExistsError(f'{target} exists already')
         if target.exists() and target.resolve() in (what.resolve(), what.resolve().parent):
             raise FileExistsError(f'{target} is the bag to recover: it is not replaced')
-        if old.kind == 'journal' and is_being_written(old.files[0]):
+        if is_journal(what) and is_being_written(what):
             raise NothingToSaveError(f'{what} is being recorded now: end record_run first')
 
         def records() -> Iterator[Record]:
@@ -116,10 +114,11 @@ def recover(
         survey = _Survey(records())
         lost, unchecked, left_out = tuple(old.losses), tuple(old.unchecked), bool(old.left_out)
         undecodable = tuple(survey.decoding.undecodable)
-        damaged = '' if old.kind == 'journal' else find_damage(what)
+        # A journal is no bag, whole as it may be.
+        damaged = '' if is_journal(what) else find_damage(what)
         count = survey.kinds[Message]
         whole = old.message_count == count or (what.suffix == '.mcap' and what.is_file())
-        if whole and not lost and not damaged:
+        if whole and not lost and not damaged and not is_journal(what):
             if unchecked:
                 found = f'nothing was found missing in {what}, but it cannot be called complete:'
                 raise UncheckedError(found, *unchecked, *undecodable)
@@ -130,7 +129,11 @@ def recover(
         # The file may still grow: the same records as in the survey are written.
         surveyed = survey.kinds.total()
         summary = build_bag(
-            lambda: islice(records(), surveyed), target, storage or old.storage, replace=replace
+            survey.channels.values(),
+            islice(records(), surveyed),
+            target,
+            storage or old.storage,
+            replace=replace,
         )
         return Recovery(
             bag=target,
@@ -146,20 +149,20 @@ def recover(
 
 
 class _Survey:
-    """Number of records by their kind, messages that cannot be decoded, and losses when recording."""
+    """Topics, number of records by their kind, messages that cannot be decoded, and noted losses."""
 
     def __init__(self, records: Iterable[Record]) -> None:
         self.kinds: Counter[type[Record]] = Counter()
         self.decoding = DecodingCheck()
         self.notes: dict[str, str] = {}
         """The custom data of the keys `LOST` and `LEFT_OUT`."""
-        channels: dict[int, Channel] = {}
+        self.channels: dict[int, Channel] = {}
         for record in records:
             self.kinds[type(record)] += 1
             if isinstance(record, Channel):
-                channels[record.id] = record
+                self.channels[record.id] = record
             elif isinstance(record, Message):
-                self.decoding.add(channels[record.channel], record.data)
+                self.decoding.add(self.channels[record.channel], record.data)
             elif isinstance(record, Text) and record.key in (LOST, LEFT_OUT):
                 self.notes[record.key] = record.value
 
@@ -188,9 +191,9 @@ def _lost_before(notes: dict[str, str]) -> tuple[str, ...]:
     return tuple(described)
 
 
-def _default_target(what: Path, kind: str) -> Path:
+def _default_target(what: Path) -> Path:
     """Return the directory of the new bag, named after the old one."""
-    if kind == 'journal' and what.suffix == JOURNAL:
-        return what.with_suffix('')
+    if is_journal(what):
+        return what.with_name(what.name.removesuffix(JOURNAL))
     stem = what.stem if what.is_file() else what.resolve().name
     return what.resolve().with_name(stem + RECOVERED)

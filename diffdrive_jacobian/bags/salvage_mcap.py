@@ -6,15 +6,14 @@ Checksums and counts, which are optional, show whether messages were altered or 
 
 from __future__ import annotations
 
-import struct
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from io import BytesIO
 from typing import BinaryIO, NamedTuple
 
-from diffdrive_jacobian.bags.files import MCAP_MAGIC
-from diffdrive_jacobian.bags.journal import Message
+from diffdrive_jacobian.bags import mcap
+from diffdrive_jacobian.bags.journal import CUSTOM_DATA, LIBRARY, Message, Text
 from diffdrive_jacobian.bags.limits import (
     MAX_RECORD,
     UNPACK_ERRORS,
@@ -45,53 +44,8 @@ class Topic(NamedTuple):
     definition: str = ''
 
 
-Found = Topic | Message | str
-"""A text is a copy of metadata.yaml in the file."""
-
-
-_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x02, 0x03, 0x04, 0x05, 0x06
-_STATISTICS, _METADATA, _DATA_END = 0x0B, 0x0C, 0x0F
-_OPCODES = range(0x01, 0x10)
-_HEAD = struct.Struct('<BQ')
-_MESSAGE_HEAD = struct.Struct('<HIQQ')
-_ATTACHMENT = 0x09
-
-
-class _Cursor:
-    """Reads the fields of an MCAP record, or raises ValueError if the record is too short."""
-
-    def __init__(self, data: bytes) -> None:
-        self._data = data
-        self._at = 0
-
-    @property
-    def left(self) -> bytes:
-        """The bytes that were not read yet."""
-        return self._data[self._at :]
-
-    def __bool__(self) -> bool:
-        """Return whether there are bytes that were not read yet."""
-        return self._at < len(self._data)
-
-    def take(self, length: int) -> bytes:
-        end = self._at + length
-        if end > len(self._data):
-            raise ValueError(f'{length} bytes expected, got {len(self._data) - self._at}')
-        taken, self._at = self._data[self._at : end], end
-        return taken
-
-    def number(self, length: int) -> int:
-        return int.from_bytes(self.take(length), 'little')
-
-    def text(self) -> str:
-        return self.take(self.number(4)).decode()
-
-    def texts(self) -> dict[str, str]:
-        inner, found = _Cursor(self.take(self.number(4))), {}
-        while inner:
-            key = inner.text()
-            found[key] = inner.text()
-        return found
+Found = Topic | Message | Text | str
+"""A `str` is a copy of metadata.yaml in the file."""
 
 
 class _Check:
@@ -105,6 +59,7 @@ class _Check:
         self._topics: dict[int, Topic] = {}
         self._unchecked = False
         self._behind = self._differing = 0
+        self._numbered, self._last = False, 0
         self._in_data, self._data_is_right = True, False
         # Only the last of each kind counts, so that each part of the file is read once.
         self._checksums: dict[str, tuple[int, int, int]] = {}
@@ -114,24 +69,33 @@ class _Check:
         if isinstance(found, Message):
             self._found[found.channel] += 1
             self._behind += not self._in_data
+            self._last = max(self._last, found.number)
         elif isinstance(found, Topic):
             self._differing += self._topics.setdefault(found.id, found) != found
-        self._unchecked |= self._in_data and not checked and not isinstance(found, str)
+        self._unchecked |= self._in_data and not checked and isinstance(found, Topic | Message)
 
     def add_record(self, opcode: int, payload: bytes, end: int) -> None:
         """Take the counts and checksums from a record, or raise ValueError if it is invalid."""
-        cursor, start = _Cursor(payload), end - len(payload) - _HEAD.size
-        if opcode == _STATISTICS:
+        cursor, start = mcap.Cursor(payload), end - len(payload) - mcap.HEAD.size
+        if self._numbered and self._in_data and opcode not in (mcap.ATTACHMENT, mcap.DATA_END):
+            self._note(f'a record has the opcode {opcode}, which is none of a journal')
+        if opcode == mcap.STATISTICS:
             cursor.take(42)
-            counts = _Cursor(cursor.take(cursor.number(4)))
+            counts = mcap.Cursor(cursor.take(cursor.number(4)))
             self._counts = {}
             while counts:
                 channel = counts.number(2)
                 self._counts[channel] = counts.number(8)
-        elif opcode == _DATA_END:
+        elif opcode == mcap.HEADER:
+            cursor.text()
+            self._numbered |= cursor.text() == LIBRARY
+        elif opcode == mcap.ATTACHMENT:
+            if payload[-4:] not in (bytes(4), _checksum(payload[:-4])):
+                self._note(f'an attachment of {len(payload)} bytes is damaged: it is left out')
+        elif opcode == mcap.DATA_END:
             self._in_data = False
             self._checksums['data section'] = 0, start, cursor.number(4)
-        elif opcode == _FOOTER:
+        elif opcode == mcap.FOOTER:
             summary, _, checksum = (cursor.number(length) for length in (8, 8, 4))
             self._checksums['summary'] = summary or start, end - 4, checksum
 
@@ -147,6 +111,8 @@ class _Check:
         if self._behind:
             self._note(f'{self._behind} of its messages are behind its data section')
         found, counts = self._found, self._counts
+        if self._numbered and self._last != found.total():
+            self._note(f'its messages have the numbers 1 to {self._last}, {found.total()} were found')
         if counts is not None and any(counts.get(one, 0) != found[one] for one in {*counts, *found}):
             self._note(
                 f'its statistics count {sum(counts.values())} messages, {found.total()} were found, '
@@ -154,7 +120,7 @@ class _Check:
             )
         if not self._data_is_right and self._unchecked:
             self._doubt('it has no checksums of its messages, so altered ones cannot be noticed')
-        elif not self._data_is_right and counts is None:
+        elif not self._data_is_right and counts is None and not self._numbered:
             self._doubt('it has no count of its messages')
 
 
@@ -168,15 +134,15 @@ def read_mcap(file: BinaryIO, note: Note, doubt: Note) -> Iterator[Found]:
     """
     size = file.seek(0, 2)
     file.seek(0)
-    if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
+    if file.read(len(mcap.MAGIC)) != mcap.MAGIC:
         note(f'its {size} bytes are not the start of an MCAP file')
         return
     schemas: Schemas = {}
     budget, check = Budget(size), _Check(file, note, doubt)
-    good, opcode = len(MCAP_MAGIC), 0
+    good, opcode = len(mcap.MAGIC), 0
     try:
         for opcode, payload, end in _walk(file, size, note):
-            if opcode == _CHUNK:
+            if opcode == mcap.CHUNK:
                 yield from _read_chunk(payload, end > size, schemas, budget, check, note)
             elif end <= size:
                 for found in _read_record(opcode, payload, schemas):
@@ -189,7 +155,9 @@ def read_mcap(file: BinaryIO, note: Note, doubt: Note) -> Iterator[Found]:
         # A record is invalid, so the position of the next one is unknown.
         pass
     file.seek(good)
-    if opcode != _FOOTER or file.read(len(MCAP_MAGIC) + 1) != MCAP_MAGIC:
+    if good == size and opcode != mcap.FOOTER:
+        doubt('it has no end: what its writer had not written yet is not in it')
+    elif opcode != mcap.FOOTER or file.read(len(mcap.MAGIC) + 1) != mcap.MAGIC:
         note(f'it is cut off: the last {size - good} of its {size} bytes are not a complete record')
     check.finish()
 
@@ -201,18 +169,18 @@ def _walk(file: BinaryIO, size: int, note: Note) -> Iterator[tuple[int, bytes, i
     """
     waiting: list[tuple[int, bytes, int]] = []
     end, opcode = file.tell(), 0
-    while end <= size and opcode != _FOOTER and (head := file.read(_HEAD.size)):
-        if head[0] not in _OPCODES:
-            waiting = [] if opcode == _MESSAGE else waiting
+    while end <= size and opcode != mcap.FOOTER and (head := file.read(mcap.HEAD.size)):
+        if head[0] not in mcap.OPCODES:
+            waiting = [] if opcode == mcap.MESSAGE else waiting
             break
         yield from waiting
         waiting = []
-        if len(head) < _HEAD.size:
+        if len(head) < mcap.HEAD.size:
             break
-        opcode, length = _HEAD.unpack(head)
-        end += _HEAD.size + length
-        if opcode == _ATTACHMENT or (length > MAX_RECORD and end <= size):
-            if opcode != _ATTACHMENT:
+        opcode, length = mcap.HEAD.unpack(head)
+        end += mcap.HEAD.size + length
+        if length > MAX_RECORD and end <= size:
+            if opcode != mcap.ATTACHMENT:
                 note(f'a record of {format_size(length)} is not read: it is too large')
             # A damaged length may be larger than any position.
             file.seek(min(end, size))
@@ -224,7 +192,7 @@ def _walk(file: BinaryIO, size: int, note: Note) -> Iterator[tuple[int, bytes, i
 def _read_chunk(
     payload: bytes, cut: bool, schemas: Schemas, budget: Budget, check: _Check, note: Note
 ) -> Iterator[Found]:
-    cursor = _Cursor(payload)
+    cursor = mcap.Cursor(payload)
     try:
         start, end, size, checksum = (cursor.number(length) for length in (8, 8, 8, 4))
         compression, length = cursor.text(), cursor.number(8)
@@ -253,20 +221,30 @@ def _read_chunk(
         note(f'the last {len(data) - good} of the {size} bytes of a chunk are not complete records')
 
 
+def _checksum(content: bytes) -> bytes:
+    return mcap.number(zlib.crc32(content), 4)
+
+
 def _read_record(opcode: int, payload: bytes, schemas: Schemas) -> Iterator[Found]:
     """Read a complete record, or raise ValueError if it is invalid."""
-    cursor = _Cursor(payload)
-    if opcode == _MESSAGE:
-        channel, _, stamp, _ = _MESSAGE_HEAD.unpack(cursor.take(_MESSAGE_HEAD.size))
-        yield Message(channel, stamp, cursor.left)
-    elif opcode == _SCHEMA:
+    cursor = mcap.Cursor(payload)
+    if opcode == mcap.MESSAGE:
+        channel, number, stamp, _ = mcap.MESSAGE_HEAD.unpack(cursor.take(mcap.MESSAGE_HEAD.size))
+        yield Message(channel, stamp, cursor.left, number)
+    elif opcode == mcap.SCHEMA:
         number, name, _ = cursor.number(2), cursor.text(), cursor.text()
         schemas[number] = name, cursor.text()
-    elif opcode == _CHANNEL:
+    elif opcode == mcap.CHANNEL:
         number, schema = cursor.number(2), cursor.number(2)
         name, encoding, extra = cursor.text(), cursor.text(), cursor.texts()
         type_name, definition = schemas.get(schema, ('', ''))
         qos, type_hash = (extra.get(key, '') for key in ('offered_qos_profiles', 'topic_type_hash'))
         yield Topic(number, name, type_name, encoding, qos, type_hash, definition)
-    elif opcode == _METADATA and cursor.text() == 'rosbag2':
+    elif opcode == mcap.ATTACHMENT and payload[-4:] == _checksum(payload[:-4]):
+        # Its times.
+        cursor.take(16)
+        key, media_type = cursor.text(), cursor.text()
+        if media_type == CUSTOM_DATA:
+            yield Text(key, cursor.take(cursor.number(8)).decode())
+    elif opcode == mcap.METADATA and cursor.text() == 'rosbag2':
         yield cursor.texts().get('serialized_metadata', '')

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
+from rosbags.interfaces import Qos
 
 from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Record, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
@@ -27,7 +28,7 @@ from diffdrive_jacobian.recording.reception import (
     Reception,
 )
 from diffdrive_jacobian.recording.selection import Selection as Selection
-from diffdrive_jacobian.ros.qos import to_fields
+from diffdrive_jacobian.ros.qos import to_rosbags
 from diffdrive_jacobian.ros.rclpy_internals import ReceivedMessage, reason
 from diffdrive_jacobian.text import printable
 
@@ -349,11 +350,6 @@ class Recorder(Node):  # type: ignore[misc]
         self.get_logger().warning(f'parameters of {node} are not all recorded: {trouble}')
 
 
-def _profiles(publishers: list[Any]) -> tuple[dict[str, Any], ...]:
+def _profiles(publishers: list[Any]) -> tuple[Qos, ...]:
     """Return the distinct offered QoS profiles."""
-    profiles: list[dict[str, Any]] = []
-    for publisher in publishers:
-        fields = to_fields(publisher.qos_profile)
-        if fields not in profiles:
-            profiles.append(fields)
-    return tuple(profiles)
+    return tuple(dict.fromkeys(to_rosbags(one.qos_profile) for one in publishers))

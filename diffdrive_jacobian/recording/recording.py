@@ -8,11 +8,18 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from diffdrive_jacobian import __version__
-from diffdrive_jacobian.bags.bag_writer import Summary, build_bag, check_target
+from diffdrive_jacobian.bags.bag_writer import (
+    Summary,
+    build_bag,
+    check_target,
+    describe_too_large,
+)
+from diffdrive_jacobian.bags.files import journal_of
 from diffdrive_jacobian.bags.journal import (
     LEFT_OUT,
     LOST,
@@ -21,10 +28,9 @@ from diffdrive_jacobian.bags.journal import (
     Message,
     Record,
     Text,
-    journal_of,
-    read_journal,
 )
 from diffdrive_jacobian.bags.limits import MAX_MESSAGE
+from diffdrive_jacobian.bags.salvage_mcap import Topic, read_mcap
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.plots.output_files import names_by_time
 from diffdrive_jacobian.recording.journal_thread import CAPACITY, JournalThread
@@ -91,13 +97,14 @@ class Recording:
         self._storage = storage
         self._replace = replace
         self.started = time.monotonic()
-        self._channels: dict[int, str] = {}
+        self._channels: dict[int, Channel] = {}
         self._added: Counter[int] = Counter()
         self._dropped: Counter[int] = Counter()
         self._too_large: Counter[int] = Counter()
         self._missed: dict[str, int] = {}
         self._left_out: dict[str, str] = {}
         self._noted: list[Text] = []
+        self._unread: list[str] = []
         self._open = True
         self.journal.add(Text('recorder', f'diffdrive_jacobian {__version__}'))
         self.journal.add(Text('storage', storage))
@@ -134,8 +141,8 @@ class Recording:
         """Number of messages known to be lost so far, by topic."""
         lost = Counter(dict(self._missed))
         for counts in (self._dropped, self._too_large):
-            for channel, number in list(counts.items()):
-                lost[self._channels[channel]] += number
+            for topic, number in self._by_topic(counts).items():
+                lost[topic] += number
         return {topic: number for topic, number in sorted(lost.items()) if number}
 
     def add(self, record: Record) -> None:
@@ -143,10 +150,10 @@ class Recording:
         if not self._open:
             return
         if isinstance(record, Channel):
-            self._channels[record.id] = record.topic
+            self._channels[record.id] = record
         added = self._thread.add(record)
         if isinstance(record, Message):
-            # Messages that are too large for a bag stay in the journal.
+            # Messages that are too large for a bag stay in the journal, which other tools can read.
             kept = self._too_large if len(record.data) > MAX_MESSAGE else self._added
             (kept if added else self._dropped)[record.channel] += 1
 
@@ -177,7 +184,13 @@ class Recording:
             self._raise_gone()
         try:
             self._count_unwritten()
-            summary = build_bag(self._records, self.bag, self._storage, replace=self._replace)
+            summary = build_bag(
+                self._channels.values(),
+                chain(self._read(), self._notes()),
+                self.bag,
+                self._storage,
+                replace=self._replace,
+            )
         # Whatever rosbags raises: the user must know that the journal exists.
         except Exception as error:
             why = getattr(error, 'strerror', None) or str(error) or repr(error)
@@ -200,9 +213,11 @@ class Recording:
                 f'{summary.messages}. The journal {journal} is kept',
                 summary,
             )
-        if summary.left_out:
+        left_out = describe_too_large(self._by_topic(self._too_large))
+        left_out += [*self._unread, *summary.left_out]
+        if left_out:
             raise RecordingError(
-                f'{self.bag} does not contain all that was recorded: {"; ".join(summary.left_out)}. '
+                f'{self.bag} does not contain all that was recorded: {"; ".join(left_out)}. '
                 f'The journal {journal} is kept',
                 summary,
             )
@@ -220,9 +235,26 @@ class Recording:
         if ours:
             self.journal.path.unlink(missing_ok=True)
 
-    def _records(self) -> Iterator[Record]:
-        yield from read_journal(self.journal.path)
-        yield from self._notes()
+    def _read(self) -> Iterator[Message | Text]:
+        """Yield what the journal contains that a bag can contain."""
+        ids = {(one.topic, one.type_name): one.id for one in self._channels.values()}
+        numbers: dict[int, int] = {}
+        self._unread.clear()
+        with open(self.journal.path, 'rb') as file:
+            for found in read_mcap(file, self._unread.append, lambda doubt: None):
+                if isinstance(found, Topic):
+                    numbers[found.id] = ids[found.name, found.type_name]
+                elif isinstance(found, Text):
+                    yield found
+                elif isinstance(found, Message) and len(found.data) <= MAX_MESSAGE:
+                    yield Message(numbers[found.channel], found.stamp, found.data)
+
+    def _by_topic(self, counts: Counter[int]) -> Counter[str]:
+        """Return numbers of messages by topic instead of channel."""
+        by_topic: Counter[str] = Counter()
+        for channel, number in list(counts.items()):
+            by_topic[self._channels[channel].topic] += number
+        return by_topic
 
     def _notes(self) -> list[Text]:
         """Return the losses so far as entries of the custom data."""
@@ -241,10 +273,9 @@ class Recording:
         """Count messages that were queued, but could not be written, as dropped."""
         if self.error is None:
             return
-        records = read_journal(self.journal.path)
-        written = Counter(record.channel for record in records if isinstance(record, Message))
-        self._dropped += self._added + self._too_large - written
-        self._too_large &= written
+        written = Counter(one.channel for one in self._read() if isinstance(one, Message))
+        self._dropped += self._added - written + self._too_large
+        self._too_large.clear()
 
     def _missing(self) -> str:
         """Return how many messages are neither in the journal nor in the bag; '': none that is known."""

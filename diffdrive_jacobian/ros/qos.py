@@ -3,25 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rosbags.interfaces import Qos, QosDurability, QosReliability
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 
-def to_fields(profile: QoSProfile) -> dict[str, Any]:
-    """Return a profile as numbers: policies as in rmw, whose numbers rosbag2 shares, durations in ns."""
-    return {
-        'history': int(profile.history),
-        'depth': profile.depth,
-        'reliability': int(profile.reliability),
-        'durability': int(profile.durability),
-        'deadline': profile.deadline.nanoseconds,
-        'lifespan': profile.lifespan.nanoseconds,
-        'liveliness': int(profile.liveliness),
-        'liveliness_lease_duration': profile.liveliness_lease_duration.nanoseconds,
-    }
+def to_rosbags(profile: QoSProfile) -> Qos:
+    """Return a profile as it is recorded. rosbag2 has the numbers of rmw for the policies."""
+    return Qos(
+        history=QosHistory(int(profile.history)),
+        depth=profile.depth,
+        reliability=QosReliability(int(profile.reliability)),
+        durability=QosDurability(int(profile.durability)),
+        deadline=_time(profile.deadline),
+        lifespan=_time(profile.lifespan),
+        liveliness=QosLiveliness(int(profile.liveliness)),
+        liveliness_lease_duration=_time(profile.liveliness_lease_duration),
+        avoid_ros_namespace_conventions=False,
+    )
+
+
+def _time(duration: Duration) -> QosTime:
+    return QosTime(*divmod(duration.nanoseconds, NANOSECONDS))
 
 
 def subscription_profile(offered: Iterable[QoSProfile], depth: int) -> QoSProfile:

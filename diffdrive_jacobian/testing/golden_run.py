@@ -6,7 +6,6 @@ import shlex
 from collections import defaultdict
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +13,8 @@ from rclpy.serialization import deserialize_message
 
 from diffdrive_jacobian.bags.bag_reader import BagError, custom_data, messages, open_bag
 from diffdrive_jacobian.bags.bag_writer import build_bag
-from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
+from diffdrive_jacobian.bags.journal import Channel, Message, Text
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition, message_class
-from diffdrive_jacobian.bags.qos import from_rosbags
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.messages.topics import CLOCK, OF_EVERY_NODE, TRANSFORMS
 from diffdrive_jacobian.numerics.fields import between
@@ -189,14 +187,13 @@ def _store(bag: Path, target: Path, omitted: set[str]) -> None:
                 type_name=one.msgtype,
                 definition=definition(one.msgtype).text,
                 type_hash=one.digest,
-                qos=tuple(from_rosbags(qos) for qos in getattr(one.ext, 'offered_qos_profiles', ())),
+                qos=tuple(getattr(one.ext, 'offered_qos_profiles', ())),
             )
             for number, one in enumerate(connections)
         }
         texts = [Text(key, value) for key, value in custom_data(reader).items()]
-        records: list[Record] = [*channels.values(), *texts]
-        records += [
+        data = [
             Message(channels[connection.id].id, time, data)
             for connection, time, data in messages(reader, connections)
         ]
-    build_bag(partial(iter, records), target, 'mcap', replace=True, compressed=True)
+    build_bag(channels.values(), [*texts, *data], target, 'mcap', replace=True, compressed=True)

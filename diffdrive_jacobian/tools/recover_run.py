@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from diffdrive_jacobian.bags.bag_writer import STORAGES
-from diffdrive_jacobian.bags.journal import JournalError
 from diffdrive_jacobian.bags.recovery import (
     RECOVERED,
     NotABagError,
@@ -52,7 +51,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         reason, *losses = error.args
         print(f'{PROGRAM}: {printable(reason, PATH_LIMIT)}', *_listed(losses), sep='\n', file=sys.stderr)
         return UNCHECKED if isinstance(error, UncheckedError) else _cli.FAILED
-    except (NotABagError, JournalError, FileExistsError) as error:
+    except (NotABagError, FileExistsError) as error:
         return _cli.complain(PROGRAM, printable(error, PATH_LIMIT))
     except (OSError, sqlite3.Error) as error:
         print(f'{PROGRAM}: error: no bag was written: {printable(error, PATH_LIMIT)}', file=sys.stderr)

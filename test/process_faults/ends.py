@@ -236,7 +236,8 @@ class Campaign:
 
 def remains(folder: Path) -> list[str]:
     """Return what a program has left that is not a result."""
-    return [one.name for one in folder.iterdir() if one.name.startswith('.') or one.suffix == '.journal']
+    names = [one.name for one in folder.iterdir()]
+    return [name for name in names if name.startswith('.') or name.endswith('.journal.mcap')]
 
 
 class Traffic:

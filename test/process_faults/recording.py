@@ -150,7 +150,7 @@ def removed_folder(world: World, folder: Path, chance: random.Random) -> tuple[R
         place.rename(folder / 'renamed')
     made.send(SECONDS)
     code = made.end()
-    found = list(folder.rglob('run*.journal'))
+    found = list(folder.rglob('run*.journal.mcap'))
     made.bag = found[0] if found else made.bag
     return made, code
 
