@@ -13,8 +13,8 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 from recorded import LockstepRecording
 
+from diffdrive_jacobian.bags.bounded_reader import BoundedReader
 from diffdrive_jacobian.bags.journal import PARAMETERS
-from diffdrive_jacobian.bags.storage import BagReader
 from diffdrive_jacobian.recording import parameter_query
 from diffdrive_jacobian.recording.parameter_query import ParameterQuery
 
@@ -74,9 +74,9 @@ def recorded_parameters(lockstep, tmp_path, stranger):
     recording.finish()
     # Whatever it answers, its messages are recorded.
     assert recording.summary.topics['/cmd_vel'] == 1
-    reader = BagReader(tmp_path / 'run')
+    reader = BoundedReader(tmp_path / 'run')
     reader.open()
-    text = dict(reader.metadata.custom).get(f'{PARAMETERS}/stranger')
+    text = dict(reader.storage.metadata.custom).get(f'{PARAMETERS}/stranger')
     reader.close()
     return None if text is None else json.loads(text)
 

@@ -20,6 +20,7 @@ from diffdrive_jacobian import bounded_yaml
 from diffdrive_jacobian.bags import bag_reader, bounded_reader, journal, limits
 from diffdrive_jacobian.bags import bag_writer as building
 from diffdrive_jacobian.bags.bag_reader import open_bag
+from diffdrive_jacobian.bags.bounded_reader import BoundedReader
 from diffdrive_jacobian.bags.journal import (
     LEFT_OUT,
     PARAMETERS,
@@ -30,7 +31,7 @@ from diffdrive_jacobian.bags.journal import (
     read_journal,
 )
 from diffdrive_jacobian.bags.message_definitions import definition
-from diffdrive_jacobian.bags.storage import BagReader, BagWriter, StoragePlugin
+from diffdrive_jacobian.bags.storage import BagWriter, StoragePlugin
 from diffdrive_jacobian.recording import recording as recordings
 from diffdrive_jacobian.recording.journal_thread import JournalThread
 from diffdrive_jacobian.recording.recording import LOST, MAX_LEFT_OUT, Recording, RecordingError
@@ -70,7 +71,7 @@ def add_all(recording, *records):
 
 def content(bag):
     """The messages of a bag in their order."""
-    reader = BagReader(bag)
+    reader = BoundedReader(bag)
     reader.open()
     try:
         return [bytes(data) for _, _, data in reader.messages(reader.connections)]
@@ -79,10 +80,10 @@ def content(bag):
 
 
 def custom_data(bag):
-    reader = BagReader(bag)
+    reader = BoundedReader(bag)
     reader.open()
     try:
-        return dict(reader.metadata.custom)
+        return dict(reader.storage.metadata.custom)
     finally:
         reader.close()
 

@@ -1,4 +1,4 @@
-"""rosbags' reader and writer for bags at any path, whose MCAP files have checksums.
+"""rosbags' writer for bags at any path, with checksums in MCAP files, and its reader of SQLite files.
 
 rosbags opens SQLite files as `file:PATH`, a URI in which `#`, `?` and `%` have a meaning, so that it
 would write and read a file of another name. In MCAP files it leaves all checksums at 0, which stands for
@@ -16,12 +16,10 @@ from typing import TYPE_CHECKING, BinaryIO
 from urllib.parse import quote
 
 from rosbags.rosbag2 import CompressionMode, ReaderError, StoragePlugin, Writer
-from rosbags.rosbag2.reader import DirectoryReader
-from rosbags.rosbag2.storage_mcap import McapReader, McapWriter
+from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader, Sqlite3Writer
 
 if TYPE_CHECKING:
-    from rosbags.rosbag2.reader import ReaderProtocol
     from rosbags.rosbag2.writer import StorageWriter
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
@@ -125,13 +123,4 @@ class BagWriter(Writer):
     STORAGE_PLUGINS: Mapping[StoragePlugin, type[StorageWriter]] = {
         StoragePlugin.MCAP: CheckedMcapWriter,
         StoragePlugin.SQLITE3: PathSqlite3Writer,
-    }
-
-
-class BagReader(DirectoryReader):
-    """Reads a bag's directory at any path."""
-
-    STORAGE_PLUGINS: Mapping[str, type[ReaderProtocol]] = {
-        'mcap': McapReader,
-        'sqlite3': PathSqlite3Reader,
     }
