@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -23,8 +22,8 @@ from diffdrive_jacobian.reading.verification import (
 )
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
-from diffdrive_jacobian.tools import _cli
-from diffdrive_jacobian.tools._waiting import busy
+from diffdrive_jacobian.tools import _cli, _options
+from diffdrive_jacobian.tools._messages import busy
 
 PROGRAM = 'verify_run'
 
@@ -130,24 +129,18 @@ def _parser(program: str = PROGRAM, option: str = '') -> argparse.ArgumentParser
         'recorded; 1: it does not; 2: wrong arguments, or the bag cannot be read; '
         '130: interrupted.',
     )
-    parser.add_argument('bag', metavar='BAG', type=Path, help='directory of a bag')
+    _options.add_bag(parser)
     default = f'{EXACT:g} if cmd_vel_out was recorded, else {BY_RECORDING_TIME:g}'
-    parser.add_argument(
-        '--tolerance',
-        metavar='M',
-        type=_cli.positive,
-        help=f'largest allowed difference of the position in m (default: {default})',
-    )
-    parser.add_argument(
-        '--yaw-tolerance',
-        metavar='RAD',
-        type=_cli.positive,
-        help=f'largest allowed difference of the heading in rad (default: {default})',
-    )
-    _cli.add_params_file(
+    for name, unit, of in (
+        ('--tolerance', 'M', 'position in m'),
+        ('--yaw-tolerance', 'RAD', 'heading in rad'),
+    ):
+        text = f'largest allowed difference of the {of} (default: {default})'
+        _options.add_value(parser, name, unit, text)
+    _options.add_params_file(
         parser,
         'ROS parameters of virtual_robot (YAML), if cmd_vel_out was not recorded '
         '(default: those recorded in the bag)',
     )
-    _cli.add_namespace(parser)
+    _options.add_namespace(parser)
     return parser
