@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from diffdrive_jacobian.bags.journal import JournalError
-from diffdrive_jacobian.recovery.recover import (
+from diffdrive_jacobian.bags.recovery import (
     RECOVERED,
     NotABagError,
     NothingToSaveError,
