@@ -13,6 +13,7 @@ from diffdrive_jacobian.parameters.declaration import (
     NodeParameters,
     specifications,
 )
+from diffdrive_jacobian.text import PATH_LIMIT, printable
 
 T = TypeVar('T')
 
@@ -163,3 +164,15 @@ def complain(program: str, message: object, code: int = USER_ERROR) -> int:
     """Print an error as argparse does; return the exit code."""
     print(f'{program}: error: {message}', file=sys.stderr)
     return code
+
+
+def interrupted(program: str, result: str = '') -> int:
+    """Print that a signal was caught, and what became of the files; return the exit code."""
+    print(f'{program}: interrupted{f": {result}" if result else ""}', file=sys.stderr)
+    return INTERRUPTED
+
+
+def cannot_write(program: str, path: object, error: OSError, result: str = '') -> int:
+    """Print that a file cannot be written, and what was written instead; return the exit code."""
+    message = f'{path} cannot be written: {error.strerror or error}{result}'
+    return complain(program, printable(message, PATH_LIMIT), FAILED)

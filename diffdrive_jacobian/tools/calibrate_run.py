@@ -56,10 +56,10 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             for note in read[-1].notes:
                 _note(f'{printable(bag, PATH_LIMIT)}: {note}')
             if signals.count:
-                return _interrupted()
+                return _cli.interrupted(PROGRAM, 'nothing was written')
         nominal = _nominal(options, read)
     except ReadingInterruptedError:
-        return _interrupted()
+        return _cli.interrupted(PROGRAM, 'nothing was written')
     except (BagError, UserError, ValueError, OSError) as error:
         return _cli.complain(PROGRAM, printable(error, PATH_LIMIT))
     try:
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     for note in result.notes:
         _note(note)
     if signals.count:
-        return _interrupted()
+        return _cli.interrupted(PROGRAM, 'nothing was written')
     _print_summary(result, read)
     if missing := explain_undetermined(result):
         return _cli.complain(PROGRAM, f'{missing}. Nothing was written', _cli.FAILED)
@@ -117,23 +117,17 @@ def _write(
         try:
             create(path, data, replace=replace)
         except OSError as error:
-            message = f'{path} cannot be written: {error.strerror or error}'
+            what = '; nothing was written'
             if replace:
-                message += f'; written: {", ".join(map(str, done)) or "nothing"}'
+                what = f'; written: {", ".join(map(str, done)) or "nothing"}'
             else:
                 for one in done:
                     one.unlink(missing_ok=True)
-                message += '; nothing was written'
-            return _cli.complain(PROGRAM, printable(message, PATH_LIMIT), _cli.FAILED)
+            return _cli.cannot_write(PROGRAM, path, error, what)
         done.append(path)
     for path in done:
         print(printable(path, PATH_LIMIT))
     return _cli.DONE
-
-
-def _interrupted() -> int:
-    print(f'{PROGRAM}: interrupted: nothing was written', file=sys.stderr)
-    return _cli.INTERRUPTED
 
 
 def _outputs(options: argparse.Namespace, bags: Sequence[Path]) -> tuple[Path, Path | None]:

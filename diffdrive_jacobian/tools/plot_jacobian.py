@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 
 from diffdrive_jacobian import plots
@@ -32,14 +31,12 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         ):
             content = render(getattr(plots, options.name)(), extension(path))
         if signals.count:
-            print(f'{PROGRAM}: interrupted: nothing was written', file=sys.stderr)
-            return _cli.INTERRUPTED
+            return _cli.interrupted(PROGRAM, 'nothing was written')
         create(path, content, replace=options.force)
     except (ValueError, UserError, FileExistsError) as error:
         return _cli.complain(PROGRAM, error)
     except OSError as error:
-        message = f'{output} cannot be written: {error.strerror or error}'
-        return _cli.complain(PROGRAM, message, _cli.FAILED)
+        return _cli.cannot_write(PROGRAM, output, error)
     print(path)
     return _cli.DONE
 

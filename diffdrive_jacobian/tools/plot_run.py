@@ -42,7 +42,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             try:
                 _check_writable(path, makes_directory=path in tables)
             except OSError as error:
-                return _not_written(path, error)
+                return _cli.cannot_write(PROGRAM, path, error)
         runs: list[Run] = []
         for bag in bags:
             with busy(PROGRAM, f'reading {printable(bag, PATH_LIMIT)}'):
@@ -59,11 +59,11 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             for note in runs[-1].notes:
                 print(f'{PROGRAM}: {printable(bag, PATH_LIMIT)}: {note}', file=sys.stderr)
             if signals.count:
-                return _interrupted()
+                return _cli.interrupted(PROGRAM)
         with explaining_no_matplotlib():
             return _write(runs, picture, tables, signals, replace=options.force)
     except ReadingInterruptedError:
-        return _interrupted()
+        return _cli.interrupted(PROGRAM)
     except (BagError, UserError) as error:
         return _cli.complain(PROGRAM, printable(error, PATH_LIMIT))
 
@@ -79,12 +79,12 @@ def _write(
     ]
     for path, write in zip([picture, *tables], writers, strict=True):
         if signals.count:
-            return _interrupted()
+            return _cli.interrupted(PROGRAM)
         try:
             with busy(PROGRAM, f'writing {printable(path, PATH_LIMIT)}'):
                 write()
         except OSError as error:
-            return _not_written(path, error)
+            return _cli.cannot_write(PROGRAM, path, error)
         try:
             print(printable(path, PATH_LIMIT))
         except BrokenPipeError:
@@ -93,11 +93,6 @@ def _write(
             # It is not buffered.
             return _cli.complain(PROGRAM, f'{OUTPUT_ERROR}: {error.strerror}', _cli.FAILED)
     return _cli.DONE
-
-
-def _not_written(path: Path, error: OSError) -> int:
-    message = f'{path} cannot be written: {error.strerror or error}'
-    return _cli.complain(PROGRAM, printable(message, PATH_LIMIT), _cli.FAILED)
 
 
 def _check_writable(path: Path, *, makes_directory: bool) -> None:
@@ -110,11 +105,6 @@ def _check_writable(path: Path, *, makes_directory: bool) -> None:
 def _write_table(run: Run, path: Path, *, replace: bool) -> None:
     path.parent.mkdir(exist_ok=True)
     write_csv(run, path, replace=replace)
-
-
-def _interrupted() -> int:
-    print(f'{PROGRAM}: interrupted', file=sys.stderr)
-    return _cli.INTERRUPTED
 
 
 def _picture(options: argparse.Namespace, bags: Sequence[Path]) -> Path:

@@ -44,8 +44,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                 interrupted=lambda: bool(signals.count),
             )
     except RecoveryInterruptedError:
-        print(f'{PROGRAM}: interrupted: no bag was written', file=sys.stderr)
-        return _cli.INTERRUPTED
+        return _cli.interrupted(PROGRAM, 'no bag was written')
     except NothingToSaveError as error:
         reason, *losses = error.args
         print(f'{PROGRAM}: {printable(reason, PATH_LIMIT)}', *_listed(losses), sep='\n', file=sys.stderr)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -63,12 +62,11 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             # Other processes that started in the same second may have taken the names meanwhile.
             picture, numbers = _files(options)
     except SweepInterruptedError:
-        print(f'{PROGRAM}: interrupted: nothing was written', file=sys.stderr)
-        return _cli.INTERRUPTED
+        return _cli.interrupted(PROGRAM, 'nothing was written')
     except (ValueError, UserError, FileExistsError) as error:
         return _cli.complain(PROGRAM, error)
     except OSError as error:
-        return _cannot_write(error.filename, error)
+        return _cli.cannot_write(PROGRAM, error.filename, error)
     code = _write([(numbers, rows), (picture, drawn)], replace=options.force)
     print(describe_sweep(swept))
     return code
@@ -187,16 +185,11 @@ def _write(contents: Sequence[tuple[Path | None, bytes]], *, replace: bool) -> i
             create(path, content, replace=replace)
             written.append(path)
         except OSError as error:
-            code = _cannot_write(path, error)
+            code = _cli.cannot_write(PROGRAM, path, error)
     # Only now: the reader of the output may go away.
     for path in written:
         print(path)
     return code
-
-
-def _cannot_write(path: object, error: OSError) -> int:
-    print(f'{PROGRAM}: error: {path} cannot be written: {error.strerror or error}', file=sys.stderr)
-    return _cli.FAILED
 
 
 def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:

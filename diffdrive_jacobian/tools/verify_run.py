@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 
 import numpy as np
@@ -111,8 +110,7 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace, signals: 
     except (UserError, BagError, ParameterError) as error:
         return _cli.complain(parser.prog, error)
     except ReadingInterruptedError:
-        print(f'{parser.prog}: interrupted', file=sys.stderr)
-        return _cli.INTERRUPTED
+        return _cli.interrupted(parser.prog)
     allowed = verification.allowed
     tolerance = allowed if options.tolerance is None else options.tolerance
     yaw_tolerance = allowed if options.yaw_tolerance is None else options.yaw_tolerance
