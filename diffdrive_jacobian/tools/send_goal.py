@@ -28,6 +28,8 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     options = _cli.parse(parser, own)
     heading = _options.given_heading(parser, options)
     _cli.refuse_with(parser, options, '--timeout', '--no-wait')
+    if options.timeout is None:
+        options.timeout = math.inf
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
         from diffdrive_jacobian.nodes.remote_goal import send_goal
@@ -39,7 +41,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                 frame=options.frame,
                 readers=options.readers or 1,
                 patience=options.wait,
-                timeout=math.inf if options.timeout is None else options.timeout,
+                timeout=options.timeout,
                 follow=not options.no_wait,
                 heading_matters=heading is not None,
                 ros_arguments=ros,
