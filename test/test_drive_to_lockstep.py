@@ -200,7 +200,7 @@ def test_a_stuck_callback_fails_and_the_recording_is_kept(tmp_path, capsys, monk
 
 
 def test_a_bug_keeps_the_recording(tmp_path, monkeypatch):
-    monkeypatch.setattr(_progress.Drive, 'show', lambda *_: 1 / 0)
+    monkeypatch.setattr(_progress.GoalBar, 'show', lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         drive_to.main(['1', '1', '--lockstep', '--no-plot', '-o', 'bag'], Signals())
     assert (tmp_path / 'bag').is_dir()

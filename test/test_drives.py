@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from diffdrive_jacobian.bags import read_run
-from diffdrive_jacobian.drives import DriveError, Outcome, drive, drive_in, waypoints_through
+from diffdrive_jacobian.drives import DriveError, Outcome, drive, waypoints_through
 from diffdrive_jacobian.drives.runners import in_lockstep
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
@@ -90,7 +90,9 @@ def test_errors_are_typed(monkeypatch):
     with pytest.raises(ValueError, match=r'must have shape \(n, 2\)'):
         drive([1.0, 1.0], lockstep=True)
     with in_lockstep() as runner, pytest.raises(ValueError, match=r'goals must have shape \(n, 3\)'):
-        drive_in(runner, np.zeros((0, 3)))
+        drive(np.zeros((0, 3)), runner=runner)
+    with in_lockstep() as runner, pytest.raises(ValueError, match='are those of the runner'):
+        drive([[1.0, 1.0]], runner=runner, lockstep=True)
 
     def sleep(self, *_):
         self.get_clock().sleep_until(self.get_clock().now() + GoToGoal.LONG)

@@ -18,11 +18,11 @@ from hypothesis import strategies as st
 
 from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.exploration import search
-from diffdrive_jacobian.exploration.result import described_replay
 from diffdrive_jacobian.faults import Delay, Loss
 from diffdrive_jacobian.properties import AccelerationWithin, NeverFasterThan
 from diffdrive_jacobian.testing import (
     ExplorationError,
+    Replay,
     SerialExecutor,
     explore,
     fault_schedules,
@@ -313,6 +313,7 @@ def test_mistakes_are_named(arguments, words):
 
 
 def test_where_a_replay_differs():
-    assert described_replay(True, False, ['numpy 1 here, 2 there']) == (
-        'violated as found, but not bit for bit; numpy 1 here, 2 there'
+    replay = Replay(
+        violation=None, same_verdict=True, same_bits=False, differences=('numpy 1 here, 2 there',)
     )
+    assert str(replay) == ('violated as found, but not bit for bit; numpy 1 here, 2 there')

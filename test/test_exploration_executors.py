@@ -27,11 +27,11 @@ from diffdrive_jacobian.exploration.replay import replay
 from diffdrive_jacobian.exploration.trial import Outcome
 from diffdrive_jacobian.faults import Loss
 from diffdrive_jacobian.properties import NeverFasterThan
-from diffdrive_jacobian.simulation import Setup, Sweep, sweep
+from diffdrive_jacobian.simulation import Sweep, SweepSetup, sweep
 from diffdrive_jacobian.testing import LocalExecutor, SerialExecutor, explore, fault_schedules
 
 LOSSES = fault_schedules(['speed'], kinds=[Loss], duration=1.2)
-SETUP = Setup(grid=5, starts=3, rate=20.0)
+SETUP = SweepSetup(grid=5, starts=3, rate=20.0)
 
 
 PYTHON = sys.executable
@@ -58,7 +58,7 @@ def expected():
 def same_results(executor, expected, monkeypatch):
     """Check that an executor explores and sweeps as this thread does, bit for bit."""
     # One row of the grid for each task.
-    monkeypatch.setattr(sys.modules[Setup.__module__], 'LOOPS_PER_TASK', 1)
+    monkeypatch.setattr(sys.modules[SweepSetup.__module__], 'LOOPS_PER_TASK', 1)
     found, swept = expected
     again = follow_on(executor)
     assert again.findings == found.findings

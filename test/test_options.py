@@ -13,7 +13,7 @@ import pytest
 from diffdrive_jacobian import __version__
 from diffdrive_jacobian.parameters.configurations import configurations
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _cli, _waiting, entry_points
+from diffdrive_jacobian.tools import _cli, _messages, _options, entry_points
 
 CONFIGS = Path(__file__).parents[1] / 'config'
 
@@ -87,7 +87,7 @@ def test_the_configurations_of_an_installation_are_found(tmp_path, monkeypatch):
 
 def test_robot_stands_for_its_parameter_file(capsys):
     parser = _cli.Parser(prog='x')
-    _cli.add_params_file(parser)
+    _options.add_params_file(parser)
     options = parser.parse_args(['--robot', 'turtlebot3_burger'])
     assert Path(options.params_file).read_text() == (CONFIGS / 'turtlebot3_burger.yaml').read_text()
     assert 'create3, turtlebot3_burger' in ' '.join(parser.format_help().split())
@@ -117,8 +117,8 @@ def test_another_robot_is_refused_with_those_there_are(capsys):
 )
 def test_headings_are_in_radians_or_degrees(arguments, expected):
     parser = _cli.Parser(prog='x')
-    _cli.add_heading(parser, 'heading')
-    assert _cli.given_heading(parser, parser.parse_args(arguments)) == expected
+    _options.add_heading(parser, 'heading')
+    assert _options.given_heading(parser, parser.parse_args(arguments)) == expected
 
 
 @pytest.mark.parametrize('tool', ['drive_to', 'send_goal'])
@@ -164,13 +164,13 @@ def test_options_without_effect_are_refused(capsys, tmp_path, monkeypatch, tool,
     ('text', 'expected'), [('robot1', '/robot1'), ('/a/b/', '/a/b'), ('/', '/'), ('', '/')]
 )
 def test_namespaces(text, expected):
-    assert _cli.namespace(text) == expected
+    assert _options.namespace(text) == expected
 
 
 @pytest.mark.parametrize('text', ['a b', '1a', 'a//b', 'a-b'])
 def test_names_that_are_no_namespace(text):
     with pytest.raises(argparse.ArgumentTypeError):
-        _cli.namespace(text)
+        _options.namespace(text)
 
 
 # --- Bags of several robots
@@ -362,8 +362,8 @@ def test_plot_run_and_sweep_gains_overwrite_files_only(tmp_path, robots, capsys,
 
 def test_what_is_waited_for_is_said_after_half_a_second_of_each_wait(monkeypatch, capsys):
     now = 100.0
-    monkeypatch.setattr(_waiting.time, 'monotonic', lambda: now)
-    waiting = _waiting.Waiting()
+    monkeypatch.setattr(_messages.time, 'monotonic', lambda: now)
+    waiting = _messages.Waiting()
     said = []
     for step in range(100):
         now = 100.0 + 0.1 * step
@@ -396,12 +396,12 @@ def test_long_work_is_named_on_a_terminal(monkeypatch, capsys):
             self.written.set()
 
     terminal = Terminal()
-    monkeypatch.setattr(_waiting, 'FIRST', 0.01)
-    with _waiting.busy('tool', 'reading'):
+    monkeypatch.setattr(_messages, 'FIRST', 0.01)
+    with _messages.busy('tool', 'reading'):
         pass
     assert capsys.readouterr().err == ''
-    monkeypatch.setattr(_waiting.sys, 'stderr', terminal)
-    with _waiting.busy('tool', 'reading'):
+    monkeypatch.setattr(_messages.sys, 'stderr', terminal)
+    with _messages.busy('tool', 'reading'):
         assert terminal.written.wait(10.0)
     assert terminal.getvalue() == 'tool: reading ...\n'
 

@@ -22,7 +22,7 @@ from diffdrive_jacobian.numerics.formula import formula
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.simulation import Setup, closed_loops, sweep, table
+from diffdrive_jacobian.simulation import SweepSetup, closed_loops, sweep, sweep_table
 from diffdrive_jacobian.tools import sweep_gains
 from diffdrive_jacobian.tools.run_node import run_node
 
@@ -160,12 +160,12 @@ def test_the_page_offers_the_gains_of_the_controller(install):
 
 
 def test_three_gains_are_swept_two_at_a_time(install, tmp_path, monkeypatch, capsys):
-    setup = Setup(controller=POLAR, gains={'k_alpha': (1.5, 3.0), 'k_beta': -0.3}, grid=3, starts=4)
+    setup = SweepSetup(controller=POLAR, gains={'k_alpha': (1.5, 3.0), 'k_beta': -0.3}, grid=3, starts=4)
     assert [gain.name for gain in setup.axes] == ['k_rho', 'k_alpha']
     swept = sweep(setup)
     # 0.05/s is too slow for a minute.
     assert swept.complete.tolist() == [[False, True, True]] * 3
-    header, *rows = table(swept).splitlines()
+    header, *rows = sweep_table(swept).splitlines()
     assert header.startswith('k_rho_per_s,k_alpha_per_s,starts,arrived,time_mean_s,')
     assert rows[3].startswith('0.775,1.5,4,4,')
     alone = closed_loops(
@@ -309,6 +309,6 @@ def test_gains_named_as_options_are_swept_under_another_name(capsys, monkeypatch
 @pytest.mark.parametrize('bad', ['x', None, (1.0,), [1.0, 2.0, 3.0], 1j, math.nan], ids=str)
 def test_gains_of_a_setup_are_numbers_or_ranges(bad):
     with pytest.raises(ValueError, match='kp must be'):
-        Setup(gains={'kp': bad})
+        SweepSetup(gains={'kp': bad})
     with pytest.raises(ValueError, match='gains must be of class Mapping'):
-        Setup(gains=[('kp', 1.0)])
+        SweepSetup(gains=[('kp', 1.0)])

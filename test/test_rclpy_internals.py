@@ -11,18 +11,15 @@ import time
 from pathlib import Path
 
 import pytest
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, ParameterEvent
 from rcl_interfaces.srv import GetParameters
 from rclpy.clock import Clock
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.exceptions import InvalidParameterValueException, ParameterAlreadyDeclaredException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode
 from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import HistoryPolicy, QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
@@ -78,87 +75,6 @@ def test_parameters_that_rclpy_declares_are_known(ros):
     assert all(name.startswith(internals.PARAMETERS_OF_RCLPY) for name in declared)
     node.declare_parameter('gain', 1.0)
     assert internals.declared_parameters(node) == {*declared, 'gain'}
-
-
-def described(node):
-    """Return the values and the descriptors of the parameters of a node, by name."""
-    return {
-        name: (node.get_parameter(name).value, node.describe_parameter(name))
-        for name in internals.declared_parameters(node)
-    }
-
-
-def test_parameters_declared_together_are_as_declared_one_by_one_with_one_event(ros):
-    together, one_by_one = (ros.add(Node, node_name=name) for name in ('together', 'one_by_one'))
-    events = ros.listen(ParameterEvent, '/parameter_events')
-
-    def parameters():
-        limits = ParameterDescriptor(
-            description='A gain.',
-            floating_point_range=[FloatingPointRange(from_value=0.0, to_value=2.0)],
-        )
-        return [
-            ('gain', 1.0, limits),
-            ('name', 'a', ParameterDescriptor(read_only=True)),
-            ('enabled', False, ParameterDescriptor()),
-            ('count', 3, ParameterDescriptor()),
-        ]
-
-    one_by_one.declare_parameters('', parameters())
-    internals.declare_together(together, parameters())
-    assert described(together) == described(one_by_one)
-    ros.until(lambda: events and events[-1].node == '/together', 'the event')
-    assert [one.node for one in events] == 4 * ['/one_by_one'] + ['/together']
-    assert events[-1].new_parameters == [one.new_parameters[0] for one in events[:4]]
-    assert not together.set_parameters([Parameter('gain', value=3.0)])[0].successful
-    assert not together.set_parameters([Parameter('name', value='b')])[0].successful
-
-
-@pytest.mark.parametrize(
-    ('second', 'error'),
-    [
-        (('gain', 2.0), ParameterAlreadyDeclaredException),
-        (
-            ('other', 2.0, FloatingPointRange(from_value=0.0, to_value=1.0)),
-            InvalidParameterValueException,
-        ),
-    ],
-)
-def test_declaring_together_raises_what_rclpy_raises(ros, second, error):
-    node = ros.add(Node, node_name='twice')
-    internals.declare_together(node, [('gain', 1.0, ParameterDescriptor())])
-    name, value, *ranges = second
-    with pytest.raises(error):
-        internals.declare_together(
-            node, [(name, value, ParameterDescriptor(floating_point_range=ranges))]
-        )
-    assert node.get_parameter('gain').value == 1.0
-
-
-def test_quality_of_service_is_declared_as_rclpy_does(ros):
-    ours, theirs = (ros.add(Node, node_name=name) for name in ('ours', 'theirs'))
-    profile = QoSProfile(depth=7)
-    assert internals.declare_qos(ours, '/odom', 'publisher', profile)
-    assert internals.declare_qos(ours, '/odom', 'subscription', profile)
-    assert not internals.declare_qos(ours, '/odom', 'publisher', profile)
-    options = QoSOverridingOptions.with_default_policies
-    theirs.create_publisher(String, 'odom', profile, qos_overriding_options=options())
-    theirs.create_subscription(String, 'odom', [].append, profile, qos_overriding_options=options())
-    assert described(ours) == described(theirs)
-
-
-def test_quality_of_service_that_a_user_overrides_is_left_to_rclpy(ros):
-    parameters = {'qos_overrides./odom.publisher.depth': 3}
-    node = ros.add(Node, node_name='overridden', parameters=parameters)
-    assert not internals.declare_qos(node, '/odom', 'publisher', QoSProfile(depth=7))
-    assert not node.has_parameter('qos_overrides./odom.publisher.depth')
-
-
-@pytest.mark.parametrize(('policy', 'value'), [('history', 'keep_last'), ('depth', 7)])
-def test_quality_of_service_that_was_declared_before_is_left_to_rclpy(ros, policy, value):
-    node = ros.add(Node, node_name='declared')
-    node.declare_parameter(f'qos_overrides./odom.publisher.{policy}', value)
-    assert not internals.declare_qos(node, '/odom', 'publisher', QoSProfile(depth=7))
 
 
 def test_services_that_rclpy_provides_are_known(ros):

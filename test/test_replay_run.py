@@ -22,7 +22,6 @@ from test_reading import count_more
 from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.recording.lateness import Lateness
 from diffdrive_jacobian.recording.replayer import Replayer
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.testing import Lockstep
@@ -307,26 +306,6 @@ def test_every_round_takes_as_long_as_the_recording(world, bag):
     times = np.array([one.clock.sec + 1e-9 * one.clock.nanosec for one in clock])
     rounds = np.flatnonzero(np.diff(times) < -LENGTH / 2)
     assert len(rounds) + 1 <= count <= len(rounds) + 2
-
-
-# --- Lateness
-
-
-def test_lateness_is_a_histogram_of_bounded_size():
-    delays = np.random.default_rng(1).lognormal(np.log(2e5), 2.0, 20_000).astype(int)
-    lateness = Lateness()
-    for delay in delays.tolist():
-        lateness.add(delay)
-    assert (lateness.count, lateness.maximum) == (len(delays), delays.max())
-    assert len(lateness._bins) < 1000
-    for percent in (0.0, 1.0, 50.0, 99.0, 100.0):
-        exact = np.percentile(delays, percent, method='inverted_cdf')
-        assert exact * 15 / 16 <= lateness.percentile(percent) <= exact
-    lateness.add(-5)
-    assert lateness.percentile(0.0) == 0.0
-    assert np.isnan(Lateness().percentile(50.0))
-    with pytest.raises(ValueError, match=r'percent must be in \[0, 100\], got 101'):
-        lateness.percentile(101.0)
 
 
 # --- Verification

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from processes import open_world
 
-from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools import _cli, _messages, _options
 
 CONFIGS = sorted((Path(__file__).parents[1] / 'config').glob('*.yaml'))
 QUICK = ('--ros-args', '-p', 'go_to_goal:kp:=8.0', '-p', 'go_to_goal:kv:=4.0')
@@ -333,13 +333,13 @@ def test_a_bag_is_not_named_like_a_file(name):
     import argparse
 
     with pytest.raises(argparse.ArgumentTypeError, match='must name a bag, which is a directory'):
-        _cli.bag_folder(name)
+        _options.bag_folder(name)
     for usual in ('run', 'run.2', 'runs.png/run', 'run_2026_01_01-10_00_00', '.png'):
-        assert _cli.bag_folder(usual) == usual
+        assert _options.bag_folder(usual) == usual
 
 
 def test_numbers_agree_with_their_nouns():
-    counted = [_cli.counted(number, 'topic') for number in (0, 1, 2)]
+    counted = [_messages.counted(number, 'topic') for number in (0, 1, 2)]
     assert counted == ['0 topics', '1 topic', '2 topics']
 
 

@@ -1,4 +1,4 @@
-"""rosbags' reader and writer for bags at any path, whose MCAP files have checksums.
+"""rosbags' writer for bags at any path, with checksums in MCAP files, and its reader of SQLite files.
 
 rosbags opens SQLite files as `file:PATH`, a URI in which `#`, `?` and `%` have a meaning, so that it
 would write and read a file of another name. In MCAP files it leaves all checksums at 0, which stands for

@@ -10,17 +10,17 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.bags.covariance_rule import NEITHER, recorded_model, rule, start_covariances
 from diffdrive_jacobian.bags.ground_truth import (
     TruthDifferences,
     placed_as_recorded,
+    recorded_drift,
     truth_differences,
 )
 from diffdrive_jacobian.bags.run import Run, Series
@@ -28,17 +28,21 @@ from diffdrive_jacobian.bags.run_reader import BagError, ReadingInterruptedError
 from diffdrive_jacobian.messages.conversion import MessageError, plausible_twist
 from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.parameters.declaration import from_ros
-from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
+from diffdrive_jacobian.parameters.virtual_robot import MULTIPLIERS, VirtualRobotParameters
+from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 ROBOT = 'virtual_robot'
 EXACT, BY_RECORDING_TIME = 1e-9, 0.02
 """Default tolerances, with `cmd_vel_out` and with commands by their time of recording (m, rad)."""
+COVARIANCE_TOLERANCE = 1e-9
+"""Largest allowed difference of a covariance, relative to the standard deviations."""
 _MAX_CANDIDATES = 32
 """Largest number of commands among which the last one that preceded an odometry message is sought."""
 _MAX_DELAY = 1.0
 """Beyond this delay of the odometry (median) its stamps and the recorder are of different clocks (s)."""
+_NOISE_PARAMETERS = ('wheel_separation', 'wheel_travel_variance')
 _NEVER = int(np.iinfo(np.int64).max)
 
 
@@ -59,12 +63,10 @@ class Verification:
     notes: tuple[str, ...] = ()
     """Faults of the bag that did not prevent reading it, such as messages that were skipped, and how
     many odometry messages were not compared."""
-    covariance: str | None = None
-    """The rule that the covariances of the pose follow: `exact moments`, `first order` (as published by
-    earlier versions), or `neither`. None: they were not compared, because the parameters of the robot or
-    its start were not recorded."""
-    covariance_difference: float = 0.0
-    """Largest difference of a covariance from the rule, relative to the standard deviations."""
+    covariance_difference: float | None = None
+    """Largest difference of a covariance of the pose from the exact moments of the noise model, relative
+    to the standard deviations. None: they were not compared, because the parameters of the robot or its
+    start were not recorded."""
     truth: TruthDifferences | None = None
     """Differences of the ground truth. None: it was not compared, because it, the parameters of the
     robot or its start were not recorded."""
@@ -75,14 +77,15 @@ class Verification:
         return EXACT if self.source == 'cmd_vel_out' else BY_RECORDING_TIME
 
     def holds(self, tolerance: float, yaw_tolerance: float) -> bool:
-        """Return whether no difference exceeds the tolerances (m, rad), and the covariances follow a
-        rule if they were compared.
+        """Return whether no difference exceeds the tolerances (m, rad).
+
+        The covariances, if they were compared, must be the exact moments.
         """
         near = np.all(self.distances <= tolerance) and np.all(self.headings <= yaw_tolerance)
         if self.truth is not None:
             near &= np.all(self.truth.distances <= tolerance)
             near &= np.all(self.truth.headings <= yaw_tolerance)
-        return bool(near) and self.covariance != NEITHER
+        return bool(near) and (self.covariance_difference or 0.0) <= COVARIANCE_TOLERANCE
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,8 +131,8 @@ def verify(
         source, start, anchors = _commanded(run, parameters)
     stamps, values = run.odometry.stamps, run.odometry.values
     seconds, poses = [], []
-    messages: list[tuple[int, Robot]] = []
-    covariances: list[int] = []
+    simulated: list[Robot] = []
+    compared: list[int] = []
     measured = []
     followed = False
     epochs = _epochs(run.odometry)
@@ -147,13 +150,12 @@ def verify(
             raise ReadingInterruptedError
         found = _nearest(anchors[epoch], run.odometry, index)
         if found is not None:
-            last, robot = found
             if epoch == 0:
-                messages.append((last, robot))
-                covariances.append(index)
+                simulated.append(found)
+                compared.append(index)
             followed |= int(stamps[index]) > first_commands[epoch]
             seconds.append((stamps[index] - stamps[0]) / NANOSECONDS)
-            poses.append(robot.pose)
+            poses.append(found.pose)
             measured.append(values[index, :3])
     if not followed:
         raise BagError(
@@ -167,13 +169,14 @@ def verify(
             f'{omitted} of {len(stamps)} odometry messages precede the start of the simulated robot and '
             'were not compared',
         )
-    covariance: tuple[str | None, float] = (None, 0.0)
+    covariance_difference = None
     if start == 'start_pose' and recorded_model(run) and len(run.odometry_covariances) == len(stamps):
-        events = [(anchor.robot, not anchor.is_command) for anchor in anchors[0]]
-        covariance = rule(events, messages, run.odometry_covariances[covariances, :6])
+        covariance_difference = largest_covariance_difference(
+            simulated, run.odometry_covariances[compared, :6]
+        )
     truth = None
     if start == 'start_pose':
-        truth = truth_differences(run, (robot for _, robot in messages))
+        truth = truth_differences(run, simulated)
     if truth is None and len(run.ground_truth):
         notes += (
             'ground_truth was not compared: it needs the parameters of virtual_robot, cmd_vel_out and '
@@ -187,8 +190,7 @@ def verify(
         distances=np.hypot(difference[:, 0], difference[:, 1]),
         headings=np.abs(wrap(difference[:, 2])),
         notes=notes,
-        covariance=covariance[0],
-        covariance_difference=covariance[1],
+        covariance_difference=covariance_difference,
         truth=truth,
     )
 
@@ -199,8 +201,8 @@ def _epochs(series: Series) -> list[int]:
     return [0, *np.cumsum(back).astype(int).tolist()]
 
 
-def _nearest(anchors: list[_Anchor], odometry: Series, index: int) -> tuple[int, Robot] | None:
-    """Return the last event before an odometry message, and the robot then; None: it starts later.
+def _nearest(anchors: list[_Anchor], odometry: Series, index: int) -> Robot | None:
+    """Return the robot at the stamp of an odometry message; None: it starts later.
 
     A command that took effect before that stamp, but was recorded no sooner than the message, may have
     reached the robot after it sent the message, or only the recorder late. Which was published first is
@@ -211,16 +213,16 @@ def _nearest(anchors: list[_Anchor], odometry: Series, index: int) -> tuple[int,
     last = bisect_right(anchors, stamp, key=lambda anchor: anchor.robot.stamp) - 1
     if last < 0:
         return None
-    robot = last, anchors[last].robot.at(stamp)
+    robot = anchors[last].robot.at(stamp)
     # The first one is the start of the robot, the others are in the order of their recording.
     known = bisect_left(anchors, received, 1, last + 1, key=lambda anchor: anchor.received) - 1
     if known == last:
         return robot
     earlier = range(max(known, last + 1 - _MAX_CANDIDATES), last)
-    candidates = [robot, *((one, anchors[one].robot.at(stamp)) for one in earlier)]
+    candidates = [robot, *(anchors[one].robot.at(stamp) for one in earlier)]
 
-    def apart(candidate: tuple[int, Robot]) -> float:
-        dx, dy, turn = (odometry.values[index, :3] - candidate[1].pose).tolist()
+    def apart(candidate: Robot) -> float:
+        dx, dy, turn = (odometry.values[index, :3] - candidate.pose).tolist()
         return math.hypot(dx, dy) + abs(float(wrap(turn)))
 
     return min(candidates, key=apart)
@@ -372,3 +374,60 @@ def _twist(model: RobotModel, source: str, values: NDArray[np.float64]) -> tuple
     if source == 'cmd_vel':
         return first, second
     return plausible_twist(*model.twist(first, second))
+
+
+# --- The covariances
+
+
+def recorded_model(run: Run) -> RobotModel | None:
+    """Return the model of the robot; None: it was not recorded, or it changed."""
+    recorded = run.of_node(ROBOT)
+    # A robot that starts later than the recorder reports its first values as changes.
+    changed = {
+        name
+        for _, node, values in run.parameter_events
+        if node.split('/')[-1] == ROBOT
+        for name, value in values.items()
+        if value != recorded.get(name)
+    }
+    separation, variance = (run.number_of_node(ROBOT, name, math.nan) for name in _NOISE_PARAMETERS)
+    separation *= run.number_of_node(ROBOT, 'wheel_separation_multiplier', 1.0)
+    if changed & {*_NOISE_PARAMETERS, *MULTIPLIERS} or not (separation > 0.0 and variance >= 0.0):
+        return None
+    drift = recorded_drift(run)
+    return RobotModel(wheel_separation=separation, wheel_travel_variance=variance, drift=drift)
+
+
+def start_covariances(run: Run) -> NDArray[np.float64]:
+    """Return the covariance in each `start_pose`, by rows, shape (n, 9); zero where it is invalid."""
+    entries = run.start_covariances
+    if len(entries) != len(run.start_pose):
+        return np.zeros((len(run.start_pose), 9))
+    matrices: NDArray[np.float64] = entries[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].copy()
+    for row in matrices:
+        try:
+            covariance_of_pose('covariance', row.reshape(3, 3))
+        except ValueError:
+            row[:] = 0.0
+    return matrices
+
+
+def largest_covariance_difference(robots: Sequence[Robot], recorded: NDArray[np.float64]) -> float:
+    """Return the largest difference of recorded covariances from the exact moments of the noise model.
+
+    Args:
+        robots: The robot at each message.
+        recorded: Entries xx, xy, xt, yy, yt, tt of each message, shape (n, 6).
+
+    Returns:
+        The difference, relative to the standard deviations. Infinity: a covariance is not comparable.
+    """
+    computed = np.array([robot.moments[:6] for robot in robots]).reshape(-1, 6)
+    position = np.sqrt(computed[:, 0] + computed[:, 3])
+    heading = np.sqrt(computed[:, 5])
+    scales = np.stack([position, position, position, position, position, heading], axis=-1)
+    scales *= np.stack([position, position, heading, position, heading, heading], axis=-1)
+    difference = np.abs(recorded - computed)
+    with np.errstate(all='ignore'):
+        relative = np.where(difference == 0.0, 0.0, difference / scales)
+    return float(np.max(relative, initial=0.0)) if not np.isnan(relative).any() else math.inf

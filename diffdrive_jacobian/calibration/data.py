@@ -55,8 +55,6 @@ class WheelsAndReference:
     reference_topic: str
     wheel_names: tuple[str, str]
     """Joints of the left and the right wheel."""
-    from_speeds: bool
-    """Whether the angles were integrated from speeds, because the bag has none."""
     dimensions: tuple[float, float] | None
     """Nominal wheel radius and wheel separation that the bag's parameters have (m)."""
     notes: tuple[str, ...] = ()
@@ -126,7 +124,6 @@ def read_wheels_and_reference(
         wheels_topic=wheels_topic,
         reference_topic=poses_topic,
         wheel_names=chosen,
-        from_speeds=from_speeds,
         dimensions=dimensions_of(where, parameters),
         notes=tuple(notes),
     )

@@ -164,14 +164,14 @@ def _ends(travel: Array, length: float) -> tuple[NDArray[np.intp], NDArray[np.in
     return bounds[:-1], bounds[1:]
 
 
-def _length(segment: Segment, travel: Array, separation: float) -> float:
+def _part_length(travel: Array, separation: float) -> float:
     return max(2.0 * separation, float(travel.sum()) / PARTS)
 
 
 def _parts(segment: Segment, nominal: Geometry, offset: float) -> tuple[Array, Array]:
     """Return the turns of both wheels and of the sensor in each part, shapes (n, 2) and (n,) (rad)."""
     moved = _moved(segment, nominal, offset)
-    first, last = _ends(moved.travel, _length(segment, moved.travel, nominal.separation))
+    first, last = _ends(moved.travel, _part_length(moved.travel, nominal.separation))
     at = segment.time + offset
     angles = np.column_stack(
         [np.interp(at, segment.wheel_time, segment.wheel_angles[:, side]) for side in (0, 1)]
@@ -185,7 +185,7 @@ def _parts(segment: Segment, nominal: Geometry, offset: float) -> tuple[Array, A
 def _positions(segment: Segment, geometry: Geometry, offset: float) -> tuple[Array, Array]:
     """Return equations for the scale, the yaw offset and the lever arm: `A x = b`."""
     moved = _moved(segment, geometry, offset)
-    first, last = _ends(moved.travel, _length(segment, moved.travel, geometry.separation))
+    first, last = _ends(moved.travel, _part_length(moved.travel, geometry.separation))
     step = relative(moved.poses[first], moved.poses[last])
     found = relative(segment.poses[first], segment.poses[last])
     c, s = np.cos(step[:, 2]), np.sin(step[:, 2])

@@ -16,7 +16,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from diffdrive_jacobian.control.controller import Controller, Law
+from diffdrive_jacobian.control.controller import Controller
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.numerics.fields import instance, short
 
@@ -121,11 +121,6 @@ def find_controller(name: str) -> Controller:
 def controller_names() -> tuple[str, ...]:
     """Return the names of the built-in and the installed controllers, sorted. Nothing is imported."""
     return tuple(CONTROLLERS)
-
-
-def controller_of(law: Law) -> Controller | None:
-    """Return the built-in controller that has this law; None if there is none."""
-    return next((one for one in BUILT_IN.values() if one.law is law), None)
 
 
 def _entry_points(name: str | None = None) -> list[EntryPoint]:

@@ -4,7 +4,6 @@ from diffdrive_jacobian.drives.driving import (
     DriveProgress,
     Outcome,
     drive,
-    drive_in,
     waypoints_through,
 )
 from diffdrive_jacobian.drives.runners import DriveError, in_lockstep, in_real_time
@@ -14,7 +13,6 @@ __all__ = [
     'DriveProgress',
     'Outcome',
     'drive',
-    'drive_in',
     'in_lockstep',
     'in_real_time',
     'waypoints_through',

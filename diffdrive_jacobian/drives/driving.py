@@ -124,6 +124,7 @@ def waypoints_through(places: ArrayLike, heading: float = 0.0) -> NDArray[np.flo
 def drive(
     goals: ArrayLike,
     *,
+    runner: NodeRunner | None = None,
     lockstep: bool = False,
     isolated: bool = True,
     timeout: float = TIMEOUT,
@@ -138,6 +139,8 @@ def drive(
     Args:
         goals: `[x, y]` of each goal, shape (n, 2), or `[x, y, theta]`, shape (n, 3) (m, m, rad). theta
             matters for controllers that use the heading, and with the parameter `use_goal_heading`.
+        runner: Runs the nodes, and may run others: `in_real_time` or `in_lockstep`. None: one is created
+            as `lockstep`, `isolated` and `ros_arguments` say, and closed at the end.
         lockstep: Whether to drive in simulated time, as fast as possible and with the same result each
             time. rclpy must not be initialised then.
         isolated: Whether no other process can communicate with the nodes. Always so in lockstep.
@@ -151,51 +154,28 @@ def drive(
     Raises:
         UserError: A node cannot run with the parameters or ROS arguments given.
         DriveError: In lockstep, a callback blocks, or simulated time cannot advance.
-        ValueError: `goals` has another shape, or `lockstep` is not isolated.
+        ValueError: `goals` has another shape, `lockstep` is not isolated, or one of the arguments for a
+            new runner is given together with `runner`.
     """
     goals = np.asarray(goals, dtype=np.float64)
     if goals.ndim != 2 or goals.shape[1] != 3:
         goals = waypoints_through(goals)
     if lockstep and not isolated:
         raise ValueError('a drive in lockstep is always isolated: other processes have another clock')
-    stage = in_lockstep(ros_arguments) if lockstep else in_real_time(ros_arguments, isolated=isolated)
-    with stage as runner:
-        return drive_in(
-            runner,
-            goals,
-            timeout=timeout,
-            parameters=parameters,
-            recording=recording,
-            signals=signals,
-            progress=progress,
-        )
-
-
-def drive_in(
-    runner: NodeRunner,
-    goals: NDArray[np.float64],
-    *,
-    timeout: float = TIMEOUT,
-    parameters: Mapping[str, Any] | None = None,
-    recording: Recording | None = None,
-    signals: Signals | None = None,
-    progress: DriveProgress | None = None,
-) -> Outcome:
-    """Drive as `drive` does, in a runner that exists: `in_real_time` or `in_lockstep`.
-
-    Args:
-        runner: Runs the nodes, and may run others.
-        goals: `[x, y, theta]` of each goal, shape (n, 3) (m, m, rad).
-        timeout: As for `drive`.
-        parameters: As for `drive`.
-        recording: As for `drive`.
-        signals: As for `drive`.
-        progress: As for `drive`.
-
-    Raises:
-        UserError: A node cannot run with the parameters given.
-        ValueError: `goals` has another shape.
-    """
+    if runner is None:
+        new = in_lockstep(ros_arguments) if lockstep else in_real_time(ros_arguments, isolated=isolated)
+        with new as created:
+            return drive(
+                goals,
+                runner=created,
+                timeout=timeout,
+                parameters=parameters,
+                recording=recording,
+                signals=signals,
+                progress=progress,
+            )
+    if lockstep or not isolated or ros_arguments:
+        raise ValueError('lockstep, isolated and ros_arguments are those of the runner, if one is given')
     signals = signals or Signals()
     progress = progress or _Silent()
     context = runner.context

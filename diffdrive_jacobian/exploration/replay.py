@@ -1,11 +1,71 @@
-"""Running a finding again."""
+"""Running a finding again, and comparing what it shows with what was found."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+from diffdrive_jacobian.exploration.digest import MessageDigest
 from diffdrive_jacobian.exploration.errors import ExplorationError
-from diffdrive_jacobian.exploration.result import Finding, Replay, compared
-from diffdrive_jacobian.exploration.trial import DIED
+from diffdrive_jacobian.exploration.result import Finding
+from diffdrive_jacobian.exploration.trial import DIED, Violation, of_exception
+from diffdrive_jacobian.exploration.versions import differences, versions
 from diffdrive_jacobian.exploration.worker import packed, run_world_afresh, run_worlds
+from diffdrive_jacobian.lockstep._errors import PropertyViolation
+from diffdrive_jacobian.lockstep.world import Lockstep
+from diffdrive_jacobian.text import printable_lines
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """The result of running the smallest case of a finding again."""
+
+    violation: Violation | None
+    """What it violates now; None: nothing."""
+    same_verdict: bool
+    """Whether the same property is violated."""
+    same_bits: bool
+    """Whether all messages are the same, bit for bit, and the violation comes at the same time."""
+    differences: tuple[str, ...]
+    """How versions and processor differ from those with which it was found."""
+
+    def __str__(self) -> str:
+        """Return a description of one line."""
+        different = self.differences
+        where = f'; {"; ".join(different)}' if different else ', with the same versions and processor'
+        if self.same_bits:
+            return f'the same as found, bit for bit{where}'
+        if self.same_verdict:
+            return f'violated as found, but not bit for bit{where}'
+        return f'not violated as it was found{where}'
+
+
+class _Shown(NamedTuple):
+    """What a run has shown."""
+
+    key: str
+    """Key of its violation."""
+    seconds: float
+    """World time of the violation (s)."""
+    digest: str
+    """Hash of all messages up to it."""
+
+
+def _compared(
+    violation: Violation | None, digest: str, found: _Shown, found_with: Mapping[str, str]
+) -> Replay:
+    """Return how a run compares with what was found with other versions, or with the same ones."""
+    now = None if violation is None else _Shown(violation.key, violation.seconds, digest)
+    return Replay(
+        violation=violation,
+        same_verdict=now is not None and now.key == found.key,
+        same_bits=now == found,
+        differences=tuple(differences(versions(), dict(found_with))),
+    )
 
 
 def replay(finding: Finding | None) -> Replay:
@@ -16,8 +76,36 @@ def replay(finding: Finding | None) -> Replay:
     """
     if finding is None:
         raise ExplorationError('there is nothing to replay: no property was violated')
-    index = finding.violation.index
-    data = packed(finding.setting, [finding.trial], only=index, digest=True)
+    violation = finding.violation
+    data = packed(finding.setting, [finding.trial], only=violation.index, digest=True)
     # A world that ends its process must not end this one.
-    (outcome,) = (run_world_afresh if finding.violation.name == DIED else run_worlds)(data)
-    return compared(finding, outcome.of(finding.violation.key), outcome.digest)
+    (outcome,) = (run_world_afresh if violation.name == DIED else run_worlds)(data)
+    found = _Shown(violation.key, violation.seconds, finding.digest)
+    return _compared(outcome.of(violation.key), outcome.digest, found, finding.versions)
+
+
+@contextmanager
+def reproducing(world: Lockstep, case: Path) -> Iterator[None]:
+    """Add to an exception that the body raises how it compares with what `explore` found.
+
+    It is the same bit for bit with the same versions and the same features of the processor. Elsewhere
+    the verdict is the same, but numbers may be rounded otherwise.
+
+    Args:
+        world: The world in which the body runs the case.
+        case: The file counterexample.json.
+    """
+    fields = json.loads(case.read_text(encoding='utf-8'))
+    found = _Shown(fields['violation'], fields['seconds'], fields['digest'])
+    with MessageDigest(world) as messages:
+        try:
+            yield
+        except (Exception, SystemExit) as error:
+            violation = of_exception(error, world)
+            if isinstance(error, PropertyViolation):
+                key = printable_lines(repr(error.property))
+                violation = replace(violation, key=key)
+            compared = _compared(violation, messages.value(), found, fields['versions'])
+            # As add_note of Python 3.11.
+            error.__notes__ = [*getattr(error, '__notes__', []), str(compared)]  # type: ignore[union-attr]
+            raise

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from diffdrive_jacobian.exploration.source import Source
 from diffdrive_jacobian.exploration.trial import Setting, Trial, Violation
-from diffdrive_jacobian.exploration.versions import differences, versions
+from diffdrive_jacobian.exploration.versions import versions
 from diffdrive_jacobian.text import printable
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.exploration.replay import Replay
 
 LONGEST_KEY = 200
 """Length beyond which a property is cut where it is a title (characters)."""
@@ -76,34 +80,6 @@ class Finding:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Replay:
-    """The result of running the smallest case of a finding again."""
-
-    violation: Violation | None
-    """What it violates now; None: nothing."""
-    same_verdict: bool
-    """Whether the same property is violated."""
-    same_bits: bool
-    """Whether all messages are the same, bit for bit, and the violation comes at the same time."""
-    differences: tuple[str, ...]
-    """How versions and processor differ from those with which it was found."""
-
-    def __str__(self) -> str:
-        """Return a description of one line."""
-        return described_replay(self.same_verdict, self.same_bits, self.differences)
-
-
-def described_replay(verdict: bool, bits: bool, different: tuple[str, ...] | list[str]) -> str:
-    """Return how a run compares with the one that was found."""
-    where = f'; {"; ".join(different)}' if different else ', with the same versions and processor'
-    if bits:
-        return f'the same as found, bit for bit{where}'
-    if verdict:
-        return f'violated as found, but not bit for bit{where}'
-    return f'not violated as it was found{where}'
-
-
-@dataclass(frozen=True, kw_only=True)
 class Exploration:
     """What an exploration has done and found. `print` shows it as text."""
 
@@ -145,6 +121,7 @@ class Exploration:
         Raises:
             ExplorationError: Nothing was found.
         """
+        # Not above: it imports this module.
         from diffdrive_jacobian.exploration.replay import replay
 
         return replay(finding or next(iter(self.findings), None))
@@ -167,20 +144,3 @@ class Exploration:
         if len(self.notes) > NOTED:
             lines.append(f'note: and {len(self.notes) - NOTED} more notes')
         return '\n\n'.join(['\n'.join(lines), *map(str, self.findings)])
-
-
-def compared(finding: Finding, violation: Violation | None, digest: str) -> Replay:
-    """Return how another run of the smallest case compares with the one that was found."""
-    verdict = violation is not None and violation.key == finding.violation.key
-    bits = (
-        verdict
-        and violation is not None
-        and violation.seconds == finding.violation.seconds
-        and digest == finding.digest
-    )
-    return Replay(
-        violation=violation,
-        same_verdict=verdict,
-        same_bits=bits,
-        differences=tuple(differences(versions(), finding.versions)),
-    )

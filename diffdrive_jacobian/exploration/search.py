@@ -13,7 +13,7 @@ from collections import Counter, deque
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from diffdrive_jacobian.exploration.errors import ExplorationError
@@ -223,17 +223,27 @@ class Search:
             again[1].digest,
             violations[1],
         )
-        return Finding(
+        return replace(
+            self._unshrunk(key),
             violation=violations[0] or violations[1] or fails.violation,
             trial=smallest,
-            setting=self._setting,
-            count=self._counts[key],
-            first_world=first.number,
-            first_trial=first.trial,
             shrink_worlds=fails.worlds,
             complete=not fails.stopped,
             deterministic=same,
             digest=again[0].digest,
+        )
+
+    def _unshrunk(self, key: str) -> Finding:
+        """Return the finding with the first case."""
+        first, violation = self._first[key]
+        return Finding(
+            violation=violation,
+            trial=first.trial,
+            setting=self._setting,
+            count=self._counts[key],
+            first_world=first.number,
+            first_trial=first.trial,
+            complete=False,
         )
 
     def _over(self) -> bool:
@@ -256,18 +266,10 @@ class Search:
         """Return what was found, but not shrunk before Ctrl-C."""
         done = {finding.violation.key for finding in findings}
         rest: list[Finding] = []
-        for key, (first, violation) in self._first.items():
+        for key in self._first:
             if key in done:
                 continue
-            finding = Finding(
-                violation=violation,
-                trial=first.trial,
-                setting=self._setting,
-                count=self._counts[key],
-                first_world=first.number,
-                first_trial=first.trial,
-                complete=False,
-            )
+            finding = self._unshrunk(key)
             if output is not None:
                 finding = write_finding(finding, output, [*findings, *rest], seed=self._seed)
             rest.append(finding)

@@ -19,7 +19,6 @@ from diffdrive_jacobian.bags.bag_reader import BagError, messages
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, message_class
 from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.messages.names import node_of
-from diffdrive_jacobian.recording.lateness import Lateness
 from diffdrive_jacobian.recording.playback import NODE, NothingToPlayError, Playback
 from diffdrive_jacobian.ros.qos import publisher_profile
 from diffdrive_jacobian.ros.rclpy_internals import RCLError, reason, restart_timer
@@ -71,8 +70,6 @@ class Replayer(Node):  # type: ignore[misc]
             self.expected = sum(one.msgcount for one in connections)
         self.sent = 0
         """Number of messages published."""
-        self.lateness = Lateness()
-        """Delays of the messages."""
         self.done = False
         """Whether all messages were published."""
         self.position = self.start
@@ -190,12 +187,10 @@ class Replayer(Node):  # type: ignore[misc]
         self._timer.cancel()
         while self._next is not None:
             connection, stamp, data = self._next
-            late = time.monotonic_ns() - self._due(stamp)
-            if late < 0:
+            if time.monotonic_ns() < self._due(stamp):
                 break
             self._publishers_by_connection[connection.id].publish(data)
             self.sent += 1
-            self.lateness.add(late)
             self.position = stamp
             self._next = next(self._coming, None)
         if self._next is None and self._playback.loop and time.monotonic_ns() >= self._due(self.end):

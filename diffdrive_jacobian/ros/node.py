@@ -33,7 +33,7 @@ from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
 from diffdrive_jacobian.ros.input_guard import guard_inputs
 from diffdrive_jacobian.ros.lasting import Interleaving, LastingFault
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
-from diffdrive_jacobian.ros.rclpy_internals import declare_qos, log_info, time_reader
+from diffdrive_jacobian.ros.rclpy_internals import log_info, time_reader
 from diffdrive_jacobian.ros.serialization import decoding
 from diffdrive_jacobian.ros.shared_graph import MAX_AGE, SharedGraph
 from diffdrive_jacobian.ros.topic_errors import explaining_failure
@@ -111,7 +111,7 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
                 message,
                 topic,
                 profile,
-                qos_overriding_options=self._qos_options('publisher', topic, profile),
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )
 
     def subscribe(
@@ -153,15 +153,9 @@ class ParameterizedNode(Node, Generic[P]):  # type: ignore[misc]
                 topic,
                 callback,
                 profile,
-                qos_overriding_options=self._qos_options('subscription', topic, profile),
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
                 raw=True,
             )
-
-    def _qos_options(self, kind: str, topic: str, profile: QoSProfile) -> QoSOverridingOptions | None:
-        """Return the options with which users override the QoS of a topic. None: nobody does."""
-        if declare_qos(self, self.resolve_topic_name(topic), kind, profile):
-            return None
-        return QoSOverridingOptions.with_default_policies()
 
     def provide(self, service: Any, name: str, callback: Callable[[Any, Any], Any]) -> Service:
         """Create a service.

@@ -32,7 +32,6 @@ from diffdrive_jacobian.parameters.declaration import (
 )
 from diffdrive_jacobian.ros.rclpy_internals import (
     PARAMETERS_OF_RCLPY,
-    declare_together,
     declared_parameters,
     parameter_overrides,
 )
@@ -96,8 +95,8 @@ def declare_new(node: Node, before: P, after: P) -> P:
 def _declare(node: Node, parameters: NodeParameters, names: Iterable[str]) -> None:
     kind = type(parameters)
     known = specifications(kind)
-    declare_together(
-        node,
+    node.declare_parameters(
+        '',
         [
             (
                 name,
@@ -106,6 +105,7 @@ def _declare(node: Node, parameters: NodeParameters, names: Iterable[str]) -> No
             )
             for name in names
         ],
+        ignore_override=True,
     )
 
 

@@ -12,12 +12,11 @@ from __future__ import annotations
 import ctypes
 import inspect
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import redirect_stderr
 from functools import cache, wraps
 from typing import Any, ClassVar, NamedTuple, Protocol
 
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.callback_groups import CallbackGroup
 from rclpy.client import Client
 from rclpy.clock import Clock
@@ -81,75 +80,6 @@ def parameter_overrides(node: Node) -> Mapping[str, Parameter]:
     """
     overrides: Mapping[str, Parameter] = node._parameter_overrides
     return overrides
-
-
-def declare_together(
-    node: Node, parameters: Sequence[tuple[str, bool | float | str, ParameterDescriptor]]
-) -> None:
-    """Declare parameters with these values, with one message on /parameter_events for all of them.
-
-    `Node.declare_parameters` publishes one for each, which takes most of its time. It is called if the
-    parameters cannot be declared, for the exception that it raises.
-    Relies on `Node._set_parameters_atomically_common`, which it calls for each.
-
-    Args:
-        node: The node.
-        parameters: Name, value and descriptor of each. Values that the user gave are ignored.
-    """
-    new = []
-    descriptors = {}
-    for name, value, descriptor in parameters:
-        parameter = Parameter(name, value=value)
-        descriptor.type = parameter.type_.value
-        new.append(parameter)
-        descriptors[name] = descriptor
-    declared = node._parameters
-    if not any(name in declared for name in descriptors):
-        result = node._set_parameters_atomically_common(new, descriptors, allow_not_set_type=True)
-        if result.successful:
-            return
-    node.declare_parameters('', parameters, ignore_override=True)
-
-
-def declare_qos(node: Node, topic: str, kind: str, profile: QoSProfile) -> bool:
-    """Declare the parameters with which users override the QoS of a topic, if no user does so.
-
-    `QoSOverridingOptions.with_default_policies` declares the same ones in several times the time.
-
-    Args:
-        node: The node.
-        topic: Full name of the topic.
-        kind: 'publisher' or 'subscription'.
-        profile: The profile of the topic.
-
-    Returns:
-        Whether they were declared. False: a user overrides the QoS of a topic of the node, or they were
-        declared before.
-    """
-    prefix = f'qos_overrides.{topic}.{kind}.'
-    values = {
-        'history': profile.history.name.lower(),
-        'depth': profile.depth,
-        'reliability': profile.reliability.name.lower(),
-    }
-    if any(prefix + policy in node._parameters for policy in values) or any(
-        name.startswith('qos_overrides.') for name in node._parameter_overrides
-    ):
-        return False
-    declare_together(
-        node,
-        [
-            (
-                prefix + policy,
-                value,
-                ParameterDescriptor(
-                    description=f'{policy} for {kind} `{topic}` with id `None`', read_only=True
-                ),
-            )
-            for policy, value in values.items()
-        ],
-    )
-    return True
 
 
 def declared_parameters(node: Node) -> set[str]:

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.exploration.errors import ExplorationError
     from diffdrive_jacobian.exploration.executors import LocalExecutor, SerialExecutor
     from diffdrive_jacobian.exploration.exploring import explore
-    from diffdrive_jacobian.exploration.reproduction import reproducing
-    from diffdrive_jacobian.exploration.result import Exploration, Finding, Replay
+    from diffdrive_jacobian.exploration.replay import Replay, reproducing
+    from diffdrive_jacobian.exploration.result import Exploration, Finding
     from diffdrive_jacobian.exploration.scenario import scenario_from
     from diffdrive_jacobian.exploration.schedules import fault_schedules
     from diffdrive_jacobian.exploration.strategies import (
@@ -83,8 +83,8 @@ _MODULES = {
     'exploration.errors': ('ExplorationError',),
     'exploration.executors': ('LocalExecutor', 'SerialExecutor'),
     'exploration.exploring': ('explore',),
-    'exploration.reproduction': ('reproducing',),
-    'exploration.result': ('Exploration', 'Finding', 'Replay'),
+    'exploration.replay': ('Replay', 'reproducing'),
+    'exploration.result': ('Exploration', 'Finding'),
     'exploration.scenario': ('scenario_from',),
     'exploration.schedules': ('fault_schedules',),
     'exploration.strategies': (

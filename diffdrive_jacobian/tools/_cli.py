@@ -1,26 +1,19 @@
-"""Arguments and exit codes of the command-line tools."""
+"""Command lines of the tools: how they are read and refused, and the exit codes."""
 
 from __future__ import annotations
 
 import argparse
 import math
-import os
-import re
 import sys
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from diffdrive_jacobian import __version__
-from diffdrive_jacobian.messages.plausibility import MAX_POSITION
-from diffdrive_jacobian.numerics import fields
-from diffdrive_jacobian.numerics.fields import Check, between, finite, inside, integer, one_of
-from diffdrive_jacobian.parameters.configurations import configurations
 from diffdrive_jacobian.parameters.declaration import (
     NodeParameters,
-    ParameterError,
     specifications,
 )
+from diffdrive_jacobian.text import PATH_LIMIT, printable
 
 T = TypeVar('T')
 
@@ -60,7 +53,7 @@ def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
             ros.append(argument)
             in_ros = argument != '--'
         else:
-            own.append(f' {argument}' if argument.startswith('-') and _is_number(argument) else argument)
+            own.append(f' {argument}' if argument.startswith('-') and is_number(argument) else argument)
     return own, ros
 
 
@@ -118,7 +111,8 @@ ROS_HINT = 'ROS arguments come after --ros-args, as in --ros-args -p NAME:=VALUE
 _ROS_OPTIONS = ('--ros-args', '-p', '--param', '-r', '--remap', '--log-level', '--enclave', '-e')
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Return whether a text is a number as people write it on a command line."""
     # Python reads more as a number than people write on a command line.
     if '_' in text or not text.isascii():
         return False
@@ -127,102 +121,6 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def number(text: str) -> float:
-    """Parse a finite number."""
-    text = text.strip()
-    if not _is_number(text):
-        hint = f' ({ROS_HINT})' if ':=' in text else ''
-        raise argparse.ArgumentTypeError(f'must be a number, got {text!r}{hint}')
-    return _checked(finite, float(text))
-
-
-def number_that(check: Check) -> Callable[[str], float]:
-    """Return a type of arguments: the finite numbers that a check accepts."""
-    return lambda text: _checked(check, number(text))
-
-
-def integer_from(low: int, high: float = math.inf) -> Callable[[str], int]:
-    """Return a type of arguments: integers from `low` to `high`."""
-    check = partial(integer, low=low, high=high)
-    # Python reads more as an integer than people write on a command line.
-
-    def parse(text: str) -> int:
-        text = text.strip()
-        # Python reads more as an integer than people write on a command line.
-        value = int(text) if re.fullmatch('-?[0-9]{1,99}', text) else text
-        return int(_checked(check, value))
-
-    return parse
-
-
-def _checked(check: Check, value: T) -> T:
-    """Return a value that a check accepts; argparse puts the name of the argument before the message."""
-    try:
-        check('', value)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error).strip()) from None
-    return value
-
-
-def angle(text: str) -> float:
-    """Parse an angle (rad). More than one turn is rejected: it is probably in degrees."""
-    value = number(text)
-    if not inside(value, -math.tau, math.tau):
-        raise argparse.ArgumentTypeError(_not_in_radians(value))
-    return value
-
-
-def _not_in_radians(value: float) -> str:
-    return (
-        f"must be in radians, from -2 pi to 2 pi, got '{value:g}' "
-        f'({value:g} degrees are {math.radians(value):.6g} rad)'
-    )
-
-
-def add_heading(parser: argparse.ArgumentParser, text: str) -> None:
-    """Add the options for a heading, which `given_heading` evaluates."""
-    parser.add_argument('--heading', metavar='RAD', type=number, help=text)
-    parser.add_argument(
-        '--degrees', action='store_true', help='the heading is in degrees (default: radians)'
-    )
-
-
-def given_heading(parser: argparse.ArgumentParser, options: argparse.Namespace) -> float | None:
-    """Return the heading that was given (rad); None: none was.
-
-    More than one turn is rejected: in radians it is probably meant in degrees.
-    """
-    value: float | None = options.heading
-    if value is None:
-        if options.degrees:
-            parser.error('--degrees needs --heading, whose unit it changes')
-        return None
-    if options.degrees:
-        if not inside(value, -360.0, 360.0):
-            parser.error(f"argument --heading: must be from -360 to 360 degrees, got '{value:g}'")
-        return math.radians(value)
-    if not inside(value, -math.tau, math.tau):
-        parser.error(f'argument --heading: {_not_in_radians(value)}; --degrees accepts them')
-    return value
-
-
-def distances(distance: float, true_distance: float) -> str:
-    """Return how far a robot is from its goal (m), in words. A true distance of NaN is not known."""
-    if math.isnan(true_distance):
-        return f'{distance:.3f} m from the goal'
-    return f'{distance:.3f} m from the goal by odometry, {true_distance:.3f} m by ground truth'
-
-
-def add_force(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add the option to overwrite files.
-
-    Args:
-        parser: The parser.
-        what: What is overwritten.
-    """
-    parser.add_argument('--force', action='store_true', help=f'overwrite {what} (default: refuse)')
 
 
 def refuse_without(
@@ -262,128 +160,19 @@ def _is_given(options: argparse.Namespace, option: str) -> bool:
     return not (value is None or value is False or value == [] or value == math.inf)
 
 
-def bag_folder(text: str) -> str:
-    """Parse the name of a bag, which is a directory. A name with the ending of a file is rejected."""
-    stem, ending = os.path.splitext(text.rstrip('/'))
-    if ending.lower() in _FILE_ENDINGS:
-        raise argparse.ArgumentTypeError(
-            f'must name a bag, which is a directory, got {text!r}, the name of a file; '
-            f'did you mean {stem!r}?'
-        )
-    return text
-
-
-_FILE_ENDINGS = ('.png', '.svg', '.pdf', '.jpg', '.jpeg', '.csv', '.txt', '.yaml', '.yml')
-
-
-coordinate = number_that(between(-MAX_POSITION, MAX_POSITION, unit='m'))
-"""Parses a coordinate of a goal (m)."""
-positive = number_that(fields.positive)
-"""Parses a positive finite number."""
-count = integer_from(1)
-"""Parses an integer of at least one."""
-
-
-def add_wait_matching(parser: argparse.ArgumentParser, what: str, default: str) -> None:
-    """Add the option of `ros2 topic pub` for subscriptions that are discovered late.
-
-    Args:
-        parser: The parser.
-        what: What must have the subscriptions, with its verb.
-        default: What is done without the option.
-    """
-    parser.add_argument(
-        '-w',
-        '--wait-matching-subscriptions',
-        dest='readers',
-        metavar='N',
-        type=count,
-        help=f'wait until {what} N subscriptions (default: {default})',
-    )
-
-
-def tolerance(text: str) -> float:
-    """Parse a distance that is a valid xy_goal_tolerance (m)."""
-    # Not above: it imports every control law.
-    from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
-
-    value = number(text)
-    try:
-        GoToGoalParameters(xy_goal_tolerance=value)
-    except ParameterError as error:
-        raise argparse.ArgumentTypeError(str(error).split("' ", 1)[1]) from error
-    return value
-
-
-def readable_file(text: str) -> str:
-    """Parse the name of a readable file."""
-    if not os.path.isfile(text):
-        raise argparse.ArgumentTypeError(f'no such file: {text!r}')
-    if not os.access(text, os.R_OK):
-        raise argparse.ArgumentTypeError(f'file cannot be read: {text!r}')
-    return text
-
-
-def add_params_file(
-    parser: argparse.ArgumentParser, text: str = 'file of ROS parameters (YAML)'
-) -> None:
-    """Add the options for a parameter file without `--ros-args`: by its path, or by the robot's name.
-
-    Args:
-        parser: The parser.
-        text: What the file contains.
-    """
-    group = parser.add_mutually_exclusive_group()
-    group.add_argument('--params-file', metavar='FILE', type=readable_file, help=text)
-    names = ', '.join(configurations()) or 'none is installed'
-    group.add_argument(
-        '--robot',
-        metavar='NAME',
-        dest='params_file',
-        type=_configuration,
-        help=f'the installed parameter file of a robot: {names}',
-    )
-
-
-def _configuration(name: str) -> str:
-    """Return the path of the installed parameter file of a robot."""
-    installed = configurations()
-    return str(installed[_checked(one_of(*installed), name)])
-
-
-def add_namespace(parser: argparse.ArgumentParser) -> None:
-    """Add the option for a bag of several robots."""
-    parser.add_argument(
-        '--namespace',
-        metavar='NS',
-        type=namespace,
-        help='namespace of the robot in a bag of several, as /robot1 (default: that of the only robot)',
-    )
-
-
-def namespace(text: str) -> str:
-    """Parse a namespace of ROS; return it with a leading slash, the root as `/`."""
-    found = '/' + text.strip('/')
-    if not re.fullmatch(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+', found):
-        raise argparse.ArgumentTypeError(
-            f'must be a namespace of letters, digits and _, as /robot1, got {text!r}'
-        )
-    return found
-
-
-def with_params_file(ros: list[str], options: argparse.Namespace) -> list[str]:
-    """Return the ROS arguments with that parameter file. Those that the user gave take precedence."""
-    if options.params_file is None:
-        return ros
-    return ['--ros-args', '--params-file', options.params_file, '--', *ros]
-
-
-def counted(number: int, noun: str) -> str:
-    """Return a number with its noun: `1 topic`, `2 topics`."""
-    return f'{number} {noun}' if number == 1 else f'{number} {noun}s'
-
-
 def complain(program: str, message: object, code: int = USER_ERROR) -> int:
     """Print an error as argparse does; return the exit code."""
     print(f'{program}: error: {message}', file=sys.stderr)
     return code
+
+
+def interrupted(program: str, result: str = '') -> int:
+    """Print that a signal was caught, and what became of the files; return the exit code."""
+    print(f'{program}: interrupted{f": {result}" if result else ""}', file=sys.stderr)
+    return INTERRUPTED
+
+
+def cannot_write(program: str, path: object, error: OSError, result: str = '') -> int:
+    """Print that a file cannot be written, and what was written instead; return the exit code."""
+    message = f'{path} cannot be written: {error.strerror or error}{result}'
+    return complain(program, printable(message, PATH_LIMIT), FAILED)

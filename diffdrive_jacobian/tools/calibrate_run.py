@@ -25,7 +25,8 @@ from diffdrive_jacobian.plots.calibration_figure import draw
 from diffdrive_jacobian.plots.output_files import create, new_file
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
-from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools import _cli, _options
+from diffdrive_jacobian.tools._messages import explaining_no_matplotlib
 
 PROGRAM = 'calibrate_run'
 ENDINGS = ('yaml', 'yml')
@@ -39,9 +40,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     parser = _parser()
     options = _cli.parse(parser, [*own, *ros], ros=False)
     try:
-        bags = [Path(bag) for bag in options.bags]
-        if len({bag.resolve() for bag in bags}) < len(bags):
-            raise UserError(f'each bag can be given once, got {" ".join(map(str, bags))}')
+        bags = _options.given_bags(options)
         output, picture = _outputs(options, bags)
         read: list[WheelsAndReference] = []
         for bag in bags:
@@ -57,10 +56,10 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             for note in read[-1].notes:
                 _note(f'{printable(bag, PATH_LIMIT)}: {note}')
             if signals.count:
-                return _interrupted()
+                return _cli.interrupted(PROGRAM, 'nothing was written')
         nominal = _nominal(options, read)
     except ReadingInterruptedError:
-        return _interrupted()
+        return _cli.interrupted(PROGRAM, 'nothing was written')
     except (BagError, UserError, ValueError, OSError) as error:
         return _cli.complain(PROGRAM, printable(error, PATH_LIMIT))
     try:
@@ -70,7 +69,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     for note in result.notes:
         _note(note)
     if signals.count:
-        return _interrupted()
+        return _cli.interrupted(PROGRAM, 'nothing was written')
     _print_summary(result, read)
     if missing := explain_undetermined(result):
         return _cli.complain(PROGRAM, f'{missing}. Nothing was written', _cli.FAILED)
@@ -109,33 +108,26 @@ def _write(
     files: list[tuple[Path, bytes]] = [(output, parameter_file(result, names).encode())]
     if picture is not None:
         try:
-            files.append((picture, draw(result, 'png')))
-        except ModuleNotFoundError as error:
-            if (error.name or '').split('.')[0] != 'matplotlib':
-                raise
-            _note("not drawn: matplotlib is not installed: pip install 'diffdrive_jacobian[plot]'")
+            with explaining_no_matplotlib():
+                files.append((picture, draw(result, 'png')))
+        except UserError as error:
+            _note(f'not drawn: {error}')
     done: list[Path] = []
     for path, data in files:
         try:
             create(path, data, replace=replace)
         except OSError as error:
-            message = f'{path} cannot be written: {error.strerror or error}'
+            what = '; nothing was written'
             if replace:
-                message += f'; written: {", ".join(map(str, done)) or "nothing"}'
+                what = f'; written: {", ".join(map(str, done)) or "nothing"}'
             else:
                 for one in done:
                     one.unlink(missing_ok=True)
-                message += '; nothing was written'
-            return _cli.complain(PROGRAM, printable(message, PATH_LIMIT), _cli.FAILED)
+            return _cli.cannot_write(PROGRAM, path, error, what)
         done.append(path)
     for path in done:
         print(printable(path, PATH_LIMIT))
     return _cli.DONE
-
-
-def _interrupted() -> int:
-    print(f'{PROGRAM}: interrupted: nothing was written', file=sys.stderr)
-    return _cli.INTERRUPTED
 
 
 def _outputs(options: argparse.Namespace, bags: Sequence[Path]) -> tuple[Path, Path | None]:
@@ -198,7 +190,7 @@ def _given(options: argparse.Namespace) -> Given:
     )
 
 
-_noise = _cli.number_that(between(1e-12, 1e3))
+_noise = _options.number_that(between(1e-12, 1e3))
 """Parses a noise that squares and inverses of floats can represent."""
 
 
@@ -212,16 +204,15 @@ def _parser() -> _cli.Parser:
         'the parameters, contradict each other, or a file cannot be written; 2: wrong arguments, or a '
         'bag cannot be read; 130: interrupted.',
     )
-    parser.add_argument('bags', metavar='BAG', nargs='+', help='directory of a bag')
-    parser.add_argument(
-        '-o',
-        '--output',
-        metavar='FILE',
-        help='parameter file to write, .yaml; the picture is FILE.png (default: BAG_calibration.yaml '
+    _options.add_bags(parser)
+    _options.add_output(
+        parser,
+        'FILE',
+        'parameter file to write, .yaml; the picture is FILE.png (default: BAG_calibration.yaml '
         'beside the first bag)',
     )
-    parser.add_argument('--no-plot', action='store_true', help='do not draw')
-    _cli.add_force(parser, 'the parameter file and the picture')
+    _options.add_no_plot(parser, 'do not draw')
+    _options.add_force(parser, 'the parameter file and the picture')
     parser.add_argument(
         '--reference',
         metavar='TOPIC',
@@ -241,41 +232,22 @@ def _parser() -> _cli.Parser:
         help='joints of the left and the right wheel (default: from the parameters in the bag, or the '
         'joints with left and right in their names)',
     )
-    for name, what in (('radius', 'wheel radius'), ('separation', 'wheel separation')):
-        parser.add_argument(
-            f'--wheel-{name}',
-            metavar='M',
-            type=_cli.positive,
-            help=f'nominal {what} (m) (default: from the parameters in the bag)',
-        )
+    for name in ('radius', 'separation'):
+        text = f'nominal wheel {name} (m) (default: from the parameters in the bag)'
+        _options.add_value(parser, f'--wheel-{name}', 'M', text)
     parser.add_argument(
         '--lever-arm',
         metavar=('X', 'Y'),
         nargs=2,
-        type=_cli.coordinate,
+        type=_options.coordinate,
         help='position of the sensor in the body frame (m) (default: estimated)',
     )
-    parser.add_argument(
-        '--yaw-offset',
-        metavar='RAD',
-        type=_cli.angle,
-        help='heading of the sensor in the body frame (rad) (default: estimated)',
-    )
-    parser.add_argument(
-        '--time-offset',
-        metavar='SECONDS',
-        type=_cli.number,
-        help='added to the times of the reference (s) (default: estimated)',
-    )
-    for name, unit, what in (
-        ('wheel', 'm', 'variance of the distance travelled by a wheel, per distance'),
-        ('position', 'm', 'standard deviation of the positions of the reference'),
-        ('heading', 'rad', 'standard deviation of the headings of the reference'),
+    for name, unit, kind, text in (
+        ('yaw-offset', 'RAD', _options.angle, 'heading of the sensor in the body frame (rad)'),
+        ('time-offset', 'SECONDS', _options.number, 'added to the times of the reference (s)'),
+        ('wheel-noise', 'M', _noise, 'variance of the distance travelled by a wheel, per distance (m)'),
+        ('position-noise', 'M', _noise, 'standard deviation of the positions of the reference (m)'),
+        ('heading-noise', 'RAD', _noise, 'standard deviation of the headings of the reference (rad)'),
     ):
-        parser.add_argument(
-            f'--{name}-noise',
-            metavar='M' if unit == 'm' else 'RAD',
-            type=_noise,
-            help=f'{what} ({unit}) (default: estimated)',
-        )
+        _options.add_value(parser, f'--{name}', unit, f'{text} (default: estimated)', kind=kind)
     return parser

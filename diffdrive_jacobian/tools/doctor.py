@@ -21,7 +21,8 @@ from diffdrive_jacobian.diagnosis.topics import check_topics
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
-from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools import _cli, _options
+from diffdrive_jacobian.tools._messages import counted
 from diffdrive_jacobian.tools._startup import long_lived
 
 PROGRAM = 'doctor'
@@ -114,7 +115,7 @@ def _report(diagnosis: Diagnosis) -> Iterator[str]:
     graph = diagnosis.graph
     if diagnosis.rmw:
         yield f'middleware: {diagnosis.rmw}'
-        yield f'{_cli.counted(len(graph.nodes), "node")} found'
+        yield f'{counted(len(graph.nodes), "node")} found'
     else:
         yield 'nodes were not searched, see the problems'
     yield from _shortened([_node(node) for node in graph.nodes])
@@ -126,7 +127,7 @@ def _report(diagnosis: Diagnosis) -> Iterator[str]:
         for number, one in enumerate(findings, 1):
             yield f'{what} {number}: {one.what}'
             yield f'  remedy: {one.remedy}'
-    yield f'{_cli.counted(len(diagnosis.problems), "problem")} found'
+    yield f'{counted(len(diagnosis.problems), "problem")} found'
 
 
 def _shortened(lines: list[str]) -> Iterator[str]:
@@ -165,12 +166,8 @@ def _parser() -> _cli.Parser:
         'its remedy. Exit code 0: no problem was found; 1: there are problems; 2: wrong arguments; 130: '
         'interrupted.',
     )
-    parser.add_argument(
-        '--timeout',
-        metavar='SECONDS',
-        type=_cli.positive,
-        default=DISCOVERY,
-        help='duration of the discovery and of the observation (s) (default: %(default)g)',
+    _options.add_timeout(
+        parser, 'duration of the discovery and of the observation (s)', default=DISCOVERY
     )
     parser.add_argument('--json', action='store_true', help='print the report as JSON')
     return parser

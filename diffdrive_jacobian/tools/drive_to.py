@@ -15,12 +15,13 @@ from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.nodes import CONTROLLERS, NODE_PARAMETERS
 from diffdrive_jacobian.plots.output_files import NOT_OVERWRITTEN
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _cli, _live
+from diffdrive_jacobian.tools import _cli, _options, _page
+from diffdrive_jacobian.tools._messages import NO_MATPLOTLIB, busy, describe_distances
 from diffdrive_jacobian.tools._startup import long_lived
-from diffdrive_jacobian.tools._waiting import busy
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.drives import Outcome
+    from diffdrive_jacobian.live.goal_progress import GoalEnd
     from diffdrive_jacobian.recording.recording import Recording
 
 PROGRAM = 'drive_to'
@@ -33,7 +34,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     options = _cli.parse(parser, own, parameters=NODE_PARAMETERS)
     if len(options.coordinates) % 2:
         parser.error(f'coordinates must be pairs X Y, got {len(options.coordinates)} of them')
-    heading = _cli.given_heading(parser, options)
+    heading = _options.given_heading(parser, options)
     for option in ('--output', '--force'):
         _cli.refuse_with(parser, options, option, '--no-record')
     _cli.refuse_without(parser, options, '--force', '--output')
@@ -46,27 +47,17 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             parser.error('--port and --no-browser are options of --live')
     elif options.timeout != parser.get_default('timeout'):
         parser.error('--timeout has no effect with --live, which ends by Ctrl-C')
-    ros = ['--ros-args', '--log-level', 'warn', '--', *_cli.with_params_file(ros, options)]
+    ros = ['--ros-args', '--log-level', 'warn', '--', *_options.with_params_file(ros, options)]
     if options.live:
-        from diffdrive_jacobian.tools._live_drive import drive_with_page
-
-        return drive_with_page(options, heading, ros, signals)
+        return _drive_with_page(options, heading, ros, signals)
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
         from diffdrive_jacobian.drives import DriveError, drive, waypoints_through
-        from diffdrive_jacobian.recording.record import open_recording, saved_on_error
+        from diffdrive_jacobian.recording.record import saved_on_error
 
     goals = waypoints_through(np.reshape(options.coordinates, (-1, 2)), heading or 0.0)
-    recording = None
     try:
-        if not options.no_record:
-            recording = open_recording(
-                'drive',
-                options.output,
-                'mcap',
-                lossless=options.lockstep,
-                replace=options.force,
-            )
+        recording = _recording(options)
     except OSError as error:
         return _cli.complain(PROGRAM, error)
     kept = recording is None or options.no_plot or options.force
@@ -82,7 +73,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                     lockstep=options.lockstep,
                     isolated=not options.open,
                     timeout=options.timeout,
-                    parameters=controller_parameters(options),
+                    parameters=_controller_parameters(options),
                     recording=recording,
                     ros_arguments=ros,
                     signals=signals,
@@ -93,18 +84,79 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                 print(f'{PROGRAM}: error: {error}', file=sys.stderr)
     except UserError as error:
         return _cli.complain(PROGRAM, error)
-    code = _cli.FAILED if outcome is None else _report(outcome, options)
+    code = _cli.FAILED if outcome is None else _print_outcome(outcome, options)
     if recording is None:
         return code
-    saved = save(recording, plot=not options.no_plot, replace=options.force)
+    saved = _save(recording, plot=not options.no_plot, replace=options.force)
     # An interruption remains one.
     return code if code == _cli.INTERRUPTED else saved or code
 
 
-def _warn_of_unused_files(ros: Sequence[str], names: Sequence[str]) -> None:
-    from diffdrive_jacobian.tools._unused_files import warn_of_unused_files
+def _drive_with_page(
+    options: argparse.Namespace, heading: float | None, ros: Sequence[str], signals: Signals
+) -> int:
+    """Drive with the page until Ctrl-C; return the exit code.
 
-    warn_of_unused_files(PROGRAM, ros, names)
+    Args:
+        options: The options.
+        heading: Heading at the last goal (rad); None: none was given.
+        ros: ROS arguments of all nodes.
+        signals: Counter of the signals.
+    """
+    # Not above: --help needs no ROS.
+    from diffdrive_jacobian.drives import DriveError, waypoints_through
+    from diffdrive_jacobian.recording.record import saved_on_error
+
+    recording = None
+    try:
+        with _page.explaining_page_errors(options.port):
+            from diffdrive_jacobian.live.running import drive_live
+
+        goals: NDArray[np.float64] = np.empty((0, 3))
+        if options.coordinates:
+            goals = waypoints_through(np.reshape(options.coordinates, (-1, 2)), heading or 0.0)
+        recording = _recording(options)
+        # Where the page cannot be served, the recording is discarded.
+        with saved_on_error(recording), _page.explaining_page_errors(options.port):
+            drive_live(
+                goals,
+                lockstep=options.lockstep,
+                isolated=not options.open,
+                parameters=_controller_parameters(options),
+                recording=recording,
+                ros_arguments=ros,
+                port=options.port,
+                signals=signals,
+                ready=_page.announcing(
+                    options,
+                    waiting='the drive starts' if len(goals) else '',
+                    notice=_page.DRIVES if len(goals) else _page.STEERS,
+                ),
+                nodes_created=lambda names: _options.warn_of_unused_files(PROGRAM, ros, names),
+                goal_ended=_print_goal_end,
+            )
+    except _page.PageError as error:
+        return _cli.complain(PROGRAM, error, _cli.FAILED)
+    except UserError as error:
+        return _cli.complain(PROGRAM, error)
+    except (DriveError, OSError) as error:
+        return _cli.complain(PROGRAM, error, _cli.FAILED)
+    return _cli.DONE if recording is None else _save(recording, plot=False, replace=options.force)
+
+
+def _recording(options: argparse.Namespace) -> Recording | None:
+    """Open the recording of the drive; None: none is wanted.
+
+    Raises:
+        OSError: It cannot be written, or exists.
+    """
+    if options.no_record:
+        return None
+    from diffdrive_jacobian.recording.record import open_recording
+
+    return open_recording(
+        'drive', options.output, 'mcap', lossless=options.lockstep, replace=options.force
+    )
 
 
 class _Progress:
@@ -112,13 +164,12 @@ class _Progress:
 
     def __init__(self, goals: NDArray[np.float64], ros: Sequence[str], *, wall: bool) -> None:
         # Slow to import.
-        from diffdrive_jacobian.tools._progress import Drive
+        from diffdrive_jacobian.tools._progress import GoalBar
 
         self._goals = goals
         self._ros = ros
-        self._index = 0
         self._seconds = 0.0
-        self._bar = Drive() if wall else Drive(lambda: self._seconds)
+        self._bar = GoalBar() if wall else GoalBar(lambda: self._seconds)
 
     def __enter__(self) -> _Progress:
         self._bar.__enter__()
@@ -128,18 +179,15 @@ class _Progress:
         self._bar.__exit__()
 
     def nodes_created(self, names: Sequence[str]) -> None:
-        _warn_of_unused_files(self._ros, names)
+        _options.warn_of_unused_files(PROGRAM, self._ros, names)
 
     def driving(self, seconds: float, index: int, distance: float, wheels: tuple[float, float]) -> None:
         self._seconds = seconds
-        if index != self._index:
-            self._index = index
-            self._bar.next()
         x, y, _ = self._goals[index]
         self._bar.show(f'goal {index + 1}/{len(self._goals)} ({x:g}, {y:g})', distance, wheels)
 
 
-def controller_parameters(options: argparse.Namespace) -> dict[str, Any]:
+def _controller_parameters(options: argparse.Namespace) -> dict[str, Any]:
     """Return the controller's parameters that were given by an option of their own."""
     given = {'xy_goal_tolerance': options.tolerance, 'controller': options.controller}
     if options.heading is not None:
@@ -151,7 +199,7 @@ def _picture(recording: Recording) -> Path:
     return recording.bag.with_name(recording.bag.name + '.png')
 
 
-def save(recording: Recording, *, plot: bool, replace: bool) -> int:
+def _save(recording: Recording, *, plot: bool, replace: bool) -> int:
     """Write the bag and its picture, and print their names; return the exit code."""
     from diffdrive_jacobian.bags.run_reader import BagError, read_run
     from diffdrive_jacobian.plots.run_figure import draw
@@ -176,14 +224,14 @@ def save(recording: Recording, *, plot: bool, replace: bool) -> int:
             draw([read_run(recording.bag)], picture, replace=replace)
         print(f'drawn: {picture}')
     except ModuleNotFoundError:
-        print("not drawn: matplotlib is not installed: pip install 'diffdrive_jacobian[plot]'")
+        print(f'not drawn: {NO_MATPLOTLIB}')
     except (OSError, BagError) as error:
         print(f'{PROGRAM}: error: {error}', file=sys.stderr)
         return _cli.FAILED
     return code
 
 
-def _report(outcome: Outcome, options: argparse.Namespace) -> int:
+def _print_outcome(outcome: Outcome, options: argparse.Namespace) -> int:
     """Print the end of a drive in one line; return the exit code."""
     if outcome.pose is None:
         where = 'the robot published no odometry'
@@ -194,7 +242,7 @@ def _report(outcome: Outcome, options: argparse.Namespace) -> int:
         simulated = ' of simulated time' if options.lockstep else ''
         where = (
             f'the robot stopped at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, '
-            f'{_cli.distances(outcome.distance, outcome.true_distance)}{point}, '
+            f'{describe_distances(outcome.distance, outcome.true_distance)}{point}, '
             f'after {outcome.seconds:.1f} s{simulated}'
         )
     if outcome.arrived:
@@ -220,6 +268,26 @@ def _reason(outcome: Outcome, timeout: float) -> str:
     return reasons.get(outcome.status, 'ROS was shut down')
 
 
+def _print_goal_end(end: GoalEnd) -> None:
+    """Print the end of a goal in one line."""
+    from diffdrive_jacobian.messages.goal_status import GoalState
+
+    ends = {
+        GoalState.SUCCEEDED: 'arrived',
+        GoalState.CANCELED: 'canceled',
+        GoalState.ABORTED: 'refused or aborted',
+    }
+    where = 'there is no odometry'
+    if end.pose is not None:
+        x, y, theta = end.pose
+        where = (
+            f'the robot is at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, '
+            f'{describe_distances(end.distance, end.true_distance)}'
+        )
+    robot = '' if end.robot == '/' else f'{end.robot}: '
+    print(f'{robot}goal ({end.goal[0]:g}, {end.goal[1]:g}) {ends[end.state]}: {where}', flush=True)
+
+
 def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
@@ -229,40 +297,38 @@ def _parser() -> _cli.Parser:
         'or the recording is not complete; 2: wrong arguments; 130: interrupted.',
     )
     parser.add_argument(
-        'coordinates', metavar='X Y', nargs='*', type=_cli.coordinate, help='x and y of each goal (m)'
+        'coordinates',
+        metavar='X Y',
+        nargs='*',
+        type=_options.coordinate,
+        help='x and y of each goal (m)',
     )
-    parser.add_argument(
-        '--timeout',
-        metavar='SECONDS',
-        type=_cli.positive,
-        default=300.0,
-        help='longest duration of the drive, of all goals together (s) (default: %(default)s)',
+    _options.add_timeout(
+        parser, 'longest duration of the drive, of all goals together (s)', default=300.0
     )
-    parser.add_argument(
+    _options.add_value(
+        parser,
         '--tolerance',
-        metavar='M',
-        type=_cli.tolerance,
-        help='distance to a goal that counts as arrived (m) (default: 0.02, unless a file sets it)',
+        'M',
+        'distance to a goal that counts as arrived (m) (default: 0.02, unless a file sets it)',
+        kind=_options.tolerance,
     )
-    _cli.add_heading(parser, 'heading at the last goal (rad) (default: any)')
-    parser.add_argument(
-        '--controller',
-        choices=CONTROLLERS,
-        metavar='NAME',
-        help='controller: %(choices)s (default: go_to_goal, unless a file names another)',
+    _options.add_heading(parser, 'heading at the last goal (rad) (default: any)')
+    _options.add_controller(
+        parser,
+        CONTROLLERS,
+        'controller: %(choices)s (default: go_to_goal, unless a file names another)',
     )
-    _cli.add_params_file(parser)
-    parser.add_argument(
-        '-o',
-        '--output',
-        metavar='BAG',
-        type=_cli.bag_folder,
-        help='directory of the rosbag2 bag to record to; the picture is BAG.png '
-        '(default: drive_DATE-TIME)',
+    _options.add_params_file(parser)
+    _options.add_output(
+        parser,
+        'BAG',
+        'directory of the rosbag2 bag to record to; the picture is BAG.png (default: drive_DATE-TIME)',
+        kind=_options.bag_folder,
     )
-    _cli.add_force(parser, 'BAG and BAG.png, at the end of the drive')
+    _options.add_force(parser, 'BAG and BAG.png, at the end of the drive')
     parser.add_argument('--no-record', action='store_true', help='neither record nor draw')
-    parser.add_argument('--no-plot', action='store_true', help='record, but do not draw')
+    _options.add_no_plot(parser, 'record, but do not draw')
     parser.add_argument(
         '--lockstep',
         action='store_true',
@@ -280,5 +346,5 @@ def _parser() -> _cli.Parser:
         help='show the drive on a page in the browser and steer the robot there, until Ctrl-C; without '
         'X Y the robot waits for goals; the bag is recorded, no picture is drawn',
     )
-    _live.add_options(parser)
+    _options.add_page(parser)
     return parser

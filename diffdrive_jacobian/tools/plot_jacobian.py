@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 
 from diffdrive_jacobian import plots
+from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.plots.output_files import FORMATS, create, extension, new_file
 from diffdrive_jacobian.plots.rendering import render
 from diffdrive_jacobian.plots.style import styled
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _cli
-from diffdrive_jacobian.tools._waiting import busy
+from diffdrive_jacobian.tools import _cli, _options
+from diffdrive_jacobian.tools._messages import busy, explaining_no_matplotlib
 
 PROGRAM = 'plot_jacobian'
 
@@ -23,23 +23,20 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     output = f'{options.name}.png' if options.output is None else options.output
     try:
         path = new_file(output, FORMATS, 'picture', replace=options.force)
-        with busy(PROGRAM, 'drawing'), signals.ending_at_once(), styled():
+        with (
+            explaining_no_matplotlib(),
+            busy(PROGRAM, 'drawing'),
+            signals.ending_at_once(),
+            styled(),
+        ):
             content = render(getattr(plots, options.name)(), extension(path))
         if signals.count:
-            print(f'{PROGRAM}: interrupted: nothing was written', file=sys.stderr)
-            return _cli.INTERRUPTED
+            return _cli.interrupted(PROGRAM, 'nothing was written')
         create(path, content, replace=options.force)
-    except (ValueError, FileExistsError) as error:
+    except (ValueError, UserError, FileExistsError) as error:
         return _cli.complain(PROGRAM, error)
-    except ModuleNotFoundError as error:
-        if (error.name or '').split('.')[0] != 'matplotlib':
-            raise
-        return _cli.complain(
-            PROGRAM, "matplotlib is not installed: pip install 'diffdrive_jacobian[plot]'"
-        )
     except OSError as error:
-        message = f'{output} cannot be written: {error.strerror or error}'
-        return _cli.complain(PROGRAM, message, _cli.FAILED)
+        return _cli.cannot_write(PROGRAM, output, error)
     print(path)
     return _cli.DONE
 
@@ -63,11 +60,6 @@ def _parser() -> _cli.Parser:
         'be written; 2: wrong arguments, or no matplotlib; 130: interrupted.',
     )
     parser.add_argument('name', metavar='NAME', type=_name, help='the picture, one of those above')
-    parser.add_argument(
-        '-o',
-        '--output',
-        metavar='FILE',
-        help=f'file to write, .{", .".join(FORMATS)} (default: NAME.png)',
-    )
-    _cli.add_force(parser, 'the file')
+    _options.add_output(parser, 'FILE', f'file to write, .{", .".join(FORMATS)} (default: NAME.png)')
+    _options.add_force(parser, 'the file')
     return parser

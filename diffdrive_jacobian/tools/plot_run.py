@@ -19,8 +19,8 @@ from diffdrive_jacobian.plots.run_figure import draw, names
 from diffdrive_jacobian.plots.run_table import DECIMALS, write_csv
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
-from diffdrive_jacobian.tools import _cli
-from diffdrive_jacobian.tools._waiting import busy
+from diffdrive_jacobian.tools import _cli, _options
+from diffdrive_jacobian.tools._messages import busy, explaining_no_matplotlib
 from diffdrive_jacobian.tools.entry_points import OUTPUT_ERROR
 
 PROGRAM = 'plot_run'
@@ -29,10 +29,8 @@ PROGRAM = 'plot_run'
 def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool and return its exit code."""
     options = _parser().parse_args(arguments)
-    bags = [Path(bag) for bag in options.bags]
     try:
-        if len({bag.resolve() for bag in bags}) < len(bags):
-            raise UserError(f'each bag can be given once, got {" ".join(map(str, bags))}')
+        bags = _options.given_bags(options)
         given = [name for name, _ in options.topics]
         if repeated := [name for name in given if given.count(name) > 1]:
             raise UserError(f'--topic can be given once for each name, got {repeated[0]} again')
@@ -44,7 +42,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             try:
                 _check_writable(path, makes_directory=path in tables)
             except OSError as error:
-                return _not_written(path, error)
+                return _cli.cannot_write(PROGRAM, path, error)
         runs: list[Run] = []
         for bag in bags:
             with busy(PROGRAM, f'reading {printable(bag, PATH_LIMIT)}'):
@@ -61,18 +59,13 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             for note in runs[-1].notes:
                 print(f'{PROGRAM}: {printable(bag, PATH_LIMIT)}: {note}', file=sys.stderr)
             if signals.count:
-                return _interrupted()
-        return _write(runs, picture, tables, signals, replace=options.force)
+                return _cli.interrupted(PROGRAM)
+        with explaining_no_matplotlib():
+            return _write(runs, picture, tables, signals, replace=options.force)
     except ReadingInterruptedError:
-        return _interrupted()
+        return _cli.interrupted(PROGRAM)
     except (BagError, UserError) as error:
         return _cli.complain(PROGRAM, printable(error, PATH_LIMIT))
-    except ModuleNotFoundError as error:
-        if (error.name or '').split('.')[0] != 'matplotlib':
-            raise
-        return _cli.complain(
-            PROGRAM, "matplotlib is not installed: pip install 'diffdrive_jacobian[plot]'"
-        )
 
 
 def _write(
@@ -86,12 +79,12 @@ def _write(
     ]
     for path, write in zip([picture, *tables], writers, strict=True):
         if signals.count:
-            return _interrupted()
+            return _cli.interrupted(PROGRAM)
         try:
             with busy(PROGRAM, f'writing {printable(path, PATH_LIMIT)}'):
                 write()
         except OSError as error:
-            return _not_written(path, error)
+            return _cli.cannot_write(PROGRAM, path, error)
         try:
             print(printable(path, PATH_LIMIT))
         except BrokenPipeError:
@@ -100,11 +93,6 @@ def _write(
             # It is not buffered.
             return _cli.complain(PROGRAM, f'{OUTPUT_ERROR}: {error.strerror}', _cli.FAILED)
     return _cli.DONE
-
-
-def _not_written(path: Path, error: OSError) -> int:
-    message = f'{path} cannot be written: {error.strerror or error}'
-    return _cli.complain(PROGRAM, printable(message, PATH_LIMIT), _cli.FAILED)
 
 
 def _check_writable(path: Path, *, makes_directory: bool) -> None:
@@ -117,11 +105,6 @@ def _check_writable(path: Path, *, makes_directory: bool) -> None:
 def _write_table(run: Run, path: Path, *, replace: bool) -> None:
     path.parent.mkdir(exist_ok=True)
     write_csv(run, path, replace=replace)
-
-
-def _interrupted() -> int:
-    print(f'{PROGRAM}: interrupted', file=sys.stderr)
-    return _cli.INTERRUPTED
 
 
 def _picture(options: argparse.Namespace, bags: Sequence[Path]) -> Path:
@@ -192,12 +175,11 @@ def _parser() -> _cli.Parser:
         'Exit code 0: drawn; 1: a file cannot be written; 2: wrong arguments, or a bag cannot be read; '
         '130: interrupted.',
     )
-    parser.add_argument('bags', metavar='BAG', nargs='+', help='directory of a bag')
-    parser.add_argument(
-        '-o',
-        '--output',
-        metavar='FILE',
-        help=f'picture to write, .{", .".join(FORMATS)} (default: BAG.png beside the bag)',
+    _options.add_bags(parser)
+    _options.add_output(
+        parser,
+        'FILE',
+        f'picture to write, .{", .".join(FORMATS)} (default: BAG.png beside the bag)',
     )
     parser.add_argument(
         '--csv',
@@ -205,8 +187,8 @@ def _parser() -> _cli.Parser:
         help='also write the values over time: to FILE.csv, or to BAG.csv for each bag in a directory. '
         f'Times are exact, values are rounded to {DECIMALS} decimal places (default: none)',
     )
-    _cli.add_force(parser, 'the picture and the tables')
-    _cli.add_namespace(parser)
+    _options.add_force(parser, 'the picture and the tables')
+    _options.add_namespace(parser)
     parser.add_argument(
         '--topic',
         dest='topics',

@@ -13,16 +13,14 @@ from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.recording.selection import RUN_TOPICS, Selection
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
-from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools import _cli, _options
+from diffdrive_jacobian.tools._messages import Waiting, busy, counted, describe_bag
 from diffdrive_jacobian.tools._startup import long_lived
-from diffdrive_jacobian.tools._waiting import Waiting, busy
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.recording.record import Status
 
 PROGRAM = 'record_run'
-STORAGES = ('mcap', 'sqlite3')
-"""File formats of bags."""
 STATUS_PERIOD = {True: 0.5, False: 10.0}
 """Time between two lines about the status, on a terminal and elsewhere (s)."""
 MAX_LISTED = 8
@@ -60,7 +58,7 @@ class StatusLine:
         rate = (status.messages - self._messages) / elapsed
         self._shown, self._messages = status.seconds, status.messages
         line = (
-            f'{_cli.counted(status.messages, "message")} of {_cli.counted(status.topics, "topic")}, '
+            f'{counted(status.messages, "message")} of {counted(status.topics, "topic")}, '
             f'{rate:.0f} per second, {status.size / 1e6:.1f} MB, {status.seconds:.0f} s'
         )
         if status.lost:
@@ -101,7 +99,6 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         # Not above: --help needs no ROS.
         from diffdrive_jacobian.recording.record import open_recording, record
         from diffdrive_jacobian.recording.recording import RecordingError
-        from diffdrive_jacobian.tools._bags import describe
 
     topics = tuple(options.topics)
     selection = Selection(
@@ -137,10 +134,10 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         return _cli.complain(PROGRAM, error)
     except RecordingError as error:
         if error.summary is not None:
-            print(describe(bag, error.summary, 'incomplete'))
+            print(describe_bag(bag, error.summary, 'incomplete'))
         print(f'{PROGRAM}: error: {error}', file=sys.stderr)
         return _cli.FAILED
-    print(describe(bag, summary))
+    print(describe_bag(bag, summary))
     if topics and not summary.messages:
         reason = line.missing or f'no message was received on {", ".join(topics)}'
         return _cli.complain(PROGRAM, reason, _cli.FAILED)
@@ -195,21 +192,11 @@ def _parser() -> _cli.Parser:
         nargs='*',
         help=f'topics to record (default: those of a run: {", ".join(RUN_TOPICS)})',
     )
-    parser.add_argument(
-        '-o',
-        '--output',
-        metavar='BAG',
-        type=_cli.bag_folder,
-        help='directory of the bag (default: run_DATE-TIME)',
+    _options.add_output(
+        parser, 'BAG', 'directory of the bag (default: run_DATE-TIME)', kind=_options.bag_folder
     )
-    _cli.add_force(parser, 'BAG, at the end of the recording')
-    parser.add_argument(
-        '-s',
-        '--storage',
-        choices=STORAGES,
-        default='mcap',
-        help='file format (default: %(default)s)',
-    )
+    _options.add_force(parser, 'BAG, at the end of the recording')
+    _options.add_storage(parser, default='mcap')
     parser.add_argument('-a', '--all', action='store_true', help='record every topic that is not hidden')
     parser.add_argument(
         '-e',
@@ -217,10 +204,7 @@ def _parser() -> _cli.Parser:
         type=_pattern,
         help='record the topics in whose names this regular expression is found',
     )
-    parser.add_argument(
-        '--max-duration',
-        metavar='SECONDS',
-        type=_cli.positive,
-        help='end the recording after this time (s) (default: never)',
+    _options.add_value(
+        parser, '--max-duration', 'SECONDS', 'end the recording after this time (s) (default: never)'
     )
     return parser

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from diffdrive_jacobian.bags.bag_writer import STORAGES
 from diffdrive_jacobian.bags.recovery import (
     RECOVERED,
     NotABagError,
@@ -19,9 +18,8 @@ from diffdrive_jacobian.bags.recovery import (
 )
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
-from diffdrive_jacobian.tools import _cli
-from diffdrive_jacobian.tools._bags import describe
-from diffdrive_jacobian.tools._waiting import busy
+from diffdrive_jacobian.tools import _cli, _options
+from diffdrive_jacobian.tools._messages import busy, describe_bag
 
 PROGRAM = 'recover_run'
 UNCHECKED = 3
@@ -36,17 +34,16 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     """Run the tool and return its exit code."""
     options = _parser().parse_args(arguments)
     try:
-        with busy(PROGRAM, f'reading {printable(options.what, PATH_LIMIT)}'):
+        with busy(PROGRAM, f'reading {printable(options.bag, PATH_LIMIT)}'):
             recovery = recover(
-                options.what,
+                options.bag,
                 options.output,
                 options.storage,
                 replace=options.force,
                 interrupted=lambda: bool(signals.count),
             )
     except RecoveryInterruptedError:
-        print(f'{PROGRAM}: interrupted: no bag was written', file=sys.stderr)
-        return _cli.INTERRUPTED
+        return _cli.interrupted(PROGRAM, 'no bag was written')
     except NothingToSaveError as error:
         reason, *losses = error.args
         print(f'{PROGRAM}: {printable(reason, PATH_LIMIT)}', *_listed(losses), sep='\n', file=sys.stderr)
@@ -66,7 +63,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
 
 def report(recovery: Recovery) -> str:
     """Return a description of a recovery, of several lines."""
-    lines = [describe(recovery.bag, recovery.summary, 'written')]
+    lines = [describe_bag(recovery.bag, recovery.summary, 'written')]
     if recovery.damaged:
         lines.append(f'damaged: {recovery.damaged}')
     lost = _listed([*recovery.lost, *recovery.lost_before], 'lost: ')
@@ -97,22 +94,17 @@ def _parser() -> _cli.Parser:
         '3: nothing to recover (nothing was found missing, but not all could be checked, for want of '
         'checksums or counts); 130: interrupted.',
     )
-    parser.add_argument(
-        'what',
-        metavar='BAG',
-        type=Path,
-        help='directory of a bag, a file of it (.mcap, .db3), a journal of record_run, or the bag that '
+    _options.add_bag(
+        parser,
+        'directory of a bag, a file of it (.mcap, .db3), a journal of record_run, or the bag that '
         'the journal belongs to',
     )
-    parser.add_argument(
-        '-o',
-        '--output',
-        metavar='NEW',
-        type=Path,
-        help=f'directory to write (default: BAG{RECOVERED}, for a journal the bag it belongs to)',
+    _options.add_output(
+        parser,
+        'NEW',
+        f'directory to write (default: BAG{RECOVERED}, for a journal the bag it belongs to)',
+        kind=Path,
     )
-    _cli.add_force(parser, 'NEW, which must not be BAG')
-    parser.add_argument(
-        '-s', '--storage', choices=sorted(STORAGES), help='storage format (default: that of BAG)'
-    )
+    _options.add_force(parser, 'NEW, which must not be BAG')
+    _options.add_storage(parser)
     return parser

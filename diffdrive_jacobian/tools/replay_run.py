@@ -7,14 +7,13 @@ import math
 import select
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from diffdrive_jacobian.errors import UserError
-from diffdrive_jacobian.numerics.fields import not_negative
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools import _cli, _options
+from diffdrive_jacobian.tools._messages import Waiting
 from diffdrive_jacobian.tools._startup import long_lived
 
 if TYPE_CHECKING:
@@ -26,7 +25,7 @@ MATCH_PATIENCE = 5.0
 """Longest wait for subscriptions without -w (s): an older participant is announced every 3 s."""
 
 
-def _replay(bag: Path, options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> int:
+def _replay(options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> int:
     with long_lived(), signals.ending_at_once():
         from diffdrive_jacobian.recording import COMMANDS, GOALS, NothingToPlayError, Playback, replay
 
@@ -44,7 +43,7 @@ def _replay(bag: Path, options: argparse.Namespace, ros: Sequence[str], signals:
     acked = options.wait_for_all_acked
     try:
         result = replay(
-            bag,
+            options.bag,
             playback,
             patience=MATCH_PATIENCE,
             readers=options.readers,
@@ -64,23 +63,22 @@ class _Progress:
 
     def __init__(self) -> None:
         # Slow to import.
-        from diffdrive_jacobian.tools._progress import Playing
-        from diffdrive_jacobian.tools._waiting import Waiting
+        from diffdrive_jacobian.tools._progress import Bar
 
-        self._create_bar = Playing
-        self._bar: Playing | None = None
-        self._create_waiting = Waiting
+        self._bar = Bar(stays=True)
+        self._seconds = 0.0
         self._waiting = Waiting()
 
     def waiting(self, reason: str) -> None:
         self._waiting.show(reason)
 
     def started(self, seconds: float) -> None:
-        self._bar = self._create_bar(seconds).__enter__()
+        self._seconds = seconds
 
     def playing(self, seconds: float, *, paused: bool) -> None:
-        if self._bar is not None:
-            self._bar.show(seconds, paused=paused)
+        what = 'paused (Enter)' if paused else 'playing'
+        share = seconds / self._seconds if self._seconds else 1.0
+        self._bar.show(what, share, f'{seconds:.1f} of {self._seconds:.1f} s')
 
     def toggled(self) -> bool:
         if not sys.stdin or not sys.stdin.isatty():
@@ -89,10 +87,9 @@ class _Progress:
         return bool(ready) and sys.stdin.readline() != ''
 
     def ended(self) -> None:
-        if self._bar is not None:
-            self._bar.__exit__()
+        self._bar.close()
         # The acknowledgements come next.
-        self._waiting = self._create_waiting()
+        self._waiting = Waiting()
 
 
 def _report(result: ReplayResult, options: argparse.Namespace) -> int:
@@ -139,9 +136,8 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     # Not above: --help needs no ROS.
     from diffdrive_jacobian.bags.bag_reader import BagError
 
-    bag = Path(options.bag)
     try:
-        return _replay(bag, options, ros, signals)
+        return _replay(options, ros, signals)
     except (UserError, BagError, ParameterError) as error:
         return _cli.complain(PROGRAM, error)
 
@@ -161,7 +157,7 @@ def _parser() -> _cli.Parser:
         'topics. On a terminal, Enter pauses and resumes. Exit code 0: played; 1: not played to the '
         'end, or nothing to play; 2: wrong arguments or no bag; 130: interrupted.',
     )
-    parser.add_argument('bag', metavar='BAG', help='directory of a rosbag2 bag')
+    _options.add_bag(parser)
     what = parser.add_mutually_exclusive_group()
     what.add_argument('--goals', action='store_true', help='play the goals of the controller')
     what.add_argument('--all-topics', action='store_true', help='play all topics')
@@ -172,17 +168,16 @@ def _parser() -> _cli.Parser:
         help='play these topics; the namespace can be left out where only one robot has the topic',
     )
     what.add_argument(VERIFY, action='store_true', help='run verify_run instead, with its options')
-    _cli.add_namespace(parser)
-    parser.add_argument(
-        '-r', '--rate', type=_cli.positive, default=1.0, help='factor on the speed (default: 1.0)'
-    )
+    _options.add_namespace(parser)
+    _options.add_value(parser, '-r --rate', 'RATE', 'factor on the speed', default=1.0)
     parser.add_argument('-l', '--loop', action='store_true', help='start again at the end of the bag')
-    parser.add_argument(
+    _options.add_value(
+        parser,
         '--start-offset',
-        metavar='SECONDS',
-        type=_cli.number_that(not_negative),
+        'SECONDS',
+        'start this long after the beginning of the bag (s)',
         default=0.0,
-        help='start this long after the beginning of the bag (s) (default: 0.0)',
+        kind=_options.not_negative,
     )
     parser.add_argument(
         '-m',
@@ -198,26 +193,24 @@ def _parser() -> _cli.Parser:
         '--clock',
         nargs='?',
         const=40.0,
-        type=_cli.positive,
+        type=_options.positive,
         metavar='HZ',
         help='publish the time of the bag on /clock at this rate (Hz) (default: 40.0 if HZ is left '
         'out, not at all without the option)',
     )
     parser.add_argument('-p', '--start-paused', action='store_true', help='start in the paused state')
-    _cli.add_wait_matching(
+    _options.add_wait_matching(
         parser, 'each topic has', f'those that are discovered within {MATCH_PATIENCE:g} s'
     )
-    parser.add_argument(
-        '--timeout',
-        type=_cli.positive,
-        metavar='SECONDS',
-        help='with -w: give up after this time (s) and play nothing (default: never)',
+    _options.add_timeout(
+        parser, 'with -w: give up after this time (s) and play nothing (default: never)'
     )
-    parser.add_argument(
+    _options.add_value(
+        parser,
         '--wait-for-all-acked',
-        type=_cli.number_that(not_negative),
-        metavar='MS',
-        help='at the end wait up to this time (ms) until all reliable subscriptions have acknowledged '
+        'MS',
+        'at the end wait up to this time (ms) until all reliable subscriptions have acknowledged '
         'all messages, 0: no limit; exit code 1 if they have not (default: do not wait)',
+        kind=_options.not_negative,
     )
     return parser

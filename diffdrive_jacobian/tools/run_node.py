@@ -13,9 +13,8 @@ from typing import NamedTuple
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, specifications
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools import _cli, _options
 from diffdrive_jacobian.tools._startup import long_lived
-from diffdrive_jacobian.tools._unused_files import warn_of_unused_files
 
 
 class Program(NamedTuple):
@@ -71,7 +70,7 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
         except ParameterError as error:
             return _cli.complain(name, error)
         parser = _parser(name, program, parameters)
-        ros = _cli.with_params_file(ros, _cli.parse(parser, own, parameters=[parameters], hint=hint))
+        ros = _options.with_params_file(ros, _cli.parse(parser, own, parameters=[parameters], hint=hint))
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS. Only the node that runs: each takes time to import.
         from diffdrive_jacobian.ros.runner import ros_context, running
@@ -84,7 +83,7 @@ def run_node(name: str, arguments: Sequence[str], signals: Signals) -> int:
         ):
             with long_lived():
                 node = runner.add(lambda: create(context=context))
-            warn_of_unused_files(name, ros, [node.get_fully_qualified_name()])
+            _options.warn_of_unused_files(name, ros, [node.get_fully_qualified_name()])
             runner.spin(lambda: False, signals=signals)
     except UserError as error:
         return _cli.complain(name, error)
@@ -117,7 +116,7 @@ def _parser(name: str, program: Program, parameters: type[NodeParameters]) -> _c
         epilog=_description(parameters),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    _cli.add_params_file(parser)
+    _options.add_params_file(parser)
     return parser
 
 

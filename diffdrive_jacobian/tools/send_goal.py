@@ -12,7 +12,8 @@ from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
-from diffdrive_jacobian.tools import _cli
+from diffdrive_jacobian.tools import _cli, _options
+from diffdrive_jacobian.tools._messages import Waiting
 from diffdrive_jacobian.tools._startup import long_lived
 
 if TYPE_CHECKING:
@@ -26,8 +27,10 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     own, ros = _cli.split_arguments(arguments)
     parser = _parser()
     options = _cli.parse(parser, own)
-    heading = _cli.given_heading(parser, options)
+    heading = _options.given_heading(parser, options)
     _cli.refuse_with(parser, options, '--timeout', '--no-wait')
+    if options.timeout is None:
+        options.timeout = math.inf
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
         from diffdrive_jacobian.nodes.remote_goal import send_goal
@@ -59,11 +62,10 @@ class _Progress:
 
     def __init__(self, goal: str) -> None:
         # Slow to import.
-        from diffdrive_jacobian.tools._progress import Drive
-        from diffdrive_jacobian.tools._waiting import Waiting
+        from diffdrive_jacobian.tools._progress import GoalBar
 
         self._goal = goal
-        self._bar = Drive()
+        self._bar = GoalBar()
         self._waiting = Waiting()
 
     def __enter__(self) -> _Progress:
@@ -139,29 +141,25 @@ def _parser() -> _cli.Parser:
         description='Send a goal to a running go_to_goal and wait until it has ended. Ctrl-C cancels '
         'the goal. Exit code 0: arrived; 1: not arrived; 2: wrong arguments; 130: interrupted.',
     )
-    parser.add_argument('x', metavar='X', type=_cli.coordinate, help='x of the goal (m)')
-    parser.add_argument('y', metavar='Y', type=_cli.coordinate, help='y of the goal (m)')
-    _cli.add_wait_matching(parser, 'goal_pose has', '1')
-    _cli.add_heading(
+    for axis in 'xy':
+        parser.add_argument(
+            axis, metavar=axis.upper(), type=_options.coordinate, help=f'{axis} of the goal (m)'
+        )
+    _options.add_wait_matching(parser, 'goal_pose has', '1')
+    _options.add_heading(
         parser, 'heading at the goal (rad), used if the controller has use_goal_heading (default: 0.0)'
     )
     parser.add_argument(
         '--frame', default='', help='frame of the goal (default: the frame of the odometry)'
     )
-    parser.add_argument(
+    _options.add_value(
+        parser,
         '--wait',
-        metavar='SECONDS',
-        type=_cli.positive,
+        'SECONDS',
+        'longest wait for a controller and for the subscriptions of -w (s)',
         default=10.0,
-        help='longest wait for a controller and for the subscriptions of -w (s) (default: 10.0)',
     )
-    parser.add_argument(
-        '--timeout',
-        metavar='SECONDS',
-        type=_cli.positive,
-        default=math.inf,
-        help='cancel the goal after this time (s) (default: never)',
-    )
+    _options.add_timeout(parser, 'cancel the goal after this time (s) (default: never)')
     parser.add_argument(
         '--no-wait', action='store_true', help='only send the goal, do not wait until it has ended'
     )

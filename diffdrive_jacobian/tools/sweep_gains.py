@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -26,8 +26,8 @@ from diffdrive_jacobian.simulation.gain_sweep import (
     sweep,
     sweep_table,
 )
-from diffdrive_jacobian.tools import _cli
-from diffdrive_jacobian.tools._waiting import busy
+from diffdrive_jacobian.tools import _cli, _options
+from diffdrive_jacobian.tools._messages import busy, explaining_no_matplotlib
 
 PROGRAM = 'sweep_gains'
 
@@ -51,7 +51,8 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         _check(signals)
         if picture is not None:
             # Slow.
-            importlib.import_module('matplotlib.figure')
+            with explaining_no_matplotlib('; the table alone, --csv FILE, does not need it'):
+                importlib.import_module('matplotlib.figure')
         swept = _sweep(options, signals)
         with busy(PROGRAM, 'drawing'):
             drawn = b'' if picture is None else sweep_figure.draw(swept, extension(picture))
@@ -61,20 +62,11 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             # Other processes that started in the same second may have taken the names meanwhile.
             picture, numbers = _files(options)
     except SweepInterruptedError:
-        print(f'{PROGRAM}: interrupted: nothing was written', file=sys.stderr)
-        return _cli.INTERRUPTED
+        return _cli.interrupted(PROGRAM, 'nothing was written')
     except (ValueError, UserError, FileExistsError) as error:
         return _cli.complain(PROGRAM, error)
-    except ModuleNotFoundError as error:
-        if (error.name or '').split('.')[0] != 'matplotlib':
-            raise
-        return _cli.complain(
-            PROGRAM,
-            "matplotlib is not installed: pip install 'diffdrive_jacobian[plot]'; "
-            'the table alone, --csv FILE, does not need it',
-        )
     except OSError as error:
-        return _cannot_write(error.filename, error)
+        return _cli.cannot_write(PROGRAM, error.filename, error)
     code = _write([(numbers, rows), (picture, drawn)], replace=options.force)
     print(describe_sweep(swept))
     return code
@@ -101,13 +93,15 @@ def _sweep(options: argparse.Namespace, signals: Signals) -> Sweep:
     )
     _check(signals)
     # Slow to import.
-    from diffdrive_jacobian.tools._progress import Batch
+    from diffdrive_jacobian.tools._progress import Bar
 
-    with Batch('sweeping', setup.loops) as bar:
+    started = time.monotonic()
+    with Bar() as bar:
 
         def progress(done: int) -> None:
             _check(signals)
-            bar.show(done)
+            seconds = time.monotonic() - started
+            bar.show('sweeping', done / setup.loops, f'{done} of {setup.loops}, {seconds:.0f} s')
 
         return sweep(setup, progress)
 
@@ -191,16 +185,11 @@ def _write(contents: Sequence[tuple[Path | None, bytes]], *, replace: bool) -> i
             create(path, content, replace=replace)
             written.append(path)
         except OSError as error:
-            code = _cannot_write(path, error)
+            code = _cli.cannot_write(PROGRAM, path, error)
     # Only now: the reader of the output may go away.
     for path in written:
         print(path)
     return code
-
-
-def _cannot_write(path: object, error: OSError) -> int:
-    print(f'{PROGRAM}: error: {path} cannot be written: {error.strerror or error}', file=sys.stderr)
-    return _cli.FAILED
 
 
 def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:
@@ -215,81 +204,61 @@ def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:
         'written; 2: wrong arguments; 130: interrupted, and nothing was written.',
     )
     usual = SweepSetup()
-    parser.add_argument(
+    _options.add_value(
+        parser,
         '--grid',
-        metavar='N',
-        type=_cli.integer_from(2, MAX_LOOPS),
+        'N',
+        'number of values of each gain',
         default=usual.grid,
-        help='number of values of each gain (default: %(default)s)',
+        kind=_options.integer_from(2, MAX_LOOPS),
     )
-    parser.add_argument(
+    _options.add_value(
+        parser,
         '--starts',
-        metavar='N',
-        type=_cli.integer_from(1, MAX_LOOPS),
+        'N',
+        'number of start poses, evenly spaced around the goal, with headings in all directions',
         default=usual.starts,
-        help='number of start poses, evenly spaced around the goal, with headings in all directions '
-        '(default: %(default)s)',
+        kind=_options.integer_from(1, MAX_LOOPS),
     )
-    parser.add_argument(
+    _options.add_value(
+        parser,
         '--distance',
-        metavar='M',
-        type=_cli.positive,
+        'M',
+        'distance of the start poses from the goal (m)',
         default=usual.distance,
-        help='distance of the start poses from the goal (m) (default: %(default)g)',
     )
-    parser.add_argument(
-        '--controller',
-        choices=CONTROLLERS,
-        metavar='NAME',
+    _options.add_controller(
+        parser,
+        CONTROLLERS,
+        'controller, whose gains are options, too: %(choices)s',
         default=usual.controller,
-        help='controller, whose gains are options, too: %(choices)s (default: %(default)s)',
     )
-    parser.add_argument(
-        '--rate',
-        metavar='HZ',
-        type=_cli.positive,
-        default=usual.rate,
-        help='control rate (Hz) (default: %(default)g)',
+    _options.add_value(parser, '--rate', 'HZ', 'control rate (Hz)', default=usual.rate)
+    _options.add_value(
+        parser, '--duration', 'S', 'longest duration of a closed loop (s)', default=usual.duration
     )
-    parser.add_argument(
-        '--duration',
-        metavar='S',
-        type=_cli.positive,
-        default=usual.duration,
-        help='longest duration of a closed loop (s) (default: %(default)g)',
-    )
-    parser.add_argument(
+    _options.add_value(
+        parser,
         '--tolerance',
-        metavar='M',
-        type=_cli.tolerance,
+        'M',
+        'distance that counts as arrived (m)',
         default=usual.tolerance,
-        help='distance that counts as arrived (m) (default: %(default)g)',
+        kind=_options.tolerance,
     )
-    parser.add_argument(
-        '--max-velocity',
-        metavar='V',
-        type=_cli.positive,
-        help='limit of the speed (m/s) (default: no limit)',
+    _options.add_value(parser, '--max-velocity', 'V', 'limit of the speed (m/s) (default: no limit)')
+    _options.add_value(
+        parser, '--max-yaw-rate', 'W', 'limit of the yaw rate (rad/s) (default: no limit)'
     )
-    parser.add_argument(
-        '--max-yaw-rate',
-        metavar='W',
-        type=_cli.positive,
-        help='limit of the yaw rate (rad/s) (default: no limit)',
-    )
-    _cli.add_params_file(
+    _options.add_params_file(
         parser,
         'parameter file (YAML) with the limits and wheels of virtual_robot, as in config/ '
         '(default: the defaults of virtual_robot)',
     )
     default = 'sweep_DATE-TIME.{}, unless {} is given'
-    parser.add_argument(
-        '-o',
-        '--output',
-        metavar='FILE',
-        help=f'picture, .{", .".join(FORMATS)} (default: {default.format("png", "--csv")})',
+    _options.add_output(
+        parser, 'FILE', f'picture, .{", .".join(FORMATS)} (default: {default.format("png", "--csv")})'
     )
-    _cli.add_force(parser, 'the picture and the table')
+    _options.add_force(parser, 'the picture and the table')
     parser.add_argument(
         '--csv', metavar='FILE', help=f'table, .csv (default: {default.format("csv", "-o")})'
     )
@@ -302,7 +271,7 @@ def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:
             dest=f'gain_{gain.name}',
             nargs='+',
             metavar='VALUE',
-            type=_cli.number,
+            type=_options.number,
             help=f'{gain.description}{unit}: MIN MAX to sweep it, or one value (default: the first two '
             f'gains are swept, this one over {gain.usual[0]:g} to {gain.usual[1]:g}; else '
             f'{gain.default:g})',

@@ -3,32 +3,28 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
-from diffdrive_jacobian.bags.covariance_rule import EXACT_MOMENTS, FIRST_ORDER, NEITHER
 from diffdrive_jacobian.bags.run_reader import read_run
-from diffdrive_jacobian.bags.verification import BY_RECORDING_TIME, EXACT, Verification, verify
+from diffdrive_jacobian.bags.verification import (
+    BY_RECORDING_TIME,
+    COVARIANCE_TOLERANCE,
+    EXACT,
+    Verification,
+    verify,
+)
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.file import robot_parameters
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
-from diffdrive_jacobian.tools import _cli
-from diffdrive_jacobian.tools._waiting import busy
+from diffdrive_jacobian.tools import _cli, _options
+from diffdrive_jacobian.tools._messages import busy
 
 PROGRAM = 'verify_run'
-
-
-_RULES = {
-    EXACT_MOMENTS: 'the exact moments of the noise model',
-    FIRST_ORDER: 'of first order, as published by earlier versions',
-    NEITHER: 'neither the exact moments of the noise model nor their first order',
-}
 
 
 def report(verification: Verification, tolerance: float, yaw_tolerance: float) -> str:
@@ -58,10 +54,11 @@ def report(verification: Verification, tolerance: float, yaw_tolerance: float) -
         if len(beyond):
             first = verification.seconds[beyond[0]]
             lines.append(f'{name}: exceeded in {len(beyond)} messages, first at {first:.3f} s')
-    if verification.covariance is not None:
+    if (difference := verification.covariance_difference) is not None:
+        exact = '' if difference <= COVARIANCE_TOLERANCE else 'not '
         lines.append(
-            f'covariance: {_RULES[verification.covariance]}; '
-            f'maximum relative difference {verification.covariance_difference:.3g}'
+            f'covariance: {exact}the exact moments of the noise model; '
+            f'maximum relative difference {difference:.3g}'
         )
     if (truth := verification.truth) is not None:
         lines.append(
@@ -113,8 +110,7 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace, signals: 
     except (UserError, BagError, ParameterError) as error:
         return _cli.complain(parser.prog, error)
     except ReadingInterruptedError:
-        print(f'{parser.prog}: interrupted', file=sys.stderr)
-        return _cli.INTERRUPTED
+        return _cli.interrupted(parser.prog)
     allowed = verification.allowed
     tolerance = allowed if options.tolerance is None else options.tolerance
     yaw_tolerance = allowed if options.yaw_tolerance is None else options.yaw_tolerance
@@ -131,24 +127,18 @@ def _parser(program: str = PROGRAM, option: str = '') -> argparse.ArgumentParser
         'recorded; 1: it does not; 2: wrong arguments, or the bag cannot be read; '
         '130: interrupted.',
     )
-    parser.add_argument('bag', metavar='BAG', type=Path, help='directory of a bag')
+    _options.add_bag(parser)
     default = f'{EXACT:g} if cmd_vel_out was recorded, else {BY_RECORDING_TIME:g}'
-    parser.add_argument(
-        '--tolerance',
-        metavar='M',
-        type=_cli.positive,
-        help=f'largest allowed difference of the position in m (default: {default})',
-    )
-    parser.add_argument(
-        '--yaw-tolerance',
-        metavar='RAD',
-        type=_cli.positive,
-        help=f'largest allowed difference of the heading in rad (default: {default})',
-    )
-    _cli.add_params_file(
+    for name, unit, of in (
+        ('--tolerance', 'M', 'position in m'),
+        ('--yaw-tolerance', 'RAD', 'heading in rad'),
+    ):
+        text = f'largest allowed difference of the {of} (default: {default})'
+        _options.add_value(parser, name, unit, text)
+    _options.add_params_file(
         parser,
         'ROS parameters of virtual_robot (YAML), if cmd_vel_out was not recorded '
         '(default: those recorded in the bag)',
     )
-    _cli.add_namespace(parser)
+    _options.add_namespace(parser)
     return parser

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.numerics.fields import between
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import _cli, _live
+from diffdrive_jacobian.tools import _cli, _options, _page
 from diffdrive_jacobian.tools._startup import long_lived
 
 PROGRAM = 'watch_run'
@@ -25,13 +24,9 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     if options.bag is not None and ros:
         parser.error('a BAG needs no ROS arguments')
     try:
-        with _live.explaining_port(options.port):
+        with _page.explaining_page_errors(options.port):
             return _bag(options, signals) if options.bag is not None else _nodes(options, ros, signals)
-    except ModuleNotFoundError as error:
-        if (error.name or '').split('.')[0] != 'websockets':
-            raise
-        return _cli.complain(PROGRAM, _live.MISSING, _cli.FAILED)
-    except _live.PortError as error:
+    except _page.PageError as error:
         return _cli.complain(PROGRAM, error, _cli.FAILED)
 
 
@@ -42,11 +37,11 @@ def _bag(options: argparse.Namespace, signals: Signals) -> int:
     print(f'reading {options.bag}', flush=True)
     try:
         watch_bag(
-            Path(options.bag),
+            options.bag,
             port=options.port,
             speed=options.rate or 1.0,
             signals=signals,
-            ready=_live.announcing(options, notice=_live.PLAYS),
+            ready=_page.announcing(options, notice=_page.PLAYS),
         )
     except BagError as error:
         return _cli.complain(PROGRAM, error)
@@ -59,7 +54,7 @@ def _nodes(options: argparse.Namespace, ros: Sequence[str], signals: Signals) ->
 
     try:
         watch_nodes(
-            ros_arguments=ros, port=options.port, signals=signals, ready=_live.announcing(options)
+            ros_arguments=ros, port=options.port, signals=signals, ready=_page.announcing(options)
         )
     except UserError as error:
         return _cli.complain(PROGRAM, error)
@@ -69,7 +64,7 @@ def _nodes(options: argparse.Namespace, ros: Sequence[str], signals: Signals) ->
 def _rate(text: str) -> float:
     from diffdrive_jacobian.live.commands import MAX_WORLD_SPEED, MIN_WORLD_SPEED
 
-    return _cli.number_that(between(MIN_WORLD_SPEED, MAX_WORLD_SPEED))(text)
+    return _options.number_that(between(MIN_WORLD_SPEED, MAX_WORLD_SPEED))(text)
 
 
 def _parser() -> _cli.Parser:
@@ -80,15 +75,13 @@ def _parser() -> _cli.Parser:
         'of the Jacobian chain. The page also steers them. With BAG the page plays a recorded run. '
         'Ctrl-C ends. Exit code 0: ended by Ctrl-C; 1: the page cannot be served; 2: wrong arguments.',
     )
-    parser.add_argument(
-        'bag', metavar='BAG', nargs='?', help='bag to play (default: show running robots)'
+    _options.add_bag(parser, 'bag to play (default: show running robots)', nargs='?')
+    _options.add_value(
+        parser,
+        '-r --rate',
+        'X',
+        'with BAG: how much faster than recorded it starts (default: 1.0)',
+        kind=_rate,
     )
-    parser.add_argument(
-        '-r',
-        '--rate',
-        metavar='X',
-        type=_rate,
-        help='with BAG: how much faster than recorded it starts (default: 1.0)',
-    )
-    _live.add_options(parser)
+    _options.add_page(parser)
     return parser

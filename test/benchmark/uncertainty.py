@@ -28,10 +28,7 @@ from diffdrive_jacobian.simulation.exact_moments import (
     propagate_moments,
     propagated_moments,
 )
-from diffdrive_jacobian.simulation.odometry_noise import (
-    _propagated,
-    propagate_covariance,
-)
+from diffdrive_jacobian.simulation.odometry_noise import propagate_covariance
 from diffdrive_jacobian.simulation.pose_region import (
     ELLIPSE_LEVEL,
     region_distance,
@@ -102,7 +99,7 @@ def cost(rounds: int) -> Table:
     ):
         table.add_column(name, justify='right')
     moments = gaussian(1e-4 * np.diag([1.0, 2.0, 3.0]))
-    entries = tuple(moments[:6])
+    rows, pose = moments.second_moment.tolist(), (0.0, 0.0, 0.3)
     model = RobotModel(wheel_separation=L, wheel_travel_variance=K)
     for name, (twist, held) in ARCS.items():
         start = Robot(model=model, stamp=0, pose=np.zeros(3), covariance=moments.second_moment)
@@ -112,7 +109,7 @@ def cost(rounds: int) -> Table:
             propagated_moments(moments, 0.3, twist, held, L, K)
 
         def of_first_order(twist=twist, held=held):
-            _propagated(*entries, 0.3, *twist, held, L, K)
+            propagate_covariance.formula(rows, pose, twist, held, L, K)
 
         def exact_message(robot=robot, stamps=stamps):
             state = robot.at(next(stamps))
@@ -120,7 +117,7 @@ def cost(rounds: int) -> Table:
 
         def first_order_message(robot=robot, stamps=stamps, twist=twist, held=held):
             state = robot.at(next(stamps))
-            covariance = _propagated(*entries, 0.3, *twist, held, L, K)
+            covariance = propagate_covariance.formula(rows, pose, twist, held, L, K)
             return state.pose_tuple, covariance, state.twist_covariance_tuple(0.02)
 
         cells = [name]

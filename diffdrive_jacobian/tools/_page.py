@@ -1,4 +1,4 @@
-"""Arguments of the tools that serve the page, and what they print about it."""
+"""The page of a tool in the browser: its address, and what prevents that it is served."""
 
 from __future__ import annotations
 
@@ -12,12 +12,10 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from diffdrive_jacobian.errors import UserError
-from diffdrive_jacobian.tools import _cli
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.live.server import LiveServer
 
-MAX_PORT = 65535
 DISPLAYS = ('DISPLAY', 'WAYLAND_DISPLAY')
 """Environment variables without which no browser can open a window."""
 MISSING = "the page needs the Python module websockets: pip install 'diffdrive_jacobian[live]'"
@@ -26,20 +24,6 @@ STEERS = 'whoever knows this address can steer the robot; Ctrl-C ends'
 PLAYS = 'the page plays the bag; Ctrl-C ends'
 DRIVES = 'whoever knows this address can steer the robot; it goes on after the goals, until Ctrl-C'
 """Last line that a tool prints about its page."""
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the page."""
-    parser.add_argument(
-        '--port',
-        metavar='PORT',
-        type=_cli.integer_from(1, MAX_PORT),
-        default=0,
-        help='TCP port of the page (default: any free one)',
-    )
-    parser.add_argument(
-        '--no-browser', action='store_true', help='only print the address, do not open a browser'
-    )
 
 
 def announcing(
@@ -66,20 +50,24 @@ def announcing(
     return announce
 
 
-class PortError(UserError):
-    """The port that the user gave cannot be used."""
+class PageError(UserError):
+    """The page cannot be served."""
 
 
 @contextmanager
-def explaining_port(port: int) -> Iterator[None]:
-    """Raise PortError where the given port cannot be used."""
+def explaining_page_errors(port: int) -> Iterator[None]:
+    """Raise PageError where the given port cannot be used, or the module of the server is missing."""
     try:
         yield
+    except ModuleNotFoundError as error:
+        if (error.name or '').split('.')[0] != 'websockets':
+            raise
+        raise PageError(MISSING) from error
     except OSError as error:
         message = _port_message(error, port)
         if message is None:
             raise
-        raise PortError(message) from error
+        raise PageError(message) from error
 
 
 def _port_message(error: OSError, port: int) -> str | None:
