@@ -434,8 +434,7 @@ def write_pictures() -> None:
     from PIL import Image
 
     from diffdrive_jacobian import plots
-    from diffdrive_jacobian.plots.rendering import render
-    from diffdrive_jacobian.plots.style import styled
+    from diffdrive_jacobian.plots.rendering import render, styled
 
     shown = {
         Path(link)

@@ -18,8 +18,7 @@ from sensor_msgs.msg import JointState
 from test_reading import count_more, write_bag
 
 from diffdrive_jacobian.calibration import PARAMETERS, calibrate, fit
-from diffdrive_jacobian.calibration.choice import wheel_names
-from diffdrive_jacobian.calibration.data import read_wheels_and_reference
+from diffdrive_jacobian.calibration.data import read_wheels_and_reference, wheel_names
 from diffdrive_jacobian.parameters.nodes import WheelBridgeParameters
 from diffdrive_jacobian.plots import calibration_figure
 from diffdrive_jacobian.plots.calibration_figure import figure

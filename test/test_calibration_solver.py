@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from diffdrive_jacobian.calibration._block_tridiagonal import solve
+from diffdrive_jacobian.calibration.normal_equations import solve
 
 
 @pytest.mark.parametrize('count', [1, 2, 3, 4, 5, 6, 7, 8, 13, 16, 17, 100])

@@ -32,7 +32,7 @@ from sensor_msgs.msg import JointState, LaserScan
 from std_msgs.msg import Empty, Float64MultiArray, Header, String
 
 from diffdrive_jacobian.messages.cdr import DecodingError, LongMessageError, Reader, Writer
-from diffdrive_jacobian.messages.errors import MessageError
+from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.structure import defined
 
 CLASSES = (

@@ -21,8 +21,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from diffdrive_jacobian.bags.known_types import is_known, known_definition, known_structure
-from diffdrive_jacobian.bags.message_definitions import message_class
+from diffdrive_jacobian.bags.message_definitions import (
+    is_known,
+    known_definition,
+    known_structure,
+    message_class,
+)
 from diffdrive_jacobian.control.controller import Controller
 from diffdrive_jacobian.messages.codecs import (
     GOALS,

@@ -28,7 +28,7 @@ from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.bags.metadata import MetadataError, check_connections, check_metadata
 from diffdrive_jacobian.bags.run_reader import read_run
 from diffdrive_jacobian.bags.time_series import commanded, limits, measured
-from diffdrive_jacobian.bags.timeline import trace
+from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.plots.run_figure import LABELS, draw
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import plot_run, recover_run, replay_run
@@ -51,7 +51,7 @@ def _quick(request, monkeypatch):
     """Save time: no bag needs to survive a power cut, and few tests need the picture itself."""
     monkeypatch.setattr(os, 'fsync', lambda descriptor: None)
     if 'drawn' not in request.fixturenames:
-        monkeypatch.setattr(plot_run, 'draw', lambda runs, path, **_: [trace(run) for run in runs])
+        monkeypatch.setattr(plot_run, 'draw', lambda runs, path, **_: [timeline(run) for run in runs])
 
 
 @pytest.fixture
@@ -394,7 +394,7 @@ def test_parameters_of_another_kind_do_not_end_the_plot(tmp_path, value):
     bag = write_bag(tmp_path / 'bag', sent, parameters=parameters)
     found = read_run(bag)
     assert len(found.wheels) == (value != 'x')
-    one = trace(found)
+    one = timeline(found)
     for bounds in limits(one).values():
         assert not np.isinf(bounds).any()
     for quantity in LABELS:

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import pytest
 
-from diffdrive_jacobian.diagnosis.clocks import check_clocks
 from diffdrive_jacobian.diagnosis.description import (
     ClockMessages,
     Endpoint,
@@ -16,23 +15,21 @@ from diffdrive_jacobian.diagnosis.description import (
     Quality,
     Stream,
 )
-from diffdrive_jacobian.diagnosis.environment import (
+from diffdrive_jacobian.diagnosis.graph import check_clocks, check_topics, mismatch
+from diffdrive_jacobian.diagnosis.machine import (
     INSTALLATION,
     ROS_PACKAGES,
     WHEELS,
     Environment,
-    check_environment,
-    environment,
-)
-from diffdrive_jacobian.diagnosis.machine import (
     Interface,
     SharedMemory,
+    check_environment,
     check_network,
     check_shared_memory,
+    environment,
     interfaces,
     shared_memory,
 )
-from diffdrive_jacobian.diagnosis.topics import check_topics, mismatch
 from diffdrive_jacobian.text import listed
 
 TWIST, STAMPED = 'geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistStamped'

@@ -15,7 +15,7 @@ import pytest
 from processes import open_world
 
 from diffdrive_jacobian.bags import journal, read_run
-from diffdrive_jacobian.bags.timeline import trace
+from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.lockstep import runner as testing_runner
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.parameters.nodes import CONTROLLERS
@@ -84,7 +84,7 @@ def test_the_error_of_the_heading_ends_where_the_robot_is(tmp_path, controller):
     options = ('--heading', str(heading), '--controller', controller)
     assert drive_to.main([*arguments, *options, *QUICK], Signals()) == 0
     run = read_run(tmp_path / 'bag')
-    one = trace(run)
+    one = timeline(run)
     last = one.goal == 1
     theta = run.odometry.values[:, 2]
     expected = np.angle(np.exp(1j * (heading - theta)))
@@ -96,7 +96,7 @@ def test_the_error_of_the_heading_ends_where_the_robot_is(tmp_path, controller):
 
 def test_without_a_heading_there_is_no_error_of_it(tmp_path):
     assert drive_to.main(['1', '1', '--lockstep', '-o', 'bag', '--no-plot', *QUICK], Signals()) == 0
-    assert np.isnan(trace(read_run(tmp_path / 'bag')).goal_heading_error).all()
+    assert np.isnan(timeline(read_run(tmp_path / 'bag')).goal_heading_error).all()
 
 
 def test_duration_is_that_of_the_control_law(capsys):
@@ -122,7 +122,7 @@ def test_every_controller_arrives_and_takes_the_heading_that_is_asked_for(tmp_pa
     assert math.hypot(x, y - 1.0) <= offset + 0.021
     assert theta == pytest.approx(-2.5, abs=0.021)
     run = read_run(tmp_path / 'bag')
-    seen = trace(run)
+    seen = timeline(run)
     first, last = (seen.distance[seen.goal == index] for index in (0, 1))
     # Of the point that is driven: it comes to each goal, and nothing is taken for the next one too soon.
     assert first.min() <= 0.021

@@ -9,7 +9,7 @@ import pytest
 
 from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.drives import DriveError, Outcome, drive, waypoints_through
-from diffdrive_jacobian.drives.runners import in_lockstep
+from diffdrive_jacobian.drives.driving import in_lockstep
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.recording.recording import Recording

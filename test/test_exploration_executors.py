@@ -22,8 +22,8 @@ from hypothesis import strategies as st
 from diffdrive_jacobian import signals
 from diffdrive_jacobian.control import find_controller
 from diffdrive_jacobian.exploration.child import call_in_child
-from diffdrive_jacobian.exploration.errors import ExplorationError
 from diffdrive_jacobian.exploration.replay import replay
+from diffdrive_jacobian.exploration.scenario import ExplorationError
 from diffdrive_jacobian.exploration.trial import Outcome
 from diffdrive_jacobian.faults import Loss
 from diffdrive_jacobian.properties import NeverFasterThan

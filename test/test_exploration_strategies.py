@@ -14,11 +14,10 @@ from hypothesis import find, given, settings
 from hypothesis import strategies as st
 
 from diffdrive_jacobian import faults
-from diffdrive_jacobian.exploration.generation import generate, shrink, trials
-from diffdrive_jacobian.exploration.scenario import ScenarioName
-from diffdrive_jacobian.exploration.source import Source
+from diffdrive_jacobian.exploration.replay import differences, versions
+from diffdrive_jacobian.exploration.scenario import ScenarioName, Source
+from diffdrive_jacobian.exploration.schedules import generate, shrink, trials
 from diffdrive_jacobian.exploration.trial import Trial
-from diffdrive_jacobian.exploration.versions import differences, versions
 from diffdrive_jacobian.testing import (
     ExplorationError,
     angles,
@@ -207,9 +206,9 @@ def test_a_block_is_generated_again_while_shrinking():
 
 def test_hypothesis_that_is_missing_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, 'hypothesis', None)
-    monkeypatch.delitem(sys.modules, 'diffdrive_jacobian.exploration.generation')
+    monkeypatch.delitem(sys.modules, 'diffdrive_jacobian.exploration.schedules')
     with pytest.raises(ExplorationError, match=r"pip install 'diffdrive_jacobian\[explore\]'"):
-        importlib.import_module('diffdrive_jacobian.exploration.generation')
+        importlib.import_module('diffdrive_jacobian.exploration.schedules')
 
 
 # --- Source and names

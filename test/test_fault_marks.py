@@ -13,7 +13,7 @@ from test_reading import SECOND, write_bag
 
 from diffdrive_jacobian.bags.run_reader import read_run
 from diffdrive_jacobian.bags.time_series import commanded, measured
-from diffdrive_jacobian.bags.timeline import trace
+from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.faults import Push, TimeJump
 from diffdrive_jacobian.plots.fault_marks import NAMED, fault_spans
 from diffdrive_jacobian.plots.run_figure import figure
@@ -45,7 +45,7 @@ def test_faults_are_bands_over_time(tmp_path):
     )
     assert run.fault_events[0] == (11 * SECOND, loss, 'begins')
     assert '5 events of faults' in repr(run)
-    spans = fault_spans(trace(run))
+    spans = fault_spans(timeline(run))
     assert [span.fault for span in spans] == [loss, kill]
     assert spans[0][1:] == pytest.approx((1.0, 1.5))
     # To the end of the run.
@@ -84,7 +84,7 @@ def test_lines_are_broken_where_time_goes_back_and_a_push_is_a_line(lockstep, ro
         lockstep.publish('cmd_vel', Twist(linear=Vector3(x=0.1)))
         lockstep.run_for(0.1)
     run = read_run(recorded.finish())
-    one = trace(run)
+    one = timeline(run)
     # Recorded in the order in which it happened.
     assert len(one.breaks) == 1
     (back,) = one.breaks

@@ -18,7 +18,7 @@ from nav_msgs.msg import Odometry
 from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.faults import EncoderSteps
-from diffdrive_jacobian.testing.artifacts import MAX_LENGTH, artifact_name, name_beside_the_file
+from diffdrive_jacobian.testing.fixtures import MAX_LENGTH, artifact_name, name_beside_the_file
 
 PLUGIN = 'diffdrive_jacobian.testing.fixtures'
 
@@ -72,7 +72,7 @@ def test_the_plugin_does_nothing_in_projects_without_ros(pytester):
     assert found['wanted'] == []
     ours = {name for name in found['modules'] if name.startswith('diffdrive_jacobian')}
     parents = {'diffdrive_jacobian', 'diffdrive_jacobian.lazy', 'diffdrive_jacobian.testing'}
-    assert ours == {*parents, PLUGIN, 'diffdrive_jacobian.testing.artifacts'}
+    assert ours == {*parents, PLUGIN, 'diffdrive_jacobian.testing.fixtures'}
     changed = {name for name, value in found['env'].items() if before.get(name) != value}
     assert all(name.startswith('PYTEST_') for name in changed)
     assert before.keys() <= found['env'].keys()

@@ -19,8 +19,7 @@ from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import Channel, Message
 from diffdrive_jacobian.bags.message_definitions import definition
-from diffdrive_jacobian.testing.differences import Comparison
-from diffdrive_jacobian.testing.golden_run import GoldenRun, GoldenRunError
+from diffdrive_jacobian.testing.golden_run import Comparison, GoldenRun, GoldenRunError
 
 # --- Messages
 

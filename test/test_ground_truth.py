@@ -18,8 +18,7 @@ from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros
 from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
-from diffdrive_jacobian.plots.ground_truth import COLOR
-from diffdrive_jacobian.plots.run_figure import figure
+from diffdrive_jacobian.plots.run_figure import COLOR, figure
 from diffdrive_jacobian.simulation import Drift, Robot, RobotModel
 from diffdrive_jacobian.testing import Lockstep
 from diffdrive_jacobian.tools.verify_run import report

@@ -10,12 +10,13 @@ from test_reading import SECOND, odom, write_bag
 from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import Channel, Message
-from diffdrive_jacobian.bags.known_types import (
+from diffdrive_jacobian.bags.message_definitions import (
+    UnknownTypeError,
+    definition,
     known_definition,
     known_structure,
     recorded_definition_differs,
 )
-from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition
 from diffdrive_jacobian.bags.salvage_mcap import Topic
 from diffdrive_jacobian.bags.topic_types import definition_and_hash
 from diffdrive_jacobian.messages.goal_status import GoalState

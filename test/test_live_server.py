@@ -15,9 +15,16 @@ from chromium import until
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from diffdrive_jacobian.live.access import Access, Refusal
 from diffdrive_jacobian.live.commands import Drive
-from diffdrive_jacobian.live.server import MAX_INVALID, MAX_PAGES, MAX_STRANGERS, PATIENCE, LiveServer
+from diffdrive_jacobian.live.server import (
+    MAX_INVALID,
+    MAX_PAGES,
+    MAX_STRANGERS,
+    PATIENCE,
+    Access,
+    LiveServer,
+    Refusal,
+)
 from diffdrive_jacobian.live.session import Session, Snapshot
 
 DRIVE = json.dumps({'do': 'drive', 'robot': '/', 'v': 0.2, 'omega': 0.0})

@@ -7,8 +7,8 @@ from unittest import mock
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from diffdrive_jacobian.recording import missed
-from diffdrive_jacobian.recording.missed import MissedMessages
+from diffdrive_jacobian.recording import reception as missed
+from diffdrive_jacobian.recording.reception import MissedMessages
 from diffdrive_jacobian.ros.rclpy_internals import ReceivedMessage
 
 

@@ -22,7 +22,7 @@ from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message, Tex
 from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.bags.run_reader import BagError, read_run
 from diffdrive_jacobian.bags.time_series import commanded, limits, measured
-from diffdrive_jacobian.bags.timeline import trace
+from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.plots.run_figure import LABELS
@@ -80,7 +80,7 @@ def read_and_use(bag):
     """Read, trace and verify a bag as the tools do."""
     run = read_run(bag)
     attempt(verify, run)
-    one = trace(run)
+    one = timeline(run)
     limits(one)
     for quantity in LABELS:
         measured(one, quantity)

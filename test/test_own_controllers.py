@@ -18,7 +18,7 @@ from ros_messages import goal, twists
 
 from diffdrive_jacobian import control
 from diffdrive_jacobian.bags import read_run
-from diffdrive_jacobian.bags.timeline import trace
+from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.control import (
     KP,
     KV,
@@ -386,7 +386,7 @@ def test_a_bag_is_read_without_the_import_of_its_controller(site, install, monke
     bag = site.parent / 'bag'
     for path in (site, site / 'nowhere'):
         monkeypatch.syspath_prepend(str(path))
-        read = trace(read_run(bag))
+        read = timeline(read_run(bag))
         assert read.run.of_node('go_to_goal')['controller'] == 'driven'
         # Its driven point is not known, so the distance is that of the axle centre.
         expected = math.dist(read.run.odometry.values[-1, :2], (0.4, 0.2))

@@ -12,7 +12,7 @@ import pytest
 from matplotlib.text import Text
 
 from diffdrive_jacobian import plots
-from diffdrive_jacobian.plots import legs_figure, rendering, style
+from diffdrive_jacobian.plots import legs_figure, rendering
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.plot_jacobian import main
 
@@ -39,7 +39,7 @@ def run(*arguments):
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('name', plots.PICTURES)
 def test_the_labels_of_a_picture_are_whole_and_apart(name):
-    with style.styled():
+    with rendering.styled():
         drawn = getattr(plots, name)()
         content = rendering.render(drawn, 'png')
     assert len(content) < LARGEST
@@ -71,7 +71,7 @@ def test_a_picture_does_not_depend_on_the_style_of_the_user(name):
 
     with matplotlib.rc_context({'text.usetex': True, 'font.size': 40.0, 'lines.linewidth': 20.0}):
         strange = getattr(plots, name)()
-    with style.styled():
+    with rendering.styled():
         assert rendering.render(strange, 'png') == rendering.render(getattr(plots, name)(), 'png')
 
 

@@ -19,10 +19,10 @@ from ros_messages import goal, goals, joint_command, twist, twist_stamped
 from test_reading import REAL, SECOND, changed, odom, start, status, write_bag
 
 from diffdrive_jacobian.bags import time_series as _lines
-from diffdrive_jacobian.bags import timeline as _trace
+from diffdrive_jacobian.bags import timeline as _timeline
 from diffdrive_jacobian.bags.run_reader import BagError, read_run
 from diffdrive_jacobian.bags.time_series import limits, line
-from diffdrive_jacobian.bags.timeline import trace
+from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.kinematics.se2 import integrate, wrap_angle
 from diffdrive_jacobian.plots import output_files
 from diffdrive_jacobian.plots import run_figure as _figure
@@ -268,7 +268,7 @@ def test_a_robot_that_stands_is_drawn(tmp_path, count):
 
 
 def test_limits_are_the_narrowest_of_the_nodes(run):
-    found = {name: bounds[:, 0, 1].tolist() for name, bounds in limits(trace(run)).items()}
+    found = {name: bounds[:, 0, 1].tolist() for name, bounds in limits(timeline(run)).items()}
     assert found == {
         'v': [-0.1, 0.22],
         'omega': [-1.0, 1.0],
@@ -279,14 +279,14 @@ def test_limits_are_the_narrowest_of_the_nodes(run):
 
 def test_limits_that_are_not_known_are_not_drawn(tmp_path):
     run = run_of(tmp_path, parameters={'/virtual_robot': {'max_wheel_velocity': math.nan}})
-    assert all(np.isnan(bounds[..., 1]).all() for bounds in limits(trace(run)).values())
+    assert all(np.isnan(bounds[..., 1]).all() for bounds in limits(timeline(run)).values())
     assert len(by_label(figure([run]))[LABELS['v']].lines) == 1 + 1 + 1 + 2
 
 
 def test_a_limit_holds_from_when_it_was_set(tmp_path):
     change = (11.0, '/parameter_events', changed('/virtual_robot', 'max_wheel_velocity', 3.0))
     run = run_of(tmp_path, [change], parameters=PARAMETERS)
-    upper = limits(trace(run))['right'][1]
+    upper = limits(timeline(run))['right'][1]
     assert upper == pytest.approx(np.array([[0.0, 6.67], [1.0, 3.0], [199 / RATE, 3.0]]), abs=1e-9)
 
 
@@ -305,7 +305,7 @@ def test_parameters_of_the_controller_count_from_when_they_were_set(tmp_path, no
         (12.0, '/parameter_events', changed(node, 'offset', 0.3)),
     ]
     run = run_of(tmp_path, extra, parameters={node: CONTROLLER}, omega=0.0)
-    one = trace(run)
+    one = timeline(run)
     x = run.odometry.values[:, 0]
     heading, driven = one.time >= 1.0, np.where(one.time >= 2.0, x + 0.3, x)
     assert one.goal_heading_error == pytest.approx(np.where(heading, 1.0, np.nan), nan_ok=True)
@@ -326,7 +326,7 @@ def test_the_tolerance_counts_from_when_it_was_set(tmp_path):
 
 def goals_of(run):
     """Give `(time, goal)` whenever the goal changes."""
-    one = trace(run)
+    one = timeline(run)
     changes = [0, *(np.flatnonzero(np.diff(one.goal)) + 1).tolist()]
     return [(round(float(one.time[index]), 6), int(one.goal[index])) for index in changes]
 
@@ -339,7 +339,7 @@ def test_a_goal_counts_from_when_it_came_until_the_next(tmp_path):
     extra = [(11.0, '/goal_pose', goal(5, 0)), (12.0, '/goal_pose', goal(5, 1))]
     run = run_of(tmp_path, extra, **STRAIGHT)
     assert goals_of(run) == [(0.0, -1), (1.0, 0), (2.0, 1)]
-    assert np.isnan(trace(run).distance[:50]).all()
+    assert np.isnan(timeline(run).distance[:50]).all()
 
 
 @pytest.mark.parametrize(
@@ -351,7 +351,7 @@ def test_the_next_waypoint_counts_from_within_the_tolerance(tmp_path, parameters
     run = run_of(tmp_path, [way], parameters=parameters, **STRAIGHT)
     times = [round((x - tolerance) / 0.5, 6) for x in (0.5, 1.0, 1.5)]
     assert goals_of(run) == [(0.0, 0), (times[0], 1), (times[1], 2)]
-    one = trace(run)
+    one = timeline(run)
     reached = np.flatnonzero(np.isnan(one.bearing_error))
     assert one.time[reached[0]] == pytest.approx(times[2])
     assert not np.isnan(one.distance).any()
@@ -406,7 +406,7 @@ def test_a_goal_that_is_only_passed_is_driven_to_until_the_end(tmp_path):
     for name, extra in (('node', states), ('other', [])):
         placed = (12.0, '/start_pose', start(1.0, 0, 0, seconds=12.0))
         sent = sample([(10.0, '/goal_pose', goal(0.5, 0)), placed, *extra], **STRAIGHT)
-        one = trace(read_run(write_bag(tmp_path / name, sent)))
+        one = timeline(read_run(write_bag(tmp_path / name, sent)))
         assert one.breaks.tolist() == [100]
         assert not np.isnan(one.distance).any()
         assert drawn(by_label(figure([one.run]))[LABELS['distance']])[-1, 0] == one.time[-1]
@@ -421,7 +421,7 @@ def test_a_goal_is_reached_when_the_node_says_so(tmp_path):
     extra = [(10.0, '/goal_pose', goal(0.75, 0)), (10.0, '/goal_status', status(2))]
     extra += [(13.0, '/goal_status', status(4)), (13.5, '/start_pose', start(0.625, 0, 0, seconds=13.5))]
     run = read_run(write_bag(tmp_path / 'bag', sorted([*sent, *extra], key=lambda one: one[0])))
-    one = trace(run)
+    one = timeline(run)
     # Within 0.02 m of it again since 12.92 s.
     assert np.flatnonzero(np.isnan(one.bearing_error))[0] == 146
     assert np.flatnonzero(np.isnan(one.distance)).tolist() == list(range(175, 200))
@@ -434,9 +434,9 @@ def test_a_goal_is_reached_when_the_node_says_so(tmp_path):
 def test_what_has_no_stamp_counts_by_the_recorders_clock(tmp_path, delay):
     extra = [(12.0 + delay, '/cmd_vel', twist(0.1, 0.2)), (11.0 + delay, '/goal_pose', goal(1, 1))]
     run = run_of(tmp_path, extra, delay=delay)
-    assert _trace.seconds(run, run.cmd_vel) == pytest.approx([2.0], abs=1e-6)
-    assert trace(run).time == pytest.approx(np.arange(200) / RATE, abs=1e-9)
-    assert np.flatnonzero(trace(run).goal == 0)[0] in (50, 51)
+    assert _timeline.seconds(run, run.cmd_vel) == pytest.approx([2.0], abs=1e-6)
+    assert timeline(run).time == pytest.approx(np.arange(200) / RATE, abs=1e-9)
+    assert np.flatnonzero(timeline(run).goal == 0)[0] in (50, 51)
 
 
 def test_no_line_leads_to_where_the_odometry_begins_anew(tmp_path):
@@ -451,7 +451,7 @@ def test_no_line_leads_to_where_the_odometry_begins_anew(tmp_path):
         (14.2, '/odom', odom(5, 5, 0, seconds=1.0)),
     ]
     run = read_run(write_bag(tmp_path / 'bag', sent))
-    assert trace(run).breaks.tolist() == [100, 200, 209]
+    assert timeline(run).breaks.tolist() == [100, 200, 209]
     (path,) = (one for one in figure([run]).axes[0].lines if not one.get_label().startswith('_'))
     assert np.flatnonzero(np.isnan(path.get_xdata())).tolist() == [100, 201, 211]
     assert path.get_label().startswith('bag: ')
@@ -463,7 +463,7 @@ def test_odometry_of_the_instant_of_a_new_beginning_may_be_from_before(tmp_path)
         (11.0, '/start_pose', start(0.52, 0, 0, seconds=11.0)),
         (11.02, '/odom', odom(0.52, 0, 0, seconds=11.02)),
     ]
-    assert trace(read_run(write_bag(tmp_path / 'bag', sent))).breaks.tolist() == [51]
+    assert timeline(read_run(write_bag(tmp_path / 'bag', sent))).breaks.tolist() == [51]
 
 
 def test_many_runs_are_drawn(recorded_plain, tmp_path):
@@ -474,12 +474,12 @@ def test_many_runs_are_drawn(recorded_plain, tmp_path):
 
 def test_a_teleport_that_nobody_announced_breaks_the_line(tmp_path):
     sent = [*drive(50, **STRAIGHT), *drive(50, begin=11.0, **STRAIGHT)]
-    assert trace(read_run(write_bag(tmp_path / 'bag', sent))).breaks.tolist() == [50]
+    assert timeline(read_run(write_bag(tmp_path / 'bag', sent))).breaks.tolist() == [50]
 
 
 def test_a_gap_in_the_recording_is_no_teleport(tmp_path):
     sent = [one for one in drive(200, **STRAIGHT) if not 10.5 < one[0] < 12.5]
-    assert trace(read_run(write_bag(tmp_path / 'bag', sent))).breaks.tolist() == []
+    assert timeline(read_run(write_bag(tmp_path / 'bag', sent))).breaks.tolist() == []
 
 
 # --- Long runs
@@ -525,7 +525,7 @@ def read_csv(path):
 def test_csv_holds_the_numbers_of_the_run(recorded, run, tmp_path):
     assert plot(recorded, '-o', tmp_path / 'a.png', '--csv', tmp_path / 'a.csv') == 0
     header, rows = read_csv(tmp_path / 'a.csv')
-    one = trace(run)
+    one = timeline(run)
     assert header == list(COLUMNS)
     columns = dict(zip(header, rows.T, strict=True))
     assert rows[:, 0].tolist() == one.time.tolist()
@@ -817,7 +817,7 @@ def test_a_bag_of_another_robot_is_drawn(tmp_path):
     assert plot(bag, '--csv', tmp_path / 'a.csv') == 0
     _, rows = read_csv(tmp_path / 'a.csv')
     assert rows[:, 4].max() == pytest.approx(0.15)
-    assert len(trace(read_run(bag)).breaks) == 0
+    assert len(timeline(read_run(bag)).breaks) == 0
 
 
 def test_a_signal_ends_the_drawing(bag, tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ import pytest
 from moments_reference import DRIVES, noisy_runs, reported_path
 
 from diffdrive_jacobian.bags.run import COLUMNS, Run, Series
-from diffdrive_jacobian.bags.timeline import trace
+from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.plots.run_figure import figure
 from diffdrive_jacobian.plots.uncertainty import ELLIPSE_LABEL, REGION_LABEL, uncertainties
@@ -150,7 +150,7 @@ def driven(drive, rate=50, covariance=NONE):
 
 def test_the_regions_along_a_path_hold_95_percent_of_the_robots():
     drive = [((0.22, 0.3), 6.0), ((0.0, 0.0), 1.0), ((0.22, -0.1), 20.0)]
-    found = uncertainties(trace(driven(drive)), places=3)
+    found = uncertainties(timeline(driven(drive)), places=3)
     assert len(found) == 3
     last = found[-1]
     errors = noisy_runs(np.random.default_rng(6), drive, NONE, 4000, L, K)
@@ -163,7 +163,7 @@ def test_the_regions_along_a_path_hold_95_percent_of_the_robots():
 def test_the_start_of_a_run_may_be_unsure():
     covariance = np.diag([0.01, 0.01, 0.04])
     drive = [((0.22, 0.2), 10.0)]
-    (only,) = uncertainties(trace(driven(drive, covariance=covariance)), places=1)
+    (only,) = uncertainties(timeline(driven(drive, covariance=covariance)), places=1)
     errors = noisy_runs(np.random.default_rng(6), drive, covariance, 4000, L, K)
     within = region_distance(only.region, only.region.pose[:2] + errors[:, :2]) <= only.region.level
     assert 0.94 <= within.mean() <= 0.96
@@ -192,9 +192,9 @@ def test_covariances_that_are_not_of_wheels_are_not_drawn(entry):
         covariances[:, column] = entry
         made = replace(run, odometry_covariances=covariances)
         if entry == 0.0 and column not in (5, 8):
-            uncertainties(trace(made))
+            uncertainties(timeline(made))
             continue
-        assert uncertainties(trace(made)) == [] or column in (1, 2, 4, 7)
+        assert uncertainties(timeline(made)) == [] or column in (1, 2, 4, 7)
     constant = np.tile(run.odometry_covariances[-1], (len(run.odometry), 1))
     assert REGION_LABEL not in legends(replace(run, odometry_covariances=constant))
     assert REGION_LABEL not in legends(replace(run, odometry_covariances=np.empty((0, 9))))

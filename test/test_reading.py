@@ -25,11 +25,10 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from diffdrive_jacobian.bags import run as run_module
-from diffdrive_jacobian.bags import timeline as trace_module
+from diffdrive_jacobian.bags import timeline as timeline_module
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Text
-from diffdrive_jacobian.bags.known_types import known_structure
-from diffdrive_jacobian.bags.message_definitions import definition
+from diffdrive_jacobian.bags.message_definitions import definition, known_structure
 from diffdrive_jacobian.bags.run_reader import BagError, Run, read_run
 from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.codecs import GOALS
@@ -434,13 +433,13 @@ def test_the_number_of_poses_is_known_without_decoding_them(order):
 
 def test_a_route_is_followed_in_one_pass_over_the_odometry(monkeypatch):
     searched = []
-    distances = trace_module._distances
+    distances = timeline_module._distances
 
     def counted(run, places, target):
         searched.append(len(places))
         return distances(run, places, target)
 
-    monkeypatch.setattr(trace_module, '_distances', counted)
+    monkeypatch.setattr(timeline_module, '_distances', counted)
     totals = []
     for n in (1000, 2000):
         times = SECOND + np.arange(n) * SECOND // 10
@@ -457,7 +456,7 @@ def test_a_route_is_followed_in_one_pass_over_the_odometry(monkeypatch):
         searched.clear()
         # The goal changes at the message at which it is reached.
         expected = np.minimum(np.arange(n) // 2 + np.arange(n) % 2, len(targets) - 1)
-        np.testing.assert_array_equal(trace_module.trace(run).goal, expected)
+        np.testing.assert_array_equal(timeline_module.timeline(run).goal, expected)
         totals.append(sum(searched))
     assert totals[1] < 2.5 * totals[0]
 

@@ -10,8 +10,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from diffdrive_jacobian.plots.rendering import render
-from diffdrive_jacobian.plots.style import DPI
+from diffdrive_jacobian.plots.rendering import DPI, render
 
 
 def sample():

@@ -8,7 +8,7 @@ from contextlib import suppress
 
 import pytest
 
-from diffdrive_jacobian.bags.scratch import REPLACED, scratch_directory
+from diffdrive_jacobian.bags.files import REPLACED, scratch_directory
 
 
 @pytest.fixture

@@ -15,9 +15,9 @@ from std_msgs.msg import String
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.ros import rclpy_internals
+from diffdrive_jacobian.ros.graph_faults import SharedGraph
 from diffdrive_jacobian.ros.node import FAULT_PATIENCE
 from diffdrive_jacobian.ros.runner import ros_context
-from diffdrive_jacobian.ros.shared_graph import SharedGraph
 
 QUERIES = ('count_publishers', 'count_subscribers', 'get_topic_names_and_types')
 

@@ -13,8 +13,7 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Goals, Odometry
 from unique_identifier_msgs.msg import UUID
 
-from diffdrive_jacobian.bags.known_types import is_known, known_definition
-from diffdrive_jacobian.bags.message_definitions import definition
+from diffdrive_jacobian.bags.message_definitions import definition, is_known, known_definition
 from diffdrive_jacobian.messages.fields import is_identifier, is_stamp, walk
 from diffdrive_jacobian.messages.structure import (
     Array,

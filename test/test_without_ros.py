@@ -18,7 +18,7 @@ from test_reading import SECOND, changed, odom, start, status, write_bag
 
 from diffdrive_jacobian.bags import read_run, verify
 from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message
-from diffdrive_jacobian.bags.known_types import known_definition
+from diffdrive_jacobian.bags.message_definitions import known_definition
 from diffdrive_jacobian.tools.entry_points import ROS_MODULES
 
 CONFIG = Path(__file__).parents[1] / 'config' / 'turtlebot3_burger.yaml'

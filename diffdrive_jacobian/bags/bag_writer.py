@@ -19,11 +19,10 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 from ruamel.yaml import YAML
 
 from diffdrive_jacobian.bags.bag_reader import BagError, DamagedBagError, messages, open_bag
-from diffdrive_jacobian.bags.files import is_journal
+from diffdrive_jacobian.bags.files import REPLACED, is_journal, scratch_directory, scratch_prefix
 from diffdrive_jacobian.bags.journal import Channel, Message, Record, Text
 from diffdrive_jacobian.bags.limits import MAX_MESSAGE
 from diffdrive_jacobian.bags.metadata import ROOT
-from diffdrive_jacobian.bags.scratch import REPLACED, scratch_directory, scratch_prefix
 from diffdrive_jacobian.bags.storage import STORAGES as STORAGES
 from diffdrive_jacobian.bags.storage import BagWriter
 from diffdrive_jacobian.bounded_yaml import MAX_SIZE

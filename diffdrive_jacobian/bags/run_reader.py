@@ -21,7 +21,7 @@ from diffdrive_jacobian.bags.bag_reader import (
     recorded_parameters,
     stored_connections,
 )
-from diffdrive_jacobian.bags.known_types import (
+from diffdrive_jacobian.bags.message_definitions import (
     known_structure,
     recorded_definition_differs,
     type_hashes,
@@ -29,7 +29,7 @@ from diffdrive_jacobian.bags.known_types import (
 from diffdrive_jacobian.bags.run import Run, Series
 from diffdrive_jacobian.messages.cdr import DecodingError, LongMessageError
 from diffdrive_jacobian.messages.codecs import Changes, FaultEvent
-from diffdrive_jacobian.messages.errors import MessageError
+from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.names import base_name, namespace_of
 from diffdrive_jacobian.messages.topics import READABLE, TOPICS, Topic
 from diffdrive_jacobian.text import printable

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from diffdrive_jacobian.bags.run import Series, number
-from diffdrive_jacobian.bags.timeline import Array, Indices, Mask, Trace, seconds
+from diffdrive_jacobian.bags.timeline import Array, Indices, Mask, Timeline, seconds
 from diffdrive_jacobian.messages.topics import SENSORS
 
 BUCKETS = 1500
@@ -25,7 +25,7 @@ _LIMITS = {
 """Quantity to the nodes that limit it, and their parameters of the upper and the lower limit."""
 
 
-def measured(one: Trace, quantity: str) -> Array:
+def measured(one: Timeline, quantity: str) -> Array:
     """Return the measured values of a quantity, shape (m, 2); m may be 0."""
     run = one.run
     if quantity in _READINGS:
@@ -45,7 +45,7 @@ def measured(one: Trace, quantity: str) -> Array:
     return line(np.column_stack([one.time, error]), breaks)
 
 
-def commanded(one: Trace, quantity: str) -> Array:
+def commanded(one: Timeline, quantity: str) -> Array:
     """Return the commanded values of a quantity, each valid until the next, shape (m, 2); m may be 0."""
     run = one.run
     if quantity in _WHEEL:
@@ -57,7 +57,7 @@ def commanded(one: Trace, quantity: str) -> Array:
     return _continued(one, np.column_stack([seconds(run, series), series.values[:, column]]))
 
 
-def limits(one: Trace) -> dict[str, Array]:
+def limits(one: Timeline) -> dict[str, Array]:
     """Return the tightest limits of all nodes, by quantity: the lower and the upper one, each a line
     (s, and m/s or rad/s), shape (2, m, 2). NaN: no limit.
     """
@@ -84,7 +84,7 @@ def _tightest(choose: Callable[[list[float]], float], bounds: list[float]) -> fl
     return choose([bound for bound in bounds if not np.isnan(bound)] or [np.nan])
 
 
-def _continued(one: Trace, rows: Array) -> Array:
+def _continued(one: Timeline, rows: Array) -> Array:
     """Return a line whose last value is continued to the end of the run, broken where time goes back."""
     if len(rows):
         rows = np.vstack([rows, [max(one.time[-1], rows[-1, 0]), rows[-1, 1]]])

@@ -32,7 +32,7 @@ TELEPORT = 0.1
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Trace:
+class Timeline:
     """Quantities of a run, one value for each odometry message; arrays of shape (n,)."""
 
     run: Run
@@ -50,7 +50,7 @@ class Trace:
     """From the heading to that of the goal (rad); NaN: none, or its heading does not count."""
 
 
-def trace(run: Run) -> Trace:
+def timeline(run: Run) -> Timeline:
     """Follow a run.
 
     A goal counts from when it was recorded until the next one, unless it was refused, canceled or
@@ -78,7 +78,7 @@ def trace(run: Run) -> Trace:
     to_goal = targets[:, :2] - _driven_points(run)
     last = [route[-1] for route, _ in _routes(run)]
     counts = _over_time(run, lambda now: heading_counts(now.of_node('go_to_goal')))
-    return Trace(
+    return Timeline(
         run=run,
         time=seconds(run, odometry),
         breaks=breaks,

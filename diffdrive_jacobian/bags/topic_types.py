@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
-from diffdrive_jacobian.bags.known_types import known_definition
-from diffdrive_jacobian.bags.message_definitions import Definition, UnknownTypeError, definition
+from diffdrive_jacobian.bags.message_definitions import (
+    Definition,
+    UnknownTypeError,
+    definition,
+    known_definition,
+)
 from diffdrive_jacobian.bags.salvage_mcap import Topic
 
 MAX_DEFINITION = 200_000

@@ -9,9 +9,15 @@ import numpy as np
 
 from diffdrive_jacobian.calibration.clock import time_offset
 from diffdrive_jacobian.calibration.consistency import misfit
-from diffdrive_jacobian.calibration.estimate import TIME_OFFSETS, YAW_OFFSET, Estimate
-from diffdrive_jacobian.calibration.fit import fit
-from diffdrive_jacobian.calibration.initial_estimate import rough, unit
+from diffdrive_jacobian.calibration.fit import (
+    TIME_OFFSETS,
+    UNDETERMINED,
+    YAW_OFFSET,
+    Estimate,
+    fit,
+    undetermined,
+)
+from diffdrive_jacobian.calibration.initial_estimate import initial_estimate, unit
 from diffdrive_jacobian.calibration.measurements import (
     Array,
     CalibrationError,
@@ -21,9 +27,8 @@ from diffdrive_jacobian.calibration.measurements import (
     Segment,
 )
 from diffdrive_jacobian.calibration.motion import Geometry, composed
-from diffdrive_jacobian.calibration.observability import UNDETERMINED, undetermined
-from diffdrive_jacobian.calibration.poses_at_rest import merged
 from diffdrive_jacobian.calibration.preparation import (
+    merged,
     overlapping,
     sampling_notes,
     thinned_poses,
@@ -203,11 +208,11 @@ def _calibrated(
             'too short: the wheels and the reference have less than 5 poses in common without a gap'
         )
     names = [one.name for one in recordings]
-    first = rough(segments, nominal, offsets)
+    first = initial_estimate(segments, nominal, offsets)
     segments, found_notes = without_jumps(segments, first, offsets, names)
     segments, thinned = thinned_poses(segments)
     notes += [*found_notes, thinned] if thinned else found_notes
-    first = rough(segments, nominal, offsets)
+    first = initial_estimate(segments, nominal, offsets)
     sensor = first.sensor.copy()
     if given.lever_arm is not None:
         sensor[:2] = given.lever_arm

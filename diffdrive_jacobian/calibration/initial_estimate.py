@@ -43,7 +43,7 @@ UNITS = {
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Rough:
+class InitialEstimate:
     """Approximate parameters."""
 
     geometry: Geometry
@@ -69,7 +69,7 @@ def _moved(segment: Segment, geometry: Geometry, offset: float) -> Increments:
     return increments(segment.wheel_time, segment.wheel_angles, segment.time + offset, geometry)
 
 
-def rough(segments: Sequence[Segment], nominal: Geometry, offsets: Array) -> Rough:
+def initial_estimate(segments: Sequence[Segment], nominal: Geometry, offsets: Array) -> InitialEstimate:
     """Return approximate parameters.
 
     Args:
@@ -130,7 +130,7 @@ def rough(segments: Sequence[Segment], nominal: Geometry, offsets: Array) -> Rou
         wheel_separation=nominal.wheel_separation,
         multipliers=(left, right, float(np.clip(scale, 0.05, 20.0))),
     )
-    return Rough(geometry=geometry, sensor=np.array([*lever, yaw]))
+    return InitialEstimate(geometry=geometry, sensor=np.array([*lever, yaw]))
 
 
 def unit(scale: float) -> str:

@@ -1,4 +1,4 @@
-"""From recordings to continuous motions: overlap in time, gaps, glitches and jumps of the reference."""
+"""Poses of a robot at rest, merged: without motion between them they observe the same pose."""
 
 from __future__ import annotations
 
@@ -10,13 +10,42 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.calibration.encoder import densified, located, poses_apart
-from diffdrive_jacobian.calibration.initial_estimate import Rough
+from diffdrive_jacobian.calibration.initial_estimate import InitialEstimate
 from diffdrive_jacobian.calibration.measurements import (
     Array,
     CalibrationError,
     Recording,
     Segment,
 )
+from diffdrive_jacobian.calibration.motion import Geometry
+from diffdrive_jacobian.numerics.elementary import wrap
+
+STILL = 1e-5
+"""Distance that both wheels together travel while the robot counts as at rest (m)."""
+MOST = 25
+"""Largest weight of merged poses: the errors of a real reference at rest are not independent."""
+
+
+def merged(segment: Segment, nominal: Geometry, time_offset: float) -> Segment:
+    """Return a segment in which poses without motion of the wheels between them are averaged."""
+    at = segment.time + time_offset
+    steps = np.abs(np.diff(segment.wheel_angles, axis=0)).sum(axis=1) * nominal.wheel_radius
+    travel = np.concatenate([[0.0], np.cumsum(steps)])
+    place = np.floor(np.interp(at, segment.wheel_time, travel) / STILL)
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(place)) + 1])
+    counts = np.diff([*starts, len(at)])
+    headings = segment.poses[np.repeat(starts, counts), 2]
+    poses = segment.poses.copy()
+    poses[:, 2] = wrap(poses[:, 2] - headings)
+    means = np.add.reduceat(poses, starts) / counts[:, None]
+    means[:, 2] += segment.poses[starts, 2]
+    return replace(
+        segment,
+        time=np.add.reduceat(segment.time, starts) / counts,
+        poses=means,
+        weights=np.minimum(counts, MOST).astype(np.float64),
+    )
+
 
 GAP = 0.5
 """A shorter pause between samples is not a gap (s)."""
@@ -170,7 +199,7 @@ def without(segments: Sequence[Segment], recording: int, begin: float, end: floa
 
 
 def without_jumps(
-    segments: Sequence[Segment], found: Rough, offsets: Array, names: Sequence[str]
+    segments: Sequence[Segment], found: InitialEstimate, offsets: Array, names: Sequence[str]
 ) -> tuple[list[Segment], list[str]]:
     """Remove glitches of the reference, and split motions at its jumps.
 
@@ -222,7 +251,7 @@ def without_jumps(
 
 
 def _followed(
-    segment: Segment, found: Rough, offset: float, off: NDArray[np.bool_], allowed: Array
+    segment: Segment, found: InitialEstimate, offset: float, off: NDArray[np.bool_], allowed: Array
 ) -> tuple[NDArray[np.bool_], list[int]]:
     """Return which poses are no glitches, and where the reference continues elsewhere after a jump."""
     use = np.ones(len(segment.time), dtype=bool)

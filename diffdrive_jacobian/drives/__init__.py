@@ -1,12 +1,14 @@
 """Drives of the virtual robot to goals, with all nodes in this process."""
 
 from diffdrive_jacobian.drives.driving import (
+    DriveError,
     DriveProgress,
     Outcome,
     drive,
+    in_lockstep,
+    in_real_time,
     waypoints_through,
 )
-from diffdrive_jacobian.drives.runners import DriveError, in_lockstep, in_real_time
 
 __all__ = [
     'DriveError',

@@ -1,21 +1,12 @@
-"""Drives of the virtual robot to goals: robot, controller and wheel bridge in one process.
-
-    from diffdrive_jacobian.drives import drive
-
-    outcome = drive([[1.0, 1.0]], lockstep=True)
-    print(outcome.arrived, outcome.pose, outcome.seconds)
-
-The robot is driven by its wheels, so that the whole Jacobian chain is in use:
-goal -> control law -> body twist -> J_w^-1 -> wheel speeds -> J_w -> body twist -> S(theta) -> pose.
-"""
+"""The runners of a drive, in real time and in simulated time, for its whole duration."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from action_msgs.msg import GoalStatus
@@ -23,21 +14,78 @@ from numpy.typing import ArrayLike, NDArray
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
-from diffdrive_jacobian.drives.runners import NAME, in_lockstep, in_real_time
+from diffdrive_jacobian.errors import DiffdriveError, UserError
 from diffdrive_jacobian.messages.codecs import JOINT_STATE, Wheels
-from diffdrive_jacobian.messages.errors import MessageError
+from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.goal_client import GoalClient
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.recording.reception import Selection
 from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording
-from diffdrive_jacobian.recording.selection import Selection
 from diffdrive_jacobian.ros.node_runner import NodeRunner
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
+from diffdrive_jacobian.ros.runner import Runner, discovery_off, ros_context, running
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.time_units import nanoseconds
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.lockstep.runner import LockstepRunner
+
+NAME = 'drive_to'
+"""Name of the node that sends the goals."""
+
+
+class DriveError(DiffdriveError):
+    """A drive in simulated time was aborted. The message says why."""
+
+
+@contextmanager
+def in_real_time(ros_arguments: Sequence[str] = (), *, isolated: bool = True) -> Iterator[Runner]:
+    """Create a runner of nodes in real time, and close it at the end.
+
+    Args:
+        ros_arguments: ROS arguments of all nodes.
+        isolated: Whether no other process can communicate with the nodes.
+
+    Raises:
+        UserError: The ROS arguments are invalid.
+    """
+    with (
+        discovery_off() if isolated else nullcontext(),
+        ros_context([NAME, *ros_arguments]) as context,
+        running(context, isolated=isolated) as runner,
+    ):
+        yield runner
+
+
+@contextmanager
+def in_lockstep(ros_arguments: Sequence[str] = ()) -> Iterator[LockstepRunner]:
+    """Create a runner of nodes in simulated time, and close it at the end.
+
+    Args:
+        ros_arguments: ROS arguments of all nodes.
+
+    Raises:
+        UserError: The ROS arguments are invalid.
+        DriveError: A callback blocks, or simulated time cannot advance for another reason.
+    """
+    # Slow to import.
+    from diffdrive_jacobian.lockstep._errors import LockstepError
+    from diffdrive_jacobian.lockstep.runner import running_in_lockstep
+
+    with ExitStack() as stack:
+        try:
+            runner = stack.enter_context(running_in_lockstep(ros_arguments))
+        except LockstepError as error:
+            raise UserError(str(error)) from error
+        try:
+            yield runner
+        except LockstepError as error:
+            raise DriveError(str(error)) from error
+
 
 TIMEOUT = 300.0
 """Default of the longest duration of a drive (s)."""

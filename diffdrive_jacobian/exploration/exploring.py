@@ -9,14 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from diffdrive_jacobian.exploration import child
-from diffdrive_jacobian.exploration.errors import ExplorationError
 from diffdrive_jacobian.exploration.executors import LocalExecutor
-from diffdrive_jacobian.exploration.generation import st, trials
 from diffdrive_jacobian.exploration.output import check_output, remove_others
 from diffdrive_jacobian.exploration.result import Exploration
-from diffdrive_jacobian.exploration.scenario import Scenario, ScenarioName
+from diffdrive_jacobian.exploration.scenario import ExplorationError, Scenario, ScenarioName, Source
+from diffdrive_jacobian.exploration.schedules import st, trials
 from diffdrive_jacobian.exploration.search import Search
-from diffdrive_jacobian.exploration.source import Source
 from diffdrive_jacobian.exploration.trial import Setting
 from diffdrive_jacobian.numerics.checks import number, positive_or_infinite
 from diffdrive_jacobian.numerics.fields import integer

@@ -15,11 +15,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from diffdrive_jacobian.exploration.child import ChildDiedError, call_in_child
-from diffdrive_jacobian.exploration.errors import ExplorationError
-from diffdrive_jacobian.exploration.recorded_world import BAG, PICTURE, record
+from diffdrive_jacobian.exploration.replay import BAG, PICTURE, record
 from diffdrive_jacobian.exploration.result import LONGEST_KEY, Finding
-from diffdrive_jacobian.exploration.scenario import ScenarioName
-from diffdrive_jacobian.exploration.source import Source
+from diffdrive_jacobian.exploration.scenario import ExplorationError, ScenarioName, Source
 from diffdrive_jacobian.exploration.worker import can_run_here
 from diffdrive_jacobian.text import error_text, printable
 

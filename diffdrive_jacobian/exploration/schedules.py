@@ -1,21 +1,288 @@
-"""Hypothesis strategies of fault schedules.
+"""Generating trials and shrinking them, which Hypothesis does.
 
-The first kinds, topics and nodes are the simplest, so put the usual suspects first. A smaller schedule
-has fewer faults. Then they become certain (probability 1), short and early, at whole seconds.
+The trials of a block depend on its seed alone. Hypothesis would also try constants that it finds in the
+modules of the running program, so that the same seed would give other trials in another program. This is
+switched off here.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from diffdrive_jacobian import faults
-from diffdrive_jacobian.exploration.generation import st
-from diffdrive_jacobian.exploration.strategies import STEP, numbers, probabilities, times
+from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.exploration.scenario import ExplorationError
+from diffdrive_jacobian.exploration.trial import Trial
 from diffdrive_jacobian.faults import Fault
 from diffdrive_jacobian.numerics.fields import between, integer
 from diffdrive_jacobian.numerics.fields import names as check_names
+
+try:
+    import hypothesis
+    from hypothesis import HealthCheck, Phase, Verbosity, settings, strategies
+    from hypothesis.errors import HypothesisDeprecationWarning, HypothesisException
+except ModuleNotFoundError as missing:
+    if missing.name != 'hypothesis':
+        raise
+    raise ExplorationError(
+        "explore and its strategies need hypothesis: pip install 'diffdrive_jacobian[explore]'"
+    ) from missing
+
+st = strategies
+MAX_SEED = 2**32 - 1
+
+
+def trials(cases: st.SearchStrategy[Any], faults: st.SearchStrategy[Any]) -> st.SearchStrategy[Trial]:
+    """Return a strategy of trials.
+
+    The faults are drawn first, so that a smaller case has fewer of them, and then simpler ones.
+    """
+
+    @st.composite
+    def draw_trial(draw: st.DrawFn) -> Trial:
+        schedule = _schedule(draw(faults))
+        case = draw(cases)
+        # Without faults the seed has no effect.
+        seed = draw(st.integers(0, MAX_SEED)) if schedule else 0
+        return Trial(case=case, faults=schedule, seed=seed)
+
+    return draw_trial()
+
+
+def _schedule(drawn: Any) -> tuple[Any, ...]:
+    if not isinstance(drawn, (list, tuple)):
+        raise ExplorationError(f'faults must be a strategy of lists of faults; it gave {drawn!r}')
+    return tuple(drawn)
+
+
+def generate(strategy: st.SearchStrategy[Trial], seed: int, block: int, count: int) -> list[Trial]:
+    """Return up to `count` different trials of a block.
+
+    Raises:
+        ExplorationError: Hypothesis cannot draw from the strategy.
+    """
+    found: list[Trial] = []
+    _run(strategy, seed, block, count, [Phase.generate], found.append)
+    return found
+
+
+def shrink(
+    strategy: st.SearchStrategy[Trial],
+    seed: int,
+    block: int,
+    count: int,
+    fails: Callable[[Trial], bool],
+) -> Trial:
+    """Return the smallest trial that fails among those that Hypothesis tries.
+
+    Args:
+        strategy: As for `generate`, as the next three, which gave a trial that fails.
+        seed: Seed of the exploration.
+        block: Number of the block.
+        count: Size of the block.
+        fails: Returns whether a trial fails. It must return the same for equal trials. It may raise
+            StopShrinking. Other exceptions end the search, too, and are raised.
+
+    Raises:
+        ExplorationError: No trial of the block fails.
+    """
+    smallest: list[Trial] = []
+    errors: list[Exception] = []
+
+    def check(trial: Trial) -> None:
+        try:
+            failed = fails(trial)
+        except Exception as error:
+            # Hypothesis would take it for a failure, run the trial again, and report what differs.
+            errors.append(error)
+            raise StopShrinking from error
+        if failed:
+            smallest[:] = [trial]
+            raise _TrialFailedError
+
+    try:
+        _run(strategy, seed, block, count, [Phase.generate, Phase.shrink], check)
+    except (_TrialFailedError, StopShrinking):
+        if errors:
+            raise errors[0] from None
+        # Hypothesis ends with the smallest one.
+        if smallest:
+            return smallest[0]
+    raise ExplorationError(f'no trial of block {block} failed again')
+
+
+class StopShrinking(BaseException):
+    """Ends shrinking. Not an Exception, which Hypothesis would take for a failure."""
+
+
+class _TrialFailedError(DiffdriveError):
+    """A trial fails."""
+
+
+def _run(
+    strategy: st.SearchStrategy[Trial],
+    seed: int,
+    block: int,
+    count: int,
+    phases: list[Phase],
+    use: Callable[[Trial], object],
+) -> None:
+    @hypothesis.seed(_number(seed, block))
+    @settings(
+        max_examples=count,
+        phases=phases,
+        database=None,
+        deadline=None,
+        derandomize=False,
+        report_multiple_bugs=False,
+        print_blob=False,
+        verbosity=Verbosity.quiet,
+        suppress_health_check=list(HealthCheck),
+    )
+    @hypothesis.given(strategy)
+    def test(trial: Trial) -> None:
+        use(trial)
+
+    with warnings.catch_warnings(), _own_constants_only():
+        # Hypothesis takes random numbers of other threads, as of Dask's, for such of the strategy.
+        warnings.filterwarnings('ignore', 'Do not use the `random` module', HypothesisDeprecationWarning)
+        try:
+            test()
+        except HypothesisException as error:
+            raise ExplorationError(f'Hypothesis cannot generate worlds: {error}') from error
+
+
+def _number(seed: int, block: int) -> int:
+    """Return the seed of a block."""
+    return int.from_bytes(hashlib.sha256(f'{seed} {block}'.encode()).digest()[:8], 'big')
+
+
+@contextmanager
+def _own_constants_only() -> Iterator[None]:
+    """Stop Hypothesis from using constants of the running program. Versions before 6.131 do not."""
+    try:
+        from hypothesis.internal.conjecture import providers
+    except ImportError:
+        yield
+        return
+    internals: Any = providers
+    collect = getattr(internals, '_get_local_constants', None)
+    make = getattr(internals, 'Constants', None)
+    cache = getattr(getattr(internals, 'CONSTANTS_CACHE', None), 'cache', None)
+    if collect is None or make is None or cache is None:
+        yield
+        return
+    none = make()
+    internals._get_local_constants = lambda: none
+    cache.clear()
+    try:
+        yield
+    finally:
+        internals._get_local_constants = collect
+        cache.clear()
+
+
+Pose = tuple[float, float, float]
+Point = tuple[float, float]
+
+STEP = 0.1
+"""Grid of times (s)."""
+ANGLES = (math.pi / 2, math.pi, -math.pi / 2, -math.pi, 3.14, -3.14, math.pi / 4, -math.pi / 4)
+"""Angles that are tried besides those of the grid (rad)."""
+
+
+def numbers(low: float, high: float, *, decimals: int = 1) -> st.SearchStrategy[float]:
+    """Return a strategy of numbers on a decimal grid. They shrink to 0, or to the end next to it.
+
+    Args:
+        low: Smallest number.
+        high: Largest number.
+        decimals: Number of decimals, 0 to 3.
+
+    Raises:
+        ValueError: An argument is invalid, or no number of the grid is between `low` and `high`.
+    """
+    if not (math.isfinite(low) and math.isfinite(high) and low <= high):
+        raise ValueError(f'low and high must be finite and low <= high, got {low!r} and {high!r}')
+    integer('decimals', decimals, 0, 3)
+    scale = 10**decimals
+    first, last = math.ceil(low * scale - 1e-9), math.floor(high * scale + 1e-9)
+    if first > last:
+        raise ValueError(f'no number with {decimals} decimals is between {low!r} and {high!r}')
+    # The part after the point is drawn first: 0 is simpler than a half, and that than the others.
+    parts = sorted(range(scale), key=lambda part: (part != 0, part * 2 != scale, part))
+    below, above = first // scale, last // scale
+
+    def number(part: int, whole: int) -> float:
+        return float(min(max(whole * scale + part, first), last) / scale)
+
+    fraction = st.sampled_from(parts) if any(parts) and first < last else st.just(0)
+    return st.builds(number, fraction, st.integers(below, above))
+
+
+def times(last: float) -> st.SearchStrategy[float]:
+    """Return a strategy of times from 0 to `last` (s), in steps of 0.1 s; whole seconds are simpler."""
+    return numbers(0.0, last, decimals=1)
+
+
+def angles() -> st.SearchStrategy[float]:
+    """Return a strategy of angles from -pi to pi (rad), in steps of 0.1, and the ends."""
+    return st.one_of(numbers(-3.1, 3.1), st.sampled_from(ANGLES))
+
+
+def points(extent: float = 5.0) -> st.SearchStrategy[Point]:
+    """Return a strategy of positions `(x, y)` with coordinates up to `extent` (m), in steps of 0.1."""
+    return st.tuples(numbers(-extent, extent), numbers(-extent, extent))
+
+
+def poses(extent: float = 5.0) -> st.SearchStrategy[Pose]:
+    """Return a strategy of poses `(x, y, theta)` (m, m, rad) with coordinates up to `extent`."""
+    return st.tuples(numbers(-extent, extent), numbers(-extent, extent), angles())
+
+
+def goals(extent: float = 5.0) -> st.SearchStrategy[Pose]:
+    """Return a strategy of goals `(x, y, theta)` (m, m, rad); the simplest is one metre ahead."""
+    return st.one_of(st.just((1.0, 0.0, 0.0)), poses(extent))
+
+
+def waypoints(
+    extent: float = 5.0, *, min_size: int = 1, max_size: int = 5
+) -> st.SearchStrategy[list[Pose]]:
+    """Return a strategy of lists of goals."""
+    return st.lists(goals(extent), min_size=min_size, max_size=max_size)
+
+
+def gains(low: float = 0.2, high: float = 5.0) -> st.SearchStrategy[float]:
+    """Return a strategy of positive gains: 1, 2, 5, 10, 0.5, ... and tenths in between.
+
+    Raises:
+        ValueError: `low` and `high` are not positive, or enclose no such gain.
+    """
+    if not 0.0 < low <= high < math.inf:
+        raise ValueError(f'low and high must be positive and low <= high, got {low!r} and {high!r}')
+    series = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
+    simple = [gain for gain in series if low <= gain <= high]
+    options = [st.sampled_from(simple)] if simple else []
+    if math.ceil(low * 10.0 - 1e-9) <= math.floor(high * 10.0 + 1e-9):
+        options.append(numbers(low, high))
+    if not options:
+        raise ValueError(f'no gain of 1, 2, 5, 10, ... or of tenths is between {low!r} and {high!r}')
+    return st.one_of(options)
+
+
+PROBABILITIES = (1.0, 0.5, *(round(0.05 * n, 2) for n in range(1, 20) if n != 10))
+"""Probabilities in steps of 0.05. The simplest needs no random number."""
+
+
+def probabilities() -> st.SearchStrategy[float]:
+    """Return a strategy of probabilities in steps of 0.05; the simplest is 1, then 0.5."""
+    return st.sampled_from(PROBABILITIES)
+
 
 Fields = dict[str, st.SearchStrategy[Any]]
 Kind = type[Fault] | st.SearchStrategy[Fault]

@@ -12,7 +12,7 @@ from typing import Any
 import rclpy
 
 from diffdrive_jacobian.exploration.child import ChildDiedError, call_in_child, call_in_fresh_child
-from diffdrive_jacobian.exploration.errors import ExplorationError
+from diffdrive_jacobian.exploration.scenario import ExplorationError
 from diffdrive_jacobian.exploration.trial import DIED, Outcome, Setting, Trial, Violation, run
 from diffdrive_jacobian.text import error_text
 

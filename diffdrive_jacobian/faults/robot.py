@@ -99,7 +99,7 @@ class DeadWheel(RobotFault):
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
         """Stop the wheel."""
-        return robot.condition.change(_saturating(self.wheel, 0.0))
+        return robot.defects.change(_saturating(self.wheel, 0.0))
 
 
 @dataclass(frozen=True, repr=False)
@@ -120,7 +120,7 @@ class SaturatedWheel(RobotFault):
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
         """Limit the wheel."""
-        return robot.condition.change(_saturating(self.wheel, self.max_velocity))
+        return robot.defects.change(_saturating(self.wheel, self.max_velocity))
 
 
 @dataclass(frozen=True, repr=False)
@@ -145,7 +145,7 @@ class ActuatorLag(RobotFault):
             actuators = model.actuators or Actuators()
             return replace(model, actuators=replace(actuators, lag=max(actuators.lag, self.seconds)))
 
-        return robot.condition.change(lag)
+        return robot.defects.change(lag)
 
     def reaction_delay(self, node: Node, since: float, now: float) -> float:
         """Return the time after which the wheels have followed a command (s)."""
@@ -169,8 +169,8 @@ class EncoderSteps(RobotFault):
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
         """Set the resolution of the encoders."""
-        robot.condition.set_encoders(self.per_revolution)
-        return lambda: robot.condition.set_encoders(None)
+        robot.defects.set_encoders(self.per_revolution)
+        return lambda: robot.defects.set_encoders(None)
 
 
 @dataclass(frozen=True, repr=False)
@@ -184,7 +184,7 @@ class Slip(RobotFault):
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
         """Start the slip of the wheels."""
         seed = injection.rng('slip').randint(0, MAX_SEED)
-        return robot.condition.change(
+        return robot.defects.change(
             lambda model: replace(model, drift=replace(_drift(model), seed=seed))
         )
 
@@ -216,7 +216,7 @@ class WrongGeometry(RobotFault):
             products = {name: getattr(drift, name) * getattr(self, name) for name in _MULTIPLIERS}
             return replace(model, drift=replace(drift, **products))
 
-        return robot.condition.change(differ)
+        return robot.defects.change(differ)
 
 
 @dataclass(frozen=True, repr=False)
@@ -244,7 +244,7 @@ class Push(RobotFault):
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> None:
         """Displace the robot."""
-        robot.condition.push((self.dx, self.dy, self.dtheta), noticed=self.noticed)
+        robot.defects.push((self.dx, self.dy, self.dtheta), noticed=self.noticed)
 
 
 _MULTIPLIERS = (

@@ -18,9 +18,8 @@ from diffdrive_jacobian.live import settings
 from diffdrive_jacobian.live.commands import Command, Pause, Seek, SetSpeed, Step
 from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.live.recorded_runs import RecordedRobot
-from diffdrive_jacobian.live.robot_state import TRUTH_LIFE, RobotState
+from diffdrive_jacobian.live.robot_state import MAX_POINTS, TRUTH_LIFE, RobotState, Trail
 from diffdrive_jacobian.live.session import Session, Snapshot
-from diffdrive_jacobian.live.trail import MAX_POINTS, Trail
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.messages.topics import SENSORS
 
@@ -145,7 +144,7 @@ class _Film:
         self._statuses = robot.run.goal_status.received
         self._sensors = {topic: robot.times(getattr(run, topic.series)) for topic in SENSORS}
         self._truths = np.maximum.accumulate(robot.times(run.ground_truth))
-        self.trail, self._trail_times = _trail(robot.time, run.odometry.values, robot.trace.breaks)
+        self.trail, self._trail_times = _trail(robot.time, run.odometry.values, robot.timeline.breaks)
         self.true_trail, self._true_times = _trail(
             self._truths, run.ground_truth.values, jumps(run.ground_truth)
         )
@@ -191,14 +190,14 @@ class _Film:
         self._state.robot_values = run.of_node('virtual_robot')
 
     def _set_goal(self, index: int) -> None:
-        run, trace, goal = self.robot.run, self.robot.trace, self._state.goal
-        number = int(trace.goal[index])
+        run, line, goal = self.robot.run, self.robot.timeline, self._state.goal
+        number = int(line.goal[index])
         if number < 0:
             goal.replay(None, 0, GoalState.UNKNOWN)
             return
         stamp = run.goals.received[number]
         route = np.flatnonzero(run.goals.received == stamp)
-        reached = bool(np.isnan(trace.bearing_error[index]))
+        reached = bool(np.isnan(line.bearing_error[index]))
         state = GoalState.SUCCEEDED if reached else GoalState.EXECUTING
         goal.replay(run.goals.values[route], int(np.searchsorted(route, number)), state)
 
@@ -215,16 +214,16 @@ class _Film:
 
     def strips(self) -> Mapping[str, Any]:
         """Return the curves over the whole bag."""
-        robot, run, trace = self.robot, self.robot.run, self.robot.trace
+        robot, run, line = self.robot, self.robot.run, self.robot.timeline
         chosen = np.unique(np.linspace(0, len(robot.time) - 1, STRIP_POINTS).astype(np.intp))
         at = robot.time[chosen]
         curves: dict[str, Array] = {
             'time': at,
             'v': run.odometry.values[chosen, 3],
             'omega': run.odometry.values[chosen, 4],
-            'distance': trace.distance[chosen],
-            'bearing_error': trace.bearing_error[chosen],
-            'goal_heading_error': trace.goal_heading_error[chosen],
+            'distance': line.distance[chosen],
+            'bearing_error': line.bearing_error[chosen],
+            'goal_heading_error': line.goal_heading_error[chosen],
         }
         for names, times, series in (
             (('command_v', 'command_omega'), self._commands, run.cmd_vel),

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 from typing import Annotated, Any, NoReturn
 
 from diffdrive_jacobian.errors import DiffdriveError
-from diffdrive_jacobian.messages.plausibility import MAX_POSITION, MAX_SPEED
+from diffdrive_jacobian.messages.conversion import MAX_POSITION, MAX_SPEED
 from diffdrive_jacobian.numerics.fields import Checked, between, boolean, optional, short
 
 MAX_SIZE = 4096

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from diffdrive_jacobian.bags.bag_reader import BagError, open_bag
 from diffdrive_jacobian.bags.run import Run, Series
 from diffdrive_jacobian.bags.run_reader import read_run
-from diffdrive_jacobian.bags.timeline import Trace, seconds, trace
+from diffdrive_jacobian.bags.timeline import Timeline, seconds, timeline
+from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.covariances import from_covariance
-from diffdrive_jacobian.messages.errors import MessageError
 from diffdrive_jacobian.messages.names import base_name, namespace_of
 from diffdrive_jacobian.messages.topics import TOPICS
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -30,7 +30,7 @@ class RecordedRobot:
     name: str
     """Its namespace, `/` or `/NAME`."""
     run: Run
-    trace: Trace
+    timeline: Timeline
     start: float
     """Time of its first odometry (s)."""
     time: Array
@@ -79,15 +79,15 @@ def read_robots(path: Path) -> list[RecordedRobot]:
     first = min(int(run.odometry.stamps[0]) for run in runs.values())
     robots = []
     for namespace, run in runs.items():
-        traced = trace(run)
+        numbers = timeline(run)
         start = (int(run.odometry.stamps[0]) - first) / NANOSECONDS
         robots.append(
             RecordedRobot(
                 name=namespace,
                 run=run,
-                trace=traced,
+                timeline=numbers,
                 start=start,
-                time=np.maximum.accumulate(traced.time + start),
+                time=np.maximum.accumulate(numbers.time + start),
                 covariance=_covariances(run),
             )
         )

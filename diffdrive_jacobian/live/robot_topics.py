@@ -19,7 +19,7 @@ from rclpy.subscription import Subscription
 from diffdrive_jacobian.bags.message_definitions import message_class
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.codecs import TWIST, Codec, Command
-from diffdrive_jacobian.messages.errors import MessageError
+from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.messages.topics import TOPICS
 from diffdrive_jacobian.ros.rclpy_internals import Polled, waiting_messages

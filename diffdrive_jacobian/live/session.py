@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from diffdrive_jacobian.live.commands import Command
-from diffdrive_jacobian.live.trail import Trail
+from diffdrive_jacobian.live.robot_state import Trail
 
 MAX_COMMANDS = 256
 """Largest number of commands that wait."""

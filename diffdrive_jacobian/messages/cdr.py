@@ -11,7 +11,535 @@ encapsulation.
 
 from __future__ import annotations
 
-from diffdrive_jacobian.messages.cdr_reader import DecodingError as DecodingError
-from diffdrive_jacobian.messages.cdr_reader import LongMessageError as LongMessageError
-from diffdrive_jacobian.messages.cdr_reader import Reader as Reader
-from diffdrive_jacobian.messages.cdr_writer import Writer as Writer
+import math
+import struct
+import sys
+from collections.abc import Callable
+from collections.abc import Sequence as Values
+from functools import lru_cache
+from itertools import accumulate, pairwise
+from operator import itemgetter
+from typing import Any, NamedTuple
+
+from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.messages.fields import check_readable, field_value
+from diffdrive_jacobian.messages.structure import (
+    BIG_ENDIAN,
+    COUNT,
+    ENCAPSULATION,
+    LITTLE_ENDIAN,
+    PLAIN,
+    Array,
+    FieldType,
+    Number,
+    Sequence,
+    Structure,
+    Text,
+    check_plain,
+    least_size,
+    structure,
+    uniform_size,
+)
+
+SMALLEST = sys.float_info.min
+"""Smallest positive normal number. No speed or position is that small but zero."""
+
+
+def integer_warning(what: str, *values: float) -> str | None:
+    """Return a warning if a value is an integer that was assigned to a field of floats, else None.
+
+    Args:
+        what: What has the values.
+        values: The values of the fields.
+    """
+    for value in values:
+        if value and -SMALLEST < value < SMALLEST:
+            return (
+                f'{what} has the value {value:.3g}: was an int assigned to a float field? Assign 1.0 '
+                'instead of 1 (with ROS_PYTHON_CHECK_FIELDS=1 rclpy reports it to the sender)'
+            )
+    return None
+
+
+_MAX_LAYOUTS = 16
+"""Layouts that a Reader keeps, one for each size of message."""
+_MAX_VALUES = 256
+"""Largest number of values of a layout that is kept."""
+_MAX_ELEMENTS = 64
+"""Most strings or structures in a sequence that are read one by one. For more, rclpy takes less time."""
+_MAX_READ = 200_000
+"""Most values of a message that are unpacked, and strings and structures that are visited one by one.
+More take seconds, and twenty times their size in memory."""
+_MAX_REMEMBERED = 1024
+"""Largest message whose texts are remembered (bytes)."""
+
+
+class DecodingError(MessageError):
+    """Bytes that are not a message of the type."""
+
+
+class LongMessageError(DecodingError):
+    """A message has more values than are read."""
+
+
+class _ManyElementsError(DiffdriveError):
+    """A sequence has more than _MAX_ELEMENTS strings or structures."""
+
+
+class Reader:
+    """Reads fields of serialized messages.
+
+    Where the fields are depends on the lengths of the strings and sequences before them. These are
+    usually the same in each message. So the layout of the last message of the same size is tried first:
+    one unpacking gives the lengths and the fields, and the fields are right if the lengths are.
+    """
+
+    def __init__(
+        self,
+        kind: Any,
+        fields: Values[str],
+        *,
+        whole: bool = True,
+        bounded: bool = True,
+        deserialize: Callable[[bytes, Any], Any] | None = None,
+    ) -> None:
+        """Compile a reader.
+
+        Args:
+            kind: Type of the messages: their class or its `Structure`.
+            fields: Paths such as `header.stamp.sec`. A path to a number gives a number, to a string a
+                str, to an array or sequence of them a tuple. `len(goals)` gives the length of a
+                sequence, `goals[].pose.position.x` a tuple with that field of each of its elements.
+            whole: Whether what follows the last field must be valid too.
+            bounded: Whether to refuse messages with more than 200,000 values and strings to read.
+            deserialize: Reads the encapsulations that this class does not, such as parameter lists, and
+                sequences of many strings (`rclpy.serialization.deserialize_message`). None: these
+                encapsulations are invalid. It needs the class.
+
+        Raises:
+            ValueError: A field does not exist, or cannot be read on its own.
+            TypeError: The message has a wide string.
+        """
+        self._class = kind
+        self._type = kind if isinstance(kind, Structure) else structure(kind)
+        check_plain(self._type)
+        self._fields = tuple(fields)
+        for field in self._fields:
+            check_readable(self._type, field)
+        self._whole = whole
+        self._budget = _MAX_READ if bounded else math.inf
+        self._deserialize = deserialize
+        self._layouts: dict[int, _Layout] = {}
+
+    def __call__(self, data: bytes) -> tuple[Any, ...]:
+        """Return the fields of a message, in the order in which they were asked for.
+
+        As in rclpy, bytes after the message are ignored, strings end at the first NUL, and invalid UTF-8
+        is replaced by U+FFFD. Unlike rclpy, a sequence that claims more elements than there are bytes is
+        refused everywhere. In a nested structure, such as `polygon.points`, rclpy reads it as empty and
+        the fields after it from the wrong place.
+
+        Raises:
+            DecodingError: The bytes are not a message of this type.
+            LongMessageError: They are, as far as they were read, but have too many values.
+        """
+        layout = self._layouts.get(len(data))
+        if layout is None:
+            return self._read_new(data)
+        values = layout.unpack_from(data)
+        if layout.lengths(values) != layout.expected:
+            return self._read_new(data)
+        return layout.fields(values)
+
+    def _read_new(self, data: bytes) -> tuple[Any, ...]:
+        """Read a message whose layout is not known."""
+        if len(data) >= ENCAPSULATION and data[:2] not in PLAIN:
+            return self._read_message(data)
+        most = math.inf if self._deserialize is None else _MAX_ELEMENTS
+        try:
+            layout = _Walk(data, self._fields, self._whole, most, self._budget).layout(self._type)
+        except struct.error as error:
+            raise self._undecodable() from error
+        except _ManyElementsError:
+            return self._read_message(data)
+        values = layout.unpack_from(data)
+        if len(values) <= _MAX_VALUES:
+            if len(self._layouts) >= _MAX_LAYOUTS:
+                self._layouts.clear()
+            self._layouts[len(data)] = layout
+        return layout.fields(values)
+
+    def _read_message(self, data: bytes) -> tuple[Any, ...]:
+        """Return the fields of a message object."""
+        if self._deserialize is None:
+            raise self._undecodable()
+        try:
+            message = self._deserialize(data, self._class)
+        except RuntimeError as error:
+            raise self._undecodable() from error
+        return tuple(field_value(message, field) for field in self._fields)
+
+    def _undecodable(self) -> DecodingError:
+        return DecodingError(f'it is not a {self._type.short_name} message')
+
+
+class _Layout(NamedTuple):
+    """Where the fields are in messages with certain lengths of strings and sequences."""
+
+    unpack_from: Callable[[bytes], tuple[Any, ...]]
+    lengths: Callable[[tuple[Any, ...]], Any]
+    """Returns the encapsulation and the lengths among the unpacked values."""
+    expected: Any
+    fields: Callable[[tuple[Any, ...]], tuple[Any, ...]]
+    """Returns the fields among the unpacked values."""
+
+
+class _Walk:
+    """One pass over a message, which collects its layout. Raises struct.error where the bytes end."""
+
+    def __init__(
+        self, data: bytes, fields: tuple[str, ...], whole: bool, most: float, budget: float
+    ) -> None:
+        self._data = data
+        self._most = most
+        self._budget = budget
+        self._fields = fields
+        self._missing = set(fields)
+        self._whole = whole
+        self._offset = ENCAPSULATION
+        self._order = '>' if data[:2] == BIG_ENDIAN else '<'
+        self._format = [f'{self._order}2s']
+        self._formatted = 2
+        self._values = 1
+        self._lengths = [0]
+        self._picks: dict[str, Any] = {field: [] for field in fields if '[]' in field}
+        """Where the fields are among the unpacked values: an index, a slice, or a list of them."""
+        self._texts: set[str] = set()
+
+    def layout(self, kind: Structure) -> _Layout:
+        self._walk(kind, '')
+        self._skip_to(self._offset)
+        compiled = struct.Struct(''.join(self._format))
+        lengths = itemgetter(*self._lengths)
+        expected = lengths(compiled.unpack_from(self._data))
+        return _Layout(compiled.unpack_from, lengths, expected, self._picker())
+
+    def _picker(self) -> Callable[[tuple[Any, ...]], tuple[Any, ...]]:
+        picks = [self._picks[field] for field in self._fields]
+        of_each = any(isinstance(one, list) for one in picks)
+        # An itemgetter of one index returns no tuple.
+        pick: Any = _picked(picks) if of_each or len(picks) < 2 else itemgetter(*picks)
+        texts = [number for number, field in enumerate(self._fields) if field in self._texts]
+        if not texts:
+            picker: Callable[[tuple[Any, ...]], tuple[Any, ...]] = pick
+            return picker
+
+        # A short message has few texts, and usually the same ones as before.
+        convert = _converted_before if self._offset <= _MAX_REMEMBERED else _converted
+        if texts == [0] and len(picks) > 2 and not of_each:
+            # Such as a frame and numbers.
+            text, numbers = picks[0], itemgetter(*picks[1:])
+            return lambda values: (convert(values[text]), *numbers(values))
+
+        def pick_texts(values: tuple[Any, ...]) -> tuple[Any, ...]:
+            picked = list(pick(values))
+            for number in texts:
+                picked[number] = convert(picked[number])
+            return tuple(picked)
+
+        return pick_texts
+
+    @property
+    def _done(self) -> bool:
+        return not (self._missing or self._whole)
+
+    def _walk(self, kind: FieldType, path: str) -> None:
+        match kind:
+            case Structure():
+                if not kind.fields:
+                    self._take('', 1)
+                for name, field in kind.fields:
+                    if self._done:
+                        return
+                    self._walk(field, f'{path}.{name}' if path else name)
+            case Number():
+                self._numbers(kind, 1, path)
+            case Text():
+                self._text(path in self._missing)
+                self._found(path, self._values - 1, is_text=True)
+            case Array():
+                self._elements(kind.element, kind.count, path)
+            case Sequence():
+                count = self._length()
+                self._found(f'len({path})', self._values - 1)
+                if not self._done:
+                    self._elements(kind.element, count, path)
+
+    def _found(self, path: str, pick: int | slice, *, is_text: bool = False) -> None:
+        """Note where a field is among the unpacked values, if it is asked for."""
+        if path not in self._missing:
+            return
+        if is_text:
+            self._texts.add(path)
+        if '[]' in path:
+            self._picks[path].append(pick)
+        else:
+            self._picks[path] = pick
+            self._missing.discard(path)
+
+    def _elements(self, kind: FieldType, count: int, path: str) -> None:
+        # Without this check a large number would take long, or much memory.
+        if count * least_size(kind) > len(self._data) - self._offset:
+            raise struct.error('more elements than bytes')
+        if isinstance(kind, Number):
+            self._numbers(kind, count, path, many=True)
+            return
+        inner = f'{path}[]'
+        unit = uniform_size(kind)
+        if unit and not any(one.startswith(inner) for one in self._missing):
+            # Such as points, which are doubles without padding.
+            if count:
+                self._align(unit)
+            self._take('', count * least_size(kind))
+            return
+        if count > self._most:
+            raise _ManyElementsError
+        self._spend(count)
+        if isinstance(kind, Text):
+            first, wanted = self._values, path in self._missing
+            for _ in range(count):
+                self._text(wanted)
+            # Each string comes after its length.
+            self._found(path, slice(first + 1, self._values, 2), is_text=True)
+            return
+        for _ in range(count):
+            self._walk(kind, inner)
+        self._missing.difference_update([one for one in self._missing if one.startswith(inner)])
+
+    def _numbers(self, kind: Number, count: int, path: str, *, many: bool = False) -> None:
+        wanted = path in self._missing
+        first = self._values
+        if wanted:
+            self._spend(count)
+        if count:
+            self._align(kind.size)
+        self._take(f'{count}{kind.code}' if wanted else '', count * kind.size)
+        if wanted:
+            self._values += count
+            self._found(path, slice(first, self._values) if many else first)
+
+    def _spend(self, count: int) -> None:
+        self._budget -= count
+        if self._budget < 0:
+            raise LongMessageError('it has more values than are read of one message')
+
+    def _text(self, wanted: bool) -> None:
+        size = self._length()
+        self._take(f'{size}s' if wanted else '', size)
+        if wanted:
+            self._values += 1
+
+    def _length(self) -> int:
+        self._align(COUNT.size)
+        (length,) = struct.unpack_from(f'{self._order}I', self._data, self._offset)
+        self._lengths.append(self._values)
+        self._take('I', COUNT.size)
+        self._values += 1
+        return int(length)
+
+    def _take(self, code: str, size: int) -> None:
+        """Advance by a value, which is unpacked unless its format is empty."""
+        start = self._offset
+        self._offset += size
+        if self._offset > len(self._data):
+            raise struct.error('the bytes end within the message')
+        if code:
+            self._skip_to(start)
+            self._format.append(code)
+            self._formatted = self._offset
+
+    def _align(self, size: int) -> None:
+        self._offset += (ENCAPSULATION - self._offset) % size
+
+    def _skip_to(self, offset: int) -> None:
+        if offset > self._formatted:
+            self._format.append(f'{offset - self._formatted}x')
+            self._formatted = offset
+
+
+def _picked(picks: Values[Any]) -> Callable[[tuple[Any, ...]], tuple[Any, ...]]:
+    """Return a function of values that returns those at some indices, and a tuple for a list of them."""
+
+    def pick(values: tuple[Any, ...]) -> tuple[Any, ...]:
+        return tuple(
+            tuple(values[index] for index in one) if isinstance(one, list) else values[one]
+            for one in picks
+        )
+
+    return pick
+
+
+def _converted(raw: Any) -> Any:
+    """Return a string, or strings as deep in tuples as they are."""
+    return _text(raw) if isinstance(raw, bytes) else tuple(map(_converted, raw))
+
+
+_converted_before = lru_cache(maxsize=64)(_converted)
+
+
+def _text(raw: bytes) -> str:
+    return raw.partition(b'\0')[0].decode('utf-8', 'replace')
+
+
+class Writer:
+    """Writes serialized messages that differ from a template in some numbers."""
+
+    def __init__(self, template: Any, fields: Values[str]) -> None:
+        """Serialize the template.
+
+        Args:
+            template: A message. Its strings and the lengths of its sequences are those of all messages
+                that are written.
+            fields: Paths of the numbers that are written, in the order of the message:
+                `pose.position.x`, `covariance[7]` for an element, `covariance` for all elements of an
+                array or sequence.
+
+        Raises:
+            ValueError: A field does not exist, is no number, or is not in the order of the message.
+            MessageError: The template cannot be serialized.
+            TypeError: The message has a wide string.
+        """
+        encoder = _Encoder()
+        message_class: Any = type(template)
+        kind = structure(message_class)
+        check_plain(kind)
+        try:
+            encoder.encode(kind, template, '')
+        except (struct.error, OverflowError, UnicodeEncodeError) as error:
+            raise MessageError(f'{kind.short_name} cannot be serialized: {error}') from error
+        self._name = kind.short_name
+        runs = _runs(encoder, fields)
+        content = bytes(encoder.buffer)
+        # All is packed at once: what does not change as strings of bytes, between the runs of numbers.
+        layout, end, constants = '<', 0, []
+        for run in runs:
+            constants.append(content[end : run.start])
+            layout += f'{run.start - end}s{run.format}'
+            end = run.end
+        tail = content[end:]
+        layout += f'{len(tail)}s' if any(tail) else f'{len(tail)}x'
+        self._tail = (tail,) if any(tail) else ()
+        self._pack = struct.Struct(layout).pack
+        self._head = constants[:1]
+        self._first = slice(runs[0].numbers if len(runs) > 1 else None)
+        self._more = list(zip(constants, _parts(runs), strict=True))[1:]
+
+    def __call__(self, *values: Any) -> bytes:
+        """Return the message with these numbers, one for each field or element of a field.
+
+        Raises:
+            MessageError: A number is out of range for its field, or their count is wrong.
+        """
+        try:
+            if not self._more:
+                return self._pack(*self._head, *values, *self._tail)
+            if len(self._more) == 1:
+                # Usually a stamp, the names of frames, and numbers.
+                ((constant, part),) = self._more
+                return self._pack(
+                    *self._head, *values[self._first], constant, *values[part], *self._tail
+                )
+            arguments = [*self._head, *values[self._first]]
+            for constant, part in self._more:
+                arguments.append(constant)
+                arguments += values[part]
+            return self._pack(*arguments, *self._tail)
+        except (struct.error, OverflowError) as error:
+            raise MessageError(f'{self._name} cannot be serialized: {error}') from error
+
+
+class _Encoder:
+    """Serializes a message, and notes where its numbers are. Padding is zero."""
+
+    def __init__(self) -> None:
+        self.buffer = bytearray(LITTLE_ENDIAN + b'\0\0')
+        self.numbers: dict[str, tuple[int, Number]] = {}
+        """Offset and type of each number, by its path."""
+        self.arrays: dict[str, list[str]] = {}
+        """Paths of the numbers of each array or sequence."""
+
+    def encode(self, kind: FieldType, value: Any, path: str) -> None:
+        """Append a value."""
+        match kind:
+            case Structure():
+                if not kind.fields:
+                    self.buffer += b'\0'
+                for name, field in kind.fields:
+                    self.encode(field, getattr(value, name), f'{path}.{name}' if path else name)
+            case Number():
+                self._align(kind.size)
+                self.numbers[path] = len(self.buffer), kind
+                self.buffer += struct.pack(f'<{kind.code}', value)
+            case Text():
+                # rclpy passes strings on as C strings.
+                encoded = value.partition('\0')[0].encode() + b'\0'
+                self._count(len(encoded))
+                self.buffer += encoded
+            case Array() | Sequence():
+                if isinstance(kind, Sequence):
+                    self._count(len(value))
+                elif len(value) != kind.count:
+                    raise struct.error(f'{path} must have {kind.count} elements, got {len(value)}')
+                elements = [f'{path}[{number}]' for number in range(len(value))]
+                for element, one in zip(elements, value, strict=True):
+                    self.encode(kind.element, one, element)
+                if isinstance(kind.element, Number):
+                    self.arrays[path] = elements
+
+    def _count(self, count: int) -> None:
+        self._align(COUNT.size)
+        self.buffer += struct.pack('<I', count)
+
+    def _align(self, size: int) -> None:
+        self.buffer += bytes((ENCAPSULATION - len(self.buffer)) % size)
+
+
+class _Run(NamedTuple):
+    """Numbers that are packed without anything else but zeros between them."""
+
+    start: int
+    end: int
+    format: str
+    numbers: int
+
+
+def _runs(encoder: _Encoder, fields: Values[str]) -> list[_Run]:
+    """Return the runs of the fields, as few as possible.
+
+    Raises:
+        ValueError: A field is no number, or is not in the order of the message.
+    """
+    paths = [path for field in fields for path in encoder.arrays.get(field, [field])]
+    unknown = [path for path in paths if path not in encoder.numbers]
+    if unknown:
+        raise ValueError(f"a field must be a number of the message, got '{unknown[0]}'")
+    slots = [encoder.numbers[path] for path in paths]
+    if any(offset >= after for (offset, _), (after, _) in pairwise(slots)):
+        raise ValueError(f'fields must be in the order of the message, got {list(fields)}')
+    runs: list[_Run] = []
+    for offset, kind in slots:
+        if runs and not any(encoder.buffer[runs[-1].end : offset]):
+            start, end, text, count = runs.pop()
+            text += f'{offset - end}x'
+        else:
+            start, text, count = offset, '', 0
+        runs.append(_Run(start, offset + kind.size, text + kind.code, count + 1))
+    return runs
+
+
+def _parts(runs: list[_Run]) -> list[slice]:
+    """Return which of the values are those of each run. Those after the last one are left to it."""
+    ends = list(accumulate(run.numbers for run in runs))
+    starts = [0, *ends[:-1]][: len(runs)]
+    return [slice(*pair) for pair in zip(starts, [*ends[:-1], None], strict=False)]

@@ -1,13 +1,4 @@
-"""Conversion between ROS messages and the quantities of the mathematics.
-
-Poses are `[x, y, theta]` (m, m, rad), twists `(v, omega)` (m/s, rad/s), times integer nanoseconds.
-Wheels are ordered left, right in messages, as is usual in ROS, and right, left in the mathematics. Only
-this module converts between these orders, and only it writes stamps.
-
-The `set_` functions fill an existing message. The `from_` functions take the fields of a message and
-check them. They raise MessageError, which reports the value and the range allowed. Which fields these
-are is said in `messages.codecs`.
-"""
+"""What fields of messages mean: poses, twists and times, checked."""
 
 from __future__ import annotations
 
@@ -15,18 +6,29 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
+from diffdrive_jacobian.errors import DiffdriveError
+from diffdrive_jacobian.text import printable
+from diffdrive_jacobian.time_units import NANOSECONDS
+
 if TYPE_CHECKING:
     import numpy as np
     from builtin_interfaces.msg import Time
     from geometry_msgs.msg import Pose
     from numpy.typing import NDArray
 
-from diffdrive_jacobian.messages.errors import MessageError as MessageError
-from diffdrive_jacobian.messages.plausibility import MAX_POSITION as MAX_POSITION
-from diffdrive_jacobian.messages.plausibility import MAX_SPEED as MAX_SPEED
-from diffdrive_jacobian.messages.plausibility import MAX_WHEEL_SPEED as MAX_WHEEL_SPEED
-from diffdrive_jacobian.text import printable
-from diffdrive_jacobian.time_units import NANOSECONDS
+
+class MessageError(DiffdriveError, ValueError):
+    """A message with invalid content."""
+
+
+MAX_SPEED = 1e3
+"""Largest plausible speed (m/s) and yaw rate (rad/s)."""
+MAX_POSITION = 1e6
+"""Largest plausible coordinate of a position (m)."""
+MAX_WHEEL_SPEED = 1e6
+"""Largest plausible wheel speed (rad/s). It corresponds to `MAX_SPEED` at the smallest wheel radius that
+the nodes accept, 1e-3 m."""
+
 
 MAX_WAYPOINTS = 2_000
 """Largest number of poses in a `goals` message: rclpy takes about 20 us to convert each of them."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diffdrive_jacobian.messages.errors import MessageError
-from diffdrive_jacobian.messages.plausibility import MAX_POSITION
+from diffdrive_jacobian.messages.conversion import MAX_POSITION, MessageError
 
 
 def from_covariance(covariance: ArrayLike) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeAlias
 
-from diffdrive_jacobian.messages.errors import MessageError
+from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.names import import_type
 
 _CODES = {

@@ -1,19 +1,23 @@
-"""Drive a robot to goals by a controller: odometry and goals in, body twists out."""
+"""A goal of the node go_to_goal, read from a message."""
 
 from __future__ import annotations
 
 import math
+import uuid
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 from action_msgs.msg import GoalInfo, GoalStatus
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Goals, Odometry
 from std_srvs.srv import Trigger
+from unique_identifier_msgs.msg import UUID
 
-from diffdrive_jacobian.control import Arrival, Controller
+from diffdrive_jacobian.control import Arrival, Controller, Waypoints
 from diffdrive_jacobian.control.sampling import LARGEST_TURN, without_whole_turns
 from diffdrive_jacobian.kinematics.saturation import scaled_to_limits
 from diffdrive_jacobian.messages import conversion as messages
@@ -27,7 +31,6 @@ from diffdrive_jacobian.messages.codecs import (
 )
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
 from diffdrive_jacobian.messages.topic_faults import SEVERAL, UNREAD
-from diffdrive_jacobian.nodes.goal import Goal, GoalIdentifiers, read_goal
 from diffdrive_jacobian.nodes.other_drivers import OtherDrivers
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.ros import serialization
@@ -38,6 +41,64 @@ from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import nanoseconds
 
 __all__ = ['GoToGoal']
+
+
+@dataclass(slots=True)
+class Goal:
+    """A goal that was accepted: the content of one message."""
+
+    info: GoalInfo
+    frame: str
+    """Frame of its poses; empty: that of the odometry."""
+    waypoints: Waypoints
+    executing: bool = False
+    """Whether odometry was received after it was accepted."""
+    stale: bool = False
+    """Whether the robot is stopped because odometry is missing."""
+
+
+class GoalIdentifiers:
+    """The identifiers of the goals of one controller.
+
+    They follow from its name, the time of receipt and their number. So runs in lockstep are the same
+    each time.
+    """
+
+    def __init__(self, controller: str) -> None:
+        """Start without goals. `controller` is the fully qualified name of the node."""
+        self._controller = controller
+        self._count = 0
+
+    def info(self, stamp: Time, now: int) -> GoalInfo:
+        """Return a new identifier, with the stamp of the goal. `now` is the time of receipt (ns)."""
+        self._count += 1
+        identifier = uuid.uuid5(uuid.NAMESPACE_URL, f'{self._controller}/{now}/{self._count}')
+        return GoalInfo(goal_id=UUID(uuid=list(identifier.bytes)), stamp=stamp)
+
+
+def read_goal(
+    frame: str, frames: Sequence[str], poses: Sequence[Sequence[float]]
+) -> tuple[str, Waypoints]:
+    """Return the frame and the poses of a goal.
+
+    Args:
+        frame: Frame of the message.
+        frames: Frames of its poses; '': that of the message.
+        poses: The fields of each pose, as `from_pose` takes them.
+
+    Raises:
+        MessageError: There is no pose, a pose is invalid, or the poses are in several frames.
+    """
+    if not poses:
+        raise MessageError('goals must contain at least one pose, got none (to stop, call cancel_goal)')
+    distinct = {one or frame for one in frames}
+    if len(distinct) > 1:
+        raise MessageError(
+            f'all poses must be given in one frame, got {messages.quoted(sorted(distinct))}'
+        )
+    read = np.array([messages.from_pose(*pose) for pose in poses])
+    return distinct.pop(), Waypoints(read)
+
 
 RATE_PERIODS = 10
 """Number of periods of the odometry from which its rate is measured."""

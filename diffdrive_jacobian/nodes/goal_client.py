@@ -28,8 +28,7 @@ from diffdrive_jacobian.messages.codecs import (
     Status,
     pose_fields,
 )
-from diffdrive_jacobian.messages.conversion import from_pose, from_time
-from diffdrive_jacobian.messages.errors import MessageError
+from diffdrive_jacobian.messages.conversion import MessageError, from_pose, from_time
 from diffdrive_jacobian.messages.goal_follower import GoalFollower
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.messages.names import is_named, node_of

@@ -11,9 +11,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
 from diffdrive_jacobian.messages.codecs import TWIST, TWIST_STAMPED
-from diffdrive_jacobian.messages.errors import MessageError
-from diffdrive_jacobian.ros.graph_faults import publishers_of
-from diffdrive_jacobian.ros.shared_graph import MAX_AGE, SharedGraph
+from diffdrive_jacobian.messages.conversion import MessageError
+from diffdrive_jacobian.ros.graph_faults import MAX_AGE, SharedGraph, publishers_of
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 PERIOD = NANOSECONDS

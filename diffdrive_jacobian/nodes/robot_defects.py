@@ -1,4 +1,4 @@
-"""The condition of a virtual robot: what is wrong with it beyond its parameters, for tests."""
+"""Defects of a virtual robot: what is wrong with it beyond its parameters, for tests."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from diffdrive_jacobian.simulation.robot import Robot, RobotModel
 from diffdrive_jacobian.simulation.slip import Drift
 
 
-class Condition:
+class RobotDefects:
     """Changes of the model of a robot, coarse encoders, and pushes.
 
     From the first one on after which the true pose may differ from the odometry, the model has a drift,

@@ -42,14 +42,14 @@ from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.covariances import from_covariance
 from diffdrive_jacobian.messages.topic_faults import GOALS_LOST, SEVERAL, UNPUBLISHED
 from diffdrive_jacobian.nodes.command_time import command_time
-from diffdrive_jacobian.nodes.robot_defects import Condition
+from diffdrive_jacobian.nodes.robot_defects import RobotDefects
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.ros.graph_faults import (
     ALTERNATION_PATIENCE,
+    Interleaving,
     alternating_commands,
     topic_check,
 )
-from diffdrive_jacobian.ros.lasting import Interleaving
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import change_timer_period, log_info
 from diffdrive_jacobian.simulation.robot import Robot
@@ -74,7 +74,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         super().__init__('virtual_robot', VirtualRobotParameters, **kwargs)
         self._robot: Robot | None = None
         self._latest = 0
-        self.condition = Condition(self._advance, self._remodel, self._move, self._set_pose)
+        self.defects = RobotDefects(self._advance, self._remodel, self._move, self._set_pose)
         """What is wrong with the robot beyond its parameters, for tests."""
         self._configure()
         self._odom = self.advertise(Odometry, 'odom')
@@ -140,7 +140,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             return None
         robot = self._robot
         if robot is None:
-            model = self.condition.model(self._model)
+            model = self.defects.model(self._model)
             robot = Robot(model=model, stamp=now, pose=self._initial_pose())
             self._publish_start(robot)
         elif now < self._latest:
@@ -171,7 +171,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             return
         now, robot = advanced
         truth = robot.at(now)
-        state = self.condition.reported(truth)
+        state = self.defects.reported(truth)
         motion = Motion(
             state.stamp,
             self.parameters.odom_frame_id,
@@ -270,7 +270,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
 
     def _set_pose(self, robot: Robot) -> None:
         self._move(robot)
-        self.condition.placed(robot)
+        self.defects.placed(robot)
         self._publish_start(robot)
         x, y, theta = robot.pose
         self.log_event_info('pose set', f'pose set to x {x:.3f}, y {y:.3f}, theta {theta:.3f}')
@@ -282,7 +282,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         With encoders of few steps: at their last reading, as it was published.
         """
         robot = self._robot_now()
-        return self._initial_pose() if robot is None else self.condition.odometry_pose(robot)
+        return self._initial_pose() if robot is None else self.defects.odometry_pose(robot)
 
     @property
     def truth(self) -> NDArray[np.float64]:
@@ -304,9 +304,9 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self._remodel()
 
     def _remodel(self) -> None:
-        """Continue with the model of the present parameters and condition."""
+        """Continue with the model of the present parameters and defects."""
         advanced = self._advance()
-        model = self.condition.model(self._model)
+        model = self.defects.model(self._model)
         if model.drift is not None and self._ground_truth is None:
             self._ground_truth = self.advertise(Odometry, 'ground_truth')
         if advanced is not None and model != advanced[1].model:

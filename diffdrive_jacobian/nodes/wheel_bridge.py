@@ -22,8 +22,12 @@ from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.topic_faults import UNREAD
 from diffdrive_jacobian.nodes.command_time import command_time
 from diffdrive_jacobian.parameters.wheel_bridge import WheelBridgeParameters
-from diffdrive_jacobian.ros.graph_faults import ALTERNATION_PATIENCE, alternating_commands, topic_check
-from diffdrive_jacobian.ros.lasting import Interleaving
+from diffdrive_jacobian.ros.graph_faults import (
+    ALTERNATION_PATIENCE,
+    Interleaving,
+    alternating_commands,
+    topic_check,
+)
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.time_units import nanoseconds

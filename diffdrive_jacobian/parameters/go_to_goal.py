@@ -12,7 +12,7 @@ from diffdrive_jacobian.control.controller import KP, KV, OFFSET, Controller, Ga
 from diffdrive_jacobian.control.controllers import BUILT_IN, ControllerError, Controllers
 from diffdrive_jacobian.control.controllers import CONTROLLERS as CONTROLLERS
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
-from diffdrive_jacobian.messages.plausibility import MAX_SPEED
+from diffdrive_jacobian.messages.conversion import MAX_SPEED
 from diffdrive_jacobian.parameters._fields import STAMPED, timeout_field
 from diffdrive_jacobian.parameters.declaration import (
     ParameterError,

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
-from diffdrive_jacobian.messages.plausibility import MAX_SPEED
+from diffdrive_jacobian.messages.conversion import MAX_SPEED
 from diffdrive_jacobian.parameters.declaration import NodeParameters, parameter
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
-from diffdrive_jacobian.messages.plausibility import MAX_POSITION
+from diffdrive_jacobian.messages.conversion import MAX_POSITION
 from diffdrive_jacobian.parameters._fields import (
     STAMPED,
     differ,

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 from diffdrive_jacobian.plots import sketch
+from diffdrive_jacobian.plots.rendering import picture
 from diffdrive_jacobian.plots.sketch import BLUE, DASHED, GREY, RED
-from diffdrive_jacobian.plots.style import picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

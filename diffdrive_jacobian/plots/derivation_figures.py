@@ -12,8 +12,8 @@ import numpy as np
 
 from diffdrive_jacobian.kinematics import diff_drive, rigid_body
 from diffdrive_jacobian.plots import sketch
+from diffdrive_jacobian.plots.rendering import picture
 from diffdrive_jacobian.plots.sketch import BLUE, DASHED, GREEN, GREY, placed
-from diffdrive_jacobian.plots.style import picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

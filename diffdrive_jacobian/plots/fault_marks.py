@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from diffdrive_jacobian.bags.run import Run, Series
-from diffdrive_jacobian.bags.timeline import Trace, seconds
+from diffdrive_jacobian.bags.timeline import Timeline, seconds
 from diffdrive_jacobian.text import printable
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class ViolationMark(NamedTuple):
     """The property, for the legend."""
 
 
-def fault_spans(one: Trace) -> list[FaultSpan]:
+def fault_spans(one: Timeline) -> list[FaultSpan]:
     """Return when the faults of a run began and ended, in the order in which they began."""
     run = one.run
     begun: dict[str, float] = {}
@@ -72,7 +72,7 @@ def _times(run: Run, recorded: Sequence[int]) -> list[float]:
 
 
 def mark_faults(
-    drawing: Figure, panels: Sequence[Axes], one: Trace, violations: Sequence[ViolationMark] = ()
+    drawing: Figure, panels: Sequence[Axes], one: Timeline, violations: Sequence[ViolationMark] = ()
 ) -> None:
     """Mark the faults of a run, and what was violated, in axes over time, and add their legend."""
     spans = fault_spans(one)

@@ -8,8 +8,8 @@ import numpy as np
 
 from diffdrive_jacobian.kinematics.diff_drive import offset_point, wheel_centres
 from diffdrive_jacobian.plots import sketch
+from diffdrive_jacobian.plots.rendering import picture
 from diffdrive_jacobian.plots.sketch import BLUE, DASHED, GREY, RED
-from diffdrive_jacobian.plots.style import picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,8 +10,8 @@ from diffdrive_jacobian.control import StraightLine
 from diffdrive_jacobian.kinematics import inverse_velocity as iv
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 from diffdrive_jacobian.plots import sketch
+from diffdrive_jacobian.plots.rendering import picture
 from diffdrive_jacobian.plots.sketch import BLUE, DASHED, GREY, INK, RED
-from diffdrive_jacobian.plots.style import picture
 from diffdrive_jacobian.simulation import track_line
 from diffdrive_jacobian.simulation.tracking import Tracking
 

@@ -10,8 +10,8 @@ import numpy as np
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.numerics.checks import array
 from diffdrive_jacobian.plots import sketch
+from diffdrive_jacobian.plots.rendering import picture
 from diffdrive_jacobian.plots.sketch import BLUE, GREY, RED
-from diffdrive_jacobian.plots.style import picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -1,9 +1,4 @@
-"""A figure of one or several runs.
-
-It shows the paths in the plane, and over time the distance to the goal, the bearing error, v, omega and
-the wheel speeds with their limits. Where the heading of a goal counts, its error is beside that of the
-bearing. matplotlib is imported when it is drawn. No display is needed.
-"""
+"""The true path of a robot whose odometry drifts."""
 
 from __future__ import annotations
 
@@ -19,16 +14,42 @@ import numpy as np
 
 from diffdrive_jacobian.bags.run import Run
 from diffdrive_jacobian.bags.time_series import commanded, limits, line, measured
-from diffdrive_jacobian.bags.timeline import Array, Trace, tolerance, trace
+from diffdrive_jacobian.bags.timeline import Array, Timeline, jumps, timeline, tolerance
 from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.plots.fault_marks import ViolationMark, mark_faults
-from diffdrive_jacobian.plots.ground_truth import draw_ground_truth, ground_truth_mark
 from diffdrive_jacobian.plots.output_files import FORMATS, create
-from diffdrive_jacobian.plots.rendering import render
-from diffdrive_jacobian.plots.style import styled
+from diffdrive_jacobian.plots.rendering import render, styled
 from diffdrive_jacobian.plots.uncertainty import draw_uncertainty, uncertainty_marks
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
+
 __all__ = ['draw', 'figure']
+
+STYLE: Any = (0, (1, 1))
+WIDTH, COLOR = 1.8, '#222222'
+
+
+def draw_ground_truth(plane: Axes, run: Run, color: str = COLOR) -> None:
+    """Draw the true path with its end, if it was recorded."""
+    series = run.ground_truth
+    if not len(series):
+        return
+    places = series.values[:, :2]
+    plane.plot(*line(places, jumps(series)).T, color=color, ls=STYLE, lw=WIDTH, zorder=2.2)
+    plane.plot(*places[-1], 'D', ms=6, mfc='white', mec=color, mew=1.5, zorder=5)
+
+
+def ground_truth_mark(color: str = COLOR) -> Line2D:
+    """Return the legend of the true path."""
+    from matplotlib.lines import Line2D
+
+    label = 'ground truth and its end'
+    return Line2D(
+        [], [], ls=STYLE, lw=WIDTH, color=color, marker='D', ms=6, mfc='white', mew=1.5, label=label
+    )
+
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -136,7 +157,7 @@ def figure(runs: Sequence[Run], violations: Sequence[ViolationMark] = ()) -> Fig
     """
     from matplotlib.figure import Figure
 
-    traces = [trace(run) for run in runs]
+    timelines = [timeline(run) for run in runs]
     quantities = [
         *(('distance', 'bearing_error') if any(len(run.goals) for run in runs) else ()),
         *('v', 'omega'),
@@ -160,21 +181,23 @@ def figure(runs: Sequence[Run], violations: Sequence[ViolationMark] = ()) -> Fig
             height_ratios=[*[1.0] * rows, 0.03 * rows],
         )
         plane, panels = drawing.add_subplot(grid[:-1, 0]), _panels(drawing, grid, quantities, columns)
-        uncertain = len(runs) == 1 and draw_uncertainty(plane, traces[0])
-        for one, label, color, style in zip(traces, labels, cycle(COLORS), cycle(STYLES), strict=False):
+        uncertain = len(runs) == 1 and draw_uncertainty(plane, timelines[0])
+        for one, label, color, style in zip(
+            timelines, labels, cycle(COLORS), cycle(STYLES), strict=False
+        ):
             _draw_path(plane, one, label, color, style)
             draw_ground_truth(plane, one.run, *([color] if len(runs) > 1 else []))
             for quantity, panel in panels.items():
                 _draw_over_time(panel, one, quantity, color, style, alone=len(runs) == 1)
         if len(runs) == 1:
-            _draw_goal_changes(panels.values(), traces[0])
-        _draw_goals(plane, traces)
-        _finish(plane, traces)
+            _draw_goal_changes(panels.values(), timelines[0])
+        _draw_goals(plane, timelines)
+        _finish(plane, timelines)
         below = drawing.add_subplot(grid[-1, :])
         below.axis('off')
-        marks = [*_marks(traces), *(uncertainty_marks() if uncertain else [])]
+        marks = [*_marks(timelines), *(uncertainty_marks() if uncertain else [])]
         if len(runs) == 1:
-            mark_faults(drawing, list(panels.values()), traces[0], violations)
+            mark_faults(drawing, list(panels.values()), timelines[0], violations)
         if any(len(run.ground_truth) for run in runs):
             marks.append(ground_truth_mark(*([GREY] if len(runs) > 1 else [])))
         below.legend(handles=marks, loc='center', ncol=4 if uncertain else 6, borderaxespad=0.0)
@@ -212,7 +235,7 @@ def _panels(drawing: Figure, grid: Any, quantities: Sequence[str], columns: int)
     return panels
 
 
-def _draw_path(plane: Axes, one: Trace, name: str, color: str, style: Any) -> None:
+def _draw_path(plane: Axes, one: Timeline, name: str, color: str, style: Any) -> None:
     """Draw the path with evenly spaced headings, its start and its end."""
     poses = one.run.odometry.values[:, :3]
     steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
@@ -231,14 +254,14 @@ def _draw_path(plane: Axes, one: Trace, name: str, color: str, style: Any) -> No
     plane.plot(*poses[-1, :2], 's', ms=7, mfc=color, mec='white', mew=0.8, zorder=5)
 
 
-def _draw_goals(plane: Axes, traces: Sequence[Trace]) -> None:
+def _draw_goals(plane: Axes, timelines: Sequence[Timeline]) -> None:
     """Draw each goal once with its tolerance, in the order in which they were sent."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Circle
 
     goals = {
         (round(x, 6), round(y, 6)): tolerance(one.run)
-        for one in traces
+        for one in timelines
         for x, y in one.run.goals.values[:, :2].tolist()
     }
     size, depth = (13, 6.0) if len(goals) <= MARKED else (4, 1.5)
@@ -246,7 +269,7 @@ def _draw_goals(plane: Axes, traces: Sequence[Trace]) -> None:
     plane.add_collection(PatchCollection(circles, fc='none', ec='black', lw=1.0, zorder=depth))
     places = np.reshape([*goals], (-1, 2))
     plane.plot(*places.T, '+', ms=size, mew=1.4, color='black', zorder=depth)
-    places = np.concatenate([line(one.run.odometry.values[:, :2], one.breaks) for one in traces])
+    places = np.concatenate([line(one.run.odometry.values[:, :2], one.breaks) for one in timelines])
     for number, place in enumerate(goals if len(goals) <= NUMBERED else (), 1):
         right, up = _free_corner(places, place)
         plane.annotate(
@@ -273,7 +296,7 @@ def _free_corner(places: Array, place: tuple[float, float]) -> tuple[int, int]:
 
 
 def _draw_over_time(
-    panel: Axes, one: Trace, quantity: str, color: str, style: Any, *, alone: bool
+    panel: Axes, one: Timeline, quantity: str, color: str, style: Any, *, alone: bool
 ) -> None:
     """Draw a quantity and its limits, and for a single run its commands."""
     panel.axhline(0.0, color='#bbbbbb', lw=0.8, zorder=1)
@@ -291,11 +314,11 @@ def _draw_over_time(
         panel.plot(*bound.T, color='black', ls=LIMIT, lw=1.0, drawstyle='steps-post', zorder=3)
 
 
-def _heading_counts(one: Trace) -> bool:
+def _heading_counts(one: Timeline) -> bool:
     return bool(np.isfinite(one.goal_heading_error).any())
 
 
-def _draw_goal_changes(panels: Iterable[Axes], one: Trace) -> None:
+def _draw_goal_changes(panels: Iterable[Axes], one: Timeline) -> None:
     """Draw the changes of goals into axes over time, whose lines are complete.
 
     After a new line, `axvline` computes the limits of all axes that share their time.
@@ -306,9 +329,9 @@ def _draw_goal_changes(panels: Iterable[Axes], one: Trace) -> None:
             panel.axvline(one.time[change], color=GREY, lw=0.9, ls=':', zorder=1)
 
 
-def _finish(plane: Axes, traces: Sequence[Trace]) -> None:
+def _finish(plane: Axes, timelines: Sequence[Timeline]) -> None:
     """Set equal scales of the plane's axes, and add the legend of the runs."""
-    places = np.concatenate([one.run.odometry.values[:, :2] for one in traces])
+    places = np.concatenate([one.run.odometry.values[:, :2] for one in timelines])
     # The noise of a robot at rest must not fill the figure.
     middle = (places.min(axis=0) + places.max(axis=0)) / 2.0
     plane.update_datalim([middle - 0.25, middle + 0.25])
@@ -320,29 +343,29 @@ def _finish(plane: Axes, traces: Sequence[Trace]) -> None:
         bbox_to_anchor=(0.0, 1.0),
         borderaxespad=0.2,
         handlelength=3.0,
-        fontsize=min(9.5, 90.0 / len(traces)),
+        fontsize=min(9.5, 90.0 / len(timelines)),
     )
 
 
-def _marks(traces: Sequence[Trace]) -> list[Line2D]:
+def _marks(timelines: Sequence[Timeline]) -> list[Line2D]:
     """Return the legend of the marks that were drawn."""
     from matplotlib.lines import Line2D
 
-    alone = len(traces) == 1
+    alone = len(timelines) == 1
     marks = [
         Line2D([], [], ls='', marker='o', ms=9, mfc='white', mew=1.8, color=GREY, label='start'),
         Line2D([], [], ls='', marker='s', ms=7, color=GREY, label='end'),
     ]
-    if any(len(one.run.goals) for one in traces):
+    if any(len(one.run.goals) for one in timelines):
         label = 'goal with its tolerance'
         marks.append(Line2D([], [], ls='', marker=r'$\oplus$', ms=12, color='black', label=label))
-    if alone and 0 < np.count_nonzero(np.diff(traces[0].goal)) <= MARKED:
+    if alone and 0 < np.count_nonzero(np.diff(timelines[0].goal)) <= MARKED:
         marks.append(Line2D([], [], ls=':', lw=0.9, color=GREY, label='goal begins or ends'))
-    if alone and any(len(commanded(traces[0], quantity)) for quantity in LABELS):
+    if alone and any(len(commanded(timelines[0], quantity)) for quantity in LABELS):
         marks.append(Line2D([], [], lw=4.5, color=COMMAND, label='commanded'))
-    if any(map(_heading_counts, traces)):
+    if any(map(_heading_counts, timelines)):
         label = 'error of the heading at the goal'
         marks.append(Line2D([], [], ls=HEADING, lw=2.2, color=GREY, label=label))
-    if any(np.isfinite(bounds[..., 1]).any() for one in traces for bounds in limits(one).values()):
+    if any(np.isfinite(bounds[..., 1]).any() for one in timelines for bounds in limits(one).values()):
         marks.append(Line2D([], [], ls=LIMIT, lw=1.0, color='black', label='limit'))
     return marks

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.run import Run, Series
-from diffdrive_jacobian.bags.timeline import Trace, seconds, trace
+from diffdrive_jacobian.bags.timeline import Timeline, seconds, timeline
 from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.plots.output_files import create
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -43,7 +43,7 @@ def table(run: Run) -> NDArray[np.float64]:
     Raises:
         BagError: There is no odometry.
     """
-    one = trace(run)
+    one = timeline(run)
     commands = run.cmd_vel_out if len(run.cmd_vel_out) else run.cmd_vel
     return np.column_stack(
         [
@@ -59,14 +59,14 @@ def table(run: Run) -> NDArray[np.float64]:
     )
 
 
-def _latest(one: Trace, series: Series) -> NDArray[np.float64]:
+def _latest(one: Timeline, series: Series) -> NDArray[np.float64]:
     """Return the latest values at each odometry message, NaN before the first one, shape (n, k)."""
     at, known = _clocks(one, series)
     last = np.searchsorted(known, at, side='right')
     return np.vstack([np.full((1, series.values.shape[1]), np.nan), series.values])[last]
 
 
-def _interpolated(one: Trace, series: Series) -> NDArray[np.float64]:
+def _interpolated(one: Timeline, series: Series) -> NDArray[np.float64]:
     """Return the value at each odometry message, NaN outside of the recorded times, shape (n, 2)."""
     at, known = _clocks(one, series)
     if not len(series):
@@ -75,7 +75,7 @@ def _interpolated(one: Trace, series: Series) -> NDArray[np.float64]:
     return np.column_stack(columns)
 
 
-def _clocks(one: Trace, series: Series) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _clocks(one: Timeline, series: Series) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return times of the odometry and of a series that can be compared and do not decrease (s)."""
     times = one.time, seconds(one.run, series)
     if all((np.diff(time) >= 0.0).all() for time in times):

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diffdrive_jacobian.control.controller import KP, KV, Gain
-from diffdrive_jacobian.plots.rendering import render
-from diffdrive_jacobian.plots.style import styled
+from diffdrive_jacobian.plots.rendering import render, styled
 
 __all__ = ['draw', 'figure']
 

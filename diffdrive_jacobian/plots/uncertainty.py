@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from diffdrive_jacobian.bags.timeline import Array, Indices, Trace
+from diffdrive_jacobian.bags.timeline import Array, Indices, Timeline
 from diffdrive_jacobian.messages.topics import TOPICS
 from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose
 from diffdrive_jacobian.simulation.pose_region import (
@@ -50,7 +50,7 @@ class Uncertainty(NamedTuple):
     """Of x and y, as published, shape (2, 2) (m^2)."""
 
 
-def uncertainties(one: Trace, places: int = PLACES) -> list[Uncertainty]:
+def uncertainties(one: Timeline, places: int = PLACES) -> list[Uncertainty]:
     """Return the uncertainty at evenly spaced places along a path, the last one at its end.
 
     There is none if the odometry has no covariance that grows by the noise of wheels.
@@ -73,7 +73,7 @@ def uncertainties(one: Trace, places: int = PLACES) -> list[Uncertainty]:
     return found
 
 
-def draw_uncertainty(plane: Axes, one: Trace) -> bool:
+def draw_uncertainty(plane: Axes, one: Timeline) -> bool:
     """Draw the regions along a path, and the ellipses. Return whether there are any."""
     drawn = False
     # Otherwise the grids of the regions remove the margins of the axes.

@@ -9,8 +9,8 @@ import numpy as np
 
 from diffdrive_jacobian.kinematics import diff_drive
 from diffdrive_jacobian.plots import sketch
+from diffdrive_jacobian.plots.rendering import picture
 from diffdrive_jacobian.plots.sketch import BLUE, RED
-from diffdrive_jacobian.plots.style import picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

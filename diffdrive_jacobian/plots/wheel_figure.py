@@ -8,8 +8,8 @@ import numpy as np
 
 from diffdrive_jacobian.kinematics import contact
 from diffdrive_jacobian.plots import sketch
+from diffdrive_jacobian.plots.rendering import picture
 from diffdrive_jacobian.plots.sketch import BLUE, DASHED, GREEN, GREY
-from diffdrive_jacobian.plots.style import picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -15,12 +15,10 @@ of your own, derive from `Property` and `Watch`.
 from diffdrive_jacobian.properties._node_time import end_of_faults
 from diffdrive_jacobian.properties.arrival import ArrivesOnceFaultsEnd, KeepsDriving
 from diffdrive_jacobian.properties.base import Property, Watch
-from diffdrive_jacobian.properties.canceling import NoCommandAfterCancel
-from diffdrive_jacobian.properties.goals import ReachesGoal, Settles
+from diffdrive_jacobian.properties.goals import NoCommandAfterCancel, NoStaleGoals, ReachesGoal, Settles
 from diffdrive_jacobian.properties.places import PoseFinite, StaysNear, StaysWithin
 from diffdrive_jacobian.properties.protocol import StatusProtocol
 from diffdrive_jacobian.properties.speed import AccelerationWithin, NeverFasterThan
-from diffdrive_jacobian.properties.stale_goals import NoStaleGoals
 from diffdrive_jacobian.properties.stopping import (
     StopsAfterLastCommand,
     StopsAfterLostOdometry,

@@ -15,11 +15,10 @@ from diffdrive_jacobian.messages.goal_follower import FollowedGoal, GoalFollower
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
 from diffdrive_jacobian.numerics.fields import Name
-from diffdrive_jacobian.properties._goals import Goal, Motion, read_goal, read_status
 from diffdrive_jacobian.properties._messages import Pose, Twist
 from diffdrive_jacobian.properties._node_time import ROUNDING, end_of_faults
 from diffdrive_jacobian.properties.base import Watch
-from diffdrive_jacobian.properties.goals import GoalProperty
+from diffdrive_jacobian.properties.goals import Goal, GoalProperty, Motion, read_goal, read_status
 
 
 @dataclass(frozen=True, repr=False)

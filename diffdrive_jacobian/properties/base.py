@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from diffdrive_jacobian.faults.expression import Expression
+from diffdrive_jacobian.faults.fault import Expression
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.messages.names import full_name

@@ -1,20 +1,103 @@
-"""Reaching goals."""
+"""Observing goals, cancellations and the pose of the robot."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
+from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep.world import Lockstep
+from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, POSE, Status
+from diffdrive_jacobian.messages.goal_follower import UNSTAMPED, Stamp
+from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.numerics.checks import NotNegative, PositiveOrInfinite
 from diffdrive_jacobian.numerics.fields import Name, Names
-from diffdrive_jacobian.properties._goals import Goal, Motion, read_goal
-from diffdrive_jacobian.properties._messages import Pose, Twist
+from diffdrive_jacobian.properties._messages import (
+    FieldReader,
+    Pose,
+    Twist,
+    planar,
+    read_pose,
+    read_twist,
+)
 from diffdrive_jacobian.properties._node_time import ROUNDING
 from diffdrive_jacobian.properties.base import Property, Watch
+
+STANDING = Twist(0.01, 0.05)
+"""Largest twist of a robot that counts as standing."""
+
+
+class Goal(NamedTuple):
+    """A goal of the robot."""
+
+    pose: Pose
+    seconds: float
+    """World time at which it was sent or received (s)."""
+    stamp: tuple[int, int]
+    """Stamp of its message: sec and nanosec."""
+
+
+_read_goal = FieldReader(lambda kind: GOALS.fields if kind.__name__ == 'Goals' else POSE.fields).read
+
+
+def read_goal(message_type: type, message: Any, seconds: float) -> Goal | None:
+    """Return the goal in a PoseStamped, or the last one in a Goals message; None: there is none."""
+    fields = _read_goal(message_type, message)
+    if fields is None:
+        return None
+    sec, nanosec, _, *pose = fields
+    if message_type.__name__ == 'Goals':
+        frames, *columns = pose
+        if not frames:
+            return None
+        pose = [column[-1] for column in columns]
+    return Goal(planar(*pose), seconds, (int(sec), int(nanosec)))
+
+
+_read_status = FieldReader(lambda _: GOAL_STATUS.fields).read
+
+
+def read_status(message_type: type, message: Any) -> Status | None:
+    """Return the status in a GoalStatus; None: the bytes are invalid."""
+    fields = _read_status(message_type, message)
+    return None if fields is None else GOAL_STATUS.value(*map(int, fields))
+
+
+class Motion:
+    """The last pose and twist in the odometry of a robot."""
+
+    def __init__(self, world: Lockstep, topic: str, changed: Callable[[Pose, Twist], None]) -> None:
+        """Observe a topic of odometry. `changed` is called with each pose and its twist."""
+        self.pose: Pose | None = None
+        self.twist: Twist | None = None
+        self._changed = changed
+        world.expect(topic)
+        self.topic = world.on_published(topic, self._on_odometry)
+
+    def _on_odometry(self, publisher: Publisher, message: Any) -> None:
+        self.pose = read_pose(publisher.msg_type, message)
+        self.twist = read_twist(publisher.msg_type, message)
+        if self.pose is not None and self.twist is not None:
+            self._changed(self.pose, self.twist)
+
+    @property
+    def stands(self) -> bool:
+        """Whether the robot stands still."""
+        twist = self.twist
+        return twist is not None and (abs(twist.v) <= STANDING.v and abs(twist.omega) <= STANDING.omega)
+
+    def where(self, goal: Goal | None, of: str = '') -> str:
+        """Return where the robot is, relative to a goal, `of` what."""
+        if self.pose is None or goal is None:
+            return f'there was no odometry on {self.topic}'
+        distance = self.pose.distance(goal.pose)
+        return (
+            f'the robot is {distance:.6g} m from the goal{of} at {goal.pose}: {self.pose}, {self.twist}'
+        )
 
 
 @dataclass(frozen=True, repr=False)
@@ -181,3 +264,117 @@ class _SettlesWatch(_PublishedGoalWatch):
             )
         self.on_motion(self.motion.pose, Twist(0.0, 0.0))
         return self._found
+
+
+@dataclass(frozen=True, repr=False)
+class NoCommandAfterCancel(Property):
+    """A controller publishes no command that moves the robot after its cancel service has responded.
+
+    It may do so again when it has received another goal. Whether the response reports success does not
+    matter. Commands of zero are allowed. Commands of other nodes do not count.
+
+    Attributes:
+        cancel: Service that cancels the goal (default: 'cancel_goal').
+        commands: Topic of type Twist or TwistStamped (default: 'cmd_vel').
+        goals: Topics of the goals (default: ('goal_pose', 'goals')).
+    """
+
+    cancel: Name = field(default='cancel_goal', kw_only=True)
+    commands: Name = field(default='cmd_vel', kw_only=True)
+    goals: Names = field(default=('goal_pose', 'goals'), kw_only=True)
+
+    def watch(self, world: Lockstep) -> Watch:
+        """Begin to observe a run."""
+        return _CancelWatch(self, world)
+
+
+class _CancelWatch(Watch):
+    def __init__(self, required: NoCommandAfterCancel, world: Lockstep) -> None:
+        super().__init__(world)
+        self._canceled: dict[Node, float] = {}
+        world.expect(required.resolved(required.commands))
+        world.expect(required.resolved(required.cancel))
+        self._commands = world.on_published(required.resolved(required.commands), self._on_command)
+        for topic in required.goals:
+            world.on_delivered(required.resolved(topic), self._on_goal)
+        self._cancel = world.on_response(required.resolved(required.cancel), self._on_cancel)
+
+    def _on_goal(self, node: Node, _: type, __: Any) -> None:
+        self._canceled.pop(node, None)
+        self.note(f'{self.name_of(node)} received a goal')
+
+    def _on_cancel(self, node: Node, _: Any) -> None:
+        self._canceled[node] = self.seconds
+        self.note(f'{self.name_of(node)} responded to {self._cancel}')
+
+    def _on_command(self, publisher: Publisher, message: Any) -> None:
+        twist = read_twist(publisher.msg_type, message)
+        node = self.owner(publisher)
+        if node is None or twist is None:
+            return
+        if node in self._canceled and not twist.is_zero:
+            self.found(
+                f'{self._commands}: {twist}, {self.seconds - self._canceled[node]:g} s after '
+                f'{self.name_of(node)} has responded to {self._cancel}; allowed: zero, '
+                'until it receives another goal'
+            )
+        self.note(self._commands, ': ', twist)
+
+
+@dataclass(frozen=True, repr=False)
+class NoStaleGoals(Property):
+    """A controller accepts no goal that is older than one that it has accepted, and none twice.
+
+    The stamps of the goals that it reports as ACCEPTED must increase. Goals without a stamp do not
+    count. When the clock of the nodes jumps back, stamps may decrease. Each publisher is checked on its
+    own.
+
+    Messages may arrive late or repeatedly (`Reorder`, `Duplicate`). A controller that accepts them
+    drives to where nobody wants it any more.
+
+    Attributes:
+        topic: Topic of type action_msgs/GoalStatus (default: 'goal_status').
+    """
+
+    topic: Name = field(default='goal_status', kw_only=True)
+
+    def watch(self, world: Lockstep) -> Watch:
+        """Begin to observe a run."""
+        return _StaleGoalWatch(self, world)
+
+
+class _StaleGoalWatch(Watch):
+    def __init__(self, required: NoStaleGoals, world: Lockstep) -> None:
+        super().__init__(world)
+        self._newest: dict[Publisher, Stamp] = {}
+        self._clock = world.now
+        world.expect(required.resolved(required.topic))
+        self._topic = world.on_published(required.resolved(required.topic), self._on_status)
+
+    def _on_status(self, publisher: Publisher, message: Any) -> None:
+        status = read_status(publisher.msg_type, message)
+        if status is None or status.status != GoalState.ACCEPTED or status.stamp == UNSTAMPED:
+            return
+        self._follow_clock()
+        stamp, newest = status.stamp, self._newest.get(publisher, UNSTAMPED)
+        if stamp <= newest:
+            self.found(
+                f'{self._topic}: ACCEPTED of the goal with stamp {_text(stamp)} s, after one with stamp '
+                f'{_text(newest)} s; allowed: newer stamps'
+            )
+        self._newest[publisher] = stamp
+        self.note(f'{self._topic}: ACCEPTED of the goal with stamp {_text(stamp)} s')
+
+    def check(self) -> str | None:
+        """Return that an old goal was accepted; None: none was."""
+        self._follow_clock()
+        return self._found
+
+    def _follow_clock(self) -> None:
+        if self.world.now < self._clock:
+            self._newest.clear()
+        self._clock = self.world.now
+
+
+def _text(stamp: Stamp) -> str:
+    return f'{stamp[0]}.{stamp[1]:09d}'

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from rclpy.publisher import Publisher
 
 from diffdrive_jacobian.lockstep.world import Lockstep
-from diffdrive_jacobian.messages.plausibility import MAX_POSITION
+from diffdrive_jacobian.messages.conversion import MAX_POSITION
 from diffdrive_jacobian.numerics.checks import NotNegativeOrInfinite
 from diffdrive_jacobian.numerics.fields import Name
 from diffdrive_jacobian.properties._messages import Pose, Twist, read_pose, read_twist

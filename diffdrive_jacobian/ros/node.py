@@ -23,19 +23,23 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 
-from diffdrive_jacobian.messages.cdr import DecodingError
+from diffdrive_jacobian.messages.cdr import DecodingError, integer_warning
 from diffdrive_jacobian.messages.codecs import Codec
-from diffdrive_jacobian.messages.integers import integer_warning
 from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterError, changed
 from diffdrive_jacobian.ros import parameters as ros_parameters
-from diffdrive_jacobian.ros.graph_faults import TYPE_PATIENCE, wrong_type
+from diffdrive_jacobian.ros.graph_faults import (
+    MAX_AGE,
+    TYPE_PATIENCE,
+    Interleaving,
+    LastingFault,
+    SharedGraph,
+    wrong_type,
+)
 from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
 from diffdrive_jacobian.ros.input_guard import guard_inputs
-from diffdrive_jacobian.ros.lasting import Interleaving, LastingFault
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
 from diffdrive_jacobian.ros.rclpy_internals import log_info, time_reader
 from diffdrive_jacobian.ros.serialization import decoding
-from diffdrive_jacobian.ros.shared_graph import MAX_AGE, SharedGraph
 from diffdrive_jacobian.ros.topic_errors import explaining_failure
 
 P = TypeVar('P', bound=NodeParameters)

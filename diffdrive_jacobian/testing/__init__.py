@@ -20,15 +20,14 @@ from typing import TYPE_CHECKING
 from diffdrive_jacobian import lazy
 
 if TYPE_CHECKING:
-    from diffdrive_jacobian.exploration.errors import ExplorationError
     from diffdrive_jacobian.exploration.executors import LocalExecutor, SerialExecutor
     from diffdrive_jacobian.exploration.exploring import explore
     from diffdrive_jacobian.exploration.replay import Replay, reproducing
     from diffdrive_jacobian.exploration.result import Exploration, Finding
-    from diffdrive_jacobian.exploration.scenario import scenario_from
-    from diffdrive_jacobian.exploration.schedules import fault_schedules
-    from diffdrive_jacobian.exploration.strategies import (
+    from diffdrive_jacobian.exploration.scenario import ExplorationError, scenario_from
+    from diffdrive_jacobian.exploration.schedules import (
         angles,
+        fault_schedules,
         gains,
         goals,
         numbers,
@@ -80,16 +79,14 @@ __all__ = [
 ]
 
 _MODULES = {
-    'exploration.errors': ('ExplorationError',),
+    'exploration.scenario': ('ExplorationError', 'scenario_from'),
     'exploration.executors': ('LocalExecutor', 'SerialExecutor'),
     'exploration.exploring': ('explore',),
     'exploration.replay': ('Replay', 'reproducing'),
     'exploration.result': ('Exploration', 'Finding'),
-    'exploration.scenario': ('scenario_from',),
-    'exploration.schedules': ('fault_schedules',),
-    'exploration.strategies': (
+    'exploration.schedules': (
         *('angles', 'gains', 'goals', 'numbers', 'points', 'poses', 'probabilities', 'times'),
-        'waypoints',
+        *('fault_schedules', 'waypoints'),
     ),
     'lockstep._errors': ('IneffectiveFaultsError', 'LockstepError', 'PropertyViolation'),
     'lockstep.external.expectations': ('Answers', 'Every', 'Idle'),

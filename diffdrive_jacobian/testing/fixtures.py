@@ -1,18 +1,11 @@
-"""The plugin of pytest. It is loaded by its entry point, wherever this package is installed.
-
-`lockstep` is a new `Lockstep` for each test. `robot_at(x, y, theta)` adds a virtual robot to it.
-`recorded_run` records the test as a bag and a figure, which are kept if it fails. `golden_run` compares
-the test with a recorded run. The marker `lockstep(args=..., start=..., patience=...)` passes arguments
-to `Lockstep`. The report of a failed test ends with the last messages of all topics.
-
-pytest loads this module in every project. Until a fixture is used it imports neither rclpy nor NumPy and
-leaves the environment as it is.
-"""
+"""Names of the files that tests leave behind, after the tests."""
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -21,13 +14,41 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from diffdrive_jacobian.testing.artifacts import artifact_name, name_beside_the_file
-
 if TYPE_CHECKING:
     from diffdrive_jacobian.lockstep.world import Lockstep
     from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
     from diffdrive_jacobian.testing.golden_run import GoldenRun
     from diffdrive_jacobian.testing.recorded_run import RecordedRun
+
+MAX_LENGTH = 120
+"""Length of the longest name. A name in a directory can have 255 bytes."""
+
+
+def artifact_name(nodeid: str) -> str:
+    """Return a name for the files of a test: `dir/test_a.py::Test::test_b[1.0-x]` is
+    `dir.test_a.Test.test_b-1.0-x`.
+
+    It has only letters, digits and `_ . + -`, so that shells and archives accept it. Different tests
+    have different names: where something else had to be replaced, a part of a hash follows.
+    """
+    place, _, tests = nodeid.partition('::')
+    path = re.sub(r'\.py$', '', place).replace('/', '.')
+    function, bracket, parameters = tests.partition('[')
+    name = path + (f'.{function.replace("::", ".")}' if function else '')
+    if bracket:
+        name += f'-{parameters.removesuffix("]")}'
+    safe = re.sub(r'[^A-Za-z0-9_.+-]+', '_', name).lstrip('.-')
+    if safe == name and len(safe) <= MAX_LENGTH:
+        return safe
+    digest = hashlib.sha256(nodeid.encode(errors='surrogateescape')).hexdigest()[:8]
+    return f'{safe[: MAX_LENGTH - 9]}-{digest}'
+
+
+def name_beside_the_file(nodeid: str) -> str:
+    """Return a name for the files of a test in the directory of its module, without the directories."""
+    place, separator, tests = nodeid.partition('::')
+    return artifact_name(place.rpartition('/')[2] + separator + tests)
+
 
 CHECK_FIELDS = 'ROS_PYTHON_CHECK_FIELDS'
 """Environment variable that each message module reads when it is imported."""

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from diffdrive_jacobian.errors import UserError
-from diffdrive_jacobian.messages.plausibility import MAX_POSITION
+from diffdrive_jacobian.messages.conversion import MAX_POSITION
 from diffdrive_jacobian.numerics import fields
 from diffdrive_jacobian.numerics.fields import Check, between, finite, inside, integer, one_of
 from diffdrive_jacobian.parameters.configurations import configurations

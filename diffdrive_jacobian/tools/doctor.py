@@ -7,17 +7,18 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 
-from diffdrive_jacobian.diagnosis.clocks import check_clocks
 from diffdrive_jacobian.diagnosis.description import Finding, Graph, Participant
-from diffdrive_jacobian.diagnosis.environment import Environment, check_environment, environment
+from diffdrive_jacobian.diagnosis.graph import check_clocks, check_topics
 from diffdrive_jacobian.diagnosis.machine import (
+    Environment,
+    check_environment,
     check_network,
     check_shared_memory,
+    environment,
     interfaces,
     multicast_error,
     shared_memory,
 )
-from diffdrive_jacobian.diagnosis.topics import check_topics
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from diffdrive_jacobian import plots
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.plots.output_files import FORMATS, create, extension, new_file
-from diffdrive_jacobian.plots.rendering import render
-from diffdrive_jacobian.plots.style import styled
+from diffdrive_jacobian.plots.rendering import render, styled
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import _cli, _options
 from diffdrive_jacobian.tools._messages import busy, explaining_no_matplotlib

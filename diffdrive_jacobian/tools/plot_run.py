@@ -11,7 +11,7 @@ from pathlib import Path
 from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
 from diffdrive_jacobian.bags.run import Run
 from diffdrive_jacobian.bags.run_reader import read_run
-from diffdrive_jacobian.bags.timeline import trace
+from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.messages.topics import READABLE
 from diffdrive_jacobian.plots.output_files import FORMATS, NOT_OVERWRITTEN, check_directory
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                     )
                 )
             # A run without odometry is reported before the others are read.
-            trace(runs[-1])
+            timeline(runs[-1])
             for note in runs[-1].notes:
                 print(f'{PROGRAM}: {printable(bag, PATH_LIMIT)}: {note}', file=sys.stderr)
             if signals.count:

@@ -1,4 +1,8 @@
-"""Residuals of the calibration and their Jacobians, as normal equations of poses and parameters."""
+"""Symmetric positive definite block-tridiagonal systems, solved by cyclic reduction.
+
+Each level eliminates every other block, all of them at once as NumPy arrays, so that a chain of n blocks
+takes log2(n) steps of Python.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.calibration.estimate import (
+from diffdrive_jacobian.calibration.fit import (
     LEVER_ARM,
     MULTIPLIERS,
     TIME_OFFSETS,
@@ -26,6 +30,55 @@ from diffdrive_jacobian.calibration.motion import (
 )
 from diffdrive_jacobian.kinematics.se2 import adjoint
 from diffdrive_jacobian.numerics.elementary import wrap
+
+
+def solve_block_tridiagonal(diagonal: Array, upper: Array, right: Array) -> tuple[Array, float]:
+    """Solve `A x = b` and compute log det A.
+
+    Args:
+        diagonal: Blocks A[i, i], shape (n, 3, 3).
+        upper: Blocks A[i, i + 1], shape (n - 1, 3, 3).
+        right: b, shape (n, 3, m); m may be 0.
+
+    Returns:
+        x, shape (n, 3, m), and log det A. It is infinite or NaN where A is singular.
+
+    Raises:
+        numpy.linalg.LinAlgError: A block is exactly singular.
+    """
+    levels = []
+    logarithm = 0.0
+    while len(diagonal) > 1:
+        count = len(diagonal)
+        if count % 2 == 0:
+            # An uncoupled block at the end, which is dropped below, gives each odd block two neighbours.
+            diagonal = np.concatenate([diagonal, np.eye(3)[None]])
+            upper = np.concatenate([upper, np.zeros((1, 3, 3))])
+            right = np.concatenate([right, np.zeros((1, *right.shape[1:]))])
+        before, after = np.swapaxes(upper[0::2], 1, 2), upper[1::2]
+        odd = diagonal[1::2]
+        logarithm += float(np.linalg.slogdet(odd)[1].sum())
+        inverse = np.linalg.inv(odd)
+        to_before, to_after = inverse @ before, inverse @ after
+        value = inverse @ right[1::2]
+        levels.append((count, to_before, to_after, value))
+        next_diagonal, next_right = diagonal[0::2].copy(), right[0::2].copy()
+        before_t, after_t = upper[0::2], np.swapaxes(after, 1, 2)
+        next_diagonal[:-1] -= before_t @ to_before
+        next_diagonal[1:] -= after_t @ to_after
+        next_right[:-1] -= before_t @ value
+        next_right[1:] -= after_t @ value
+        kept = (count + 1) // 2
+        upper = (-before_t @ to_after)[: kept - 1]
+        diagonal, right = next_diagonal[:kept], next_right[:kept]
+    logarithm += float(np.linalg.slogdet(diagonal[0])[1])
+    solution = np.linalg.inv(diagonal) @ right
+    for count, to_before, to_after, value in reversed(levels):
+        whole = np.zeros((2 * len(value) + 1, *solution.shape[1:]))
+        whole[0 : 2 * len(solution) : 2] = solution
+        whole[1::2] = value - to_before @ whole[0:-1:2] - to_after @ whole[2::2]
+        solution = whole[:count]
+    return solution, logarithm
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

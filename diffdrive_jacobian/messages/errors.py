@@ -1,9 +1,0 @@
-"""Errors of messages."""
-
-from __future__ import annotations
-
-from diffdrive_jacobian.errors import DiffdriveError
-
-
-class MessageError(DiffdriveError, ValueError):
-    """A message with invalid content."""
