@@ -9,7 +9,7 @@ from geometry_msgs.msg import PoseStamped
 from ros_messages import pose_message, stamp
 from sensor_msgs.msg import JointState
 
-from diffdrive_jacobian.calibration.measurements import Noise, Recording
+from diffdrive_jacobian.calibration.measurements import CalibrationDrive, Noise
 from diffdrive_jacobian.calibration.motion import Geometry, composed
 
 NOMINAL = Geometry(wheel_radius=0.033, wheel_separation=0.16)
@@ -97,7 +97,7 @@ class Simulation:
         here = slice(3, -3, self.rate)
         poses = self.observed(self.truth(random)[here], random)
         poses[:, 2] = (poses[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
-        return Recording(
+        return CalibrationDrive(
             name=name,
             wheel_time=self.drive.time,
             wheel_angles=self.drive.angles,

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from diffdrive_jacobian.live.commands import (
     CommandError,
-    Drive,
+    DriveByHand,
     Pause,
     Seek,
     SendGoal,
@@ -30,7 +30,7 @@ SET = {'do': 'set', 'robot': '/', 'parameter': 'controller/controller', 'value':
     [
         (GOAL, SendGoal('/', 1.0, -2.5, None, append=False)),
         ({**GOAL, 'theta': 3.0, 'append': True}, SendGoal('/', 1.0, -2.5, 3.0, append=True)),
-        (DRIVE, Drive('/a', 0.2, -1.0)),
+        (DRIVE, DriveByHand('/a', 0.2, -1.0)),
         ({'do': 'pause', 'paused': True}, Pause(paused=True)),
         ({'do': 'step'}, Step()),
         ({'do': 'speed', 'speed': 5}, SetSpeed(5.0)),

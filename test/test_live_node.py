@@ -18,7 +18,7 @@ from diffdrive_jacobian.live import node as live_node
 from diffdrive_jacobian.live.commands import (
     CancelGoal,
     ClearPath,
-    Drive,
+    DriveByHand,
     Pause,
     Place,
     Release,
@@ -177,7 +177,7 @@ def test_driving_by_hand_cancels_the_goal_first_and_stops_with_the_page(driven):
     commands = driven.world.listen(Twist, 'cmd_vel')
     driven.send(goal(5.0, 0.0))
     driven.until(lambda: driven.state() == 'executing')
-    driven.send(Drive('/', 0.25, 0.5))
+    driven.send(DriveByHand('/', 0.25, 0.5))
     driven.until(lambda: driven.robot()['by_hand'] and driven.robot()['commanded'], timeout=2.0)
     driven.until(lambda: commands[-1].linear.x == 0.25, timeout=2.0)
     assert driven.state() == 'canceled'
@@ -197,7 +197,7 @@ def test_driving_by_hand_cancels_the_goal_first_and_stops_with_the_page(driven):
 
 def test_driving_by_hand_sends_25_commands_per_second_however_often_the_page_is_asked(driven):
     commands = driven.world.listen(Twist, 'cmd_vel')
-    driven.send(Drive('/', 0.25, 0.5))
+    driven.send(DriveByHand('/', 0.25, 0.5))
     begin = driven.world.elapsed
     while driven.world.elapsed < begin + 1.0:
         for _ in range(5):
@@ -207,12 +207,12 @@ def test_driving_by_hand_sends_25_commands_per_second_however_often_the_page_is_
 
 
 def test_a_goal_is_refused_while_the_robot_is_driven_by_hand(driven):
-    driven.send(Drive('/', 0.2, 0.0), goal(1.0, 0.0))
+    driven.send(DriveByHand('/', 0.2, 0.0), goal(1.0, 0.0))
     driven.pass_time(0.1)
     assert any('release the keys' in text for text in driven.texts)
     assert not driven.robot()['goal']['active']
     other = driven.session.enter()
-    driven.send(Drive('/', -0.9, 0.0), page=other)
+    driven.send(DriveByHand('/', -0.9, 0.0), page=other)
     driven.pass_time(0.1)
     assert 'another page drives this robot by hand' in driven.texts
     assert driven.robot()['twist'][0] == pytest.approx(0.2)
@@ -345,7 +345,7 @@ def test_a_robot_without_a_controller(live):
 def test_a_robot_that_takes_stamped_commands(live):
     live.world.add(make_complete(VirtualRobot, enable_stamped_cmd_vel=True))
     live.until(lambda: live.robot())
-    live.send(Drive('/', 0.3, 0.0))
+    live.send(DriveByHand('/', 0.3, 0.0))
     live.until(lambda: live.robot()['twist'][0] == pytest.approx(0.3), timeout=2.0)
 
 

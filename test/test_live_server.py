@@ -15,7 +15,7 @@ from chromium import until
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from diffdrive_jacobian.live.commands import Drive
+from diffdrive_jacobian.live.commands import DriveByHand
 from diffdrive_jacobian.live.server import (
     MAX_INVALID,
     MAX_PAGES,
@@ -194,7 +194,7 @@ def test_commands_arrive_with_their_page(server):
         second.send(DRIVE)
         taken = []
         until(lambda: taken.extend(session_of(server).take_commands()) or len(taken) == 2, 'commands')
-    assert [command for _, command in taken] == [Drive('/', 0.2, 0.0)] * 2
+    assert [command for _, command in taken] == [DriveByHand('/', 0.2, 0.0)] * 2
     numbers = [number for number, _ in taken]
     assert len(set(numbers)) == 2
     until(lambda: not any(map(session_of(server).is_open, numbers)), 'both pages are gone')

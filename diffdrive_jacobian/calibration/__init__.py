@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 from diffdrive_jacobian import lazy
 from diffdrive_jacobian.calibration.calibrate import PARAMETERS, Calibration, calibrate
 from diffdrive_jacobian.calibration.measurements import (
+    CalibrationDrive,
     CalibrationError,
     Given,
     Noise,
-    Recording,
 )
 from diffdrive_jacobian.calibration.motion import Geometry
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 __all__ = [
     'PARAMETERS',
     'Calibration',
+    'CalibrationDrive',
     'CalibrationError',
     'Geometry',
     'Given',
     'Noise',
-    'Recording',
     'WheelsAndReference',
     'calibrate',
     'read_wheels_and_reference',

@@ -20,10 +20,10 @@ from diffdrive_jacobian.calibration.fit import (
 from diffdrive_jacobian.calibration.initial_estimate import initial_estimate, unit
 from diffdrive_jacobian.calibration.measurements import (
     Array,
+    CalibrationDrive,
     CalibrationError,
     Given,
     Noise,
-    Recording,
     Segment,
 )
 from diffdrive_jacobian.calibration.motion import Geometry, composed
@@ -78,7 +78,7 @@ class Calibration:
 
     nominal: Geometry
     estimate: Estimate
-    recordings: tuple[Recording, ...]
+    recordings: tuple[CalibrationDrive, ...]
     segments: tuple[Segment, ...]
     """Continuous motions; poses at rest are not merged."""
     motions: tuple[Segment, ...]
@@ -136,7 +136,7 @@ class Calibration:
 
 
 def calibrate(
-    recordings: Sequence[Recording], nominal: Geometry, given: Given | None = None
+    recordings: Sequence[CalibrationDrive], nominal: Geometry, given: Given | None = None
 ) -> Calibration:
     """Estimate the multipliers of the wheel radii and of the wheel separation.
 
@@ -186,7 +186,7 @@ def _misfit(noise: Noise) -> float:
 
 
 def _calibrated(
-    recordings: tuple[Recording, ...], nominal: Geometry, given: Given, smooth: bool
+    recordings: tuple[CalibrationDrive, ...], nominal: Geometry, given: Given, smooth: bool
 ) -> Calibration:
     notes = [note for one in recordings for note in sampling_notes(one)]
     offsets = np.zeros(len(recordings))
@@ -252,7 +252,7 @@ def _calibrated(
     return replace(result, notes=tuple(notes))
 
 
-def _check(one: Recording) -> None:
+def _check(one: CalibrationDrive) -> None:
     for what, time, values in (
         ('the wheels', one.wheel_time, one.wheel_angles),
         ('the reference', one.pose_time, one.poses),

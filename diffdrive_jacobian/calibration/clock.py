@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.calibration.measurements import Array, CalibrationError, Recording
+from diffdrive_jacobian.calibration.measurements import Array, CalibrationDrive, CalibrationError
 from diffdrive_jacobian.calibration.motion import Geometry
 
 WINDOW = 0.5
@@ -38,7 +38,7 @@ PERFECT = 0.99
 REMEDY = 'synchronize the clocks, or give the offset (--time-offset of calibrate_run)'
 
 
-def time_offset(recording: Recording, nominal: Geometry) -> float | None:
+def time_offset(recording: CalibrationDrive, nominal: Geometry) -> float | None:
     """Return what must be added to the times of the poses; None: the speeds do not show it.
 
     Raises:
@@ -151,14 +151,14 @@ def _differences(time: Array, values: Array, step: float, window: float) -> Arra
     return np.asarray((ends[1] - ends[0]) / window)
 
 
-def _wheel_speeds(recording: Recording, nominal: Geometry, step: float, window: float) -> Array:
+def _wheel_speeds(recording: CalibrationDrive, nominal: Geometry, step: float, window: float) -> Array:
     """Return the forward speed, not negative, and the yaw rate, shape (n, 2)."""
     right, left = _differences(recording.wheel_time, recording.wheel_angles, step, window).T
     r, L = nominal.wheel_radius, nominal.wheel_separation
     return np.column_stack([np.abs(right + left) * r / 2.0, (right - left) * r / L])
 
 
-def _pose_speeds(recording: Recording, step: float, window: float) -> Array:
+def _pose_speeds(recording: CalibrationDrive, step: float, window: float) -> Array:
     """Return the speed of the sensor and the yaw rate, shape (n, 2)."""
     values = np.column_stack([recording.poses[:, :2], np.unwrap(recording.poses[:, 2])])
     dx, dy, turn = _differences(recording.pose_time, values, step, window).T

@@ -26,7 +26,7 @@ from diffdrive_jacobian.bags.message_definitions import (
     recorded_definition_differs,
     type_hashes,
 )
-from diffdrive_jacobian.calibration.measurements import Recording
+from diffdrive_jacobian.calibration.measurements import CalibrationDrive
 from diffdrive_jacobian.calibration.samples import (
     POSES,
     JointRows,
@@ -170,7 +170,7 @@ WHEELS, REFERENCE = 'joint_states', 'ground_truth'
 class WheelsAndReference:
     """What a bag has for a calibration."""
 
-    recording: Recording
+    recording: CalibrationDrive
     wheels_topic: str
     reference_topic: str
     wheel_names: tuple[str, str]
@@ -234,7 +234,7 @@ def read_wheels_and_reference(
     else:
         angles = unwrapped(wheel_seconds, angles, f'{where}: {wheels_topic}')
     return WheelsAndReference(
-        recording=Recording(
+        recording=CalibrationDrive(
             name=str(where),
             wheel_time=wheel_seconds,
             wheel_angles=angles,

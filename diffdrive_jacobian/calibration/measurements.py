@@ -17,7 +17,7 @@ class CalibrationError(DiffdriveError):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Recording:
+class CalibrationDrive:
     """One drive. Both times are of the same clock, up to a constant offset."""
 
     name: str

@@ -13,8 +13,8 @@ from diffdrive_jacobian.calibration.encoder import densified, located, poses_apa
 from diffdrive_jacobian.calibration.initial_estimate import InitialEstimate
 from diffdrive_jacobian.calibration.measurements import (
     Array,
+    CalibrationDrive,
     CalibrationError,
-    Recording,
     Segment,
 )
 from diffdrive_jacobian.calibration.motion import Geometry
@@ -73,7 +73,7 @@ MOST_JUMPS = 0.05
 
 
 def overlapping(
-    recording: Recording, index: int, offset: float, radius: float, smooth: bool = True
+    recording: CalibrationDrive, index: int, offset: float, radius: float, smooth: bool = True
 ) -> list[Segment]:
     """Return the continuous motions of a recording: its times in common, split at gaps of the wheels.
 
@@ -125,7 +125,7 @@ def overlapping(
     return found
 
 
-def thinned_samples(recording: Recording) -> Recording:
+def thinned_samples(recording: CalibrationDrive) -> CalibrationDrive:
     """Return a recording with at most `MOST_SAMPLES` samples of wheels and of the reference each."""
     wheels = slice(None, None, -(-len(recording.wheel_time) // MOST_SAMPLES) or 1)
     poses = slice(None, None, -(-len(recording.pose_time) // MOST_SAMPLES) or 1)
@@ -165,7 +165,7 @@ def gaps(time: Array) -> list[tuple[float, float]]:
     return [(float(time[i]), float(steps[i])) for i in long]
 
 
-def sampling_notes(one: Recording) -> list[str]:
+def sampling_notes(one: CalibrationDrive) -> list[str]:
     """Return descriptions of gaps, and of wheels that are recorded too rarely."""
     lines = []
     period = float(np.median(np.diff(one.wheel_time)))

@@ -12,7 +12,7 @@ INFINITE = 2**63 - 1
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Problem:
     """Something that is wrong or worth knowing, and what to do about it."""
 
     what: str

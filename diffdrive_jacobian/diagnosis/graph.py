@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 from diffdrive_jacobian.diagnosis.description import (
     Endpoint,
-    Finding,
     Graph,
+    Problem,
     Quality,
     Stream,
 )
@@ -27,7 +27,7 @@ def _known(topic: str) -> Topic:
     return TOPICS.get(base_name(topic), _UNKNOWN)
 
 
-def check_topics(graph: Graph) -> Iterator[Finding]:
+def check_topics(graph: Graph) -> Iterator[Problem]:
     """Yield what keeps nodes from communicating."""
     yield from _check_names(graph)
     for topic in graph.topics():
@@ -36,18 +36,18 @@ def check_topics(graph: Graph) -> Iterator[Finding]:
         yield from _check_ends(graph, topic)
 
 
-def _check_names(graph: Graph) -> Iterator[Finding]:
+def _check_names(graph: Graph) -> Iterator[Problem]:
     names = Counter(node.name for node in graph.nodes)
     for name, count in sorted(names.items()):
         if count > 1:
-            yield Finding(
+            yield Problem(
                 f'{count} nodes have the name {name}',
                 'stop one of them, or give each a name or a namespace of its own (-r __node:=NAME, '
                 '-r __ns:=/NAME); one that was killed disappears within 20 s',
             )
 
 
-def _check_types(graph: Graph, topic: str) -> Iterator[Finding]:
+def _check_types(graph: Graph, topic: str) -> Iterator[Problem]:
     publishers: dict[str, list[str]] = {}
     subscriptions: dict[str, list[str]] = {}
     for one in graph.publishers(topic):
@@ -57,7 +57,7 @@ def _check_types(graph: Graph, topic: str) -> Iterator[Finding]:
     for theirs, sources in sorted(publishers.items()):
         for ours, sinks in sorted(subscriptions.items()):
             if theirs != ours:
-                yield Finding(
+                yield Problem(
                     f'{listed(sources)} publishes {topic} as {theirs}, but {listed(sinks)} subscribes '
                     f'to it as {ours}: no message arrives',
                     type_remedy(theirs, ours),
@@ -106,14 +106,14 @@ INFINITE_FROM = 2**62
 """Durations from here on mean no limit (ns): implementations of DDS round the largest one."""
 
 
-def _check_quality(graph: Graph, topic: str) -> Iterator[Finding]:
+def _check_quality(graph: Graph, topic: str) -> Iterator[Problem]:
     for subscription in graph.subscriptions(topic):
         publishers = [one for one in graph.publishers(topic) if one.kind == subscription.kind]
         bad = [one for one in publishers if mismatch(one.quality, subscription.quality)]
         for publisher in bad:
             reasons = mismatch(publisher.quality, subscription.quality)
             rest = ' It receives the other publishers.' if len(bad) < len(publishers) else ''
-            yield Finding(
+            yield Problem(
                 f'{subscription.node} receives nothing of {publisher.node} on {topic}, because their '
                 f'quality of service does not match ({"; ".join(reasons)}).{rest}',
                 f'change one of both; for nodes of this package as in -p '
@@ -128,7 +128,7 @@ def _changed_policy(reason: str) -> str:
     }.get(reason.split(':')[0], 'POLICY:=VALUE')
 
 
-def _check_ends(graph: Graph, topic: str) -> Iterator[Finding]:
+def _check_ends(graph: Graph, topic: str) -> Iterator[Problem]:
     known, publishers = _known(topic), [one.node for one in graph.publishers(topic)]
     # A node that listens to what it publishes itself, as go_to_goal may, does not act on it.
     subscriptions = [one.node for one in graph.subscriptions(topic) if one.node not in publishers]
@@ -136,7 +136,7 @@ def _check_ends(graph: Graph, topic: str) -> Iterator[Finding]:
         remedy = fault.remedy(known)
         if remedy and fault.present(len(publishers), len(subscriptions)):
             missing_end = fault in (UNREAD, UNPUBLISHED)
-            yield Finding(
+            yield Problem(
                 fault.found(topic, publishers, subscriptions),
                 remedy + (_namesake(graph, topic, publishes=not publishers) if missing_end else ''),
                 # Tools that publish goals come and go.
@@ -165,7 +165,7 @@ PATIENCE = 1.0
 """Shortest observation after which a silent /clock is reported (s)."""
 
 
-def check_clocks(graph: Graph) -> Iterator[Finding]:
+def check_clocks(graph: Graph) -> Iterator[Problem]:
     """Yield what is wrong with the clocks of the nodes."""
     publishers = [one.node for one in graph.publishers(CLOCK)]
     simulated = [node.name for node in graph.nodes if node.use_sim_time]
@@ -173,12 +173,12 @@ def check_clocks(graph: Graph) -> Iterator[Finding]:
         node.name for node in graph.nodes if node.use_sim_time is False and node.name not in publishers
     ]
     if len(publishers) > 1:
-        yield Finding(
+        yield Problem(
             f'{listed(publishers)} publish {CLOCK}: the time jumps back and forth',
             'stop all but one (a simulator, replay_run --clock or ros2 bag play --clock)',
         )
     if simulated and not publishers:
-        yield Finding(
+        yield Problem(
             f'{listed(simulated)} uses simulated time (use_sim_time), but nobody publishes {CLOCK}: '
             'its time stands at zero',
             'start the simulator, or set use_sim_time to false',
@@ -186,13 +186,13 @@ def check_clocks(graph: Graph) -> Iterator[Finding]:
     if publishers and graph.seconds >= PATIENCE:
         yield from _check_messages(graph, publishers, simulated)
     if simulated and real and publishers:
-        yield Finding(
+        yield Problem(
             f'{listed(simulated)} uses simulated time, {listed(real)} does not: their stamps cannot be '
             'compared',
             'set use_sim_time to the same value everywhere (-p use_sim_time:=true)',
         )
     elif publishers and real:
-        yield Finding(
+        yield Problem(
             f'{listed(publishers)} publishes {CLOCK}, but no node uses it',
             'set use_sim_time to true (-p use_sim_time:=true) if it is the time of the robot',
             problem=False,
@@ -201,27 +201,27 @@ def check_clocks(graph: Graph) -> Iterator[Finding]:
         yield from _check_stamps(graph, stream)
 
 
-def _check_messages(graph: Graph, publishers: list[str], simulated: list[str]) -> Iterator[Finding]:
+def _check_messages(graph: Graph, publishers: list[str], simulated: list[str]) -> Iterator[Problem]:
     if not graph.clock.messages:
-        yield Finding(
+        yield Problem(
             f'nothing was received on {CLOCK} in {graph.seconds:.1f} s, although '
             f'{listed(publishers)} publishes it',
             'start or resume the simulator; it may be paused',
             problem=bool(simulated),
         )
     elif graph.clock.messages > 1 and graph.clock.advanced <= 0.0 and not graph.clock.went_back:
-        yield Finding(
+        yield Problem(
             f'the time on {CLOCK} stands still', 'resume the simulator', problem=bool(simulated)
         )
     elif graph.clock.went_back:
-        yield Finding(
+        yield Problem(
             f'the time on {CLOCK} went back {graph.clock.went_back} times in {graph.seconds:.1f} s',
             'one source must publish it; a bag that loops sets it back at each round',
             problem=bool(simulated),
         )
 
 
-def _check_stamps(graph: Graph, stream: Stream) -> Iterator[Finding]:
+def _check_stamps(graph: Graph, stream: Stream) -> Iterator[Problem]:
     clocks = {node.name: node.use_sim_time for node in graph.nodes}
     nodes = [one.node for one in graph.publishers(stream.topic)]
     known = {clocks.get(node) for node in nodes}
@@ -235,7 +235,7 @@ def _check_stamps(graph: Graph, stream: Stream) -> Iterator[Finding]:
     if -MAX_AHEAD <= age <= MAX_AGE:
         return
     where = f'{age:.3g} s old on receipt' if age > 0.0 else f'{-age:.3g} s in the future'
-    yield Finding(
+    yield Problem(
         f'the messages of {listed(nodes)} on {stream.topic} have stamps that are {where}',
         'set the clocks of the machines (chrony or NTP), and use_sim_time to the same value everywhere',
     )

@@ -17,7 +17,7 @@ from importlib import metadata
 from pathlib import Path
 
 from diffdrive_jacobian import __version__
-from diffdrive_jacobian.diagnosis.description import Finding
+from diffdrive_jacobian.diagnosis.description import Problem
 from diffdrive_jacobian.text import format_size, printable
 
 DISTRIBUTION = 'jazzy'
@@ -116,7 +116,7 @@ def _file(wheel: metadata.Distribution, package: str) -> Path:
     return Path(str(wheel.locate_file(f'{package}/__init__.py'))).resolve()
 
 
-def check_environment(found: Environment) -> Iterator[Finding]:
+def check_environment(found: Environment) -> Iterator[Problem]:
     """Yield what is wrong with the environment."""
     yield from _check_versions(found)
     yield from _check_domain(found)
@@ -124,17 +124,17 @@ def check_environment(found: Environment) -> Iterator[Finding]:
     for name in PROFILES:
         path = found.variables.get(name)
         if path and not Path(path).is_file():
-            yield Finding(
+            yield Problem(
                 f'{name} names a file that does not exist: {printable(path)}',
                 f'unset {name}, or correct it',
             )
 
 
-def _check_versions(found: Environment) -> Iterator[Finding]:
+def _check_versions(found: Environment) -> Iterator[Problem]:
     install = "pip install '.[jazzy]' in a clone of diffdrive_jacobian"
     missing = [name for name in ROS_PACKAGES if name not in found.sources]
     if missing:
-        yield Finding(
+        yield Problem(
             f'there is no {", ".join(missing)}',
             f'source the setup file of a ROS installation (. /opt/ros/{DISTRIBUTION}/setup.bash), or '
             f'call {install}',
@@ -144,7 +144,7 @@ def _check_versions(found: Environment) -> Iterator[Finding]:
         for source in set(found.sources.values())
     }
     if len(by_source) > 1:
-        yield Finding(
+        yield Problem(
             f'two installations of ROS are mixed: {", ".join(by_source[WHEELS])} from {WHEELS}, '
             f'{", ".join(by_source[INSTALLATION])} from a {INSTALLATION}',
             'use a virtual environment without the wheels beside a sourced ROS installation, or a shell '
@@ -152,66 +152,66 @@ def _check_versions(found: Environment) -> Iterator[Finding]:
         )
     version = found.versions.get('rclpy', WHEEL_VERSION)
     if found.sources.get('rclpy') == WHEELS and not version.startswith(WHEEL_VERSION):
-        yield Finding(
+        yield Problem(
             f'rclpy {version} is not that of ROS 2 Jazzy ({WHEEL_VERSION}x)', f'call {install}'
         )
     if found.rmw_missing:
-        yield Finding(
+        yield Problem(
             f'RMW_IMPLEMENTATION is {printable(found.variables["RMW_IMPLEMENTATION"])}, which is not '
             'installed: no node can start',
             f'unset RMW_IMPLEMENTATION, or install it (the wheels have {WHEEL_RMW} only)',
         )
     distribution = found.variables.get('ROS_DISTRO', DISTRIBUTION)
     if distribution != DISTRIBUTION:
-        yield Finding(
+        yield Problem(
             f'ROS_DISTRO is {printable(distribution)}, this package is made for {DISTRIBUTION}',
             f'. /opt/ros/{DISTRIBUTION}/setup.bash in a new shell',
             problem=False,
         )
 
 
-def _check_domain(found: Environment) -> Iterator[Finding]:
+def _check_domain(found: Environment) -> Iterator[Problem]:
     domain = found.domain
     if not (domain.isascii() and domain.isdecimal() and int(domain) <= MAX_DOMAIN):
-        yield Finding(
+        yield Problem(
             f'ROS_DOMAIN_ID must be in 0 to {MAX_DOMAIN}, got {printable(domain)!r}',
             'export ROS_DOMAIN_ID=0, the same everywhere',
         )
     elif int(domain) > SAFE_DOMAIN:
-        yield Finding(
+        yield Problem(
             f'the ports of ROS_DOMAIN_ID {domain} can be taken by other programs',
             f'choose one in 0 to {SAFE_DOMAIN}',
             problem=False,
         )
 
 
-def _check_discovery(found: Environment) -> Iterator[Finding]:
+def _check_discovery(found: Environment) -> Iterator[Problem]:
     given = found.variables.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '')
     if given and given not in RANGES:
-        yield Finding(
+        yield Problem(
             f'ROS_AUTOMATIC_DISCOVERY_RANGE must be one of {", ".join(RANGES)}, '
             f'got {printable(given)!r}: SUBNET is used',
             'export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST',
         )
     local = found.variables.get('ROS_LOCALHOST_ONLY', '')
     if local not in ('', '0', '1'):
-        yield Finding(
+        yield Problem(
             f'ROS_LOCALHOST_ONLY must be 0 or 1, got {printable(local)!r}: it has no effect',
             'unset ROS_LOCALHOST_ONLY; export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST',
         )
     if local == '1':
-        yield Finding(
+        yield Problem(
             'ROS_LOCALHOST_ONLY is set, which is deprecated and overrides ROS_AUTOMATIC_DISCOVERY_RANGE',
             'unset ROS_LOCALHOST_ONLY; export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST',
             problem=False,
         )
     elif given == 'OFF':
-        yield Finding(
+        yield Problem(
             'ROS_AUTOMATIC_DISCOVERY_RANGE is OFF: no other process is found',
             'export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, or SUBNET for other machines',
         )
     if found.variables.get('ROS_DISCOVERY_SERVER'):
-        yield Finding(
+        yield Problem(
             f'ROS_DISCOVERY_SERVER is {printable(found.variables["ROS_DISCOVERY_SERVER"])}: a client '
             'lists only topics that it uses itself',
             'export ROS_SUPER_CLIENT=TRUE for this tool, or use a Super Client profile',
@@ -325,10 +325,10 @@ def multicast_error() -> str:
     return ''
 
 
-def check_shared_memory(memory: SharedMemory | None) -> Iterator[Finding]:
+def check_shared_memory(memory: SharedMemory | None) -> Iterator[Problem]:
     """Yield what is wrong with the shared memory."""
     if memory is None or not memory.writable:
-        yield Finding(
+        yield Problem(
             f'{SHARED_MEMORY} is missing or cannot be written: Fast DDS sends messages by the network',
             f'mount a tmpfs on {SHARED_MEMORY} (in a container: --ipc=host or --shm-size)',
             problem=False,
@@ -337,20 +337,20 @@ def check_shared_memory(memory: SharedMemory | None) -> Iterator[Finding]:
     stale = f'{memory.stale} segments of killed processes in {SHARED_MEMORY}'
     if memory.free < SCARCE:
         held = f', {format_size(memory.stale_bytes)} of it in {stale}' if memory.stale else ''
-        yield Finding(
+        yield Problem(
             f'{SHARED_MEMORY} is full: {format_size(memory.free)} of {format_size(memory.size)} are '
             f'free{held}',
             f'run `fastdds shm clean`, or enlarge {SHARED_MEMORY} (in a container: --shm-size=512m)',
         )
     elif memory.stale:
-        yield Finding(
+        yield Problem(
             f'{stale} take {format_size(memory.stale_bytes)}',
             'run `fastdds shm clean`, which removes them',
             problem=False,
         )
 
 
-def check_network(found: tuple[Interface, ...], reach: str, multicast: str) -> Iterator[Finding]:
+def check_network(found: tuple[Interface, ...], reach: str, multicast: str) -> Iterator[Problem]:
     """Yield what is wrong with the network.
 
     Args:
@@ -360,7 +360,7 @@ def check_network(found: tuple[Interface, ...], reach: str, multicast: str) -> I
     """
     loopback = [one for one in found if one.loopback]
     if found and not any(one.up for one in loopback):
-        yield Finding(
+        yield Problem(
             'the loopback interface is down: nodes on this machine do not find each other',
             'ip link set lo up',
         )
@@ -368,19 +368,19 @@ def check_network(found: tuple[Interface, ...], reach: str, multicast: str) -> I
         return
     others = [one for one in found if one.up and not one.loopback]
     if found and not others:
-        yield Finding(
+        yield Problem(
             'no network interface is up: nodes on other machines are not found',
             'connect the network, or set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST',
             problem=False,
         )
     elif found and not any(one.multicast for one in others):
         names = ', '.join(one.name for one in others)
-        yield Finding(
+        yield Problem(
             f'no network interface has multicast ({names}): nodes on other machines are not found',
             f'ip link set {others[0].name} multicast on, or name the other machines in ROS_STATIC_PEERS',
         )
     elif multicast:
-        yield Finding(
+        yield Problem(
             f'multicast does not work ({multicast}): nodes on other machines are not found',
             'permit UDP to 239.255.0.0/16 in the firewall, or name the other machines in '
             'ROS_STATIC_PEERS',

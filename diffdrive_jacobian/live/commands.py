@@ -72,7 +72,7 @@ class CancelGoal(Checked):
 
 
 @dataclass(frozen=True, slots=True)
-class Drive(Checked):
+class DriveByHand(Checked):
     """Drive a robot by hand. It must be repeated, otherwise the robot stops."""
 
     robot: _Text
@@ -151,7 +151,7 @@ class Seek(Checked):
 Command = (
     SendGoal
     | CancelGoal
-    | Drive
+    | DriveByHand
     | Release
     | Place
     | Reset
@@ -167,7 +167,7 @@ Command = (
 _KINDS: dict[str, type[Any]] = {
     'goal': SendGoal,
     'cancel': CancelGoal,
-    'drive': Drive,
+    'drive': DriveByHand,
     'release': Release,
     'place': Place,
     'reset': Reset,

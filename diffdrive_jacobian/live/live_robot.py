@@ -19,7 +19,7 @@ from diffdrive_jacobian.live.commands import (
     CancelGoal,
     ClearPath,
     Command,
-    Drive,
+    DriveByHand,
     Place,
     Release,
     Reset,
@@ -163,7 +163,7 @@ class LiveRobot:
         """Do what a page asks for."""
         if isinstance(command, SendGoal):
             self._send_goal(command)
-        elif isinstance(command, Drive):
+        elif isinstance(command, DriveByHand):
             if not self.hand.command(page, (command.v, command.omega), time.monotonic()):
                 self._session.notify('another page drives this robot by hand', 'warning')
         elif isinstance(command, Release):

@@ -44,7 +44,7 @@ MESSAGES: dict[str, type] = {'goal_pose': PoseStamped, 'goals': Goals}
 """Topic of goals to its type."""
 
 
-class RobotState(NamedTuple):
+class RobotOdometry(NamedTuple):
     """What an odometry message says about the robot."""
 
     pose: NDArray[np.float64]
@@ -55,8 +55,8 @@ class RobotState(NamedTuple):
     """Timestamp of the message (ns)."""
 
 
-def _state(sec: int, nanosec: int, v: float, omega: float, *pose: float) -> RobotState:
-    return RobotState(np.array(from_pose(*pose)), (v, omega) != (0.0, 0.0), from_time(sec, nanosec))
+def _state(sec: int, nanosec: int, v: float, omega: float, *pose: float) -> RobotOdometry:
+    return RobotOdometry(np.array(from_pose(*pose)), (v, omega) != (0.0, 0.0), from_time(sec, nanosec))
 
 
 STATE = Codec(
@@ -111,7 +111,7 @@ class GoalClient(Node):  # type: ignore[misc]
         """Index of the goal that is being driven to."""
         self.arrival = Arrival()
         """Determines which point of the robot is to arrive. The default is the axle centre."""
-        self.robot: RobotState | None = None
+        self.robot: RobotOdometry | None = None
         """State in the last odometry. None: no odometry was received."""
         self._monotonic = monotonic
         self.seen = monotonic()
@@ -247,7 +247,7 @@ class GoalClient(Node):  # type: ignore[misc]
         # Other processes may publish, and anything.
         self.get_logger().warning(f'odometry dropped: {error}', throttle_duration_sec=THROTTLE)
 
-    def _on_odometry(self, state: RobotState) -> None:
+    def _on_odometry(self, state: RobotOdometry) -> None:
         self.robot = state
         self.seen = self._monotonic()
         if self._send_on_odometry:

@@ -18,7 +18,7 @@ from diffdrive_jacobian.numerics.fields import Name
 from diffdrive_jacobian.properties._messages import Pose, Twist
 from diffdrive_jacobian.properties._node_time import ROUNDING, end_of_faults
 from diffdrive_jacobian.properties.base import Watch
-from diffdrive_jacobian.properties.goals import Goal, GoalProperty, Motion, read_goal, read_status
+from diffdrive_jacobian.properties.goals import GoalProperty, Motion, SentGoal, read_goal, read_status
 
 
 @dataclass(frozen=True, repr=False)
@@ -80,8 +80,8 @@ class _DueGoalWatch(Watch):
     def __init__(self, required: DueGoalProperty, world: Lockstep) -> None:
         super().__init__(world)
         self._required = required
-        self._followers: defaultdict[Node, GoalFollower[Goal]] = defaultdict(GoalFollower)
-        self._received: dict[Node, FollowedGoal[Goal]] = {}
+        self._followers: defaultdict[Node, GoalFollower[SentGoal]] = defaultdict(GoalFollower)
+        self._received: dict[Node, FollowedGoal[SentGoal]] = {}
         self._moved = self.seconds
         world.expect(*map(required.resolved, required.goals))
         for topic in required.goals:
@@ -128,7 +128,7 @@ class _DueGoalWatch(Watch):
         """Find what is violated by goals that are due."""
         raise NotImplementedError
 
-    def _due(self) -> list[tuple[Node, Goal]]:
+    def _due(self) -> list[tuple[Node, SentGoal]]:
         if not self._received:
             return []
         nodes = self.world.nodes
@@ -140,14 +140,14 @@ class _DueGoalWatch(Watch):
             and node in nodes
         ]
 
-    def _begin(self, goal: Goal) -> tuple[float, str]:
+    def _begin(self, goal: SentGoal) -> tuple[float, str]:
         """Return when the time for a goal begins, and what happened then."""
         end = end_of_faults(self.world)
         if end > goal.seconds:
             return end, 'the faults have ended'
         return goal.seconds, 'the goal was received'
 
-    def _where(self, node: Node, goal: Goal) -> str:
+    def _where(self, node: Node, goal: SentGoal) -> str:
         return self._motion.where(goal, f' of {self.name_of(node)}')
 
 

@@ -31,7 +31,7 @@ STANDING = Twist(0.01, 0.05)
 """Largest twist of a robot that counts as standing."""
 
 
-class Goal(NamedTuple):
+class SentGoal(NamedTuple):
     """A goal of the robot."""
 
     pose: Pose
@@ -44,7 +44,7 @@ class Goal(NamedTuple):
 _read_goal = FieldReader(lambda kind: GOALS.fields if kind.__name__ == 'Goals' else POSE.fields).read
 
 
-def read_goal(message_type: type, message: Any, seconds: float) -> Goal | None:
+def read_goal(message_type: type, message: Any, seconds: float) -> SentGoal | None:
     """Return the goal in a PoseStamped, or the last one in a Goals message; None: there is none."""
     fields = _read_goal(message_type, message)
     if fields is None:
@@ -55,7 +55,7 @@ def read_goal(message_type: type, message: Any, seconds: float) -> Goal | None:
         if not frames:
             return None
         pose = [column[-1] for column in columns]
-    return Goal(planar(*pose), seconds, (int(sec), int(nanosec)))
+    return SentGoal(planar(*pose), seconds, (int(sec), int(nanosec)))
 
 
 _read_status = FieldReader(lambda _: GOAL_STATUS.fields).read
@@ -90,7 +90,7 @@ class Motion:
         twist = self.twist
         return twist is not None and (abs(twist.v) <= STANDING.v and abs(twist.omega) <= STANDING.omega)
 
-    def where(self, goal: Goal | None, of: str = '') -> str:
+    def where(self, goal: SentGoal | None, of: str = '') -> str:
         """Return where the robot is, relative to a goal, `of` what."""
         if self.pose is None or goal is None:
             return f'there was no odometry on {self.topic}'
@@ -145,7 +145,7 @@ class _PublishedGoalWatch(Watch):
 
     def __init__(self, required: GoalProperty, world: Lockstep) -> None:
         super().__init__(world)
-        self.goal: Goal | None = None
+        self.goal: SentGoal | None = None
         world.expect(*map(required.resolved, required.goals))
         for topic in required.goals:
             world.on_published(required.resolved(topic), self._on_goal)

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 
-from diffdrive_jacobian.diagnosis.description import Finding, Graph, Participant
+from diffdrive_jacobian.diagnosis.description import Graph, Participant, Problem
 from diffdrive_jacobian.diagnosis.graph import check_clocks, check_topics
 from diffdrive_jacobian.diagnosis.machine import (
     Environment,
@@ -42,10 +42,10 @@ class Diagnosis:
     rmw: str
     """The implementation of the middleware. Empty: ROS cannot be used."""
     graph: Graph
-    findings: tuple[Finding, ...]
+    findings: tuple[Problem, ...]
 
     @property
-    def problems(self) -> list[Finding]:
+    def problems(self) -> list[Problem]:
         """The findings because of which something does not work."""
         return [one for one in self.findings if one.problem]
 
@@ -70,7 +70,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
             return _cli.complain(PROGRAM, error)
         except (ImportError, OSError, RuntimeError) as error:
             why = printable(' '.join(str(error).split()), 300)
-            findings.append(Finding(f'ROS cannot be used: {why}', INSTALL))
+            findings.append(Problem(f'ROS cannot be used: {why}', INSTALL))
     findings += [*check_topics(graph), *check_clocks(graph)]
     if signals.count:
         return _cli.INTERRUPTED

@@ -1,6 +1,6 @@
 """Robots and recordings for the calibration that share no code with the package or its tests.
 
-Only `Recording` and `Geometry` are taken from the package, as the interface. A drive is a list of
+Only `CalibrationDrive` and `Geometry` are taken from the package, as the interface. A drive is a list of
 commands of the body velocity, which ramps limit to finite accelerations. Wheels and body are integrated
 on a grid of 1 ms by the midpoint rule. The recording follows from that: encoders with finite steps at
 the sample rate of the wheels, and poses of a sensor at some place on the robot, with white noise.
@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from diffdrive_jacobian.calibration import Geometry, Recording
+from diffdrive_jacobian.calibration import CalibrationDrive, Geometry
 
 RADIUS, SEPARATION = 0.033, 0.16
 """Nominal dimensions (m)."""
@@ -157,7 +157,7 @@ CASES: dict[str, Robot | Callable[[np.random.Generator], Robot]] = {
 """Robots by the name of the case; functions draw one."""
 
 
-def simulate(case: str, seed: int) -> tuple[list[Recording], Geometry, np.ndarray]:
+def simulate(case: str, seed: int) -> tuple[list[CalibrationDrive], Geometry, np.ndarray]:
     """Return recordings of a random robot, its nominal dimensions and its true multipliers.
 
     The multipliers are those of the left radius, the right radius and the separation.
@@ -166,7 +166,7 @@ def simulate(case: str, seed: int) -> tuple[list[Recording], Geometry, np.ndarra
     return recordings, Geometry(wheel_radius=RADIUS, wheel_separation=SEPARATION), multipliers
 
 
-def _simulated(case: str, seed: int) -> tuple[list[Recording], list[Drive], np.ndarray]:
+def _simulated(case: str, seed: int) -> tuple[list[CalibrationDrive], list[Drive], np.ndarray]:
     """Return recordings, the true drives and the true multipliers."""
     random = np.random.default_rng([seed, zlib.crc32(case.encode())])
     robot = CASES[case]
@@ -245,7 +245,7 @@ def _ramped(at: np.ndarray, begins: list[float], targets: list[float], rate: flo
 
 def _recording(
     name: str, robot: Robot, drive: Drive, sensor: np.ndarray, random: np.random.Generator
-) -> Recording:
+) -> CalibrationDrive:
     last = drive.time[-1]
     wheel_time = np.arange(random.uniform(0.0, 1.0 / robot.wheel_rate), last, 1.0 / robot.wheel_rate)
     angles = drive.at(wheel_time, drive.angles)
@@ -269,7 +269,7 @@ def _recording(
     poses[:, :2] /= robot.unit
     poses[:, 2] = np.arctan2(np.sin(poses[:, 2]), np.cos(poses[:, 2]))
     offset = robot.time_offset + random.uniform(-0.05, 0.05)
-    return Recording(
+    return CalibrationDrive(
         name=name,
         wheel_time=wheel_time,
         wheel_angles=angles,
