@@ -16,7 +16,8 @@ from diffdrive_jacobian.calibration.consistency import misfit
 from diffdrive_jacobian.calibration.description import explain_undetermined
 from diffdrive_jacobian.calibration.encoder import PERIOD, densified, located
 from diffdrive_jacobian.calibration.errors import compared_distance, rms, tracks
-from diffdrive_jacobian.calibration.fit import Estimate, fit, information, undetermined
+from diffdrive_jacobian.calibration.estimate import Estimate, undetermined
+from diffdrive_jacobian.calibration.fit import fit, information
 from diffdrive_jacobian.calibration.motion import composed, increments, inverted, relative
 from diffdrive_jacobian.calibration.preparation import overlapping, without
 from diffdrive_jacobian.kinematics.se2 import adjoint

@@ -9,14 +9,14 @@ import numpy as np
 
 from diffdrive_jacobian.calibration.clock import time_offset
 from diffdrive_jacobian.calibration.consistency import misfit
-from diffdrive_jacobian.calibration.fit import (
+from diffdrive_jacobian.calibration.estimate import (
     TIME_OFFSETS,
     UNDETERMINED,
     YAW_OFFSET,
     Estimate,
-    fit,
     undetermined,
 )
+from diffdrive_jacobian.calibration.fit import fit
 from diffdrive_jacobian.calibration.initial_estimate import initial_estimate, unit
 from diffdrive_jacobian.calibration.measurements import (
     Array,

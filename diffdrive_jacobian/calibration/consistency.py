@@ -16,13 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.calibration.encoder import poses_apart
-from diffdrive_jacobian.calibration.fit import (
-    MULTIPLIERS,
-    TIME_OFFSETS,
-    Estimate,
-    prior_deviations,
-    score,
-)
+from diffdrive_jacobian.calibration.estimate import MULTIPLIERS, TIME_OFFSETS, Estimate, prior_deviations
+from diffdrive_jacobian.calibration.fit import score
 from diffdrive_jacobian.calibration.measurements import Array, Segment
 from diffdrive_jacobian.calibration.motion import Geometry
 

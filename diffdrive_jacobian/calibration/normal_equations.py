@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.calibration.fit import (
+from diffdrive_jacobian.calibration.estimate import (
     LEVER_ARM,
     MULTIPLIERS,
     TIME_OFFSETS,

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import platform
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
-from diffdrive_jacobian import __version__
 from diffdrive_jacobian.bags import BagError, read_run
 from diffdrive_jacobian.exploration.digest import MessageDigest
 from diffdrive_jacobian.exploration.result import Finding
 from diffdrive_jacobian.exploration.scenario import ExplorationError
 from diffdrive_jacobian.exploration.trial import DIED, Setting, Trial, Violation, of_exception, run
+from diffdrive_jacobian.exploration.versions import differences, versions
 from diffdrive_jacobian.exploration.worker import packed, run_world_afresh, run_worlds
 from diffdrive_jacobian.lockstep._errors import PropertyViolation
 from diffdrive_jacobian.lockstep.world import Lockstep
@@ -28,54 +23,6 @@ from diffdrive_jacobian.plots.run_figure import draw
 from diffdrive_jacobian.recording.recorder import Recorder, Selection
 from diffdrive_jacobian.recording.recording import Recording, RecordingError
 from diffdrive_jacobian.text import printable_lines
-
-
-def versions() -> dict[str, str]:
-    """Return the versions and the processor on which the last bit of a run may depend.
-
-    Elsewhere a run may differ by rounding: NumPy and the C library choose their code by the features of
-    the processor.
-    """
-    return {
-        'diffdrive_jacobian': __version__,
-        'python': platform.python_version(),
-        'numpy': np.__version__,
-        'rclpy': _rclpy(),
-        'libc': ' '.join(platform.libc_ver()),
-        'machine': platform.machine(),
-        'processor features': _processor(),
-    }
-
-
-def differences(here: dict[str, str], there: dict[str, str]) -> list[str]:
-    """Return what differs between two results of `versions`, one line for each."""
-    return [
-        f'{name} {here.get(name, "unknown")} here, {there.get(name, "unknown")} there'
-        for name in dict.fromkeys([*here, *there])
-        if here.get(name) != there.get(name)
-    ]
-
-
-def _rclpy() -> str:
-    for name in ('ros-rclpy', 'rclpy'):
-        try:
-            return version(name)
-        except PackageNotFoundError:
-            continue
-    return 'unknown'
-
-
-def _processor() -> str:
-    """Return a hash of the features of the processor, as Linux lists them."""
-    try:
-        lines = Path('/proc/cpuinfo').read_text(errors='replace').splitlines()
-    except OSError:
-        return 'unknown'
-    flags = next(
-        (line.partition(':')[2] for line in lines if line.startswith(('flags', 'Features'))), ''
-    )
-    return hashlib.sha256(' '.join(sorted(flags.split())).encode()).hexdigest()[:16]
-
 
 BAG, PICTURE = 'run', 'run.png'
 """Names of the bag and of the picture."""

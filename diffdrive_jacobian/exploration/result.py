@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from diffdrive_jacobian.exploration.replay import versions
 from diffdrive_jacobian.exploration.scenario import Source
 from diffdrive_jacobian.exploration.trial import Setting, Trial, Violation
+from diffdrive_jacobian.exploration.versions import versions
 from diffdrive_jacobian.text import printable
 
 if TYPE_CHECKING:

@@ -1,0 +1,122 @@
+"""The parameters of the calibration with their uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffdrive_jacobian.calibration.measurements import Array, Noise
+from diffdrive_jacobian.calibration.motion import Geometry
+
+MULTIPLIERS, LEVER_ARM, YAW_OFFSET, TIME_OFFSETS = slice(0, 3), slice(3, 5), 5, 6
+"""Where the parameters are in their vector: logarithms of the multipliers (left, right, separation), the
+pose of the sensor in the body frame, and the time offset of each recording."""
+SCALES = (0.2, 0.2, 0.2, 0.3, 0.3, 0.5, 0.3)
+"""Prior standard deviations about the approximate parameters (-, m, rad, s). They keep parameters that
+the data do not determine near these, and are without effect on the others."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Estimate:
+    """Parameters of the model and the state of their estimation."""
+
+    parameters: Array
+    """As described at `MULTIPLIERS`, shape (6 + number of recordings,)."""
+    noise: Noise
+    free: NDArray[np.bool_]
+    """Which of the parameters are estimated, shape as `parameters`."""
+    states: tuple[Array, ...] = ()
+    """Most likely poses of the body at the times of each segment, shapes (n, 3)."""
+    information: Array
+    """Fisher information of the free parameters."""
+
+    def geometry(self, nominal: Geometry) -> Geometry:
+        """Return the dimensions of the robot with the estimated multipliers."""
+        left, right, separation = np.exp(self.parameters[MULTIPLIERS]).tolist()
+        return replace(nominal, multipliers=(left, right, separation))
+
+    @property
+    def sensor(self) -> Array:
+        """Pose of the sensor in the body frame, shape (3,)."""
+        return self.parameters[3:6]
+
+    def covariance(self) -> Array:
+        """Return the covariance of all parameters, zero for those that are not free.
+
+        Directions that the data do not determine have about the variance of `SCALES`.
+        """
+        full = np.zeros((len(self.parameters),) * 2)
+        scales = prior_deviations(len(self.parameters))[self.free]
+        inverse = np.linalg.inv(self.information + np.diag(scales**-2.0))
+        full[np.ix_(self.free, self.free)] = (inverse + inverse.T) / 2.0
+        return full
+
+    def widened(self, errors: Array) -> Estimate:
+        """Return the estimate with additional errors, shape (any, number of parameters)."""
+        free = np.ix_(self.free, self.free)
+        covariance = self.covariance()[free] + (errors.T @ errors)[free]
+        scales = prior_deviations(len(self.parameters))[self.free]
+        information = np.linalg.inv(covariance) - np.diag(scales**-2.0)
+        return replace(self, information=np.asarray(information, dtype=np.float64))
+
+
+def prior_deviations(count: int) -> Array:
+    """Return `SCALES` for a number of parameters."""
+    return np.array([*SCALES[:TIME_OFFSETS], *[SCALES[-1]] * (count - TIME_OFFSETS)])
+
+
+UNDETERMINED = 0.02
+"""Standard deviation of a combination of multipliers beyond which it counts as not determined [-]."""
+_WITHIN = 0.98
+"""Part of a combination that must lie in the undetermined space."""
+_TURN = 'turn in place or drive arcs, in both directions'
+_STRAIGHT = 'drive straight'
+COMBINATIONS: tuple[tuple[str, tuple[float, float, float], str], ...] = (
+    ('the wheel separation', (0.0, 0.0, 1.0), _TURN),
+    (
+        'the common scale of radii and separation (only their ratio is determined)',
+        (1.0, 1.0, 1.0),
+        _STRAIGHT,
+    ),
+    ('the mean of the wheel radii', (1.0, 1.0, 0.0), _STRAIGHT),
+    ('the difference of the wheel radii', (1.0, -1.0, 0.0), f'{_STRAIGHT}, further'),
+    ('the radius of the left wheel', (1.0, 0.0, 0.0), f'{_STRAIGHT}, with both wheels turning'),
+    ('the radius of the right wheel', (0.0, 1.0, 0.0), f'{_STRAIGHT}, with both wheels turning'),
+)
+"""Name, direction in the space of the logarithms of the multipliers (left, right, separation), and what
+drive determines it."""
+
+
+def undetermined(covariance: Array) -> list[tuple[str, str]]:
+    """Return the combinations of multipliers that are not determined, and what drive determines them.
+
+    Args:
+        covariance: Of the logarithms of the multipliers (left, right, separation), shape (3, 3).
+    """
+    variances, directions = np.linalg.eigh(covariance)
+    space = directions[:, variances > UNDETERMINED**2]
+    dimension = space.shape[1]
+    if dimension == 3:
+        return [('any of the multipliers', f'{_STRAIGHT}, and {_TURN}')]
+    found: list[tuple[str, str]] = []
+    spanned = np.zeros((3, 0))
+    for name, direction, remedy in COMBINATIONS:
+        unit = np.array(direction) / np.linalg.norm(direction)
+        if np.linalg.norm(space.T @ unit) < _WITHIN or spanned.shape[1] == dimension:
+            continue
+        rest = unit - spanned @ (spanned.T @ unit)
+        if np.linalg.norm(rest) > 0.5:
+            spanned = np.column_stack([spanned, rest / np.linalg.norm(rest)])
+            found.append((name, remedy))
+    if spanned.shape[1] < dimension:
+        for direction in space.T:
+            rest = direction - spanned @ (spanned.T @ direction)
+            if np.linalg.norm(rest) > 0.5:
+                weights = rest / np.linalg.norm(rest)
+                parts = zip(weights.tolist(), ('left radius', 'right radius', 'separation'), strict=True)
+                text = ', '.join(f'{weight:+.2f} {name}' for weight, name in parts)
+                found.append((f'the combination {text}', f'{_STRAIGHT}, and {_TURN}'))
+                spanned = np.column_stack([spanned, weights])
+    return found
