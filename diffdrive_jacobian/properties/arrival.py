@@ -91,7 +91,6 @@ class _DueGoalWatch(Watch):
             world.on_delivered(required.resolved(topic), self._on_goal)
         self._commands = world.node.resolve_topic_name(required.resolved(required.commands))
         world.expect(self._commands)
-        world.on_published(self._commands, lambda publisher, _: self.check_observable(publisher))
         world.expect(required.resolved(required.odom))
         self._odom = world.on_published(required.resolved(required.odom), self._motion.on_odometry)
         world.on_published(required.resolved(required.status), self._on_status)
