@@ -20,8 +20,10 @@ from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.srv import GetParameters
+from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 
@@ -71,8 +73,12 @@ SILENCE = 0.2
 """Time for which a process that has started must not send anything by itself (s)."""
 END = 2.0
 """Time in which a process ends after a process of its nodes has (s)."""
-PING = 'rcl_interfaces/srv/GetParameters'
-"""Type of the service with which a node answers that it has discovered what the world has."""
+ATTEMPTS = 2
+"""Number of domains that are tried, if a program that the world has not started comes into one."""
+
+
+class ForeignNodeError(LockstepError):
+    """There is a node in the domain that is in no process of the world."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +153,7 @@ class NodeProcess:
         self._closing = ExitStack()
         self.child: ExternalProcess
         self._relays: list[Relay] = []
-        self._clock_senders: dict[str, Callable[[bytes], None]] = {}
+        self._clock_publishers: dict[str, Publisher] = {}
         self._participants: set[int] = set()
         self._given = -1
         self._called: dict[str, tuple[str, StandIn]] = {}
@@ -226,25 +232,27 @@ class NodeProcess:
             LockstepError: They are not within the timeout, or cannot take part.
         """
         begin = time.monotonic()
-        command = self._command
-        domain = free_domain()
-        variables = {DISCOVERY[0]: 'LOCALHOST', 'ROS_DOMAIN_ID': str(domain)}
         if hasattr(self, 'child'):
             self._ended.append(self.child)
-        try:
-            self._launch(domain, variables)
-            self._connect(begin + command.timeout)
-        except BaseException:
-            if hasattr(self, 'child'):
-                self.child.kill()
-            self._leave()
-            raise
+        for attempt in range(ATTEMPTS):
+            try:
+                self._launch()
+                self._connect(time.monotonic() + self._command.timeout)
+                break
+            except BaseException as error:
+                if hasattr(self, 'child'):
+                    self.child.kill()
+                self._leave()
+                if not isinstance(error, ForeignNodeError) or attempt == ATTEMPTS - 1:
+                    raise
         self._extend(time.monotonic() - begin)
         return list(self._stand_ins.values())
 
-    def _launch(self, domain: int, variables: dict[str, str]) -> None:
+    def _launch(self) -> None:
         """Start the process, and create what is needed to receive from it."""
         command = self._command
+        self._domain = free_domain()
+        variables = {DISCOVERY[0]: 'LOCALHOST', 'ROS_DOMAIN_ID': str(self._domain)}
         before = threads_of_this_process()
         with environment({**dict.fromkeys(DISCOVERY), **variables}):
             context = self._closing.enter_context(ros_context(['lockstep']))
@@ -265,7 +273,6 @@ class NodeProcess:
             command.directory,
             command.cwd,
         )
-        self._domain = domain
         self._quiet = Quiet(self.child.pid, receiving)
         self._closing.callback(self._quiet.close)
 
@@ -314,7 +321,7 @@ class NodeProcess:
         for relay in self._relays:
             relay.close()
         self._relays, self._called = [], {}
-        self._clock_senders, self._participants = {}, set()
+        self._clock_publishers, self._participants = {}, set()
         self._given = -1
         self._closing.close()
 
@@ -328,13 +335,15 @@ class NodeProcess:
     def _connect(self, end: float) -> None:
         """Wait until the nodes of the process and the world have discovered each other."""
         while True:
-            while not (self._learn() and all(relay.is_matched() for relay in self._relays)):
+            while not (self._learn() and self._is_matched()):
                 self.child.check_running()
                 if time.monotonic() > end:
                     raise LockstepError(self._not_discovered())
                 time.sleep(PERIOD)
+            known = len(self._relays)
             self._confirm(end)
-            if not graph_changed(self._outside):
+            graph_changed(self._outside)
+            if self._learn() and len(self._relays) == known:
                 break
         self._check_timed()
         self._wait()
@@ -342,7 +351,15 @@ class NodeProcess:
         self._latched = [arrived for arrived in self._take() if arrived.latched]
         time.sleep(SILENCE)
         self._wait()
-        self._check_silent()
+        late = self._take()
+        self._latched += [arrived for arrived in late if arrived.latched]
+        self._refuse([arrived for arrived in late if not arrived.latched])
+
+    def _is_matched(self) -> bool:
+        """Return whether the world has discovered all endpoints of the process."""
+        return all(relay.is_matched() for relay in self._relays) and all(
+            publisher.get_subscription_count() for publisher in self._clock_publishers.values()
+        )
 
     def _learn(self) -> bool:
         """Create what the topics and services of the process need. Return whether it has nodes."""
@@ -383,8 +400,8 @@ class NodeProcess:
         present = {relay.topic for relay in self._relays if isinstance(relay, ToTopic)}
         for topic, type_name in graph.subscriptions.items():
             if type_name == CLOCK_TYPE and topic.rpartition('/')[2] == 'clock':
-                if topic not in self._clock_senders:
-                    self._clock_senders[topic] = raw_sender(outside.create_publisher(Clock, topic, 1))
+                if topic not in self._clock_publishers:
+                    self._clock_publishers[topic] = outside.create_publisher(Clock, topic, 1)
             elif topic not in present:
                 kind = import_type(type_name, f'topic {topic} of {name}')
                 infos = outside.get_subscriptions_info_by_topic(topic)
@@ -428,7 +445,7 @@ class NodeProcess:
         numbers = {int.from_bytes(bytes(info.endpoint_gid)[PID], 'little') for info in infos}
         pids = {pid for pid in descendants(self.child.pid) if pid & 0xFFFF in numbers}
         if numbers and not pids:
-            raise LockstepError(
+            raise ForeignNodeError(
                 f'node {graph.full_name} is in domain {self._domain}, but in no process that '
                 f'{self.command} has started and that runs on: a daemon, a container or another machine '
                 'cannot take part in lockstep'
@@ -444,28 +461,37 @@ class NodeProcess:
     def _confirm(self, end: float) -> None:
         """Wait until the nodes respond, which shows that they have discovered what the world has.
 
-        They discover endpoints in the order of their creation.
+        They discover endpoints in the order of their creation, so those of new clients come last.
         """
-        clients = [
-            relay.client
+        names = [
+            relay.name
             for relay in self._relays
             if isinstance(relay, OfferedService) and relay.client.srv_type is GetParameters
         ]
-        for client in clients:
-            repeat = 0.0
-            while take_response(client) is None:
-                self.child.check_running()
-                if time.monotonic() > end:
-                    raise LockstepError(
-                        f'{client.service_name} does not respond: the executor of the node does not '
-                        f'spin; {self._quiet.describe()}\n{self.describe()}'
-                    )
-                if time.monotonic() > repeat:
-                    send_request(client, GetParameters.Request(names=['use_sim_time']))
-                    repeat = time.monotonic() + REPETITION
-                time.sleep(PERIOD / 10)
-        if len(clients) < len(self._stand_ins):
+        for name in names:
+            client = self._outside.create_client(GetParameters, name)
+            try:
+                self._await_response(client, end)
+            finally:
+                self._outside.destroy_client(client)
+        if len(names) < len(self._stand_ins):
             time.sleep(UNCONFIRMED)
+
+    def _await_response(self, client: Client, end: float) -> None:
+        """Ask a node for a parameter until it responds."""
+        repeat = 0.0
+        while take_response(client) is None:
+            self.child.check_running()
+            now = time.monotonic()
+            if now > end:
+                raise LockstepError(
+                    f'{client.service_name} does not respond: the executor of the node does not spin; '
+                    f'{self._quiet.describe()}\n{self.describe()}'
+                )
+            if now > repeat and client.service_is_ready():
+                send_request(client, GetParameters.Request(names=['use_sim_time']))
+                repeat = now + REPETITION
+            time.sleep(PERIOD / 10)
 
     def _check_timed(self) -> None:
         """Check that the nodes receive the time."""
@@ -473,7 +499,7 @@ class NodeProcess:
             return
         timed = {
             node_name(info)
-            for topic in self._clock_senders
+            for topic in self._clock_publishers
             for info in self._outside.get_subscriptions_info_by_topic(topic)
         }
         if untimed := sorted(self._stand_ins.keys() - timed):
@@ -518,8 +544,8 @@ class NodeProcess:
         data = serialize_message(message)
 
         def send() -> None:
-            for send_clock in self._clock_senders.values():
-                send_clock(data)
+            for publisher in self._clock_publishers.values():
+                raw_sender(publisher)(data)
 
         return None if self._exchange(send) else FREE
 
@@ -544,8 +570,17 @@ class NodeProcess:
         if self.child.returncode is not None or not all(map(_is_alive, self._participants)):
             self._on_end()
         elif graph_changed(self._outside):
-            self._learn()
+            self._learn_more()
         return len(arrived)
+
+    def _learn_more(self) -> None:
+        """Create what is needed for topics and services that the process has created meanwhile."""
+        known = len(self._relays)
+        self._learn()
+        if len(self._relays) > known:
+            self._connect(time.monotonic() + self._command.timeout)
+            latched, self._latched = self._latched, []
+            self._forward(latched)
 
     def _wait(self) -> None:
         """Wait until the process and the threads that receive from it are quiet."""
@@ -574,7 +609,11 @@ class NodeProcess:
             self._check_silent()
 
     def _check_silent(self) -> None:
-        if arrived := self._take():
+        self._refuse(self._take())
+
+    def _refuse(self, arrived: Sequence[Arrived]) -> None:
+        """Raise LockstepError if something has arrived."""
+        if arrived:
             names = ', '.join(self._stand_ins)
             what = ', '.join(dict.fromkeys(one.what for one in arrived))
             raise LockstepError(
