@@ -275,10 +275,8 @@ def main(arguments):
     stopped = threading.Event()
     signal.signal(signal.SIGINT, lambda *_: stopped.set())
     nodes = [NODES[name](name) for name in arguments if name in NODES]
-    if 'several_threads' in arguments:
-        executor = MultiThreadedExecutor(4)
-    else:
-        executor = SingleThreadedExecutor()
+    threads = 4 if 'several_threads' in arguments else 1
+    executor = MultiThreadedExecutor(threads) if threads > 1 else SingleThreadedExecutor()
     if 'several_executors' in arguments:
         other = SingleThreadedExecutor()
         other.add_node(nodes.pop())

@@ -614,5 +614,5 @@ def test_runs_that_differ_are_an_error():
         world.node.create_timer(1.0, lambda: publisher.publish(Float64()))
         world.run_for(next(lengths))
 
-    with pytest.raises(LockstepError, match='/value at 3 s .* instead of none'):
+    with pytest.raises(LockstepError, match=r'/value at 3 s .* instead of none'):
         check_repeats(longer)
