@@ -520,7 +520,7 @@ def started(tmp_path):
 
 
 def until_says_hi(process):
-    while 'hi' not in process.stdout:
+    while 'hi' not in process.printed(0):
         assert process.returncode is None
 
 
@@ -532,7 +532,7 @@ def test_a_process_and_its_children_are_ended(started):
     polite = started('trap "echo bye; exit 7" INT; echo hi; while :; do sleep 0.05; done')
     until_says_hi(polite)
     assert polite.stop() == 7
-    assert polite.stdout == 'hi\nbye\n'
+    assert polite.printed(0) == 'hi\nbye\n'
 
 
 def test_a_process_in_a_session_of_its_own_is_ended_with_the_world(tmp_path):

@@ -17,7 +17,6 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rcl_interfaces.srv import GetParameters
 from rclpy.client import Client
@@ -182,12 +181,12 @@ class NodeProcess:
     @property
     def stdout(self) -> str:
         """What it has printed on the standard output, also before a fault has started it again."""
-        return ''.join(one.stdout for one in (*self._ended, self.child))
+        return ''.join(one.printed(0) for one in (*self._ended, self.child))
 
     @property
     def stderr(self) -> str:
         """What it has printed on the standard error stream, as `stdout`."""
-        return ''.join(one.stderr for one in (*self._ended, self.child))
+        return ''.join(one.printed(1) for one in (*self._ended, self.child))
 
     @property
     def command(self) -> str:
@@ -567,7 +566,7 @@ class NodeProcess:
         arrived = self._take()
         self._extend(time.monotonic() - begin)
         self._forward(arrived)
-        if self.child.returncode is not None or not all(map(_is_alive, self._participants)):
+        if any(map(self._quiet.has_ended, (self.child.pid, *self._participants))):
             self._on_end()
         elif graph_changed(self._outside):
             self._learn_more()
@@ -653,14 +652,6 @@ def _order(relay: Relay) -> tuple[int, str]:
     if isinstance(relay, (FromTopic, ToTopic)):
         return 0, relay.topic
     return (1 if isinstance(relay, OfferedService) else 2), relay.name
-
-
-def _is_alive(pid: int) -> bool:
-    try:
-        state: Any = Path(f'/proc/{pid}/stat').read_bytes().rpartition(b') ')[2][:1]
-    except OSError:
-        return False
-    return state not in (b'Z', b'X')
 
 
 def _domains(pid: int) -> set[int]:

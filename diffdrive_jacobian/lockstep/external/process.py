@@ -145,24 +145,15 @@ class ExternalProcess:
             os.killpg(self.pid, signal.SIGKILL)
         return self._process.poll()
 
-    @property
-    def stdout(self) -> str:
-        """What it has printed on the standard output."""
-        return self._printed(0)
-
-    @property
-    def stderr(self) -> str:
-        """What it has printed on the standard error stream."""
-        return self._printed(1)
-
-    def _printed(self, number: int) -> str:
+    def printed(self, number: int) -> str:
+        """Return what it has printed on the standard output (0) or the standard error stream (1)."""
         text = self._kept.get(number)
         return self._files[number].read_text(errors='replace') if text is None else text
 
     def close(self) -> None:
         """End it, and keep what it printed."""
         self.stop()
-        self._kept = {number: self._printed(number) for number in range(len(self._files))}
+        self._kept = {number: self.printed(number) for number in range(len(self._files))}
 
     def signal(self, number: int) -> None:
         """Send a signal to it and its children. Nothing happens if it has ended."""
@@ -205,8 +196,8 @@ class ExternalProcess:
         else:
             state = f'{self.command} has exited with {code}'
         lines = [state]
-        for name, text in (('stdout', self.stdout), ('stderr', self.stderr)):
-            if shown := text.splitlines()[-SHOWN_LINES:]:
+        for number, name in enumerate(('stdout', 'stderr')):
+            if shown := self.printed(number).splitlines()[-SHOWN_LINES:]:
                 lines += [f'  {name}:', *(f'    {line}' for line in shown)]
         return '\n'.join(lines)
 

@@ -105,10 +105,9 @@ class Quiet:
         self._why = ''
         self._ended: set[tuple[int, int]] = set()
 
-    @property
-    def pids(self) -> list[int]:
-        """The process and what it has started, as far as it was seen alive."""
-        return list(self._sizes)
+    def has_ended(self, pid: int) -> bool:
+        """Return whether a process of those that are observed had ended when it was looked at last."""
+        return pid not in self._sizes or (pid, pid) in self._ended
 
     def close(self) -> None:
         """End the observation."""

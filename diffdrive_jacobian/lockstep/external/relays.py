@@ -168,7 +168,7 @@ class OfferedService:
 
     def take(self) -> Iterator[Arrived]:
         """Yield the responses that have arrived."""
-        while (taken := take_response(self.client)) is not None:
+        while self._asked and (taken := take_response(self.client)) is not None:
             number, response = taken
             if (future := self._asked.pop(number, None)) is not None:
                 yield Arrived(f'answered {self.name}', False, partial(future.set_result, response))
