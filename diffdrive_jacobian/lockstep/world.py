@@ -32,7 +32,7 @@ from diffdrive_jacobian.lockstep._properties import Properties, Property
 from diffdrive_jacobian.lockstep._report import describe
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.lockstep._simulated_time import SimulatedTime, checked_nanoseconds
-from diffdrive_jacobian.lockstep.external.node_process import NodeProcess, Surroundings
+from diffdrive_jacobian.lockstep.external.node_process import Command, NodeProcess, Surroundings
 from diffdrive_jacobian.lockstep.external.others import Processes
 from diffdrive_jacobian.ros.fastdds_profiles import open_to_others, withdraw
 from diffdrive_jacobian.ros.rclpy_internals import refuse_init
@@ -565,20 +565,17 @@ class Lockstep:
             ('patience', patience),
         ):
             checked_nanoseconds(name, value)
-        process = self._processes.create(
-            command,
-            self._surroundings,
+        parameters = Command(
+            command=command,
             use_sim_time=use_sim_time,
             cwd=cwd,
-            env=env,
+            env=env or {},
             clock_period=clock_period,
+            queue_depth=queue_depth,
             timeout=timeout,
             patience=patience,
-            queue_depth=queue_depth,
         )
-        process.start()
-        self._processes.all.append(process)
-        process.join()
+        process = self._processes.start(parameters, self._surroundings)
         self._time.arrive()
         return process
 

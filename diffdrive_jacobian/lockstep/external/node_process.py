@@ -26,7 +26,7 @@ from rclpy.publisher import Publisher
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 
-from diffdrive_jacobian.lockstep._errors import LockstepError
+from diffdrive_jacobian.lockstep._errors import LockstepError, described
 from diffdrive_jacobian.lockstep._gate import FREE
 from diffdrive_jacobian.lockstep._link import Link, Source, Stage
 from diffdrive_jacobian.lockstep._nodes import Nodes
@@ -82,17 +82,30 @@ class ForeignNodeError(LockstepError):
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """How a process is started, as by `Lockstep.start`."""
+    """How a process is started: the arguments of `Lockstep.start`."""
 
-    arguments: Sequence[str]
-    directory: Path
-    cwd: str | None
-    variables: Mapping[str, str]
+    command: Sequence[str | os.PathLike[str]]
+    use_sim_time: bool
+    cwd: str | os.PathLike[str] | None
+    env: Mapping[str, str]
     clock_period: float
+    queue_depth: int
     timeout: float
     patience: float
-    queue_depth: int
-    timed: bool
+
+    def __post_init__(self) -> None:
+        """Check the command."""
+        if isinstance(self.command, (str, os.PathLike)) or not self.command:
+            raise LockstepError(
+                "start takes a program and its arguments, ['ros2', 'run', 'my_package', 'my_node'], got "
+                f'{described(self.command)}'
+            )
+
+    @property
+    def arguments(self) -> list[str]:
+        """The program and all its arguments."""
+        timed = ('--ros-args', '-p', 'use_sim_time:=true') if self.use_sim_time else ()
+        return [*(os.fspath(part) for part in self.command), *timed]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,9 +152,10 @@ class StandIn(Node):  # type: ignore[misc]
 class NodeProcess:
     """A process with nodes in the world, as of `Lockstep.start`. It is ended with the world."""
 
-    def __init__(self, command: Command, surroundings: Surroundings) -> None:
-        """Start nothing yet."""
+    def __init__(self, command: Command, surroundings: Surroundings, directory: Path) -> None:
+        """Start nothing yet. What it prints is kept in the directory, that of the world alone."""
         self._command = command
+        self._directory = directory
         self._scheduler = surroundings.scheduler
         self._nodes = surroundings.nodes
         self._extend, self._is_open = surroundings.extend, surroundings.is_open
@@ -268,9 +282,9 @@ class NodeProcess:
         hash_seed = {} if 'PYTHONHASHSEED' in os.environ else {'PYTHONHASHSEED': '0'}
         self.child = ExternalProcess(
             command.arguments,
-            {**variables, **hash_seed, **command.variables},
-            command.directory,
-            command.cwd,
+            {**variables, **hash_seed, **command.env},
+            self._directory,
+            None if command.cwd is None else os.fspath(command.cwd),
         )
         self._quiet = Quiet(self.child.pid, receiving)
         self._closing.callback(self._quiet.close)
@@ -494,7 +508,7 @@ class NodeProcess:
 
     def _check_timed(self) -> None:
         """Check that the nodes receive the time."""
-        if not self._command.timed:
+        if not self._command.use_sim_time:
             return
         timed = {
             node_name(info)
