@@ -30,6 +30,10 @@ DEPTH = 1000
 """Queue size in the domain of the process: the number of messages of a topic at one simulated time."""
 
 
+QUEUE = 10
+"""Queue size of a client."""
+
+
 class Arrived(NamedTuple):
     """What a process has sent."""
 
@@ -167,8 +171,15 @@ class OfferedService:
         return future.result() if future.done() else _wait_for(future)
 
     def take(self) -> Iterator[Arrived]:
-        """Yield the responses that have arrived."""
-        while self._asked and (taken := take_response(self.client)) is not None:
+        """Yield the responses that have arrived.
+
+        Those to other clients are in the queue, too. They are taken like none.
+        """
+        misses = 0
+        while self._asked and misses <= QUEUE:
+            if (taken := take_response(self.client)) is None:
+                misses += 1
+                continue
             number, response = taken
             if (future := self._asked.pop(number, None)) is not None:
                 yield Arrived(f'answered {self.name}', False, partial(future.set_result, response))
