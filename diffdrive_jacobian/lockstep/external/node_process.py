@@ -297,6 +297,7 @@ class NodeProcess:
                 self._nodes.check_new(node)
                 self._nodes.add(node, observer=False)
         self._connected = True
+        self._quiet.learning = False
         (first, *_) = self._stand_ins.values()
         first.create_timer(self._command.clock_period, self._give_time)
         first.executor.create_task(self._begin)

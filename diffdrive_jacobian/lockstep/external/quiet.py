@@ -8,8 +8,8 @@ sleeps in the second round, it is known that it did not run in between, and was 
 holds for all of them, there was a moment between the rounds at which none did anything, and no message
 was on its way from one to the other.
 
-A thread that sleeps for a time, as in `time.sleep`, goes on by itself. It counts as busy. One that waits
-for something is quiet, also with a timeout: nobody can tell what it will do then.
+A thread that sleeps for a time, as in `time.sleep`, goes on by itself. It counts as busy. So does one
+that waits with a timeout at another place of its stack than in an idle process: it is in a callback.
 """
 
 from __future__ import annotations
@@ -30,6 +30,14 @@ SLEEPS = {
 }
 """Numbers of the system calls that sleep (nanosleep, clock_nanosleep), and of those that do if they have
 no file to wait for (poll, select, pselect6, ppoll), for each machine."""
+TIMED = {
+    'x86_64': {b'202': 3, b'7': 2, b'271': 2, b'270': 4, b'23': 4, b'232': 3, b'281': 3},
+    'aarch64': {b'98': 3, b'73': 2, b'72': 4, b'22': 3},
+}
+"""Numbers of the system calls that wait (futex, poll, select, epoll), with the place of their timeout
+among the arguments, for each machine."""
+ENDLESS = (b'0x0', b'0xffffffff', b'0xffffffffffffffff')
+"""Timeouts that are none."""
 TRIES = 30
 """Number of attempts that follow each other at once. Later ones leave the processor to others."""
 PAUSE = 0.0001
@@ -97,6 +105,11 @@ class Quiet:
             LockstepError: The process may not be observed.
         """
         self._sleeps, self._polls = SLEEPS[platform.machine()]
+        self._timed = TIMED[platform.machine()]
+        self.learning = True
+        """Whether the process is idle, so that its threads wait where they do when they are."""
+        self._idle: set[tuple[int, int, bytes]] = set()
+        """Threads and stack pointers, of waits with a timeout in an idle process."""
         self._threads: dict[tuple[int, int], _Thread] = {}
         self._sizes: dict[int, int] = {pid: 0}
         """Number of links of the folder of the threads, by process."""
@@ -171,15 +184,29 @@ class Quiet:
                 return state not in ENDED or not self._was_ended(thread)
             if thread.call < 0:
                 return False
-            number, *arguments = os.pread(thread.call, 128, 0).split(b' ', 2)
-            if number in self._sleeps or (
-                number in self._polls and _waits_for_no_file(number, arguments)
-            ):
-                self._why = 'sleeps'
-                return True
+            return self._waits_in_callback(thread, os.pread(thread.call, 256, 0).split())
         except ProcessLookupError:
             raise _EndedError from None
-        return False
+
+    def _waits_in_callback(self, thread: _Thread, call: list[bytes]) -> bool:
+        """Return whether a thread sleeps for a time, or waits with a timeout as it does not when idle.
+
+        Args:
+            thread: The thread.
+            call: Number, arguments, stack pointer and program counter of its system call.
+        """
+        number = call[0]
+        if number in self._sleeps or (number in self._polls and _waits_for_no_file(number, call[1:])):
+            self._why = 'sleeps'
+            return True
+        place = self._timed.get(number)
+        if place is None or call[1 + place] in ENDLESS:
+            return False
+        wait = (thread.pid, thread.tid, call[-2])
+        if self.learning:
+            self._idle.add(wait)
+        self._why = 'waits in a callback, with a timeout'
+        return wait not in self._idle
 
     def _was_ended(self, thread: _Thread) -> bool:
         """Return whether a thread had ended when it was looked at before.
@@ -272,8 +299,7 @@ def _waits_for_no_file(number: bytes, arguments: list[bytes]) -> bool:
     """Return whether a call of poll or select has no file, and so only waits for its timeout."""
     # The number of files is the second argument of poll, and the first of select.
     place = 1 if number in (b'7', b'271', b'73') else 0
-    words = b' '.join(arguments).split(b' ')
-    return words[place : place + 1] == [b'0x0']
+    return arguments[place] == b'0x0'
 
 
 def _read(descriptor: int, *, close: bool = False) -> bytes:
