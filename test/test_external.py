@@ -8,6 +8,7 @@ import signal
 import socket
 import sys
 import threading
+from collections import Counter
 
 import external_nodes
 import pytest
@@ -21,6 +22,7 @@ from rclpy.node import Node
 from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
 
+from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.exploration.digest import MessageDigest
 from diffdrive_jacobian.faults import ClockPause, Corrupt, Delay, Hang, Kill, Loss, Slow, TimeJump
 from diffdrive_jacobian.lockstep.external import process as external_process
@@ -314,6 +316,20 @@ def test_properties_observe_processes(lockstep):
         lockstep.publish('echo/odom', odometry(speed))
     with pytest.raises(PropertyViolation, match='NeverFasterThan'):
         lockstep.publish('echo/odom', odometry(3.0))
+
+
+def test_what_processes_publish_is_recorded(lockstep, recorded_run):
+    lockstep.start(command('echo', 'ticker'))
+    for number in range(3):
+        lockstep.publish('echo/odom', odometry(float(number)))
+        lockstep.run_for(0.1)
+    recorded_run.finish()
+    with open_bag(recorded_run.bag) as bag:
+        counts = Counter(connection.topic for connection, _, _ in bag.messages())
+    assert counts['/echo/cmd_vel'] == counts['/echo/odom'] == 3
+    assert counts['/ticker/cmd_vel'] >= 6
+    # Latched, before the process took part.
+    assert counts['/ticker/description'] == 1
 
 
 # --- Attacks: right, or a named error
