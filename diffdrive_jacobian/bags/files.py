@@ -1,4 +1,7 @@
-"""The hidden directory in which a bag is written, until it is complete and gets its name."""
+"""Files of a bag: which there are, and what they are by their first bytes.
+
+A bag is written in a hidden directory beside it, until it is complete and gets its name.
+"""
 
 from __future__ import annotations
 
