@@ -6,6 +6,8 @@ import ast
 import importlib
 import inspect
 import pkgutil
+import subprocess
+import sys
 from collections import defaultdict
 
 import pages
@@ -24,6 +26,17 @@ def test_every_public_object_has_one_path():
             paths[id(value)].append(path)
     assert len(paths) > 200
     assert not [several for several in paths.values() if len(several) > 1]
+
+
+def test_every_public_name_is_an_attribute_of_its_package():
+    code = f"""
+import importlib
+for name in {PACKAGES}:
+    package = importlib.import_module(f'{PACKAGE}.{{name}}')
+    for one in getattr(package, '__all__', []):
+        getattr(package, one)
+"""
+    subprocess.run([sys.executable, '-c', code], check=True)
 
 
 @pytest.mark.parametrize('name', PACKAGES)

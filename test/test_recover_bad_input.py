@@ -38,12 +38,19 @@ def test_what_is_no_bag(tmp_path, capsys):
     write_journal(tmp_path / 'others' / 'run', [])
     for name, words in {
         'nothing': ('there is no bag', 'nothing.journal.mcap'),
-        'others': ('holds neither .mcap nor .db3 files',),
+        'others': ('holds no files of a bag but journals (*.journal.mcap)',),
         'empty': ('is an empty folder',),
         'other': ('holds neither .mcap nor .db3 files',),
         'other/notes.txt': ('is neither MCAP nor SQLite',),
     }.items():
         assert_refused(capsys, tmp_path, [tmp_path / name], 2, *words)
+
+
+def test_a_journal_without_the_name_of_a_bag(tmp_path, capsys, messages):
+    write_journal(tmp_path / 'run', messages).rename(tmp_path / '.journal.mcap')
+    code, out, _ = recover(capsys, tmp_path / '.journal.mcap')
+    assert code == 0
+    assert '.journal_recovered is written' in out
 
 
 @pytest.mark.parametrize('storage', PLUGINS)

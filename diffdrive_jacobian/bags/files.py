@@ -1,4 +1,7 @@
-"""The hidden directory in which a bag is written, until it is complete and gets its name."""
+"""Files of a bag: which there are, and what they are by their first bytes.
+
+A bag is written in a hidden directory beside it, until it is complete and gets its name.
+"""
 
 from __future__ import annotations
 
@@ -88,8 +91,8 @@ def journal_of(bag: Path) -> Path:
 
 
 def is_journal(path: Path) -> bool:
-    """Return whether a file is a journal by its name."""
-    return path.name.endswith(JOURNAL)
+    """Return whether a file is a journal by its name, which begins with that of the bag."""
+    return path.name.endswith(JOURNAL) and path.name != JOURNAL
 
 
 def check_regular(path: Path) -> None:
@@ -143,6 +146,8 @@ def bag_files(path: Path) -> list[Path]:
     files = [one for one in files if file_kind(one) and not is_journal(one)]
     if not files:
         what = 'holds neither .mcap nor .db3 files' if present else 'is an empty folder'
+        if any(map(is_journal, present)):
+            what = f'holds no files of a bag but journals (*{JOURNAL}): recover these one by one'
         raise NotABagError(f'{path} {what}: it is not a bag')
     # Files are numbered, and 10 comes after 9.
     return sorted(

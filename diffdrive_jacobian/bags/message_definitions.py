@@ -1,8 +1,10 @@
-"""The types of ROS 2 Jazzy, where no ROS is installed.
+"""Message types of the installed packages: their definitions and their Python classes.
 
-rosbags generates Python code from definitions of message types, and executes it. So only the definitions
-that come with rosbags, and the one in this module, are given to it, and never a definition in a bag.
-Where a bag has the hash of a type (RIHS01, REP 2011), it is compared with that of the known definition.
+A bag stores the full definition of each type, so that it can be read where the type is not installed.
+
+Names of types come from bags and from other processes. A package is imported only if its name is a valid
+one, the first module of that name on the import path lies in an installation prefix, and the share
+directory of the same prefix holds the .msg file. All of that is checked without importing anything.
 """
 
 from __future__ import annotations

@@ -1,4 +1,10 @@
-"""Comparison of recorded ground truth with the simulated robot."""
+"""Verification of a recorded run: a simulation from its commands is compared with its odometry.
+
+The commands are applied to `simulation.Robot`, as in the node `virtual_robot`, and each odometry message
+is compared with the pose of that robot at the message's stamp. `cmd_vel_out` has each command as it was
+applied, after limits and timeout, with the time it took effect, so that no parameter is needed. Without
+it the commands take effect when they were recorded, with the limits and the timeout of the parameters.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which topics, joints and dimensions of a bag a calibration takes."""
+"""Wheels and a reference of the pose from a bag, as the calibration takes them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,11 @@
-"""Which combinations of the multipliers a drive does not determine, in words."""
+"""Maximum likelihood estimate of the multipliers from wheel angles and poses of a reference.
+
+The model is that of doc/mathematics.md, "Calibration": the pose of the body is a random walk about the
+motion that the wheels measure, and the reference observes it with white noise. All poses of the body and
+all parameters are estimated together by Gauss-Newton steps. The poses form a block-tridiagonal system,
+so that a step takes a time proportional to their number. The noise is estimated by restricted maximum
+likelihood.
+"""
 
 from __future__ import annotations
 

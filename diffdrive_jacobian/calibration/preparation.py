@@ -1,4 +1,4 @@
-"""Poses of a robot at rest, merged: without motion between them they observe the same pose."""
+"""From recordings to continuous motions: overlap in time, gaps, glitches and jumps of the reference."""
 
 from __future__ import annotations
 

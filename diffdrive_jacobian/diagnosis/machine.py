@@ -1,4 +1,4 @@
-"""The environment of nodes: ROS variables, versions, and where the packages come from."""
+"""What nodes run on: environment variables, versions, shared memory, network interfaces, multicast."""
 
 from __future__ import annotations
 

@@ -1,4 +1,13 @@
-"""The runners of a drive, in real time and in simulated time, for its whole duration."""
+"""Drives of the virtual robot to goals: robot, controller and wheel bridge in one process.
+
+    from diffdrive_jacobian.drives import drive
+
+    outcome = drive([[1.0, 1.0]], lockstep=True)
+    print(outcome.arrived, outcome.pose, outcome.seconds)
+
+The robot is driven by its wheels, so that the whole Jacobian chain is in use:
+goal -> control law -> body twist -> J_w^-1 -> wheel speeds -> J_w -> body twist -> S(theta) -> pose.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the bits of a run depend on besides its inputs: versions and features of the processor."""
+"""Running a finding again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors of the exploration."""
+"""Scenarios by name, so that other processes and test files find them; errors of the exploration."""
 
 from __future__ import annotations
 

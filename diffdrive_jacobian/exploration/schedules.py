@@ -1,4 +1,7 @@
-"""Generating trials and shrinking them, which Hypothesis does.
+"""Hypothesis strategies of fault schedules, and the trials that Hypothesis generates and shrinks.
+
+The first kinds, topics and nodes are the simplest, so put the usual suspects first. A smaller schedule
+has fewer faults. Then they become certain (probability 1), short and early, at whole seconds.
 
 The trials of a block depend on its seed alone. Hypothesis would also try constants that it finds in the
 modules of the running program, so that the same seed would give other trials in another program. This is

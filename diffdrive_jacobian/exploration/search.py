@@ -1,4 +1,9 @@
-"""Which trials fail, for Hypothesis while it shrinks one."""
+"""Exploring worlds: thousands of cases and fault schedules, of which the failing ones are shrunk.
+
+Hypothesis generates the trials in this process, block by block. The executor runs them. So the worlds
+depend on the seed alone, not on the number of cores. A violated property is shrunk by running its block
+again in Hypothesis, with the outcomes that are known already, until its first failing trial.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Values that are printed as the Python expression that makes them: faults and properties."""
+"""The base classes of all faults.
+
+A fault is a value: a frozen dataclass that can be compared, pickled and printed as the Python expression
+that makes it. `Lockstep.inject` lets it happen. How it happens is in `install`, which uses what the
+world offers to every fault (`Injection`).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The path of a robot for the page, with a bounded number of points."""
+"""What is known of one robot, its path included, and the JSON object that the page receives of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The files of the page, as they are installed with the package."""
+"""The server of the page: HTTP and websockets on 127.0.0.1, in a thread of its own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,13 @@
-"""What fields of messages mean: poses, twists and times, checked."""
+"""Conversion between ROS messages and the quantities of the mathematics.
+
+Poses are `[x, y, theta]` (m, m, rad), twists `(v, omega)` (m/s, rad/s), times integer nanoseconds.
+Wheels are ordered left, right in messages, as is usual in ROS, and right, left in the mathematics. Only
+this module converts between these orders, and only it writes stamps.
+
+The `set_` functions fill an existing message. The `from_` functions take the fields of a message and
+check them. They raise MessageError, which reports the value and the range allowed. Which fields these
+are is said in `messages.codecs`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A goal of the node go_to_goal, read from a message."""
+"""Drive a robot to goals by a controller: odometry and goals in, body twists out."""
 
 from __future__ import annotations
 

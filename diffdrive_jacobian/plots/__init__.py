@@ -67,6 +67,6 @@ _PICTURES = {
 PICTURES = {name: what for name, (_, what) in _PICTURES.items()}
 """What each picture shows."""
 if not TYPE_CHECKING:
-    __getattr__, __dir__ = lazy.attach(
-        __name__, {name: f'plots.{module}' for name, (module, _) in _PICTURES.items()}
-    )
+    _FUNCTIONS = {name: f'plots.{module}' for name, (module, _) in _PICTURES.items()}
+    _MODULES = {name: f'plots.{name}' for name in ('run_figure', 'run_table', 'sweep_figure')}
+    __getattr__, __dir__ = lazy.attach(__name__, _FUNCTIONS | _MODULES)

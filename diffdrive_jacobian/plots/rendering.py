@@ -1,4 +1,7 @@
-"""The style of all figures. matplotlib is imported when something is drawn. No display is needed."""
+"""The style of all figures, and the content of a file with one.
+
+matplotlib is imported when something is drawn. No display is needed.
+"""
 
 from __future__ import annotations
 

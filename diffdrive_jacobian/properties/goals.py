@@ -1,4 +1,4 @@
-"""Observing goals, cancellations and the pose of the robot."""
+"""Reaching goals."""
 
 from __future__ import annotations
 

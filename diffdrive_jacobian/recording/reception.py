@@ -1,4 +1,7 @@
-"""The selection of topics to record."""
+"""The selection of topics to record, and the reception of their messages.
+
+They are received whatever quality of service their publishers offer.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Faults that are reported when they have lasted for a while, once until they change."""
+"""Checks of the graph around a node for `ParameterizedNode.watch`.
+
+A check returns a line for the log with the remedy, or None, and costs microseconds unless there is a
+fault. The `SharedGraph` must be refreshed before.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,13 @@
-"""Names of the files that tests leave behind, after the tests."""
+"""The plugin of pytest. It is loaded by its entry point, wherever this package is installed.
+
+`lockstep` is a new `Lockstep` for each test. `robot_at(x, y, theta)` adds a virtual robot to it.
+`recorded_run` records the test as a bag and a figure, which are kept if it fails. `golden_run` compares
+the test with a recorded run. The marker `lockstep(args=..., start=..., patience=...)` passes arguments
+to `Lockstep`. The report of a failed test ends with the last messages of all topics.
+
+pytest loads this module in every project. Until a fixture is used it imports neither rclpy nor NumPy and
+leaves the environment as it is.
+"""
 
 from __future__ import annotations
 

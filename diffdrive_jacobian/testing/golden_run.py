@@ -1,4 +1,4 @@
-"""Comparison of the messages of two runs, field by field."""
+"""The golden run of a test: a recorded bag, with which later runs of the test are compared."""
 
 from __future__ import annotations
 
