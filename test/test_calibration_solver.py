@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from diffdrive_jacobian.calibration.normal_equations import solve
+from diffdrive_jacobian.calibration.normal_equations import solve_block_tridiagonal
 
 
 @pytest.mark.parametrize('count', [1, 2, 3, 4, 5, 6, 7, 8, 13, 16, 17, 100])
@@ -21,6 +21,6 @@ def test_equals_dense_linear_algebra(count):
         dense[3 * i : 3 * i + 3, 3 * i + 3 : 3 * i + 6] = upper[i]
         dense[3 * i + 3 : 3 * i + 6, 3 * i : 3 * i + 3] = upper[i].T
     np.linalg.cholesky(dense)  # raises unless it is positive definite
-    solution, logarithm = solve(diagonal, upper, right)
+    solution, logarithm = solve_block_tridiagonal(diagonal, upper, right)
     np.testing.assert_allclose(solution.reshape(-1, 4), np.linalg.solve(dense, right.reshape(-1, 4)))
     assert logarithm == pytest.approx(np.linalg.slogdet(dense)[1])
