@@ -401,10 +401,11 @@ def public_page() -> str:
     lines = [
         '# Public names',
         '',
-        'What a program may import, with the first sentence of its docstring. Each object has one',
-        'public path, as on this page. Packages and modules list these names in `__all__`. Everything',
-        'else is internal and may change without notice. All errors derive from',
-        '`errors.DiffdriveError`.',
+        'What a program may import, with the first sentence of its docstring. Paths begin with',
+        '`diffdrive_jacobian`: under kinematics, `planar_arm.PlanarArm` is',
+        '`from diffdrive_jacobian.kinematics.planar_arm import PlanarArm`. Each object has one public path,',
+        'as on this page. Packages and modules list these names in `__all__`. Everything else is internal',
+        'and may change without notice. All errors derive from `errors.DiffdriveError`.',
         '',
         'Written by `python test/pages.py public`.',
     ]
@@ -422,8 +423,8 @@ def _sentence(value: object) -> str:
     if not (inspect.ismodule(value) or callable(value)):
         return str(getattr(value, 'description', ''))
     text = ' '.join((inspect.getdoc(value) or '').partition('\n\n')[0].split())
-    found = re.match(r'.*?[.:](?= [A-Z]|$)', text)
-    return (found[0] if found else text).rstrip(':').replace('|', '\\|')
+    found = re.match(r'.*?\.(?= [A-Z]|$)', text)
+    return (found[0] if found else text).replace('|', '\\|')
 
 
 # --- Pictures

@@ -1,4 +1,7 @@
-"""Recording of topics as bags, through a journal that survives a crash, and replay of bags."""
+"""Recording of topics as bags, which the command `record_run` does, and replay of bags.
+
+A recording goes through a journal that survives a crash.
+"""
 
 from __future__ import annotations
 
