@@ -403,9 +403,9 @@ def public_page() -> str:
         '',
         'What a program may import, with the first sentence of its docstring. Paths begin with',
         '`diffdrive_jacobian`: under kinematics, `planar_arm.PlanarArm` is',
-        '`from diffdrive_jacobian.kinematics.planar_arm import PlanarArm`. Each object has one public path,',
-        'as on this page. Packages and modules list these names in `__all__`. Everything else is internal',
-        'and may change without notice. All errors derive from `errors.DiffdriveError`.',
+        '`from diffdrive_jacobian.kinematics.planar_arm import PlanarArm`. Each object has one public',
+        'path, as on this page. Packages and modules list these names in `__all__`. Everything else is',
+        'internal and may change without notice. All errors derive from `errors.DiffdriveError`.',
         '',
         'Written by `python test/pages.py public`.',
     ]

@@ -148,7 +148,8 @@ def _parser() -> _cli.Parser:
     _options.add_wait_matching(parser, 'goal_pose has', '1')
     _options.add_heading(
         parser,
-        'heading at the goal (rad), used if the controller has use_goal_heading or is pose (default: 0.0)',
+        'heading at the goal (rad), used if the controller has use_goal_heading or is pose '
+        '(default: 0.0)',
     )
     parser.add_argument(
         '--frame', default='', help='frame of the goal (default: the frame of the odometry)'
