@@ -12,7 +12,7 @@ import pytest
 
 from diffdrive_jacobian.control import KP, KV, OFFSET, Arrival
 from diffdrive_jacobian.kinematics import diff_drive
-from diffdrive_jacobian.live import server, settings
+from diffdrive_jacobian.live import files, settings
 from diffdrive_jacobian.live.commands import Pause, SetSpeed, Step
 from diffdrive_jacobian.live.goal_progress import GoalProgress
 from diffdrive_jacobian.live.hand import CANCEL_PATIENCE, DEAD_MAN, Act, HandDriving
@@ -354,7 +354,7 @@ def test_settings_that_are_shown_and_taken():
 
 
 def test_the_page_loads_nothing_from_elsewhere():
-    found = server.page_files()
+    found = files.page_files()
     assert {'index.html', 'main.js', 'theme.css', 'icon.svg'} <= set(found)
     for name, (_, content) in found.items():
         text = content.decode().replace('http://www.w3.org/2000/svg', '')
@@ -362,7 +362,7 @@ def test_the_page_loads_nothing_from_elsewhere():
 
 
 def test_modules_and_elements_that_are_used_exist():
-    texts = {name: content.decode() for name, (_, content) in server.page_files().items()}
+    texts = {name: content.decode() for name, (_, content) in files.page_files().items()}
     ids = set(re.findall(r'id="([\w-]+)"', texts['index.html']))
     for name, text in texts.items():
         for used in re.findall(r"byId\('([\w-]+)'\)", text):
@@ -377,7 +377,7 @@ def test_modules_and_elements_that_are_used_exist():
 
 
 def test_every_control_has_a_name():
-    html = server.page_files()['index.html'][1].decode()
+    html = files.page_files()['index.html'][1].decode()
     for tag in re.findall(r'<(?:button|canvas|select|input)[^>]*>[^<]*', html):
         text = tag.split('>', 1)[1].strip()
         labelled = 'aria-label' in tag or any(letter.isalpha() for letter in text)

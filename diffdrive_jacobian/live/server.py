@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from enum import Enum
 from functools import partial
 from http import HTTPStatus
-from importlib.resources import files
 from typing import Any
 
 from websockets.asyncio.server import Server, ServerConnection, serve
@@ -25,27 +24,9 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from diffdrive_jacobian.live.commands import MAX_SIZE, CommandError, parse
+from diffdrive_jacobian.live.files import page_files
 from diffdrive_jacobian.live.session import Page, Session
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
-
-TYPES = {
-    '.html': 'text/html; charset=utf-8',
-    '.css': 'text/css; charset=utf-8',
-    '.js': 'text/javascript; charset=utf-8',
-    '.svg': 'image/svg+xml',
-}
-"""Content type by the ending of a file."""
-
-
-def page_files() -> dict[str, tuple[str, bytes]]:
-    """Return content type and content of every file of the page, by name."""
-    found = {}
-    for file in files('diffdrive_jacobian.live').joinpath('page').iterdir():
-        ending = file.name[file.name.rfind('.') :]
-        if ending in TYPES:
-            found[file.name] = TYPES[ending], file.read_bytes()
-    return found
-
 
 HOSTS = ('127.0.0.1', 'localhost')
 """Names of this machine by which the page may be reached. The port may differ, as through ssh -L."""
