@@ -30,9 +30,9 @@ from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.goal_client import GoalClient
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.recording.reception import Selection
 from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording
+from diffdrive_jacobian.recording.selection import Selection
 from diffdrive_jacobian.ros.node_runner import NodeRunner
 from diffdrive_jacobian.ros.rate_limit import TokenBucket
 from diffdrive_jacobian.ros.runner import Runner, discovery_off, ros_context, running

@@ -1,13 +1,12 @@
-"""The selection of topics to record, and the reception of their messages.
+"""Reception of the messages of a topic, whatever quality of service its publishers offer.
 
-They are received whatever quality of service their publishers offer.
+Which of them were missed follows from their numbers.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable, Sequence, Set
-from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from math import inf
@@ -25,7 +24,6 @@ from rclpy.qos import (
 from rclpy.subscription import Subscription
 from rclpy.waitable import NumberOfEntities, Waitable
 
-from diffdrive_jacobian.messages.topics import TOPICS
 from diffdrive_jacobian.ros.qos import subscription_profile
 from diffdrive_jacobian.ros.rclpy_internals import (
     Polled,
@@ -33,22 +31,6 @@ from diffdrive_jacobian.ros.rclpy_internals import (
     lost_messages,
     waiting_messages,
 )
-
-RUN_TOPICS = tuple(topic.name for topic in TOPICS.values() if topic.recorded)
-"""The topics of a run."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Selection:
-    """Which topics are recorded."""
-
-    topics: tuple[str, ...] = RUN_TOPICS
-    """Names, resolved by the recorder's namespace and remappings."""
-    everything: bool = False
-    """Whether to record every topic that is not hidden."""
-    pattern: str = ''
-    """Regular expression. Topics in whose full name it is found are recorded as well."""
-
 
 MAX_RUNS = 100
 """Runs of consecutive numbers that are kept of each publisher, to recognize messages received twice."""

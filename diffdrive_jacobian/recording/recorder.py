@@ -27,7 +27,7 @@ from diffdrive_jacobian.recording.reception import (
     Intake,
     Reception,
 )
-from diffdrive_jacobian.recording.reception import Selection as Selection
+from diffdrive_jacobian.recording.selection import Selection as Selection
 from diffdrive_jacobian.ros.qos import to_rosbags
 from diffdrive_jacobian.ros.rclpy_internals import ReceivedMessage, reason
 from diffdrive_jacobian.text import printable
