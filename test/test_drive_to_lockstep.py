@@ -161,13 +161,17 @@ def test_timeout_is_of_simulated_time(capsys):
     assert line.endswith('after 3.0 s of simulated time')
 
 
+FULL = 20_000
+"""Size at which the disk of a test is full (bytes): less than a drive of a second."""
+
+
 def test_a_full_disk_is_reported(tmp_path, capsys, monkeypatch):
     """A drive that arrives, but of which only a part is recorded, is not done."""
     write, written = os.write, []
 
     def limited(descriptor, data):
         if threading.current_thread().name == 'journal':
-            if sum(written) > 20_000:
+            if sum(written) + len(data) > FULL:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             written.append(len(data))
         return write(descriptor, data)
