@@ -10,6 +10,7 @@ from diffdrive_jacobian.control.controllers import (
 )
 from diffdrive_jacobian.control.go_to_goal import go_to_goal, turn_in_place
 from diffdrive_jacobian.control.offset_point import offset_point
+from diffdrive_jacobian.control.path import Path, Reference
 from diffdrive_jacobian.control.pose import go_to_pose
 from diffdrive_jacobian.control.resolved_rate import StraightLine, resolved_rate
 from diffdrive_jacobian.control.waypoints import Waypoints
@@ -26,6 +27,8 @@ __all__ = [
     'Controllers',
     'Gain',
     'LawError',
+    'Path',
+    'Reference',
     'StraightLine',
     'VelocityLimits',
     'Waypoints',

@@ -1,0 +1,387 @@
+"""A planned path: poses to drive through without stopping, and where a robot is along them.
+
+Model: the positions are connected by circular arcs, two for each pair (a biarc), which meet with the
+same tangent. The tangent at a position is that of the circle through it and its neighbours, so the
+positions of a circle give that circle. The arcs are what a unicycle drives at constant speeds: the path
+at arc length s is `exp` of SE(2), exact, with the curvature omega / v.
+
+- Headings of the poses are not used, because planners often leave them at 0. A robot drives along the
+  path forwards.
+- Where the direction changes by more than `CORNER` between two poses, the path has a corner: the tangent
+  jumps, and a robot rounds it as its law does.
+- Of two neighbours with very different lengths the longer one is a straight line.
+- A position that is repeated is skipped. In a trajectory (poses with times) it is a pause.
+
+Source: Bolton 1975, "Biarc curves"; Fritsch and Carlson 1980 for the times.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import cos, floor, sin
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from diffdrive_jacobian.kinematics import se2
+from diffdrive_jacobian.numerics.checks import array, finite, floats, number, read_only
+from diffdrive_jacobian.numerics.elementary import wrap
+
+Floats = NDArray[np.float64]
+
+CORNER = np.radians(35.0)
+"""Largest change of direction between two poses that is a curve rather than a corner (rad). A circle of
+twelve poses or more is a circle."""
+STRAIGHT = 4.0
+"""A distance between poses that is this many times the next one is a straight line."""
+REPEATED = 1e-6
+"""Distance below which a position is the one before (m)."""
+CLOSED = 1e-3
+"""Largest distance between the ends of a closed path (m)."""
+WINDOW = 0.5
+"""Arc length that `nearest` searches to either side, but at most a quarter of the path (m)."""
+
+
+class Reference(NamedTuple):
+    """A path at one place: where a robot should be, and how it should move there."""
+
+    x: float
+    """Position (m)."""
+    y: float
+    theta: float
+    """Direction of the tangent (rad)."""
+    v: float
+    """Speed along the path (m/s)."""
+    omega: float
+    """Yaw rate, curvature times speed (rad/s)."""
+    ax: float
+    """Acceleration of the point (m/s^2)."""
+    ay: float
+    s: float
+    """Arc length from the first pose (m)."""
+
+
+class Errors(NamedTuple):
+    """Tracking errors of a robot, in the frame of the reference. Each of shape (...)."""
+
+    along: Any
+    """Positive ahead of the reference (m)."""
+    across: Any
+    """Positive to the left of the path (m)."""
+    heading: Any
+    """Heading of the robot minus that of the path (rad)."""
+
+
+class _Arcs(NamedTuple):
+    """Arcs of constant curvature, each array of shape (m)."""
+
+    start: Floats
+    """Arc length at which each begins (m)."""
+    pose: Floats
+    """Pose in which each begins, shape (m, 3)."""
+    curvature: Floats
+    """Left positive (1/m)."""
+    length: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Path:
+    """Poses to drive through in order, with times a trajectory. Immutable.
+
+    Raises:
+        ValueError: The poses have another shape than (n, 3) or (n, 2), an entry is not finite, or fewer
+            than two positions differ. The times are not of shape (n), or do not increase.
+    """
+
+    poses: Floats
+    """`[x, y, theta]` each, shape (n, 3), read-only (m, m, rad). Given as (n, 2), theta is 0."""
+    times: Floats | None = None
+    """Time of each pose since the first, shape (n), read-only (s); None: a path without times."""
+    length: float = field(init=False)
+    """Arc length (m)."""
+    closed: bool = field(init=False)
+    """Whether the path ends where it begins, in the same direction."""
+    arc_lengths: Floats = field(init=False, repr=False)
+    """Arc length of each pose, shape (n), read-only (m)."""
+    _arcs: _Arcs = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Check the poses and connect them."""
+        poses = floats('poses', self.poses)
+        poses = array('poses', poses, 'n', 2 if poses.shape[-1:] == (2,) else 3)
+        if poses.ndim != 2:
+            raise ValueError(f'poses must have shape (n, 3) or (n, 2), got {poses.shape}')
+        if poses.shape[-1] == 2:
+            poses = np.column_stack([poses, np.zeros(len(poses))])
+        with np.errstate(over='ignore'):
+            new = np.hypot(*np.diff(poses[:, :2], axis=0).T) > REPEATED
+        if not new.any():
+            raise ValueError(f'poses must have two different positions, got {len(poses)} in one place')
+        distinct = poses[np.concatenate([[True], new]), :2]
+        with np.errstate(over='ignore', invalid='ignore'):
+            arcs, closed = _connected(distinct)
+            ends = np.concatenate([[0.0], np.cumsum(arcs.length)])
+        if not np.isfinite(ends[-1]):
+            raise ValueError('poses must give a path of finite length, but it overflows')
+        at_pose = ends[::2][np.concatenate([[0], np.cumsum(new)])]
+        times = None if self.times is None else _times(self.times, len(poses))
+        values = {
+            'poses': read_only(poses),
+            'times': times,
+            'length': float(ends[-1]),
+            'closed': closed,
+            'arc_lengths': read_only(at_pose),
+            '_arcs': arcs,
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first pose to the last (s); NaN for a path without times."""
+        return float('nan') if self.times is None else float(self.times[-1])
+
+    def at(self, s: float, speed: float) -> Reference:
+        """Return the path at an arc length.
+
+        Args:
+            s: Arc length (m). Before the start of an open path it is the start, after the end the end. A
+                closed path is repeated.
+            speed: Speed along the path, which is constant (m/s).
+
+        Raises:
+            ValueError: An argument is not a finite number.
+        """
+        return self._reference(number('s', s, finite), number('speed', speed, finite), 0.0)
+
+    def at_time(self, t: float) -> Reference:
+        """Return a trajectory at a time: between its poses the speed is continuous.
+
+        Args:
+            t: Time since the first pose (s). Before 0 the robot rests at the first pose, after the
+                duration at the last one.
+
+        Raises:
+            ValueError: t is not a finite number, or the path has no times.
+        """
+        t = number('t', t, finite)
+        if self.times is None:
+            raise ValueError('path must have times, got a path without')
+        if not 0.0 <= t < self.times[-1]:
+            return self._reference(0.0 if t < 0.0 else self.length, 0.0, 0.0)
+        return self._reference(*_interpolated(self.times, self.arc_lengths, t))
+
+    def poses_at(self, s: ArrayLike) -> Floats:
+        """Return the poses of the path, with the direction of the tangent, at arc lengths as in `at`.
+
+        Args:
+            s: Arc lengths, shape (...) (m).
+
+        Returns:
+            `[x, y, theta]`, shape (..., 3) (m, m, rad).
+
+        Raises:
+            ValueError: An arc length is not finite.
+        """
+        s = self._inside(array('s', s, *np.shape(s)))
+        index = self._arcs.start.searchsorted(s, 'right') - 1
+        beyond = s - self._arcs.start[index]
+        turn = self._arcs.curvature[index] * beyond
+        return se2.compose(
+            self._arcs.pose[index], se2.exp(np.stack([beyond, np.zeros_like(turn), turn], axis=-1))
+        )
+
+    def nearest(self, x: float, y: float, near: float | None = None) -> float:
+        """Return the arc length of the nearest point, in a window about a place.
+
+        The window keeps a robot on its branch where a path crosses itself or passes close to itself. On
+        a closed path the result may be below 0 or beyond the length, so that progress does not jump.
+
+        Args:
+            x: Position of the robot (m).
+            y: Likewise.
+            near: Arc length of the place, such as the result for the position before (m). None: the
+                whole path is searched.
+
+        Raises:
+            ValueError: An argument is not a finite number.
+        """
+        x, y = number('x', x, finite), number('y', y, finite)
+        low, high = 0.0, self.length
+        if near is not None:
+            window = min(WINDOW, self.length / 4.0)
+            near = number('near', near, finite)
+            near = near if self.closed else min(max(near, 0.0), high)
+            low, high = near - window, near + window
+            if not self.closed:
+                low, high = max(low, 0.0), min(high, self.length)
+        arcs, count = self._arcs, len(self._arcs.start)
+        first, last = self._arc(low), self._arc(high)
+        unwrapped = np.arange(first, last + 1)
+        index = unwrapped % count
+        start = arcs.start[index] + self.length * (unwrapped // count)
+        # The position in the frame in which each arc begins, and the angle that it has passed there.
+        theta, curvature = arcs.pose[index, 2], arcs.curvature[index]
+        dx, dy = x - arcs.pose[index, 0], y - arcs.pose[index, 1]
+        along = np.cos(theta) * dx + np.sin(theta) * dy
+        across = np.cos(theta) * dy - np.sin(theta) * dx
+        straight = curvature == 0.0
+        passed = np.where(
+            straight,
+            along,
+            np.arctan2(curvature * along, 1.0 - curvature * across) / np.where(straight, 1.0, curvature),
+        )
+        s = np.clip(start + np.clip(passed, 0.0, arcs.length[index]), low, high)
+        turn = curvature * (s - start) / 2.0
+        chord = (s - start) * np.sinc(turn / np.pi)
+        return float(s[np.argmin(np.hypot(along - chord * np.cos(turn), across - chord * np.sin(turn)))])
+
+    def project(self, positions: ArrayLike, near: float | None = 0.0) -> Floats:
+        """Return the arc length of the nearest point for each of the positions of a drive in order.
+
+        Args:
+            positions: Shape (n, 2) or (n, 3) (m).
+            near: Arc length about which the first is searched (m). None: on the whole path.
+
+        Returns:
+            Arc lengths, shape (n) (m), as of `nearest`.
+
+        Raises:
+            ValueError: The shape differs, or an entry is not finite.
+        """
+        positions = array('positions', positions, *np.shape(positions))
+        result = np.empty(len(positions))
+        for index, (x, y) in enumerate(positions[:, :2].tolist()):
+            near = result[index] = self.nearest(x, y, near)
+        return result
+
+    @staticmethod
+    def errors(pose: Any, reference: Any) -> Errors:
+        """Compute the tracking errors of a robot in the frame of a reference.
+
+        Args:
+            pose: `[x, y, theta]` of the robot, shape (..., 3) (m, m, rad).
+            reference: A Reference, or `[x, y, theta]` of the path, shape (..., 3).
+
+        Returns:
+            The errors along and across the path and of the heading, each of shape (...).
+
+        Raises:
+            ValueError: A shape differs, or an entry is not finite.
+        """
+        placed = se2.compose(se2.inverse(np.asarray(reference)[..., :3]), pose)
+        return Errors(*(one[()] for one in np.moveaxis(placed, -1, 0)))
+
+    def _inside(self, s: Any) -> Any:
+        """Return arc lengths from 0 to the length."""
+        return np.mod(s, self.length) if self.closed else np.clip(s, 0.0, self.length)
+
+    def _arc(self, s: float) -> int:
+        """Return the number of the arc at an arc length; a closed path goes on counting."""
+        turns = floor(s / self.length) if self.closed else 0
+        start = self._arcs.start
+        return turns * len(start) + int(start.searchsorted(s - turns * self.length, 'right')) - 1
+
+    def _reference(self, s: float, v: float, v_dot: float) -> Reference:
+        inside = float(self._inside(s))
+        index = int(self._arcs.start.searchsorted(inside, 'right')) - 1
+        beyond = inside - float(self._arcs.start[index])
+        curvature = float(self._arcs.curvature[index])
+        passed = se2.exp.formula([beyond, 0.0, curvature * beyond])
+        x, y, theta = se2.compose.formula(self._arcs.pose[index].tolist(), passed)
+        a_n = curvature * v * v
+        ax, ay = v_dot * cos(theta) - a_n * sin(theta), v_dot * sin(theta) + a_n * cos(theta)
+        return Reference(x, y, theta, v, curvature * v, ax, ay, s if self.closed else inside)
+
+
+def _times(times: ArrayLike, count: int) -> Floats:
+    result = array('times', times, 'n')
+    if result.shape != (count,):
+        raise ValueError(f'times must have shape ({count},), as many as poses, got {result.shape}')
+    back = np.flatnonzero(np.diff(result) <= 0.0)
+    if back.size:
+        one, two = result[back[0] : back[0] + 2].tolist()
+        raise ValueError(f'times must increase, got {two:g} s after {one:g} s at index {back[0] + 1}')
+    return read_only(result - result[0])
+
+
+def _connected(positions: Floats) -> tuple[_Arcs, bool]:
+    """Return two arcs for each pair of positions, shape (n, 2), and whether the path is closed."""
+    chords = np.diff(positions, axis=0)
+    lengths, directions = np.hypot(*chords.T), np.arctan2(chords[:, 1], chords[:, 0])
+    # At the join of a closed path the last chord precedes the first.
+    turns = wrap(directions - np.roll(directions, 1))
+    before = np.roll(lengths, 1)
+    ends_meet = bool(np.hypot(*(positions[-1] - positions[0])) <= CLOSED)
+    closed = ends_meet and bool(abs(turns[0]) <= CORNER)
+    # Angle from the chord before a position to its tangent: the angle between chord and tangent of a
+    # circle is half of the arc, so the sines of both angles are in proportion to the chords.
+    ahead = np.arctan2(before * np.sin(turns), lengths + before * np.cos(turns))
+    ahead = np.where(before > STRAIGHT * lengths, 0.0, ahead)
+    ahead = np.where(lengths > STRAIGHT * before, turns, ahead)
+    smooth = abs(turns) <= CORNER
+    smooth[0] = closed
+    begin = np.where(smooth, ahead - turns, np.nan)
+    end = np.where(np.roll(smooth, -1), np.roll(ahead, -1), np.nan)
+    # An end without a tangent has that of the circle which has the other end's.
+    begin, end = _known(begin, -end), _known(end, -begin)
+    return _biarcs(positions[:-1], directions, lengths, begin, end), closed
+
+
+def _known(angle: Floats, other: Floats) -> Floats:
+    return np.where(np.isfinite(angle), angle, np.where(np.isfinite(other), other, 0.0))
+
+
+def _biarcs(positions: Floats, directions: Floats, lengths: Floats, begin: Floats, end: Floats) -> _Arcs:
+    """Return the arcs over chords whose tangents at both ends have given angles to the chord."""
+    both = np.cos(begin) + np.cos(end)
+    d = lengths / (both + np.sqrt(both**2 + 4.0 * np.sin((end - begin) / 2.0) ** 2))
+    # Where the two arcs meet, in the frame of the chord.
+    x = (lengths + d * (np.cos(begin) - np.cos(end))) / 2.0
+    y = d * (np.sin(begin) - np.sin(end)) / 2.0
+    to_joint, from_joint = np.arctan2(y, x), np.arctan2(-y, lengths - x)
+    half_turns = np.column_stack([to_joint - begin, end - from_joint]).ravel()
+    chords = np.column_stack([np.hypot(x, y), np.hypot(lengths - x, y)]).ravel()
+    arcs = chords / np.sinc(half_turns / np.pi)
+    headings = np.column_stack([directions + begin, directions + 2.0 * to_joint - begin]).ravel()
+    offset_x = x * np.cos(directions) - y * np.sin(directions)
+    offset_y = x * np.sin(directions) + y * np.cos(directions)
+    joints = positions + np.column_stack([offset_x, offset_y])
+    starts = np.stack([positions, joints], axis=1).reshape(-1, 2)
+    return _Arcs(
+        start=read_only(np.concatenate([[0.0], np.cumsum(arcs)[:-1]])),
+        pose=read_only(np.column_stack([starts, wrap(headings)])),
+        curvature=read_only(2.0 * half_turns / arcs),
+        length=read_only(arcs),
+    )
+
+
+def _interpolated(times: Floats, s: Floats, t: float) -> tuple[float, float, float]:
+    """Return arc length, speed and its derivative: the monotone cubic of Fritsch and Carlson.
+
+    Monotone, so that a robot pauses where it should, and never drives backwards.
+    """
+    index = int(times.searchsorted(t, 'right')) - 1
+    first = max(index - 1, 0)
+    intervals = np.diff(times[first : index + 3])
+    means = (np.diff(s[first : index + 3]) / intervals).tolist()
+    here = index - first
+    h, mean = float(intervals[here]), means[here]
+    v_0 = mean if here == 0 else _slope(intervals[here - 1], h, means[here - 1], mean)
+    v_1 = mean if here + 1 == len(means) else _slope(h, intervals[here + 1], mean, means[here + 1])
+    u = (t - float(times[index])) / h
+    quadratic, cubic = 3.0 * mean - 2.0 * v_0 - v_1, v_0 + v_1 - 2.0 * mean
+    return (
+        float(s[index]) + h * u * (v_0 + u * (quadratic + u * cubic)),
+        v_0 + u * (2.0 * quadratic + 3.0 * u * cubic),
+        (2.0 * quadratic + 6.0 * u * cubic) / h,
+    )
+
+
+def _slope(h_0: Any, h_1: Any, mean_0: float, mean_1: float) -> float:
+    """Return the weighted harmonic mean of two speeds, 0 at a pause."""
+    if min(mean_0, mean_1) <= 0.0:
+        return 0.0
+    w_0, w_1 = 2.0 * float(h_1) + float(h_0), float(h_1) + 2.0 * float(h_0)
+    return (w_0 + w_1) / (w_0 / mean_0 + w_1 / mean_1)

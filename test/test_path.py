@@ -1,0 +1,202 @@
+"""A planned path: circles stay circles, corners stay corners, progress does not jump, times are kept."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from diffdrive_jacobian.control.path import CORNER, Path
+from diffdrive_jacobian.kinematics import se2
+
+
+def circle(count, radius=1.0, turns=1.0):
+    """Positions on a circle to the left, from the origin along x."""
+    angle = np.linspace(0.0, 2.0 * math.pi * turns, count)
+    return radius * np.stack([np.sin(angle), 1.0 - np.cos(angle)], -1)
+
+
+def figure_eight(count):
+    angle = np.linspace(0.0, 2.0 * math.pi, count)
+    return np.stack([np.sin(angle), np.sin(angle) * np.cos(angle)], -1)
+
+
+def wobbly(rng, count=40):
+    """A random smooth path, coarsely sampled."""
+    heading = np.cumsum(rng.uniform(-0.5, 0.5, count))
+    step = rng.uniform(0.5, 1.5, (count, 1))
+    return np.cumsum(step * np.stack([np.cos(heading), np.sin(heading)], -1), axis=0)
+
+
+@pytest.mark.parametrize('turns', [0.6, 1.0])
+def test_a_coarse_circle_is_a_circle(turns):
+    path = Path(circle(17, 1.5, turns))
+    assert path.closed is (turns == 1.0)
+    assert path.length == pytest.approx(3.0 * math.pi * turns, rel=1e-12)
+    s = np.linspace(0.0, path.length, 1000, endpoint=False)
+    x, y, theta = path.poses_at(s).T
+    assert_allclose(np.hypot(x, y - 1.5), 1.5, atol=1e-12)
+    assert_allclose(se2.wrap_angle(theta - s / 1.5), 0.0, atol=1e-12)
+
+
+def test_a_reference_has_the_derivatives_of_the_path():
+    path, h = Path(wobbly(np.random.default_rng(1))), 1e-6
+    for s in np.linspace(0.1, path.length - 0.1, 200):
+        before, here, after = (path.at(at, 0.3) for at in (s - 0.3 * h, s, s + 0.3 * h))
+        velocity = (after.x - before.x) / (2 * h), (after.y - before.y) / (2 * h)
+        assert_allclose(velocity, [0.3 * math.cos(here.theta), 0.3 * math.sin(here.theta)], atol=1e-8)
+        if before.omega == after.omega:
+            assert (after.theta - before.theta) / (2 * h) == pytest.approx(here.omega, abs=1e-8)
+            assert_allclose(
+                [here.ax, here.ay],
+                0.3 * here.omega * np.array([-math.sin(here.theta), math.cos(here.theta)]),
+                atol=1e-15,
+            )
+
+
+def test_the_path_goes_through_the_poses_with_one_tangent():
+    positions = wobbly(np.random.default_rng(2))
+    path = Path(positions)
+    s = path.arc_lengths[1:-1]
+    assert_allclose(path.poses_at(path.arc_lengths)[:, :2], positions, atol=1e-12)
+    assert_allclose(
+        se2.wrap_angle(path.poses_at(s - 1e-9)[:, 2] - path.poses_at(s + 1e-9)[:, 2]), 0.0, atol=1e-7
+    )
+    # Nowhere far from the straight lines between the poses.
+    between = path.poses_at(np.linspace(0.0, path.length, 5000))[:, :2]
+    chord = np.diff(positions, axis=0)
+    share = np.clip(((between[:, None] - positions[:-1]) * chord).sum(-1) / (chord**2).sum(-1), 0.0, 1.0)
+    off = np.linalg.norm(between[:, None] - positions[:-1] - share[..., None] * chord, axis=-1).min(-1)
+    assert 0.01 < off.max() < 0.5 * math.tan(CORNER / 2) * np.linalg.norm(chord, axis=-1).max()
+
+
+def test_it_moves_and_is_mirrored_with_its_poses():
+    positions, motion = wobbly(np.random.default_rng(3)), (3.0, -2.0, 2.5)
+    poses = np.column_stack([positions, np.zeros(len(positions))])
+    path, s = Path(positions), np.linspace(0.0, 20.0, 100)
+    assert_allclose(
+        Path(se2.compose(motion, poses)).poses_at(s), se2.compose(motion, path.poses_at(s)), atol=1e-9
+    )
+    mirrored = path.poses_at(s) * [1.0, -1.0, -1.0]
+    assert_allclose(Path(positions * [1.0, -1.0]).poses_at(s), mirrored, atol=1e-9)
+
+
+def test_a_corner_stays_a_corner():
+    square = Path([(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)])
+    assert (square.length, square.closed) == (4.0, False)
+    assert square.at(0.5, 1.0).theta == 0.0
+    assert square.at(1.5, 1.0).theta == pytest.approx(math.pi / 2)
+    # A long line that goes over into a finely sampled arc stays straight.
+    joined = Path(np.concatenate([[(-10.0, 0.0)], circle(100)[:25]]))
+    assert abs(joined.poses_at(np.linspace(0.0, 10.0, 100))[:, 1]).max() < 1e-12
+    assert abs(Path([(0, 0), (1, 0), (0, 0)]).at(1.5, 1.0).theta) == pytest.approx(math.pi)
+
+
+def test_repeated_positions_are_skipped():
+    positions = circle(40)
+    once, twice = Path(positions), Path(np.repeat(positions, 2, axis=0))
+    assert twice.length == pytest.approx(once.length, rel=1e-12)
+    assert_allclose(twice.arc_lengths[::2], once.arc_lengths, atol=1e-12)
+
+
+def test_the_nearest_point_stays_on_its_branch():
+    path = Path(figure_eight(200))
+    s = np.linspace(0.0, path.length, 400)
+    x, y, theta = path.poses_at(s).T
+    for off in (-0.1, 0.0, 0.1):
+        beside = np.stack([x - off * np.sin(theta), y + off * np.cos(theta)], -1)
+        assert_allclose(path.project(beside), s, atol=1e-3)
+    # On the whole path the other branch is nearer to some of these.
+    assert max(abs(np.array([path.nearest(*one) for one in beside.tolist()]) - s)[1:-1]) > 1.0
+
+
+def test_progress_on_a_closed_path_goes_on():
+    path = Path(circle(60))
+    angle = np.linspace(-0.3, 4.0 * math.pi, 300)
+    inside = np.stack([0.9 * np.sin(angle), 1.0 - 0.9 * np.cos(angle)], -1)
+    assert_allclose(path.project(inside), angle, atol=1e-9)
+    assert_allclose(path.at(path.length + 1.0, 1.0)[:7], path.at(1.0, 1.0)[:7], atol=1e-9)
+    assert path.nearest(0.0, -0.2) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_open_ends():
+    path = Path([(0, 0), (1, 0), (2, 0)])
+    assert path.at(5.0, 0.3)[:3] == (2.0, 0.0, 0.0)
+    assert path.at(-5.0, 0.3)[:3] == (0.0, 0.0, 0.0)
+    assert path.nearest(9.0, 1.0) == path.nearest(9.0, 1.0, near=7.0) == 2.0
+    assert path.nearest(1.4, 3.0, near=1.2) == pytest.approx(1.4)
+
+
+def test_errors_are_in_the_frame_of_the_reference():
+    reference = Path([(0, 0), (0, 1)]).at(0.5, 0.2)
+    along, across, heading = Path.errors((-0.1, 0.7, math.pi), reference)
+    assert (along, across, heading) == pytest.approx((0.2, 0.1, math.pi / 2))
+    batch = Path.errors(np.tile([-0.1, 0.7, math.pi], (4, 1)), reference)
+    assert_allclose(batch.across, [0.1] * 4)
+
+
+def test_a_trajectory_keeps_its_times_and_its_pauses():
+    angle = np.linspace(0.0, 1.5, 16)
+    t = angle / 0.4
+    path = Path(circle(16, turns=1.5 / (2 * math.pi)), t + 100.0)
+    assert path.duration == pytest.approx(t[-1])
+    for at in np.linspace(0.0, t[-1], 50, endpoint=False):
+        here = path.at_time(at)
+        assert (here.s, here.v, here.omega) == pytest.approx((0.4 * at, 0.4, 0.4))
+        assert math.hypot(here.ax, here.ay) == pytest.approx(0.16)
+    assert path.at_time(99.0)[:5] == pytest.approx((math.sin(1.5), 1 - math.cos(1.5), 1.5, 0.0, 0.0))
+    paused = Path([(0, 0), (1, 0), (1, 0), (2, 0.5)], [0, 2, 3, 5])
+    assert paused.at_time(2.5)[:5] == pytest.approx((*paused.poses_at(paused.arc_lengths[1]), 0.0, 0.0))
+    speeds = [paused.at_time(at).v for at in np.linspace(0.0, 5.0, 500)]
+    assert min(speeds) >= 0.0
+    assert max(abs(np.diff(speeds)[:-1])) < 0.02
+    h = 1e-6
+    for at in (0.3, 1.7, 3.2, 4.4):
+        before, here, after = (paused.at_time(at + d) for d in (-h, 0.0, h))
+        assert (after.s - before.s) / (2 * h) == pytest.approx(here.v, abs=1e-8)
+        velocity = [
+            np.array([one.v * math.cos(one.theta), one.v * math.sin(one.theta)])
+            for one in (before, after)
+        ]
+        assert_allclose((velocity[1] - velocity[0]) / (2 * h), [here.ax, here.ay], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ('poses', 'times', 'message'),
+    [
+        ([(0, 0, 0)], None, 'two different positions, got 1 in one place'),
+        ([(1, 1, 0)] * 5, None, 'two different positions, got 5 in one place'),
+        ([(0, 0, 0), (math.nan, 0, 0)], None, 'poses must be finite'),
+        ([(0, 0), (1e308, 0), (-1e308, 0)], None, 'finite length'),
+        ([[(0, 0), (1, 0)]], None, 'shape'),
+        ([0, 1], None, 'shape'),
+        ([(0, 0), (1, 0), (2, 0)], [0, 2, 1], 'got 1 s after 2 s at index 2'),
+        ([(0, 0), (1, 0)], [0, 0], 'times must increase'),
+        ([(0, 0), (1, 0)], [0, 1, 2], 'as many as poses'),
+    ],
+)
+def test_bad_poses_are_refused(poses, times, message):
+    with pytest.raises(ValueError, match=message):
+        Path(poses, times)
+
+
+def test_it_is_immutable_and_says_what_is_missing():
+    path = Path(circle(20))
+    with pytest.raises(ValueError, match='read-only'):
+        path.poses[0, 0] = 1.0
+    with pytest.raises(ValueError, match='path must have times'):
+        path.at_time(0.0)
+    with pytest.raises(ValueError, match='s must be finite'):
+        path.at(math.nan, 1.0)
+
+
+def test_a_hundred_thousand_poses():
+    begin = time.process_time()
+    path = Path(circle(100_000, 50.0))
+    path.nearest(50.0, 50.0)
+    path.nearest(1.0, 0.0, near=1.0)
+    assert path.length == pytest.approx(100.0 * math.pi)
+    assert time.process_time() - begin < 5.0  # 0.1 s on an idle machine
