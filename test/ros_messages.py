@@ -7,12 +7,12 @@ import math
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, PoseStamped, PoseWithCovarianceStamped, Twist, TwistStamped
-from nav_msgs.msg import Goals, Odometry
+from nav_msgs.msg import Goals, Odometry, Path
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
 from diffdrive_jacobian.messages.codecs import ODOMETRY, POSE_WITH_COVARIANCE
-from diffdrive_jacobian.messages.conversion import from_time, set_pose
+from diffdrive_jacobian.messages.conversion import from_time, set_pose, set_time
 
 PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 WHEELS = ['left_wheel_joint', 'right_wheel_joint']
@@ -101,6 +101,15 @@ def goal(x, y, theta=0.0, frame='', stamp=0):
 def goals(*poses, frame='', stamp=0):
     message = Goals(goals=list(poses))
     message.header.frame_id, message.header.stamp.sec = frame, stamp
+    return message
+
+
+def path(*poses, frame='', stamp=0, times=None):
+    """A path of `goal`s or of places; the times of a trajectory are seconds."""
+    message = Path(poses=[one if isinstance(one, PoseStamped) else goal(*one) for one in poses])
+    message.header.frame_id, message.header.stamp.sec = frame, stamp
+    for pose, time in zip(message.poses, times or (), strict=False):
+        set_time(pose.header.stamp, round(time * 1e9))
     return message
 
 

@@ -12,11 +12,11 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist, Twi
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lockstep_nodes import change, make
-from nav_msgs.msg import Goals, Odometry
+from nav_msgs.msg import Goals, Odometry, Path
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message, serialize_message
-from ros_messages import goal, goals, joint_command, odometry, pose_of, twist, value_of
+from ros_messages import goal, goals, joint_command, odometry, path, pose_of, twist, value_of
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -34,6 +34,7 @@ from diffdrive_jacobian.messages.codecs import (
     ODOMETRY,
     ODOMETRY_POSE,
     PARAMETER_EVENT,
+    PATH,
     POSE,
     POSE_WITH_COVARIANCE,
     TWIST,
@@ -251,6 +252,25 @@ def test_too_many_goals_are_refused_before_they_are_read():
     struct.pack_into('<I', data, at, 2001)
     with pytest.raises(MessageError, match='goals must contain at most 2000 poses, got 2001'):
         GOALS.reader(Goals)(bytes(data) + bytes(2001 * 80))
+
+
+def test_a_path_is_read_with_its_frames_and_stamps():
+    route = value_of(PATH, path((0, 1), goal(2, 3, 0.5, 'map'), frame='odom', stamp=4, times=[5.0, 6.5]))
+    assert (route.stamp, route.frame, route.frames) == ((4, 0), 'odom', ('', 'map'))
+    assert route.poses == ((0.0, 1.0, 0.0), (2.0, 3.0, pytest.approx(0.5)))
+    assert route.times == (0.0, 1.5)
+    assert value_of(PATH, path((0, 1), (2, 3), times=[5.0, 5.0])).times is None
+    assert value_of(PATH, path()).times is None
+    for times, words in (([2, 1], '1.0* s after 2.0* s at pose 1'), ([0, 1, 1], 'must increase')):
+        with pytest.raises(MessageError, match=f'stamps of the poses .*{words}'):
+            _ = value_of(PATH, path((0, 1), (2, 3), (4, 5), times=times)).times
+
+
+def test_a_path_of_too_many_poses_is_refused_before_they_are_read():
+    data = bytearray(serialize_message(path((1, 0), (2, 0), (3, 0))))
+    struct.pack_into('<I', data, data.index(struct.pack('<I', 3), 12), 10_001)
+    with pytest.raises(MessageError, match='path must contain at most 10000 poses, got 10001'):
+        PATH.reader(Path)(bytes(data) + bytes(10_001 * 80))
 
 
 def test_goals_without_poses_have_a_stamp_too():

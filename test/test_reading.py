@@ -19,7 +19,17 @@ from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
-from ros_messages import goal, goals, joint_command, odometry, placement, stamp, twist, twist_stamped
+from ros_messages import (
+    goal,
+    goals,
+    joint_command,
+    odometry,
+    path,
+    placement,
+    stamp,
+    twist,
+    twist_stamped,
+)
 from ruamel.yaml import YAML
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -37,7 +47,7 @@ from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
 SECOND = 1_000_000_000
 FIELDS = (
     *('odometry', 'cmd_vel', 'cmd_vel_out', 'start_pose'),
-    *('wheel_commands', 'wheels', 'goals', 'goal_status'),
+    *('wheel_commands', 'wheels', 'goals', 'planned_path', 'goal_status'),
 )
 REAL = Path(__file__).parent / 'bags' / 'turtlebot3_fake_sqlite'
 
@@ -114,6 +124,8 @@ def test_every_series_holds_what_was_sent(tmp_path, namespace, storage):
         (1.5, 'joint_states', joint_command(5.0, 6.0, 1_450_000_000)),
         (1.6, 'goal_pose', goal(1.0, 2.0, 0.5, stamp=1)),
         (1.7, 'goals', goals(goal(3.0, 4.0), goal(5.0, 6.0, -0.5), stamp=7)),
+        (1.75, 'path', path((0, 1), (2, 3, 0.5), stamp=8, times=[5.0, 6.5])),
+        (1.76, 'path', path((4, 5), (6, 7), stamp=9)),
         (1.8, 'goal_status', status(4, seconds=7)),
         (1.9, 'odom', odom(-0.1, -0.2, 3.0, seconds=1.85)),
     ]
@@ -128,7 +140,7 @@ def test_every_series_holds_what_was_sent(tmp_path, namespace, storage):
     def holds(series, received, stamps, values):
         assert (series.received / SECOND).tolist() == pytest.approx(received, abs=1e-12)
         assert (series.stamps / SECOND).tolist() == pytest.approx(stamps, abs=1e-12)
-        assert series.values == pytest.approx(np.array(values), abs=1e-15)
+        assert series.values == pytest.approx(np.array(values), abs=1e-15, nan_ok=True)
 
     holds(run.start_pose, [1.0], [0.9], [[0.5, 0.25, -1.0]])
     rows = [[0.1, 0.2, 0.3, 0.4, 0.5], [-0.1, -0.2, 3.0, 0.0, 0.0]]
@@ -139,6 +151,13 @@ def test_every_series_holds_what_was_sent(tmp_path, namespace, storage):
     holds(run.wheels, [1.5], [1.45], [[6.0, 5.0]])
     three = [[1.0, 2.0, 0.5], [3.0, 4.0, 0.0], [5.0, 6.0, -0.5]]
     holds(run.goals, [1.6, 1.7, 1.7], [1.0, 7.0, 7.0], three)
+    planned = [
+        [0.0, 1.0, 0.0, 0.0],
+        [2.0, 3.0, 0.5, 1.5],
+        [4.0, 5.0, 0.0, math.nan],
+        [6.0, 7.0, 0.0, math.nan],
+    ]
+    holds(run.planned_path, [1.75, 1.75, 1.76, 1.76], [8.0, 8.0, 9.0, 9.0], planned)
     holds(run.goal_status, [1.8], [7.0], [[4.0]])
 
 

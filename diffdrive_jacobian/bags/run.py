@@ -78,6 +78,9 @@ class Run:
     """`[omega_R, omega_L]` of joint_states (rad/s)."""
     goals: Series
     """`[x, y, theta]` of each goal and waypoint (m, m, rad)."""
+    planned_path: Series
+    """`[x, y, theta, t]` of each pose of each path; t is the time since the first pose of a trajectory,
+    NaN of a path without times (m, m, rad, s)."""
     goal_status: Series
     """`[status]`, the numbers of action_msgs/GoalStatus, stamped as the goal."""
     odometry_covariances: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 9)))

@@ -11,11 +11,13 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from operator import itemgetter
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from diffdrive_jacobian.messages.cdr import Reader, Writer
 from diffdrive_jacobian.messages.conversion import (
+    MAX_PATH_POSES,
     MAX_WAYPOINTS,
     MessageError,
     from_joints,
@@ -255,7 +257,7 @@ POSE_WITH_COVARIANCE = Codec(
     lambda place: (*stamp_of(place.stamp), *_pose_numbers(place.pose), *place.covariance),
 )
 
-# --- Goals: goal_pose, goals, goal_status
+# --- Goals: goal_pose, goals, path, goal_status
 
 
 class Route(NamedTuple):
@@ -269,6 +271,8 @@ class Route(NamedTuple):
     """`(x, y, theta)` of each (m, m, rad)."""
     frames: tuple[str, ...] = ()
     """Their frames; empty: `frame`."""
+    stamps: tuple[tuple[int, int], ...] = ()
+    """Their stamps in a path."""
 
     @property
     def time(self) -> int:
@@ -278,6 +282,24 @@ class Route(NamedTuple):
             MessageError: It is none.
         """
         return from_time(*self.stamp)
+
+    @property
+    def times(self) -> tuple[float, ...] | None:
+        """Time of each pose since the first (s), of a trajectory; None: all stamps are equal.
+
+        Raises:
+            MessageError: A stamp is none, or the stamps neither increase nor are all equal.
+        """
+        if len(set(self.stamps)) <= 1:
+            return None
+        stamps = [from_time(*stamp) for stamp in self.stamps]
+        for index, (one, two) in enumerate(pairwise(stamps)):
+            if one >= two:
+                raise MessageError(
+                    'stamps of the poses must increase, or all be equal for a path without times, got '
+                    f'{two / NANOSECONDS:.9f} s after {one / NANOSECONDS:.9f} s at pose {index + 1}'
+                )
+        return tuple((stamp - stamps[0]) / NANOSECONDS for stamp in stamps)
 
 
 class Status(NamedTuple):
@@ -298,10 +320,13 @@ class Status(NamedTuple):
         return from_time(*self.stamp)
 
 
-def _header(sec: int, nanosec: int, count: int) -> tuple[tuple[int, int], int]:
-    if count > MAX_WAYPOINTS:
-        raise MessageError(f'goals must contain at most {MAX_WAYPOINTS} poses, got {count}')
-    return (sec, nanosec), count
+def _at_most(most: int, what: str) -> Callable[[int, int, int], tuple[tuple[int, int], int]]:
+    def header(sec: int, nanosec: int, count: int) -> tuple[tuple[int, int], int]:
+        if count > most:
+            raise MessageError(f'{what} must contain at most {most} poses, got {count}')
+        return (sec, nanosec), count
+
+    return header
 
 
 POSE = Codec(
@@ -311,7 +336,7 @@ POSE = Codec(
     (*STAMP, *(f'pose.{field}' for field in _PLANAR_POSE)),
     lambda route: (*route.stamp, *_pose_numbers(route.poses[0])),
 )
-GOALS_HEADER = Codec('nav_msgs/msg/Goals', (*STAMP, 'len(goals)'), _header)
+GOALS_HEADER = Codec('nav_msgs/msg/Goals', (*STAMP, 'len(goals)'), _at_most(MAX_WAYPOINTS, 'goals'))
 """Stamp and number of poses."""
 GOALS = Codec(
     'nav_msgs/msg/Goals',
@@ -323,6 +348,24 @@ GOALS = Codec(
         frames,
     ),
     header=GOALS_HEADER,
+)
+PATH_HEADER = Codec('nav_msgs/msg/Path', (*STAMP, 'len(poses)'), _at_most(MAX_PATH_POSES, 'path'))
+"""Stamp and number of poses."""
+PATH = Codec(
+    'nav_msgs/msg/Path',
+    (
+        *(*STAMP, FRAME),
+        *(f'poses[].header.{field}' for field in ('frame_id', 'stamp.sec', 'stamp.nanosec')),
+        *(f'poses[].pose.{field}' for field in _POSE),
+    ),
+    lambda sec, nanosec, frame, frames, secs, nanosecs, *columns: Route(
+        (sec, nanosec),
+        frame,
+        tuple(from_pose(*pose) for pose in zip(*columns, strict=True)),
+        frames,
+        tuple(zip(secs, nanosecs, strict=True)),
+    ),
+    header=PATH_HEADER,
 )
 GOAL_STATUS = Codec(
     'action_msgs/msg/GoalStatus',

@@ -41,6 +41,9 @@ the nodes accept, 1e-3 m."""
 
 MAX_WAYPOINTS = 2_000
 """Largest number of poses in a `goals` message: rclpy takes about 20 us to convert each of them."""
+MAX_PATH_POSES = 10_000
+"""Largest number of poses in a `path` message, which take a quarter of a second to read. At the 5 cm of
+common planners this is a path of 500 m."""
 
 
 def quoted(texts: Iterable[str], most: int = 4) -> str:

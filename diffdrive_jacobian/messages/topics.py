@@ -5,6 +5,7 @@ A new topic is an entry in `TOPICS`, its codec in `messages.codecs`, and the nod
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -127,6 +128,11 @@ def _route(route: codecs.Route, _: Names) -> list[Row]:
     return [Row(time, pose) for pose in route.poses]
 
 
+def _path(route: codecs.Route, _: Names) -> list[Row]:
+    time, times = route.time, route.times or (math.nan,) * len(route.poses)
+    return [Row(time, (*pose, t)) for pose, t in zip(route.poses, times, strict=True)]
+
+
 def _status(status: codecs.Status, _: Names) -> list[Row]:
     return [Row(status.time, (float(status.status),))]
 
@@ -205,6 +211,14 @@ TOPICS = {
             series='goals',
             columns=_POSE,
             rows=_route,
+            if_unread='start go_to_goal',
+        ),
+        Topic(
+            name='path',
+            codecs=(codecs.PATH,),
+            series='planned_path',
+            columns=(*_POSE, 't'),
+            rows=_path,
             if_unread='start go_to_goal',
         ),
         Topic(
