@@ -209,7 +209,7 @@ def test_goals_with_too_many_poses_are_refused_unread(controller, monkeypatch, c
 def test_header_of_goals_is_read_without_the_poses(frame, count):
     message = goals(*[goal(1, 0, frame='x')] * count, frame=frame)
     message.header.stamp = stamp(-5_000_000_123)
-    assert serialization.goals_header(serialize_message(message)) == (message.header.stamp, count)
+    assert serialization.poses_header(serialize_message(message), Goals) == (message.header.stamp, count)
 
 
 def big_endian_goals(count):
@@ -219,7 +219,7 @@ def big_endian_goals(count):
 
 
 def test_long_goals_in_another_byte_order_are_not_converted(lockstep, monkeypatch, capfd):
-    assert serialization.goals_header(big_endian_goals(10)) == (Time(sec=2), 10)
+    assert serialization.poses_header(big_endian_goals(10), Goals) == (Time(sec=2), 10)
     controller = Controller(lockstep)
     publisher = lockstep.node.create_publisher(Goals, 'goals', 10)
     with monkeypatch.context() as patched:
@@ -234,7 +234,7 @@ def test_long_goals_in_another_byte_order_are_not_converted(lockstep, monkeypatc
 def test_goals_that_are_cut_off_are_no_goals(length):
     data = serialize_message(goals(goal(1, 0)))[:length]
     with pytest.raises(MessageError, match='it is not a Goals message'):
-        serialization.goals_header(data)
+        serialization.poses_header(data, Goals)
 
 
 @pytest.mark.parametrize(

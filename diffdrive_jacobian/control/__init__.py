@@ -1,7 +1,16 @@
 """Control laws that compute velocities from a goal, and controllers by name. No ROS."""
 
 from diffdrive_jacobian.control.arrival import Arrival
-from diffdrive_jacobian.control.controller import KP, KV, OFFSET, Boundary, Controller, Gain, LawError
+from diffdrive_jacobian.control.controller import (
+    KP,
+    KV,
+    OFFSET,
+    Boundary,
+    Controller,
+    Gain,
+    LawError,
+    PathController,
+)
 from diffdrive_jacobian.control.controllers import (
     ControllerError,
     Controllers,
@@ -35,6 +44,7 @@ __all__ = [
     'Gain',
     'LawError',
     'Path',
+    'PathController',
     'PathError',
     'Reference',
     'StraightLine',

@@ -27,6 +27,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
+from diffdrive_jacobian.control.path import Reference
 from diffdrive_jacobian.control.sampling import rate_warning
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
@@ -156,11 +157,8 @@ def no_advice(gains: GainValues, limits: VelocityLimits) -> Iterable[str]:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Controller(Checked):
-    """A control law that drives a unicycle to a goal.
-
-    The node go_to_goal, sweeps, their pictures and batches of closed loops read this object. Only `name`
-    and `law` are required.
+class ControlLaw(Checked):
+    """What controllers of goals and of paths have in common.
 
     Raises:
         ValueError: A field is invalid.
@@ -179,17 +177,8 @@ class Controller(Checked):
     with `state`, shape (..., n), and with the time dt since the call before (s), at first and where the
     clock goes back 0, by keyword.
     It returns `(v, omega, state)`."""
-    takes_heading: Annotated[bool, boolean] = False
-    """Whether the law takes the heading of the goal. The robot then always turns to it at the end."""
-    offset: str = ''
-    """Name of the gain that is the x coordinate of the driven point in the body frame; empty: the law
-    drives the axle centre."""
     advice: Annotated[Callable[[GainValues, VelocityLimits], Iterable[str]], function] = no_advice
     """Return warnings about gains or limits that do not suit the law."""
-    slope: Annotated[Callable[[GainValues], float] | None, optional(function)] = None
-    """Return the largest slope of the yaw rate over the heading (1/s). The sampling rate limits it."""
-    boundary: Annotated[Boundary | None, optional(partial(instance, wanted=Boundary))] = None
-    """Line that is drawn in the picture of a sweep."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -204,10 +193,6 @@ class Controller(Checked):
         names = self.gain_names
         if len(set(names)) < len(names):
             raise ValueError(f'gains must have different names, got {", ".join(names)}')
-        if self.offset not in ('', *names):
-            raise ValueError(
-                f"offset must be '' or one of {', '.join(names)}, got {short(repr(self.offset))}"
-            )
         state = array('state', self.state, 'n') if self.state else np.zeros(0)
         object.__setattr__(self, 'state', tuple(state.tolist()))
 
@@ -225,16 +210,53 @@ class Controller(Checked):
         """Return the values that are passed to the law, in its order."""
         return tuple(getattr(gains, name) for name in self.gain_names)
 
-    def driven_offset(self, gains: GainValues) -> float:
-        """Return the x coordinate of the driven point in the body frame (m)."""
-        return float(getattr(gains, self.offset)) if self.offset else 0.0
-
     def warnings(self, gains: GainValues, limits: VelocityLimits) -> list[str]:
         """Return the warnings about gains or limits; a failure of `advice` is one of them."""
         try:
             return [str(text) for text in self.advice(gains, limits)]
         except Exception as error:
             return [f'the advice of controller {self.name!r} failed: {_reason(error)}']
+
+    def _check_gain(self, field: str) -> None:
+        """Require a field to be empty or the name of a gain."""
+        name, names = getattr(self, field), self.gain_names
+        if name not in ('', *names):
+            raise ValueError(f"{field} must be '' or one of {', '.join(names)}, got {short(repr(name))}")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Controller(ControlLaw):
+    """A control law that drives a unicycle to a goal.
+
+    The node go_to_goal, sweeps, their pictures and batches of closed loops read this object. Only `name`
+    and `law` are required.
+
+    Raises:
+        ValueError: A field is invalid.
+    """
+
+    takes_heading: Annotated[bool, boolean] = False
+    """Whether the law takes the heading of the goal. The robot then always turns to it at the end."""
+    offset: str = ''
+    """Name of the gain that is the x coordinate of the driven point in the body frame; empty: the law
+    drives the axle centre."""
+    slope: Annotated[Callable[[GainValues], float] | None, optional(function)] = None
+    """Return the largest slope of the yaw rate over the heading (1/s). The sampling rate limits it."""
+    boundary: Annotated[Boundary | None, optional(partial(instance, wanted=Boundary))] = None
+    """Line that is drawn in the picture of a sweep."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        ControlLaw.__post_init__(self)
+        self._check_gain('offset')
+
+    def bind(self, gains: GainValues) -> BoundLaw:
+        """Return the law with its gains, for single poses."""
+        return BoundLaw(self, self.values(gains), 3 if self.takes_heading else 2)
+
+    def driven_offset(self, gains: GainValues) -> float:
+        """Return the x coordinate of the driven point in the body frame (m)."""
+        return float(getattr(gains, self.offset)) if self.offset else 0.0
 
     def rate_warnings(self, gains: GainValues, rate: float, *, turns: bool) -> list[str]:
         """Return the warnings about gains that are too large for the rate of the odometry.
@@ -251,23 +273,50 @@ class Controller(Checked):
             warning = f'the slope of controller {self.name!r} failed: {_reason(error)}'
         return [warning] if warning else []
 
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PathController(ControlLaw):
+    """A control law that drives a unicycle along a path: `law(poses, references, *gains)`.
+
+    A reference is a `path.Reference`, shape (..., 8): where the robot should be, and how it should move
+    there. Otherwise the law is as that of a `Controller`.
+
+    Raises:
+        ValueError: A field is invalid.
+    """
+
+    lookahead: str = ''
+    """Name of the gain that is the look-ahead distance (m): the reference is the first point of the path
+    that is so far from the robot. Empty: it is the nearest point, and of a trajectory that of the
+    time."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        ControlLaw.__post_init__(self)
+        self._check_gain('lookahead')
+
     def bind(self, gains: GainValues) -> BoundLaw:
         """Return the law with its gains, for single poses."""
-        return BoundLaw(self, self.values(gains))
+        return BoundLaw(self, self.values(gains), len(Reference._fields))
+
+    def lookahead_distance(self, gains: GainValues) -> float:
+        """Return the look-ahead distance (m); 0: the law has none."""
+        return float(getattr(gains, self.lookahead)) if self.lookahead else 0.0
 
 
 class BoundLaw:
     """A law with its gains, for single poses, and what it remembers.
 
-    It is called with a pose, shape (3,), and a goal, shape (3,), arrays or tuples of floats, and returns
-    `(v, omega)`. It raises LawError if the law raises an exception or returns something else.
+    It is called with a pose, shape (3,), and a goal, shape (3,), or a reference, shape (8,), arrays or
+    tuples of floats, and returns `(v, omega)`. It raises LawError if the law raises an exception or
+    returns something else.
     """
 
-    def __init__(self, controller: Controller, values: tuple[float, ...]) -> None:
-        """Take the gains in the order of the law."""
+    def __init__(self, controller: ControlLaw, values: tuple[float, ...], size: int) -> None:
+        """Take the gains in the order of the law, and the number of entries of its goals."""
         self.controller = controller
         self._values = values
-        self._size = 3 if controller.takes_heading else 2
+        self._size = size
         # An equation is given floats that are checked already; another law may index arrays.
         self._equation = getattr(controller.law, 'formula', None)
         self.now = 0

@@ -5,6 +5,7 @@ packages provide theirs as entry points of the group `diffdrive_jacobian.control
 
     entry_points={'diffdrive_jacobian.controllers': ['my_law = my_package.my_law:CONTROLLER']}
 
+Those of paths are found likewise, in `path_laws` and in the group `diffdrive_jacobian.path_controllers`.
 An entry point is imported when its controller is used, not before.
 """
 
@@ -12,19 +13,19 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
 
-from diffdrive_jacobian.control.controller import Controller
+from diffdrive_jacobian.control.controller import ControlLaw, Controller, PathController
+from diffdrive_jacobian.control.path_laws import PATH_CONTROLLERS
 from diffdrive_jacobian.errors import DiffdriveError
 from diffdrive_jacobian.numerics.fields import instance, short
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-GROUP = 'diffdrive_jacobian.controllers'
-"""Entry-point group of the controllers of other packages."""
+C = TypeVar('C', bound=ControlLaw)
 
 
 class ControllerError(DiffdriveError, ValueError):
@@ -47,27 +48,39 @@ BUILT_IN: dict[str, Controller] = _built_in()
 """The controllers of this package, by name. Reading it imports nothing."""
 
 
-class Controllers(Collection[str]):
+class AnyControllers(Collection[str], Generic[C]):
     """Names of the controllers that can be used, and the controllers by name.
 
     Iteration and `in` look for installed entry points, but do not import them.
     """
 
-    def __init__(self, *given: Controller) -> None:
+    kind: type[C]
+    """Their class."""
+    built_in: ClassVar[Mapping[str, ControlLaw]]
+    """The controllers of this package, by name."""
+    group: ClassVar[str]
+    """Entry-point group of the controllers of other packages."""
+    parameter: ClassVar[str]
+    """Parameter of go_to_goal that chooses one."""
+    title: ClassVar[str]
+    """What it is, in the description of the parameter."""
+
+    def __init__(self, *given: C) -> None:
         """Create the collection.
 
         Args:
             given: Further controllers. They take precedence over installed ones of the same name.
 
         Raises:
-            ValueError: Something given is not a Controller, or has the name of a built-in one.
+            ValueError: Something given is of another class, or has the name of a built-in one.
         """
-        self._given: dict[str, Controller] = {}
+        self._given: dict[str, C] = {}
         for controller in given:
-            instance('controller', controller, Controller)
-            if BUILT_IN.get(controller.name, controller) != controller:
+            instance(self.parameter, controller, self.kind)
+            if self.built_in.get(controller.name, controller) != controller:
                 raise ValueError(
-                    f'controller must have a name of its own, got {controller.name!r}, which is built in'
+                    f'{self.parameter} must have a name of its own, got {controller.name!r}, '
+                    'which is built in'
                 )
             self._given[controller.name] = controller
 
@@ -75,12 +88,13 @@ class Controllers(Collection[str]):
         """Return whether there is a controller of that name, without loading it."""
         if not isinstance(name, str):
             return False
-        known = name in BUILT_IN or name in self._given or name in _loaded
-        return known or bool(_entry_points(name))
+        known = name in self.built_in or name in self._given or (self.group, name) in _loaded
+        return known or bool(self._entry_points(name))
 
     def __iter__(self) -> Iterator[str]:
         """Return the names, sorted."""
-        return iter(sorted({*BUILT_IN, *self._given, *(one.name for one in _entry_points())}))
+        installed = (one.name for one in self._entry_points())
+        return iter(sorted({*self.built_in, *self._given, *installed}))
 
     def __len__(self) -> int:
         """Return how many there are."""
@@ -90,23 +104,91 @@ class Controllers(Collection[str]):
         """Return True: there are always the built-in ones."""
         return True
 
-    def find(self, name: str) -> Controller:
+    def find(self, name: str) -> C:
         """Return the controller of that name; an installed one is imported.
 
         Raises:
             ControllerError: There is none, or it cannot be loaded.
         """
-        if isinstance(name, str) and (found := self._given.get(name) or BUILT_IN.get(name)):
+        if isinstance(name, str) and (found := self._given.get(name) or self.built_in.get(name)):
+            assert isinstance(found, self.kind)
             return found
         if name not in self:
             raise ControllerError(
-                f'controller must be one of {", ".join(map(repr, self))}, got {short(repr(name))}'
+                f'{self.parameter} must be one of {", ".join(map(repr, self))}, got {short(repr(name))}'
             )
-        return _load(name)
+        return self._load(name)
+
+    def _entry_points(self, name: str | None = None) -> list[EntryPoint]:
+        """Return the installed entry points, all or those of one name."""
+        # It takes tens of milliseconds to import and to search, and built-in controllers do not need it.
+        from importlib.metadata import entry_points
+
+        group = self.group
+        found = entry_points(group=group) if name is None else entry_points(group=group, name=name)
+        # The names of all others would only lead to errors.
+        return [one for one in found if one.name not in self.built_in]
+
+    def _load(self, name: str) -> C:
+        """Import an installed controller.
+
+        Raises:
+            ControllerError: Several packages provide that name, or it cannot be loaded.
+        """
+        known = _loaded.get((self.group, name))
+        if isinstance(known, self.kind):
+            return known
+        found = self._entry_points(name)
+        owners = ' and '.join(sorted(_owner(one) for one in found))
+        if len(found) > 1:
+            raise ControllerError(f'{self.parameter} {name!r} is provided by several packages: {owners}')
+        (entry_point,) = found
+        what = f'{self.parameter} {name!r} of {owners} ({short(entry_point.value)})'
+        try:
+            controller = entry_point.load()
+        except (Exception, SystemExit) as error:
+            reason = ' '.join(f'{type(error).__name__}: {error}'.split())[:200]
+            raise ControllerError(f'{what} cannot be loaded: {reason}') from error
+        if not isinstance(controller, self.kind):
+            raise ControllerError(f'{what} must be a {self.kind.__name__}, got {short(controller)}')
+        if controller.name != name:
+            raise ControllerError(
+                f'{what} must have the name of its entry point, {name!r}, got {controller.name!r}'
+            )
+        _loaded[self.group, name] = controller
+        return controller
+
+
+class Controllers(AnyControllers[Controller]):
+    """Names of the controllers of goals that can be used, and the controllers by name.
+
+    Iteration and `in` look for installed entry points, but do not import them.
+    """
+
+    kind = Controller
+    built_in = BUILT_IN
+    group = 'diffdrive_jacobian.controllers'
+    parameter = 'controller'
+    title = 'Control law'
+
+
+class PathControllers(AnyControllers[PathController]):
+    """Names of the controllers of paths that can be used, and the controllers by name.
+
+    Iteration and `in` look for installed entry points, but do not import them.
+    """
+
+    kind = PathController
+    built_in: ClassVar = {one.name: one for one in PATH_CONTROLLERS}
+    group = 'diffdrive_jacobian.path_controllers'
+    parameter = 'path_controller'
+    title = 'Control law along a path'
 
 
 CONTROLLERS = Controllers()
-"""The built-in and the installed controllers."""
+"""The built-in and the installed controllers of goals."""
+ALL_PATH_CONTROLLERS = PathControllers()
+"""The built-in and the installed controllers of paths."""
 
 
 def find_controller(name: str) -> Controller:
@@ -123,47 +205,8 @@ def controller_names() -> tuple[str, ...]:
     return tuple(CONTROLLERS)
 
 
-def _entry_points(name: str | None = None) -> list[EntryPoint]:
-    """Return the installed entry points, all or those of one name."""
-    # It takes tens of milliseconds to import and to search, and built-in controllers do not need it.
-    from importlib.metadata import entry_points
-
-    found = entry_points(group=GROUP) if name is None else entry_points(group=GROUP, name=name)
-    # The names of all others would only lead to errors.
-    return [one for one in found if one.name not in BUILT_IN]
-
-
-_loaded: dict[str, Controller] = {}
-"""The installed controllers that were imported, by name."""
-
-
-def _load(name: str) -> Controller:
-    """Import an installed controller.
-
-    Raises:
-        ControllerError: Several packages provide that name, or it cannot be loaded.
-    """
-    if name in _loaded:
-        return _loaded[name]
-    found = _entry_points(name)
-    owners = ' and '.join(sorted(_owner(one) for one in found))
-    if len(found) > 1:
-        raise ControllerError(f'controller {name!r} is provided by several packages: {owners}')
-    (entry_point,) = found
-    what = f'controller {name!r} of {owners} ({short(entry_point.value)})'
-    try:
-        controller = entry_point.load()
-    except (Exception, SystemExit) as error:
-        reason = ' '.join(f'{type(error).__name__}: {error}'.split())[:200]
-        raise ControllerError(f'{what} cannot be loaded: {reason}') from error
-    if not isinstance(controller, Controller):
-        raise ControllerError(f'{what} must be a Controller, got {short(controller)}')
-    if controller.name != name:
-        raise ControllerError(
-            f'{what} must have the name of its entry point, {name!r}, got {controller.name!r}'
-        )
-    _loaded[name] = controller
-    return controller
+_loaded: dict[tuple[str, str], ControlLaw] = {}
+"""The installed controllers that were imported, by group and name."""
 
 
 def _owner(entry_point: EntryPoint) -> str:

@@ -1,35 +1,40 @@
-"""Drive a robot to goals by a controller: odometry and goals in, body twists out."""
+"""Drive a robot to goals and along paths: odometry, goals and paths in, body twists out."""
 
 from __future__ import annotations
 
 import math
 import uuid
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from action_msgs.msg import GoalInfo, GoalStatus
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Goals, Odometry
+from nav_msgs.msg import Path as PathMessage
 from std_srvs.srv import Trigger
 from unique_identifier_msgs.msg import UUID
 
-from diffdrive_jacobian.control import Arrival, Controller, Waypoints
+from diffdrive_jacobian.control import Arrival, Controller, Path, PathController, Waypoints
+from diffdrive_jacobian.control.path_following import PathFollower
 from diffdrive_jacobian.control.sampling import LARGEST_TURN, without_whole_turns
 from diffdrive_jacobian.kinematics.saturation import scaled_to_limits
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.codecs import (
     GOALS,
     ODOMETRY_POSE,
+    PATH,
     POSE,
     TWIST,
     TWIST_STAMPED,
     Command,
+    Route,
 )
-from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
+from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES, MAX_WAYPOINTS, MessageError
 from diffdrive_jacobian.messages.topic_faults import SEVERAL, UNREAD
 from diffdrive_jacobian.nodes.other_drivers import OtherDrivers
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
@@ -38,9 +43,13 @@ from diffdrive_jacobian.ros.graph_faults import topic_check
 from diffdrive_jacobian.ros.node import THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.text import printable
-from diffdrive_jacobian.time_units import nanoseconds
+from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
 
 __all__ = ['GoToGoal']
+
+
+Poses: TypeAlias = Sequence[Sequence[float]]
+Stamps: TypeAlias = Iterable[tuple[int, int]]
 
 
 @dataclass(slots=True)
@@ -51,6 +60,10 @@ class Goal:
     frame: str
     """Frame of its poses; empty: that of the odometry."""
     waypoints: Waypoints
+    path: PathFollower | None = None
+    """The path that is followed; None: the waypoints are driven to one by one."""
+    stepped: int = 0
+    """Time of the last step along the path (ns)."""
     executing: bool = False
     """Whether odometry was received after it was accepted."""
     stale: bool = False
@@ -76,9 +89,7 @@ class GoalIdentifiers:
         return GoalInfo(goal_id=UUID(uuid=list(identifier.bytes)), stamp=stamp)
 
 
-def read_goal(
-    frame: str, frames: Sequence[str], poses: Sequence[Sequence[float]]
-) -> tuple[str, Waypoints]:
+def read_goal(frame: str, frames: Sequence[str], poses: Poses) -> tuple[str, Waypoints]:
     """Return the frame and the poses of a goal.
 
     Args:
@@ -100,40 +111,92 @@ def read_goal(
     return distinct.pop(), Waypoints(read)
 
 
+def read_path(frame: str, frames: Sequence[str], poses: Poses, stamps: Stamps) -> tuple[str, Path]:
+    """Return the frame of a path and the path, a trajectory if the stamps of the poses increase.
+
+    Args:
+        frame: Frame of the message.
+        frames: Frames of its poses; '': that of the message.
+        poses: The fields of each pose, as `from_pose` takes them.
+        stamps: `sec` and `nanosec` of each pose.
+
+    Raises:
+        MessageError: Fewer than two positions differ, a pose is invalid, the poses are in several
+            frames, or the stamps neither increase nor are all equal.
+    """
+    if len(poses) < 2:
+        raise MessageError(
+            f'path must contain at least two poses, got {len(poses)} (to stop, call cancel_goal; to '
+            'drive to one pose, publish goal_pose)'
+        )
+    frame, waypoints = read_goal(frame, frames, poses)
+    times = Route((0, 0), frame, (), stamps=tuple(stamps)).times
+    try:
+        return frame, Path(waypoints.poses, None if times is None else np.array(times))
+    except ValueError as error:
+        raise MessageError(f'path is invalid: {error}') from error
+
+
+def described(goal: Goal) -> str:
+    """Return a goal in words, for the log."""
+    x, y, _ = goal.waypoints.poses[-1]
+    count, words = len(goal.waypoints.poses), ''
+    if goal.path is not None and not goal.path.passing:
+        path = goal.path.path
+        time = '' if path.times is None else f' in {path.duration:.1f} s'
+        words = f'path of {path.length:.2f} m{time} through {count} poses, the last at '
+    elif count > 1:
+        words = f'{count} waypoints, the last at '
+    return f'{words}x {x:.3f}, y {y:.3f}'
+
+
 RATE_PERIODS = 10
 """Number of periods of the odometry from which its rate is measured."""
 _read_goals = serialization.reader(Goals, GOALS.fields)
+_read_path = serialization.reader(PathMessage, PATH.fields)
 SLOW_TURN = 60.0
 """Time for half a turn above which a limit of the yaw rate is reported (s)."""
 
 
 class GoToGoal(ParameterizedNode[GoToGoalParameters]):
-    """Node go_to_goal: `odom`, `goal_pose` and `goals` in; `cmd_vel` and `goal_status` out;
+    """Node go_to_goal: `odom`, `goal_pose`, `goals` and `path` in; `cmd_vel` and `goal_status` out;
     `cancel_goal` stops.
 
-    While a goal is active, every odometry message is answered by one command; without one the node is
-    silent, so that others may drive. A command of another node that is not zero cancels the goal.
+    A path is a goal, too. While a goal is active, every odometry message is answered by one command;
+    without one the node is silent, so that others may drive. A command of another node that is not zero
+    cancels the goal.
     """
 
-    def __init__(self, *, controller: Controller | None = None, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        *,
+        controller: Controller | None = None,
+        path_controller: PathController | None = None,
+        **kwargs: Any,
+    ) -> None:
         """Create the node without a goal.
 
         Args:
             controller: A controller that can be chosen besides the built-in and the installed ones. Its
                 name becomes the default of the parameter `controller`.
+            path_controller: Likewise, of the parameter `path_controller`.
             kwargs: As for `ParameterizedNode`.
 
         Raises:
-            ValueError: `controller` is not a Controller, or has the name of a built-in one.
+            ValueError: `controller` is not a Controller, `path_controller` not a PathController, or one
+                has the name of a built-in one.
             ParameterError: The parameters given are not a valid set.
         """
         parameters = GoToGoalParameters
         if controller is not None:
-            parameters = GoToGoalParameters.with_controller(controller)
+            parameters = parameters.with_controller(controller)
+        if path_controller is not None:
+            parameters = parameters.with_path_controller(path_controller)
         super().__init__('go_to_goal', parameters, **kwargs)
         self._goal: Goal | None = None
         self._controller = self.parameters.chosen_controller()
         self._law = self._controller.bind(self.parameters)
+        self._path_law = self.parameters.chosen_path_controller().bind(self.parameters)
         self._identifiers = GoalIdentifiers(self.get_fully_qualified_name())
         self._odom_frame = ''
         # Rate of the odometry (Hz), and the times of the messages from which it is measured (ns).
@@ -148,6 +211,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self.subscribe(PoseStamped, 'goal_pose', self._on_goal_pose, codec=POSE)
         # As bytes, because reading a long message blocks the node for seconds.
         self.subscribe(Goals, 'goals', self._on_goals)
+        self.subscribe(PathMessage, 'path', self._on_path)
         self.provide(Trigger, 'cancel_goal', self._on_cancel)
         # Without a frame: the twist is in the body frame, whose name this node does not know.
         self._serialized = TWIST_STAMPED.writer(TwistStamped()) if stamped else TWIST.writer(Twist())
@@ -161,12 +225,14 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self.watch(topic_check(self, UNREAD, 'cmd_vel', readers))
         self.watch(topic_check(self, SEVERAL, 'odom'))
         self.watch(topic_check(self, SEVERAL, 'goal_status'))
-        self.announce(subscribed=['goal_pose', 'goals'], publishing=['cmd_vel'])
+        self.announce(subscribed=['goal_pose', 'goals', 'path'], publishing=['cmd_vel'])
 
     @property
     def waypoint(self) -> int | None:
         """Index of the pose of the active goal that is driven to; None without a goal."""
-        return None if self._goal is None else self._goal.waypoints.index
+        if self._goal is None:
+            return None
+        return (self._goal.path or self._goal.waypoints).index
 
     @property
     def arrival(self) -> Arrival:
@@ -187,19 +253,47 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._accept(goal)
 
     def _on_goals(self, data: bytes) -> None:
-        try:
-            stamp, count = serialization.goals_header(data)
-        except MessageError as error:
-            self.get_logger().warning(f'goals dropped: {error}', throttle_duration_sec=THROTTLE)
-            return
-        info = self._identifiers.info(stamp, self.now())
-        try:
-            if count > MAX_WAYPOINTS:
-                raise MessageError(f'goals must contain at most {MAX_WAYPOINTS} poses, got {count}')
+        def read(info: GoalInfo) -> Goal:
             _, _, frame, frames, *columns = _read_goals(data)
             poses = [*zip(*columns, strict=True)]
             self._warn_of_integers('goals', poses)
-            goal = Goal(info, *read_goal(frame, frames, poses))
+            frame, waypoints = read_goal(frame, frames, poses)
+            return Goal(info, frame, waypoints, self._passing(waypoints))
+
+        self._receive('goals', data, Goals, MAX_WAYPOINTS, read)
+
+    def _passing(self, waypoints: Waypoints) -> PathFollower | None:
+        """Return the path through waypoints, if they are to be passed without stopping."""
+        if self.parameters.pass_waypoints:
+            # In one place there is no path.
+            with suppress(ValueError):
+                return PathFollower(Path(waypoints.poses), passing=True)
+        return None
+
+    def _on_path(self, data: bytes) -> None:
+        def read(info: GoalInfo) -> Goal:
+            _, _, frame, frames, secs, nanosecs, *columns = _read_path(data)
+            poses = [*zip(*columns, strict=True)]
+            self._warn_of_integers('path', poses)
+            frame, path = read_path(frame, frames, poses, zip(secs, nanosecs, strict=True))
+            return Goal(info, frame, Waypoints(path.poses), PathFollower(path))
+
+        self._receive('path', data, PathMessage, MAX_PATH_POSES, read)
+
+    def _receive(
+        self, topic: str, data: bytes, kind: type[Any], most: int, read: Callable[[GoalInfo], Goal]
+    ) -> None:
+        """Accept or refuse the goal in a message with many poses, whose number is checked first."""
+        try:
+            stamp, count = serialization.poses_header(data, kind)
+        except MessageError as error:
+            self.get_logger().warning(f'{topic} dropped: {error}', throttle_duration_sec=THROTTLE)
+            return
+        info = self._identifiers.info(stamp, self.now())
+        try:
+            if count > most:
+                raise MessageError(f'{topic} must contain at most {most} poses, got {count}')
+            goal = read(info)
             self._match_frames(goal)
         except MessageError as error:
             self._refuse(info, error)
@@ -227,19 +321,27 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._watchdog.start(nanoseconds(self.parameters.odom_timeout))
         self._goal = goal
         self._law.reset()
+        self._path_law.reset()
         self._times.clear()
         self._others.start()
         self._publish_status(goal.info, GoalStatus.STATUS_ACCEPTED)
-        x, y, _ = goal.waypoints.poses[-1]
-        count = len(goal.waypoints.poses)
-        last = f'{count} waypoints, the last at ' if count > 1 else ''
-        self.log_event_info('goal accepted', f'goal accepted: {last}x {x:.3f}, y {y:.3f}')
+        self.log_event_info('goal accepted', f'goal accepted: {described(goal)}')
 
     def _match_frames(self, goal: Goal) -> None:
         if goal.frame and self._odom_frame and goal.frame != self._odom_frame:
             raise MessageError(
                 f"it must be given in the frame of the odometry, '{printable(self._odom_frame)}' "
                 f"or '' for it, got '{printable(goal.frame)}'"
+            )
+
+    def _match_start(self, path: Path, pose: tuple[float, float, float]) -> None:
+        x, y, _ = pose
+        start = path.at(path.nearest(x, y, 0.0), 0.0)
+        distance, most = math.hypot(start.x - x, start.y - y), self.parameters.max_path_distance
+        if distance > most:
+            raise MessageError(
+                f'the start of a path must be within max_path_distance, {most:g} m, of the robot, got '
+                f'{distance:.3g} m'
             )
 
     def _on_cancel(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -292,16 +394,16 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._others.search(now)
         if len(self._times) <= RATE_PERIODS:
             self._measure_rate(now)
-        if not goal.executing and not self._begin(goal):
+        if not goal.executing and not self._begin(goal, pose):
             return
         if goal.stale:
             goal.stale = False
+            # The robot has stopped.
+            self._path_law.reset()
             self.log_event_info('odometry is back', 'odometry is received again: driving on')
-        self._law.now = now
+        self._law.now = self._path_law.now = now
         try:
-            goal.waypoints, command = goal.waypoints.follow(
-                pose, self._law, self._arrival, self.parameters.kp
-            )
+            command = self._step(goal, pose, now)
             if command is not None:
                 command = self._limited(*command)
         except ValueError as error:
@@ -314,6 +416,41 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._end(GoalStatus.STATUS_SUCCEEDED, 'reached')
             return
         self._publish_command(*command)
+
+    def _step(
+        self, goal: Goal, pose: tuple[float, float, float], now: int
+    ) -> tuple[float, float] | None:
+        """Return the next command towards a goal or along its path; None: the robot has arrived.
+
+        Raises:
+            ValueError: A law failed.
+        """
+        if goal.path is not None:
+            # While the robot stands because odometry is missing, a trajectory waits.
+            longest = self.parameters.odom_timeout or math.inf
+            dt = min(max(0, now - (goal.stepped or now)) / NANOSECONDS, longest)
+            goal.path, command = goal.path.follow(
+                pose, dt, self._path_law, self._law, self._path_settings
+            )
+            goal.stepped = now
+            if command is not None:
+                return command
+            self._leave_path(goal, goal.path)
+        goal.waypoints, command = goal.waypoints.follow(
+            pose, self._law, self._arrival, self.parameters.kp
+        )
+        return command
+
+    def _leave_path(self, goal: Goal, path: PathFollower) -> None:
+        """Drive to the pose at the end of a path as to a goal, or to the waypoints that remain."""
+        last = len(goal.waypoints.poses) - 1
+        if path.index < last:
+            self.log_event_warning(
+                'waypoint missed',
+                f'waypoint {path.index + 1} of {last + 1} was passed at more than waypoint_tolerance, '
+                f'{self.parameters.waypoint_tolerance:g} m: driving to it and those after it one by one',
+            )
+        goal.path, goal.waypoints = None, Waypoints(goal.waypoints.poses, path.index)
 
     def _limited(self, v: float, omega: float) -> tuple[float, float]:
         """Return a command within the limits, without whole turns between two messages.
@@ -329,10 +466,12 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             v, omega = scaled_to_limits.formula(v, omega, *self._limits.all(), 1.0, 1.0)
         return v, omega
 
-    def _begin(self, goal: Goal) -> bool:
-        """Start executing a goal, now that the frame of the odometry is known."""
+    def _begin(self, goal: Goal, pose: tuple[float, float, float]) -> bool:
+        """Start executing a goal, now that the frame of the odometry and the pose are known."""
         try:
             self._match_frames(goal)
+            if goal.path is not None:
+                self._match_start(goal.path.path, pose)
         except MessageError as error:
             self.log_event_warning('goal refused', f'goal refused: {error}')
             self._end(GoalStatus.STATUS_ABORTED, 'refused')
@@ -421,6 +560,10 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         law = controller.bind(parameters)
         law.continue_from(self._law)
         self._law = law
+        path_controller = parameters.chosen_path_controller()
+        path_law = path_controller.bind(parameters)
+        path_law.continue_from(self._path_law)
+        self._path_law, self._path_settings = path_law, parameters.path_settings()
         # Far from the goal a law may return more than what counts as a plausible command.
         self._limits = parameters.limits()
         self._arrival = Arrival(
@@ -448,7 +591,9 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
                 f'{SLOW_TURN:g} s',
             )
         self._warn_of_rate()
-        for number, warning in enumerate(controller.warnings(parameters, self._limits)):
+        warnings = controller.warnings(parameters, self._limits)
+        warnings += path_controller.warnings(parameters, self._limits)
+        for number, warning in enumerate(warnings):
             self.log_event_warning(f'advice {number}', warning)
 
     def _warn_of_rate(self) -> None:

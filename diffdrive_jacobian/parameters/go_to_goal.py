@@ -6,11 +6,27 @@ import dataclasses
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, TypeVar, cast
 
-from diffdrive_jacobian.control.controller import KP, KV, OFFSET, Controller, Gain
-from diffdrive_jacobian.control.controllers import BUILT_IN, ControllerError, Controllers
+from diffdrive_jacobian.control.controller import (
+    KP,
+    KV,
+    OFFSET,
+    ControlLaw,
+    Controller,
+    Gain,
+    PathController,
+)
+from diffdrive_jacobian.control.controllers import (
+    ALL_PATH_CONTROLLERS,
+    AnyControllers,
+    ControllerError,
+    Controllers,
+    PathControllers,
+)
 from diffdrive_jacobian.control.controllers import CONTROLLERS as CONTROLLERS
+from diffdrive_jacobian.control.path_following import PathSettings
+from diffdrive_jacobian.control.path_laws import PATH_CONTROLLERS
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MAX_SPEED
 from diffdrive_jacobian.parameters._fields import STAMPED, timeout_field
@@ -21,18 +37,20 @@ from diffdrive_jacobian.parameters.declaration import (
 )
 from diffdrive_jacobian.parameters.limits import LimitParameters
 
+C = TypeVar('C', bound=ControlLaw)
+
 OF_RCLPY = ('use_sim_time', 'start_type_description_service')
 """Parameters of every node."""
 MIN_OFFSET = 1e-3
 """Smallest absolute offset (m). The yaw rate of the law is proportional to the inverse of the offset."""
 
 
-def _controller(default: str, choices: Controllers) -> Any:
-    laws = '; '.join(f'{name}, {one.summary}' for name, one in BUILT_IN.items())
-    names = ', '.join(map(repr, BUILT_IN))
+def _controller(default: str, choices: AnyControllers[Any]) -> Any:
+    laws = '; '.join(f'{name}, {one.summary}' for name, one in choices.built_in.items())
+    names = ', '.join(map(repr, choices.built_in))
     return parameter(
         default,
-        f'Control law: {laws}; or the name of an installed one.',
+        f'{choices.title}: {laws}; or the name of an installed one.',
         choices=choices,
         constraint=f'one of {names}, or an installed or given one',
     )
@@ -49,8 +67,13 @@ class GoToGoalParameters(LimitParameters):
 
     controllers: ClassVar[Controllers] = CONTROLLERS
     """The controllers that can be chosen."""
+    path_controllers: ClassVar[PathControllers] = ALL_PATH_CONTROLLERS
+    """Those of paths."""
 
-    declared_gains: ClassVar[Mapping[str, Gain]] = {gain.name: gain for gain in (KP, KV, OFFSET)}
+    declared_gains: ClassVar[Mapping[str, Gain]] = {
+        gain.name: gain
+        for gain in (KP, KV, OFFSET, *(gain for one in PATH_CONTROLLERS for gain in one.gains))
+    }
     """The gains among the parameters."""
 
     kp: float = _gain(KP)
@@ -66,6 +89,40 @@ class GoToGoalParameters(LimitParameters):
     use_goal_heading: bool = parameter(
         False, 'Turn to the heading of the last goal after its position is reached.'
     )
+    path_controller: str = _controller('pure_pursuit', ALL_PATH_CONTROLLERS)
+    lookahead_distance: float = _gain(declared_gains['lookahead_distance'])
+    k_x: float = _gain(declared_gains['k_x'])
+    k_y: float = _gain(declared_gains['k_y'])
+    k_theta: float = _gain(declared_gains['k_theta'])
+    k_point: float = _gain(declared_gains['k_point'])
+    k_position: float = _gain(declared_gains['k_position'])
+    k_velocity: float = _gain(declared_gains['k_velocity'])
+    path_speed: float = parameter(
+        0.2, 'Speed along a path without times [m/s].', bounds=(1e-3, MAX_SPEED)
+    )
+    path_deceleration: float = parameter(
+        0.5, 'Deceleration towards the end of a path [m/s^2].', bounds=(1e-3, MAX_SPEED)
+    )
+    path_approach_distance: float = parameter(
+        0.3,
+        'Distance from a path beyond which the robot first drives to it as to a goal [m].',
+        bounds=(1e-3, 1e6),
+    )
+    max_path_distance: float = parameter(
+        math.nan,
+        'Largest distance of the robot from the start of a path; others are refused [m].',
+        bounds=(1e-3, 1e6),
+        nan_is_none=True,
+    )
+    pass_waypoints: bool = parameter(
+        False,
+        'Drive through the poses of goals without stopping, along a smooth path; stop at the last.',
+    )
+    waypoint_tolerance: float = parameter(
+        0.1,
+        'Largest distance at which a pose of goals counts as passed, with pass_waypoints [m].',
+        bounds=(1e-6, 100.0),
+    )
     odom_timeout: float = timeout_field(
         0.5,
         'Time without odometry after which the robot stops, until it returns [s]; 0: never.',
@@ -79,33 +136,48 @@ class GoToGoalParameters(LimitParameters):
         Raises:
             ValueError: It is not a Controller, or has the name of a built-in one.
         """
-        known = Controllers(controller)
-        choice = ('controller', str, _controller(controller.name, known))
-        return cls._subclass([choice], {'controllers': known})
+        return cls._with_default(controller, Controllers(controller))
+
+    @classmethod
+    def with_path_controller(cls, controller: PathController) -> type[GoToGoalParameters]:
+        """As `with_controller`, for a controller of paths."""
+        return cls._with_default(controller, PathControllers(controller))
+
+    @classmethod
+    def _with_default(cls, controller: C, known: AnyControllers[C]) -> type[GoToGoalParameters]:
+        choice = (known.parameter, str, _controller(controller.name, known))
+        return cls._subclass([choice], {f'{known.parameter}s': known})
 
     @classmethod
     def extended(cls, values: Mapping[str, Any]) -> type[GoToGoalParameters]:
-        """Return the class that has the gains of the controller, too, with the defaults it declares.
+        """Return the class that has the gains of the controllers, too, with the defaults they declare.
 
         Raises:
-            ParameterError: The controller cannot be loaded, or a gain has the name of something else, or
+            ParameterError: A controller cannot be loaded, or a gain has the name of something else, or
                 another range than the gain of that name.
         """
-        name = values.get('controller', default_of(cls, 'controller'))
-        if name not in cls.controllers or name in BUILT_IN:
+        return cls._with_gains(cls.controllers, values)._with_gains(cls.path_controllers, values)
+
+    @classmethod
+    def _with_gains(
+        cls, controllers: AnyControllers[Any], values: Mapping[str, Any]
+    ) -> type[GoToGoalParameters]:
+        parameter = controllers.parameter
+        name = values.get(parameter, default_of(cls, parameter))
+        if name not in controllers or name in controllers.built_in:
             return cls
-        controller = _found(cls.controllers, name)
+        controller = _found(controllers, name)
         new = [gain for gain in controller.gains if cls.declared_gains.get(gain.name) != gain]
         for gain in new:
             known = cls.declared_gains.get(gain.name)
             if known is None and (hasattr(cls, gain.name) or gain.name in OF_RCLPY):
                 raise ParameterError(
-                    f"parameter 'controller': {name!r} has a gain {gain.name!r}, a name that go_to_goal "
-                    'uses otherwise: choose another one'
+                    f"parameter '{parameter}': {name!r} has a gain {gain.name!r}, a name that "
+                    'go_to_goal uses otherwise: choose another one'
                 )
             if known is not None and not gain.shares_range(known):
                 raise ParameterError(
-                    f"parameter 'controller': {name!r} has a gain {gain.name!r} with another unit or "
+                    f"parameter '{parameter}': {name!r} has a gain {gain.name!r} with another unit or "
                     'other bounds than the parameter of that name: choose another name'
                 )
         gains = {**cls.declared_gains, **{gain.name: gain for gain in new}}
@@ -127,13 +199,14 @@ class GoToGoalParameters(LimitParameters):
         return self.twist_limits(MAX_SPEED)
 
     def check(self) -> None:
-        """Check that the driven point is not on the axle, and that the controller can be loaded."""
+        """Check that the driven point is not on the axle, and that the controllers can be loaded."""
         if abs(self.offset) < MIN_OFFSET:
             raise ParameterError(
                 f"parameter 'offset' must be at least {MIN_OFFSET:g} m or at most {-MIN_OFFSET:g} m, "
                 f'got {self.offset:g}: the Jacobian of the axle centre itself has rank 1'
             )
         self.chosen_controller()
+        self.chosen_path_controller()
 
     def chosen_controller(self) -> Controller:
         """Return the controller; an installed one is imported.
@@ -143,9 +216,30 @@ class GoToGoalParameters(LimitParameters):
         """
         return _found(self.controllers, self.controller)
 
+    def chosen_path_controller(self) -> PathController:
+        """Return the controller of paths; an installed one is imported.
 
-def _found(controllers: Controllers, name: str) -> Controller:
+        Raises:
+            ParameterError: It cannot be loaded.
+        """
+        return _found(self.path_controllers, self.path_controller)
+
+    def path_settings(self) -> PathSettings:
+        """Return how a path is followed, not faster than the limits allow."""
+        return PathSettings(
+            speed=min(self.path_speed, self.limits().max_v),
+            deceleration=self.path_deceleration,
+            approach_distance=self.path_approach_distance,
+            lookahead=self.chosen_path_controller().lookahead_distance(self),
+            turning_gain=self.kp,
+            catching_up=self.kv,
+            end_tolerance=self.xy_goal_tolerance,
+            waypoint_tolerance=self.waypoint_tolerance,
+        )
+
+
+def _found(controllers: AnyControllers[C], name: str) -> C:
     try:
         return controllers.find(name)
     except ControllerError as error:
-        raise ParameterError(f"parameter 'controller': {error}") from error
+        raise ParameterError(f"parameter '{controllers.parameter}': {error}") from error

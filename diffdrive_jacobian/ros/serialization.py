@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from builtin_interfaces.msg import Time
-from nav_msgs.msg import Goals
+from nav_msgs.msg import Goals, Path
 from rclpy.serialization import deserialize_message
 
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader
-from diffdrive_jacobian.messages.codecs import GOALS_HEADER, Codec
+from diffdrive_jacobian.messages.codecs import GOALS_HEADER, PATH_HEADER, Codec
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.structure import PLAIN
 from diffdrive_jacobian.ros.graph_faults import Interleaving
@@ -19,8 +19,8 @@ from diffdrive_jacobian.ros.rclpy_internals import with_message_info
 V = TypeVar('V')
 
 MAX_OTHER_ENCAPSULATION = 200_000
-"""Longest Goals message in an encapsulation that only rclpy reads (bytes): it creates an object for each
-of its poses, of which 2,000 have this size."""
+"""Longest message of poses in an encapsulation that only rclpy reads (bytes): it creates an object for
+each pose, of which 2,000 have this size."""
 MAX_SIZE = 1 << 20
 """Size of the largest message that clients of our nodes decode (bytes). rclpy would take minutes for a
 Goals message of 1.5 million poses."""
@@ -113,11 +113,14 @@ def decoding(
     return chosen
 
 
-_read_header = reader(Goals, GOALS_HEADER.fields, whole=False)
+_read_header = {
+    Goals: reader(Goals, GOALS_HEADER.fields, whole=False),
+    Path: reader(Path, PATH_HEADER.fields, whole=False),
+}
 
 
-def goals_header(data: bytes) -> tuple[Time, int]:
-    """Return the stamp and the number of poses of a serialized Goals message without its poses.
+def poses_header(data: bytes, kind: type[Any]) -> tuple[Time, int]:
+    """Return the stamp and the number of poses of a serialized Goals or Path message without its poses.
 
     Raises:
         DecodingError: The bytes end before the poses, or are too few for them. Or it takes message
@@ -125,8 +128,8 @@ def goals_header(data: bytes) -> tuple[Time, int]:
     """
     if data[:2] not in PLAIN and len(data) > MAX_OTHER_ENCAPSULATION:
         raise DecodingError(
-            f'a Goals message must have at most {MAX_OTHER_ENCAPSULATION} bytes, unless it is plain '
-            f'CDR, got {len(data)}'
+            f'a {kind.__name__} message must have at most {MAX_OTHER_ENCAPSULATION} bytes, unless it is '
+            f'plain CDR, got {len(data)}'
         )
-    sec, nanosec, count = _read_header(data)
+    sec, nanosec, count = _read_header[kind](data)
     return Time(sec=sec, nanosec=nanosec), count

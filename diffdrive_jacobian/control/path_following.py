@@ -1,0 +1,159 @@
+"""Following a path: where the robot is along it, and what drives it at each place.
+
+- Far from the path, the law of goals drives the robot to it.
+- A robot that faces backwards turns in place.
+- On the path the law of the path drives.
+- At its end, the last pose is a goal like any other.
+
+Each step takes the robot's pose and returns the next command. The time of a trajectory advances
+while the law of the path drives.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import cos, hypot, pi, sin, sqrt
+from typing import Any
+
+import numpy as np
+
+from diffdrive_jacobian.control.controller import BoundLaw
+from diffdrive_jacobian.control.go_to_goal import turn_in_place
+from diffdrive_jacobian.control.path import Path, Reference
+from diffdrive_jacobian.control.waypoints import Law
+from diffdrive_jacobian.numerics.checks import NotNegative, Positive
+from diffdrive_jacobian.numerics.elementary import wrap
+from diffdrive_jacobian.numerics.fields import Checked
+
+SAMPLES = 33
+"""Number of points of the path among which the one at the look-ahead distance is searched."""
+REACH = 4.0
+"""Arc length that is searched for it, in look-ahead distances."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PathSettings(Checked):
+    """How a path is followed.
+
+    Raises:
+        ValueError: A value is negative or not finite, or one that must be positive is zero.
+    """
+
+    speed: NotNegative = 0.2
+    """Speed along a path without times (m/s)."""
+    deceleration: Positive = 0.5
+    """Deceleration towards its end (m/s^2)."""
+    approach_distance: Positive = 0.3
+    """Distance from the path beyond which the law of goals drives the robot to it (m)."""
+    lookahead: NotNegative = 0.0
+    """Look-ahead distance of the law of the path (m); 0: it has none."""
+    turning_gain: Positive = 3.0
+    """Gain of the turn in place (1/s)."""
+    catching_up: NotNegative = 0.5
+    """Gain on the distance from the pose of a trajectory, for a law with a look-ahead distance (1/s)."""
+    end_tolerance: NotNegative = 0.02
+    """Rest of the path at which its end is driven to as a goal (m)."""
+    waypoint_tolerance: Positive = 0.1
+    """Largest distance at which a waypoint counts as passed (m)."""
+
+
+@dataclass(frozen=True, slots=True)
+class PathFollower:
+    """A path and the progress along it. Immutable."""
+
+    path: Path
+    passing: bool = False
+    """Whether each pose is a waypoint that the robot must pass within the tolerance."""
+    s: float = 0.0
+    """Arc length of the nearest point (m)."""
+    elapsed: float = 0.0
+    """Time of the trajectory (s)."""
+    index: int = 0
+    """The next pose to pass; at the end of the path the last one."""
+
+    def follow(
+        self,
+        pose: tuple[float, float, float],
+        dt: float,
+        law: BoundLaw,
+        law_of_goals: Law,
+        how: PathSettings,
+    ) -> tuple[PathFollower, tuple[Any, Any] | None]:
+        """Compute the next command.
+
+        Args:
+            pose: Pose of the robot (m, m, rad).
+            dt: Time since the step before (s).
+            law: The law of the path with its gains. It is reset where another one drives.
+            law_of_goals: The law that drives to goals.
+            how: Speeds and distances.
+
+        Returns:
+            The follower with the new progress, and the command `(v, omega)` (m/s, rad/s). The command is
+            None at the end, and where a waypoint was missed: then what follows `index` remains, to be
+            driven to as goals.
+        """
+        x, y, theta = pose
+        path = self.path
+        s = path.nearest(x, y, self.s)
+        here = replace(self, s=s, index=self._next(x, y, s, how.waypoint_tolerance))
+        if here.passing and s > path.arc_lengths[here.index] + how.waypoint_tolerance:
+            return here, None
+        at_end = s >= path.length - how.end_tolerance
+        if self.elapsed >= path.duration or (at_end and path.times is None):
+            return here if self.passing else replace(here, index=len(path.poses) - 1), None
+        reference = here._reference(how)
+        away = hypot(reference.x - x, reference.y - y)
+        if away > how.approach_distance:
+            law.reset()
+            return here, law_of_goals(pose, np.array(reference[:3]))
+        if abs(wrap(reference.theta - theta)) > pi / 2.0:
+            law.reset()
+            return here, turn_in_place.formula(theta, reference.theta, how.turning_gain)
+        here = replace(here, elapsed=self.elapsed + dt)
+        return here, law(pose, here._target(x, y, how) if how.lookahead else here._reference(how))
+
+    def _next(self, x: float, y: float, s: float, tolerance: float) -> int:
+        """Return the index of the next pose to pass."""
+        last = len(self.path.poses) - 1
+        if not self.passing:
+            return min(int(self.path.arc_lengths.searchsorted(s, 'right')), last)
+        index = self.index
+        while index < last and hypot(*(self.path.poses[index, :2] - (x, y))) <= tolerance:
+            index += 1
+        return index
+
+    def _reference(self, how: PathSettings) -> Reference:
+        """Return where the robot should be."""
+        if self.path.times is not None:
+            return self.path.at_time(self.elapsed)
+        rest = max(self.path.length - self.s, 0.0)
+        return self.path.at(self.s, min(how.speed, sqrt(2.0 * how.deceleration * rest)))
+
+    def _target(self, x: float, y: float, how: PathSettings) -> Reference:
+        """Return the first point of the path at the look-ahead distance. The path goes on straight.
+
+        If the robot is farther from the path, return the nearest point.
+        """
+        path, distance = self.path, how.lookahead
+        reference = self._reference(how)
+        v = reference.v
+        if path.times is not None:
+            v = max(0.0, v + how.catching_up * (reference.s - self.s))
+        s = self.s + np.linspace(0.0, REACH * distance, SAMPLES)
+        points = path.poses_at(s)
+        beyond = np.zeros(SAMPLES) if path.closed else np.maximum(s - path.length, 0.0)
+        distances = np.hypot(
+            points[:, 0] + beyond * np.cos(points[:, 2]) - x,
+            points[:, 1] + beyond * np.sin(points[:, 2]) - y,
+        )
+        far = np.flatnonzero(distances >= distance)
+        # None is as far where the path is a narrow curl.
+        index = int(far[0]) if far.size else int(np.argmax(distances))
+        pair = slice(max(index - 1, 0), index + 1)
+        at = float(np.interp(distance, distances[pair], s[pair]))
+        target = path.at(at, v)
+        rest = 0.0 if path.closed else max(at - path.length, 0.0)
+        return target._replace(
+            x=target.x + rest * cos(target.theta), y=target.y + rest * sin(target.theta)
+        )
