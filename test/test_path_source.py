@@ -30,11 +30,12 @@ def test_a_line():
 def test_a_figure_eight():
     path = figure_eight_path(1.0)
     assert path.closed
-    assert np.diff(path.arc_lengths).max() < 0.06
+    assert np.diff(path.arc_lengths).max() < 0.0501
     half = path.at(path.length / 2.0, 1.0)
     assert half[:3] == pytest.approx((0.0, 2.0, 0.0), abs=1e-6)
     # To the left at the bottom, to the right at the top.
-    assert (path.at(0.0, 1.0).omega, half.omega) == pytest.approx((1.0, -1.0), abs=5e-3)
+    assert (path.at(0.0, 1.0).omega, half.omega) == pytest.approx((3.0, -3.0), abs=0.02)
+    assert path.length == pytest.approx(5.2441, abs=1e-3)
     crossings = path.poses_at(path.length * np.array([0.25, 0.75]))
     assert_allclose(crossings[:, :2], [[0.0, 1.0]] * 2, atol=1e-6)
 

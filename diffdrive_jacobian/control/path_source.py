@@ -2,7 +2,7 @@
 
     circle:1.0      a circle to the left of the robot, of this radius (m)
     line:2.0        a straight line ahead, of this length (m)
-    eight:1.0       a figure eight, whose ends have this radius (m)
+    eight:1.0       a figure eight, of this length from its middle to its ends (m)
     poses.csv       x, y and perhaps theta and t in columns
     poses.yaml      a list of poses
 
@@ -68,20 +68,25 @@ def line_path(length: float) -> Path:
     return _shape(lambda u: (length * u / (2.0 * math.pi), 0.0 * u), length)
 
 
-def figure_eight_path(radius: float) -> Path:
-    """Return a figure eight, the lemniscate of Gerono: `x = r sin u cos u, y = r - r cos u`.
+def figure_eight_path(size: float) -> Path:
+    """Return a figure eight, the lemniscate of Bernoulli, from one of its ends to the left.
 
-    It is r wide in x and 2 r long in y. Both ends are circles of radius r, and it starts at the lower
-    one, to the left.
+    With `c = a / (1 + sin(u)^2)` it is `x = c sin(u) cos(u), y = a - c cos(u)`. It is 2 a long in y, and
+    narrowest at its ends, with the radius a/3.
 
     Args:
-        radius: Radius of curvature at both ends (m).
+        size: Half of its length, a (m).
 
     Raises:
-        ValueError: The radius is not a positive number.
+        ValueError: The size is not a positive number.
     """
-    radius = number('radius', radius, positive)
-    return _shape(lambda u: (radius * np.sin(u) * np.cos(u), radius * (1.0 - np.cos(u))), 8.9 * radius)
+    a = number('size', size, positive)
+
+    def point(u: Floats) -> tuple[Floats, Floats]:
+        c = a / (1.0 + np.sin(u) ** 2)
+        return c * np.sin(u) * np.cos(u), a - c * np.cos(u)
+
+    return _shape(point, 2.0 * math.pi * a)
 
 
 SHAPES: dict[str, Callable[[float], Path]] = {
@@ -90,7 +95,7 @@ SHAPES: dict[str, Callable[[float], Path]] = {
     'eight': figure_eight_path,
 }
 """Shapes by their names, and what makes them of their size (m)."""
-ALLOWED = 'circle:RADIUS, line:LENGTH, eight:RADIUS (m) or the name of a .csv or .yaml file of poses'
+ALLOWED = 'circle:RADIUS, line:LENGTH, eight:SIZE (m) or the name of a .csv or .yaml file of poses'
 
 
 def is_shape(text: str) -> bool:

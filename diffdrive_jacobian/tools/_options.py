@@ -195,7 +195,7 @@ def add_path(parser: argparse.ArgumentParser, name: str, what: str = '') -> None
     parser.add_argument(
         name,
         metavar='PATH',
-        help=f'{what}circle:RADIUS, line:LENGTH or eight:RADIUS (m), or a .csv or .yaml file of poses',
+        help=f'{what}circle:RADIUS, line:LENGTH or eight:SIZE (m), or a .csv or .yaml file of poses',
     )
 
 
