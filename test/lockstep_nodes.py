@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
-from nav_msgs.msg import Goals, Odometry
+from nav_msgs.msg import Goals, Odometry, Path
 from rclpy.parameter import Parameter
 from ros_messages import odometry, twists
 from sensor_msgs.msg import JointState
@@ -112,8 +112,9 @@ class Controller:
         return [(one.goal_info.stamp.sec, one.status) for one in self.status]
 
     def send(self, message):
-        """Send a goal or several."""
-        self._world.publish('goals' if isinstance(message, Goals) else 'goal_pose', message)
+        """Send a goal, several or a path."""
+        topics = {Goals: 'goals', Path: 'path'}
+        self._world.publish(topics.get(type(message), 'goal_pose'), message)
 
     def sees(self, message):
         """Send odometry; give the commands that answer it."""

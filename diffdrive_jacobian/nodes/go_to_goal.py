@@ -69,6 +69,16 @@ class Goal:
     stale: bool = False
     """Whether the robot is stopped because odometry is missing."""
 
+    def same_path(self, other: Goal) -> bool:
+        """Return whether both are on the same path."""
+        if self.path is None or other.path is None or self.frame != other.frame:
+            return False
+        one, two = (
+            (path.poses, np.zeros(0) if path.times is None else path.times)
+            for path in (self.path.path, other.path.path)
+        )
+        return all(map(np.array_equal, one, two))
+
 
 class GoalIdentifiers:
     """The identifiers of the goals of one controller.
@@ -137,11 +147,23 @@ def read_path(frame: str, frames: Sequence[str], poses: Poses, stamps: Stamps) -
         raise MessageError(f'path is invalid: {error}') from error
 
 
+def _through(pose: tuple[float, float, float], waypoints: Waypoints) -> PathFollower | None:
+    """Return the path from a robot through waypoints; None: they are all in one place, where it is."""
+    with suppress(ValueError):
+        return PathFollower(Path(np.array([pose, *waypoints.poses])), passing=True)
+    return None
+
+
+def _waypoint(path: PathFollower) -> int:
+    """Return the index of the next pose of a goal. A path through waypoints begins at the robot."""
+    return max(path.index - path.passing, 0)
+
+
 def described(goal: Goal) -> str:
     """Return a goal in words, for the log."""
     x, y, _ = goal.waypoints.poses[-1]
     count, words = len(goal.waypoints.poses), ''
-    if goal.path is not None and not goal.path.passing:
+    if goal.path is not None:
         path = goal.path.path
         time = '' if path.times is None else f' in {path.duration:.1f} s'
         words = f'path of {path.length:.2f} m{time} through {count} poses, the last at '
@@ -232,7 +254,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         """Index of the pose of the active goal that is driven to; None without a goal."""
         if self._goal is None:
             return None
-        return (self._goal.path or self._goal.waypoints).index
+        path, waypoints = self._goal.path, self._goal.waypoints
+        return waypoints.index if path is None else _waypoint(path)
 
     @property
     def arrival(self) -> Arrival:
@@ -257,18 +280,9 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             _, _, frame, frames, *columns = _read_goals(data)
             poses = [*zip(*columns, strict=True)]
             self._warn_of_integers('goals', poses)
-            frame, waypoints = read_goal(frame, frames, poses)
-            return Goal(info, frame, waypoints, self._passing(waypoints))
+            return Goal(info, *read_goal(frame, frames, poses))
 
         self._receive('goals', data, Goals, MAX_WAYPOINTS, read)
-
-    def _passing(self, waypoints: Waypoints) -> PathFollower | None:
-        """Return the path through waypoints, if they are to be passed without stopping."""
-        if self.parameters.pass_waypoints:
-            # In one place there is no path.
-            with suppress(ValueError):
-                return PathFollower(Path(waypoints.poses), passing=True)
-        return None
 
     def _on_path(self, data: bytes) -> None:
         def read(info: GoalInfo) -> Goal:
@@ -313,9 +327,11 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._publish_status(self._goal.info, self._goal_status(self._goal))
 
     def _accept(self, goal: Goal) -> None:
-        """Replace the active goal, if there is one."""
+        """Replace the active goal, if there is one. On the same path the robot goes on where it is."""
         if self._goal is not None:
             self._publish_status(self._goal.info, GoalStatus.STATUS_CANCELED)
+            if self._goal.same_path(goal):
+                goal.path, goal.stepped = self._goal.path, self._goal.stepped
         if not self._driving:
             # While the robot moves the watchdog runs already, and a new goal is no sign of odometry.
             self._watchdog.start(nanoseconds(self.parameters.odom_timeout))
@@ -334,9 +350,9 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
                 f"or '' for it, got '{printable(goal.frame)}'"
             )
 
-    def _match_start(self, path: Path, pose: tuple[float, float, float]) -> None:
-        x, y, _ = pose
-        start = path.at(path.nearest(x, y, 0.0), 0.0)
+    def _match_start(self, follower: PathFollower, pose: tuple[float, float, float]) -> None:
+        (x, y, _), path = pose, follower.path
+        start = path.at(path.nearest(x, y, follower.s), 0.0)
         distance, most = math.hypot(start.x - x, start.y - y), self.parameters.max_path_distance
         if distance > most:
             raise MessageError(
@@ -443,14 +459,14 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
 
     def _leave_path(self, goal: Goal, path: PathFollower) -> None:
         """Drive to the pose at the end of a path as to a goal, or to the waypoints that remain."""
-        last = len(goal.waypoints.poses) - 1
-        if path.index < last:
+        poses, index = goal.waypoints.poses, _waypoint(path)
+        if index + 1 < len(poses):
             self.log_event_warning(
                 'waypoint missed',
-                f'waypoint {path.index + 1} of {last + 1} was passed at more than waypoint_tolerance, '
+                f'waypoint {index + 1} of {len(poses)} was passed at more than waypoint_tolerance, '
                 f'{self.parameters.waypoint_tolerance:g} m: driving to it and those after it one by one',
             )
-        goal.path, goal.waypoints = None, Waypoints(goal.waypoints.poses, path.index)
+        goal.path, goal.waypoints = None, Waypoints(poses, index)
 
     def _limited(self, v: float, omega: float) -> tuple[float, float]:
         """Return a command within the limits, without whole turns between two messages.
@@ -471,7 +487,9 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         try:
             self._match_frames(goal)
             if goal.path is not None:
-                self._match_start(goal.path.path, pose)
+                self._match_start(goal.path, pose)
+            elif self.parameters.pass_waypoints and len(goal.waypoints.poses) > 1:
+                goal.path = _through(pose, goal.waypoints)
         except MessageError as error:
             self.log_event_warning('goal refused', f'goal refused: {error}')
             self._end(GoalStatus.STATUS_ABORTED, 'refused')
