@@ -30,7 +30,7 @@ def test_a_line():
 def test_a_figure_eight():
     path = figure_eight_path(1.0)
     assert path.closed
-    assert np.diff(path.arc_lengths).max() < 0.0501
+    assert np.diff(path.arc_lengths).max() < 0.0502
     half = path.at(path.length / 2.0, 1.0)
     assert half[:3] == pytest.approx((0.0, 2.0, 0.0), abs=1e-6)
     # To the left at the bottom, to the right at the top.

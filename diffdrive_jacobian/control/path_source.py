@@ -147,7 +147,7 @@ def _shape(point: Callable[[Floats], tuple[Floats, Floats]], length: float) -> P
 
     `length` is that of the curve, or more where its points are not evenly spaced.
     """
-    count = int(min(max(length / SPACING, FEWEST), MOST))
+    count = min(max(math.ceil(length / SPACING), FEWEST), MOST)
     path = Path(np.column_stack(point(np.linspace(0.0, 2.0 * math.pi, count + 1))))
     # The end of a closed path is its beginning.
     inside = np.minimum(path.arc_lengths, np.nextafter(path.length, 0.0))

@@ -283,6 +283,10 @@ class RobotState:
     def _law(self, target: NDArray[np.float64] | None) -> dict[str, Any]:
         """Return the name of the law, its gains, and what it computes here without limits."""
         values = self.controller_values
+        if self.goal.path is not None:
+            name = str(values.get('path_controller', ''))[:64]
+            # The twist is that of the look-ahead or the time of the node, which are not known here.
+            return {'name': name, 'gains': {}, 'twist': None}
         name = str(values.get('controller', ''))[:64]
         # Only built-in ones: another one may be slow, and runs in the controller.
         controller = BUILT_IN.get(name)
