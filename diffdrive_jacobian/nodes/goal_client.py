@@ -136,10 +136,10 @@ class GoalClient(Node):  # type: ignore[misc]
             ParameterError: A topic has another type in this process.
             ValueError: `goals` has another shape than the topic takes.
         """
-        poses = goals.poses if isinstance(goals, Path) else goals
+        poses, used = (goals.poses, 'path') if isinstance(goals, Path) else (goals, topic)
         if poses.ndim != 2 or poses.shape[1] != 3 or not len(poses):
             raise ValueError(f'goals must have shape (n, 3) with n > 0, got {poses.shape}')
-        if topic == 'goal_pose' and len(poses) != 1:
+        if used == 'goal_pose' and len(poses) != 1:
             raise ValueError(f'goal_pose takes one goal, got {len(poses)}')
         super().__init__(name, context=context, **kwargs)
         self.goals = poses
@@ -158,7 +158,7 @@ class GoalClient(Node):  # type: ignore[misc]
         """Time of the last odometry, or since when it is expected (s, monotonic)."""
         self._frame = frame
         self._readers = readers
-        self.topic = 'path' if isinstance(goals, Path) else topic
+        self.topic: str = used
         """Where the goals are published."""
         self._relative = relative
         self._send_on_odometry = False

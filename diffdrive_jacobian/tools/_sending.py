@@ -58,13 +58,14 @@ def send(
         signals: Counter of the signals that cancel it.
         arguments: Further arguments of `sending`.
     """
+    options.timeout = math.inf if options.timeout is None else options.timeout
     try:
         with Progress(program, what) as progress:
             result = sending(
                 frame=options.frame,
                 readers=options.readers or 1,
                 patience=options.wait,
-                timeout=math.inf if options.timeout is None else options.timeout,
+                timeout=options.timeout,
                 follow=not options.no_wait,
                 ros_arguments=ros,
                 signals=signals,

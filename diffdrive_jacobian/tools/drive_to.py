@@ -327,8 +327,7 @@ def _print_goal_end(end: GoalEnd) -> None:
 def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
-        usage=f'{PROGRAM} X Y [X Y ...] [options] [--ros-args ...]\n'
-        f'       {PROGRAM} --path PATH [options] [--ros-args ...]',
+        usage=f'{PROGRAM} (X Y [X Y ...] | --path PATH) [options] [--ros-args ...]',
         description='Drive the virtual robot to goals, in order, or along a path: robot, controller and '
         'wheel bridge in one process, the whole Jacobian chain in use. Exit code 0: arrived; 1: not '
         'arrived, or the recording is not complete; 2: wrong arguments; 130: interrupted.',
