@@ -11,6 +11,7 @@ COMMANDS = [
     'wheel_bridge',
     'drive_to',
     'send_goal',
+    'send_path',
     'record_run',
     'recover_run',
     'replay_run',

@@ -5,17 +5,19 @@ Times are seconds since the first odometry, by its own stamps.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from operator import attrgetter
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.run import Run, Series
+from diffdrive_jacobian.control import Path
 from diffdrive_jacobian.control.controllers import BUILT_IN
-from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
+from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES, MAX_WAYPOINTS
 from diffdrive_jacobian.messages.goal_follower import Fate, FollowedGoal, GoalFollower, Stamp
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.numerics.elementary import wrap
@@ -48,6 +50,18 @@ class Timeline:
     """From the heading to the direction of that goal (rad); NaN: none, or it is reached."""
     goal_heading_error: Array
     """From the heading to that of the goal (rad); NaN: none, or its heading does not count."""
+    paths: tuple[Path, ...]
+    """The paths that were sent and not refused."""
+    path: Indices
+    """Which of `paths` is driven along; -1: none."""
+    progress: Array
+    """Arc length of the point of it that is nearest to the axle centre (m); NaN: none."""
+    along: Array
+    """How far that is ahead of where a trajectory is by its times (m); NaN: no trajectory."""
+    across: Array
+    """Distance from the path, positive to its left (m); NaN: none."""
+    path_heading_error: Array
+    """From the direction of the path to the heading (rad); NaN: none."""
 
 
 def timeline(run: Run) -> Timeline:
@@ -62,6 +76,8 @@ def timeline(run: Run) -> Timeline:
     The last goal is reached when the node reports success, or, if `goal_status` was not recorded, at
     the first odometry within the tolerance. A reached goal has no direction. Its distance continues
     until the odometry is reset, or, without `goal_status`, reset while the robot is at the goal.
+    A path counts until the next goal or path, or until it has ended. The times of a trajectory advance
+    as in go_to_goal: not while the robot is farther from it than path_approach_distance, or turned away.
 
     Raises:
         BagError: There is no odometry.
@@ -70,13 +86,15 @@ def timeline(run: Run) -> Timeline:
     if not len(odometry):
         raise run.lacking('odometry: no valid message on a topic odom of nav_msgs/msg/Odometry')
     breaks = _breaks(run)
-    goal, reached = _progress(run, breaks)
+    routes = _routes(run)
+    goal, reached, driven = _progress(run, breaks, routes)
     x, y, theta = odometry.values[:, :3].T
     targets = np.full((len(odometry), 3), np.nan)
     targets[goal >= 0] = run.goals.values[goal[goal >= 0]]
     dx, dy = targets[:, 0] - x, targets[:, 1] - y
     to_goal = targets[:, :2] - _driven_points(run)
-    last = [route[-1] for route, _ in _routes(run)]
+    last = [sent.rows[-1] for sent, _ in routes if not sent.is_path]
+    paths, path, errors = _along_paths(run, routes, driven)
     counts = _over_time(run, lambda now: heading_counts(now.of_node('go_to_goal')))
     return Timeline(
         run=run,
@@ -88,6 +106,12 @@ def timeline(run: Run) -> Timeline:
         goal_heading_error=np.where(
             np.isin(goal, last) & (counts > 0.0), wrap(targets[:, 2] - theta), np.nan
         ),
+        paths=paths,
+        path=path,
+        progress=errors[0],
+        along=errors[1],
+        across=errors[2],
+        path_heading_error=errors[3],
     )
 
 
@@ -153,21 +177,33 @@ def _over_time(run: Run, value: Callable[[Run], float]) -> Array:
     return np.asarray(values[np.maximum(latest, 0)], dtype=np.float64)
 
 
-def _progress(run: Run, breaks: Indices) -> tuple[Indices, NDArray[np.bool_]]:
-    """Return for each odometry which goal is driven to, -1 for none, and whether it is reached."""
+def _progress(
+    run: Run, breaks: Indices, routes: list[Followed]
+) -> tuple[Indices, NDArray[np.bool_], Indices]:
+    """Return for each odometry which goal is driven to, -1 for none, and whether it is reached.
+
+    And which route is the path that is driven along, -1 for none.
+    """
     seen = run.odometry.received
     places = np.column_stack([_driven_points(run), _over_time(run, tolerance)])
     goal, reached = np.full(len(seen), -1), np.zeros(len(seen), dtype=bool)
+    driven = np.full(len(seen), -1)
     known = len(run.goal_status) > 0 or bool(run.of_node('go_to_goal'))
-    routes = _routes(run)
-    begins = [run.goals.received[route.start] for route, _ in routes]
-    for (route, followed), begun, until in zip(routes, begins, [*begins, _NEVER][1:], strict=True):
-        state = followed.state
+    begins = [sent.received for sent, _ in routes]
+    for number, ((sent, followed), begun, until) in enumerate(
+        zip(routes, begins, [*begins, _NEVER][1:], strict=True)
+    ):
+        route, state = sent.rows, followed.state
         here, end = np.searchsorted(seen, [begun, until]).tolist()
         stop = end
         if state in (GoalState.CANCELED, GoalState.ABORTED):
             stop = min(stop, int(np.searchsorted(seen, followed.since, side='right')))
         succeeded = state is GoalState.SUCCEEDED
+        if sent.is_path:
+            if succeeded:
+                stop = min(stop, int(np.searchsorted(seen, followed.since, side='right')))
+            driven[here:stop] = number
+            continue
         for target in route[:-1]:
             next_here = _first_within(run, places, target, here, stop)
             if next_here is None and here < stop and (succeeded or not known):
@@ -193,7 +229,50 @@ def _progress(run: Run, breaks: Indices) -> tuple[Indices, NDArray[np.bool_]]:
                 over = over[within[over - 1 - begin]]
             stop = min([stop, *over.tolist()])
             goal[stop:end], reached[here:stop] = -1, True
-    return goal, reached
+    return goal, reached, driven
+
+
+def _along_paths(
+    run: Run, routes: list[Followed], driven: Indices
+) -> tuple[tuple[Path, ...], Indices, Array]:
+    """Return the paths, which is driven along, and progress and errors, shape (4, n)."""
+    paths: list[Path] = []
+    which, errors = np.full(len(driven), -1), np.full((4, len(driven)), np.nan)
+    poses, stamps = run.odometry.values[:, :3], run.odometry.stamps
+    approach = run.number_of_node(
+        'go_to_goal', 'path_approach_distance', GoToGoalParameters().path_approach_distance
+    )
+    for number, (sent, _) in enumerate(routes):
+        if not sent.is_path:
+            continue
+        rows = run.planned_path.values[sent.rows.start : sent.rows.stop]
+        try:
+            path = Path(rows[:, :3], None if np.isnan(rows[:, 3]).any() else rows[:, 3])
+        except ValueError:
+            # The node refuses it, too.
+            continue
+        here = np.flatnonzero(driven == number)
+        which[here] = len(paths)
+        paths.append(path)
+        s = path.project(poses[here])
+        placed = Path.errors(poses[here], path.poses_at(s))
+        errors[:, here] = s, np.full(len(s), np.nan), placed.across, placed.heading
+        if path.times is not None:
+            dt = np.clip(np.diff(stamps[here], prepend=stamps[here][:1]) / NANOSECONDS, 0.0, None)
+            errors[1, here] = s - _times_of_node(path, poses[here], dt, approach)
+    return tuple(paths), which, errors
+
+
+def _times_of_node(path: Path, poses: Array, dt: Array, approach: float) -> Array:
+    """Return the arc length of a trajectory at the times of go_to_goal, shape (n,) (m)."""
+    elapsed, result = 0.0, np.empty(len(poses))
+    for index, (x, y, theta) in enumerate(poses.tolist()):
+        reference = path.at_time(elapsed)
+        turned = abs(wrap(reference.theta - theta)) > np.pi / 2.0
+        if not turned and np.hypot(reference.x - x, reference.y - y) <= approach:
+            elapsed += float(dt[index])
+        result[index] = path.at_time(elapsed).s
+    return result
 
 
 def _distances(run: Run, places: Array, target: int) -> Array:
@@ -233,14 +312,42 @@ def _arrival(within: Mask, success: int) -> int:
     return min(int(outside[-1]) + 1 if len(outside) else 0, success)
 
 
-def _routes(run: Run) -> list[tuple[range, FollowedGoal[range]]]:
-    """Find which goals came in one message, and follow them; those that were refused are left out."""
-    goals, statuses = run.goals, run.goal_status
-    together = (np.diff(goals.received) == 0) & (np.diff(goals.stamps) == 0)
-    edges = [0, *(np.flatnonzero(~together) + 1).tolist(), len(goals)]
-    # Too many came in several messages at the same time, of which the last one counts.
-    routes = [range(*pair)[-MAX_WAYPOINTS:] for pair in pairwise(edges) if len(range(*pair))]
-    received = goals.received[[route.start for route in routes]]
+class Sent(NamedTuple):
+    """Goals or a path that came in one message."""
+
+    received: int
+    """When they were recorded (ns)."""
+    rows: range
+    """Rows of `run.goals` or of `run.planned_path`."""
+    is_path: bool
+    stamp: Stamp
+
+
+Followed: TypeAlias = tuple[Sent, FollowedGoal[Sent]]
+
+
+def _sent(run: Run, series: Series, most: int, *, is_path: bool) -> Iterator[Sent]:
+    """Find which goals came in one message."""
+    together = (np.diff(series.received) == 0) & (np.diff(series.stamps) == 0)
+    edges = [0, *(np.flatnonzero(~together) + 1).tolist(), len(series)]
+    stamps = _stamps(run, series)
+    for pair in pairwise(edges):
+        # Too many came in several messages at the same time, of which the last one counts.
+        if rows := range(*pair)[-most:]:
+            yield Sent(int(series.received[rows.start]), rows, is_path, stamps[rows.start])
+
+
+def _routes(run: Run) -> list[Followed]:
+    """Follow goals and paths in the order in which they came; those that were refused are left out."""
+    statuses = run.goal_status
+    routes = sorted(
+        [
+            *_sent(run, run.goals, MAX_WAYPOINTS, is_path=False),
+            *_sent(run, run.planned_path, MAX_PATH_POSES, is_path=True),
+        ],
+        key=attrgetter('received'),
+    )
+    received = [route.received for route in routes]
     reports = [
         *zip(
             statuses.values[:, 0].astype(int).tolist(),
@@ -249,14 +356,14 @@ def _routes(run: Run) -> list[tuple[range, FollowedGoal[range]]]:
             strict=True,
         )
     ]
-    follower: GoalFollower[range] = GoalFollower()
+    follower: GoalFollower[Sent] = GoalFollower()
     answered: list[int] = np.searchsorted(statuses.received, received).tolist()
     answered.append(len(reports))
     for report in reports[: answered[0]]:
         follower.reported(*report)
-    stamps, followed = _stamps(run, goals), []
+    followed = []
     for route, (begin, end) in zip(routes, pairwise(answered), strict=True):
-        followed.append((route, follower.sent(route, stamps[route.start])))
+        followed.append((route, follower.sent(route, route.stamp)))
         for report in reports[begin:end]:
             follower.reported(*report)
     return [pair for pair in followed if pair[1].fate is not Fate.REFUSED]

@@ -20,6 +20,13 @@ from diffdrive_jacobian.control.controllers import (
 from diffdrive_jacobian.control.go_to_goal import go_to_goal, turn_in_place
 from diffdrive_jacobian.control.offset_point import offset_point
 from diffdrive_jacobian.control.path import Path, Reference
+from diffdrive_jacobian.control.path_source import (
+    PathError,
+    circle_path,
+    figure_eight_path,
+    line_path,
+    planned_path,
+)
 from diffdrive_jacobian.control.pose import go_to_pose
 from diffdrive_jacobian.control.resolved_rate import StraightLine, resolved_rate
 from diffdrive_jacobian.control.waypoints import Waypoints
@@ -38,15 +45,20 @@ __all__ = [
     'LawError',
     'Path',
     'PathController',
+    'PathError',
     'Reference',
     'StraightLine',
     'VelocityLimits',
     'Waypoints',
+    'circle_path',
     'controller_names',
+    'figure_eight_path',
     'find_controller',
     'go_to_goal',
     'go_to_pose',
+    'line_path',
     'offset_point',
+    'planned_path',
     'resolved_rate',
     'saturate',
     'turn_in_place',

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.kinematics import se2
-from diffdrive_jacobian.numerics.checks import array, finite, floats, number, read_only
+from diffdrive_jacobian.numerics.checks import array, finite, floats, number, positive, read_only
 from diffdrive_jacobian.numerics.elementary import wrap
 
 Floats = NDArray[np.float64]
@@ -141,6 +141,18 @@ class Path:
     def duration(self) -> float:
         """Time from the first pose to the last (s); NaN for a path without times."""
         return float('nan') if self.times is None else float(self.times[-1])
+
+    def timed(self, speed: float) -> Path:
+        """Return the trajectory along this path with a constant speed (m/s).
+
+        Poses that repeat the position before are left out.
+
+        Raises:
+            ValueError: The speed is not a positive number.
+        """
+        speed = number('speed', speed, positive)
+        new = np.concatenate([[True], np.diff(self.arc_lengths) > 0.0])
+        return Path(self.poses[new], self.arc_lengths[new] / speed)
 
     def at(self, s: float, speed: float) -> Reference:
         """Return the path at an arc length.

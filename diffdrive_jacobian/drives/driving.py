@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
+from diffdrive_jacobian.control import Path
 from diffdrive_jacobian.errors import DiffdriveError, UserError
 from diffdrive_jacobian.messages.codecs import JOINT_STATE, Wheels
 from diffdrive_jacobian.messages.conversion import MessageError
@@ -117,9 +118,11 @@ class Outcome:
     pose: NDArray[np.float64] | None
     """`[x, y, theta]` where the robot stopped, shape (3,) (m, m, rad). None: there was no odometry."""
     distance: float
-    """Distance from the driven point to the last goal by the odometry (m)."""
+    """Distance from the driven point to the last goal by the odometry, of a path what remained (m)."""
     true_distance: float
     """The same by the ground truth (m). NaN: the robot has no drift."""
+    across: float
+    """Greatest distance of the robot from the path by the odometry (m). NaN: there were goals."""
     offset: float
     """x of the driven point in the body frame (m). 0: the axle centre."""
     seconds: float
@@ -179,8 +182,9 @@ def waypoints_through(places: ArrayLike, heading: float = 0.0) -> NDArray[np.flo
 
 
 def drive(
-    goals: ArrayLike,
+    goals: ArrayLike | Path,
     *,
+    relative: bool = False,
     runner: NodeRunner | None = None,
     lockstep: bool = False,
     isolated: bool = True,
@@ -191,11 +195,14 @@ def drive(
     signals: Signals | None = None,
     progress: DriveProgress | None = None,
 ) -> Outcome:
-    """Drive the virtual robot to goals, in order, with all three nodes in this process.
+    """Drive the virtual robot to goals in order, or along a path, with all three nodes in this process.
 
     Args:
         goals: `[x, y]` of each goal, shape (n, 2), or `[x, y, theta]`, shape (n, 3) (m, m, rad). theta
-            matters for controllers that use the heading, and with the parameter `use_goal_heading`.
+            matters for controllers that use the heading, and with the parameter `use_goal_heading`. Or a
+            path, with times a trajectory.
+        relative: Whether the goals are in the body frame of the robot where it starts. Otherwise they
+            are in the frame of the odometry.
         runner: Runs the nodes, and may run others: `in_real_time` or `in_lockstep`. None: one is created
             as `lockstep`, `isolated` and `ros_arguments` say, and closed at the end.
         lockstep: Whether to drive in simulated time, as fast as possible and with the same result each
@@ -214,9 +221,11 @@ def drive(
         ValueError: `goals` has another shape, `lockstep` is not isolated, or one of the arguments for a
             new runner is given together with `runner`.
     """
-    goals = np.asarray(goals, dtype=np.float64)
-    if goals.ndim != 2 or goals.shape[1] != 3:
-        goals = waypoints_through(goals)
+    if not isinstance(goals, Path):
+        goals = np.asarray(goals, dtype=np.float64)
+        if goals.ndim != 2 or goals.shape[1] != 3:
+            goals = waypoints_through(goals)
+    sent = goals
     if lockstep and not isolated:
         raise ValueError('a drive in lockstep is always isolated: other processes have another clock')
     if runner is None:
@@ -224,6 +233,7 @@ def drive(
         with new as created:
             return drive(
                 goals,
+                relative=relative,
                 runner=created,
                 timeout=timeout,
                 parameters=parameters,
@@ -241,7 +251,7 @@ def drive(
     bridge = runner.add(lambda: WheelBridge(context=context))
     overrides = [Parameter(name, value=value) for name, value in (parameters or {}).items()]
     controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=overrides))
-    client = runner.add(lambda: GoalClient(NAME, goals, context))
+    client = runner.add(lambda: GoalClient(NAME, sent, context, relative=relative))
     client.arrival = controller.arrival
     wheels = WheelSpeeds(client, robot.parameters.wheel_names)
     nodes = (robot, bridge, controller, client)
@@ -256,7 +266,7 @@ def drive(
             index = controller.waypoint
             if index is not None:
                 # A goal of another process may have more poses.
-                client.index = min(index, len(goals) - 1)
+                client.index = min(index, len(client.goals) - 1)
             seconds = runner.seconds() - started
             progress.driving(seconds, client.index, client.distance, wheels.speeds)
         return client.ended
@@ -279,11 +289,11 @@ def drive(
 
     patience = STOP_PATIENCE + 1.0 / robot.parameters.publish_rate
     runner.spin(stands, timeout=patience, signals=signals, handled=signals.count)
-    client.index = len(goals) - 1
+    client.index = len(client.goals) - 1
     true_distance = math.nan
     if robot.parameters.drift() is not None:
         true_distance = float(
-            controller.arrival.distance(*robot.truth.tolist(), *goals[-1, :2].tolist())
+            controller.arrival.distance(*robot.truth.tolist(), *client.goals[-1, :2].tolist())
         )
     return Outcome(
         status=status,
@@ -291,6 +301,7 @@ def drive(
         pose=None if client.robot is None else client.robot.pose,
         distance=client.distance,
         true_distance=true_distance,
+        across=math.nan if client.path is None else client.path.greatest,
         offset=controller.arrival.offset,
         seconds=seconds,
     )

@@ -191,6 +191,13 @@ class _Film:
 
     def _set_goal(self, index: int) -> None:
         run, line, goal = self.robot.run, self.robot.timeline, self._state.goal
+        if line.path[index] >= 0:
+            path = line.paths[line.path[index]]
+            goal.replay(path, 0, GoalState.EXECUTING)
+            assert goal.path is not None
+            goal.path.s, goal.path.across = float(line.progress[index]), float(line.across[index])
+            goal.path.heading = float(line.path_heading_error[index])
+            return
         number = int(line.goal[index])
         if number < 0:
             goal.replay(None, 0, GoalState.UNKNOWN)
@@ -224,6 +231,8 @@ class _Film:
             'distance': line.distance[chosen],
             'bearing_error': line.bearing_error[chosen],
             'goal_heading_error': line.goal_heading_error[chosen],
+            'across': line.across[chosen],
+            'path_heading_error': line.path_heading_error[chosen],
         }
         for names, times, series in (
             (('command_v', 'command_omega'), self._commands, run.cmd_vel),

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.control import Arrival
+from diffdrive_jacobian.control import Arrival, Path
+from diffdrive_jacobian.control.path_progress import PathProgress
 from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.messages.goal_follower import (
     UNSTAMPED,
@@ -20,6 +21,13 @@ from diffdrive_jacobian.messages.goal_status import GoalState
 
 Goals = NDArray[np.float64]
 """`[x, y, theta]` of each, shape (n, 3) (m, m, rad)."""
+MAX_POINTS = 300
+"""Number of points of a path that the page draws."""
+
+
+def poses_of(goals: Goals | Path) -> Goals:
+    """Return goals, of a path its poses."""
+    return goals.poses if isinstance(goals, Path) else goals
 
 
 class GoalEnd(NamedTuple):
@@ -46,13 +54,17 @@ class GoalProgress:
         """Start without goals."""
         self.index = 0
         """Index of the goal that is driven to."""
-        self._follower: GoalFollower[Goals] = GoalFollower()
-        self._shown: FollowedGoal[Goals] | None = None
+        self._points: Any = None
+        self.path: PathProgress | None = None
+        """The path that is driven along, and the progress. None: goals are driven to."""
+        self._follower: GoalFollower[Goals | Path] = GoalFollower()
+        self._shown: FollowedGoal[Goals | Path] | None = None
 
     @property
     def goals(self) -> Goals | None:
         """The goals that were sent last, or that the controller has reported since. None: unknown."""
-        return None if self._shown is None else self._shown.goal
+        goal = None if self._shown is None else self._shown.goal
+        return None if goal is None else poses_of(goal)
 
     @property
     def state(self) -> GoalState:
@@ -93,16 +105,16 @@ class GoalProgress:
             return np.empty((0, 3))
         return self.goals[self.index :]
 
-    def sent(self, goals: Goals, stamp: Stamp) -> None:
-        """Take goals that somebody has sent, with their stamp."""
+    def sent(self, goals: Goals | Path, stamp: Stamp) -> None:
+        """Take goals or a path that somebody has sent, with their stamp."""
         shown = self._shown
         if shown is not None and shown.goal is not None and shown.stamp == stamp != UNSTAMPED:
             # Those that this program has sent come back by their topic.
             return
-        if len(goals):
+        if len(poses_of(goals)):
             self._show(self._follower.sent(goals, stamp))
 
-    def reported(self, status: int, stamp: Stamp) -> FollowedGoal[Goals] | None:
+    def reported(self, status: int, stamp: Stamp) -> FollowedGoal[Goals | Path] | None:
         """Take a status of a controller, with the stamp of its goal.
 
         Returns:
@@ -117,13 +129,19 @@ class GoalProgress:
             self._shown = changed
         return changed
 
-    def replay(self, goals: Goals | None, index: int, state: GoalState) -> None:
-        """Show recorded goals and their state."""
+    def replay(self, goals: Goals | Path | None, index: int, state: GoalState) -> None:
+        """Show recorded goals or a recorded path, and their state."""
         self._shown, self.index = FollowedGoal(goals, UNSTAMPED, state), index
+        self._use(goals)
 
     def moved(self, pose: NDArray[np.float64], arrival: Arrival) -> None:
         """Take a pose of the robot, `[x, y, theta]`: a waypoint may be reached."""
         if self.goals is None or not self.active:
+            return
+        if self.path is not None:
+            self.path.moved(pose)
+            passed = self.path.path.arc_lengths.searchsorted(self.path.s, 'right')
+            self.index = min(int(passed), len(self.goals) - 1)
             return
         x, y, theta = pose.tolist()
         while self.index + 1 < len(self.goals):
@@ -133,6 +151,16 @@ class GoalProgress:
 
     def shown(self) -> dict[str, Any]:
         """Return what the page shows."""
+        if self.path is not None:
+            path = self.path.path
+            return {
+                'state': self.state.name.lower(),
+                'active': self.active,
+                # All poses would be too many, many times a second.
+                'goals': rounded(path.poses[-1:]),
+                'index': 0,
+                'path': self._points,
+            }
         return {
             'state': self.state.name.lower(),
             'active': self.active,
@@ -140,6 +168,16 @@ class GoalProgress:
             'index': self.index,
         }
 
-    def _show(self, followed: FollowedGoal[Goals]) -> None:
+    def _show(self, followed: FollowedGoal[Goals | Path]) -> None:
         if followed is not self._shown:
-            self._shown, self.index = followed, 0
+            self._shown, self.index, self.path = followed, 0, None
+            self._use(followed.goal)
+
+    def _use(self, goals: Goals | Path | None) -> None:
+        """Take what is driven to, the progress along a path as it was if it is the same."""
+        if not isinstance(goals, Path):
+            self.path = None
+        elif self.path is None or self.path.path is not goals:
+            self.path = PathProgress(goals)
+            s = np.linspace(0.0, goals.length, MAX_POINTS)
+            self._points = rounded(goals.poses_at(s)[:, :2])

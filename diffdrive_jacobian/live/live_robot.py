@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from diffdrive_jacobian.control import Gain
+from diffdrive_jacobian.control import Gain, Path
+from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.live import settings
 from diffdrive_jacobian.live.commands import (
     CancelGoal,
@@ -32,7 +33,7 @@ from diffdrive_jacobian.live.parameter_link import PATIENCE, ParameterLink
 from diffdrive_jacobian.live.robot_state import RobotState
 from diffdrive_jacobian.live.robot_topics import RobotTopics
 from diffdrive_jacobian.live.session import Session
-from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, POSE, Motion, Route, Status
+from diffdrive_jacobian.messages.codecs import GOAL_STATUS, GOALS, PATH, POSE, Motion, Route, Status
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
 from diffdrive_jacobian.messages.covariances import from_covariance
 from diffdrive_jacobian.messages.goal_status import GoalState
@@ -85,6 +86,7 @@ class LiveRobot:
         self.topics.listen(GOAL_STATUS, 'goal_status', self._on_status, latched=True)
         self.topics.listen(POSE, 'goal_pose', self._on_goals, latched=False)
         self.topics.listen(GOALS, 'goals', self._on_goals, latched=False)
+        self.topics.listen(PATH, 'path', self._on_path, latched=False)
         self.topics.prepare()
         self.links: dict[str, ParameterLink] = {}
         """Parameters by role."""
@@ -142,6 +144,12 @@ class LiveRobot:
     def _on_goals(self, route: Route) -> None:
         goals = np.array(route.poses, dtype=np.float64)
         self.state.goal.sent(goals.reshape(-1, 3), route.stamp)
+
+    def _on_path(self, route: Route) -> None:
+        # One that is no path is refused by the controller.
+        with suppress(ValueError):
+            times = None if route.times is None else np.array(route.times)
+            self.state.goal.sent(Path(np.array(route.poses), times), route.stamp)
 
     def _on_status(self, one: Status) -> None:
         changed = self.state.goal.reported(one.status, one.stamp)
@@ -282,13 +290,30 @@ class LiveRobot:
         """Whether a controller can receive goals, and the robot has odometry."""
         return self.state.pose is not None and self.topics.readers('goals') > 0
 
-    def send(self, goals: NDArray[np.float64], *, together: bool = True) -> None:
-        """Send goals, `[x, y, theta]` each, shape (n, 3), on the topic goals or, one, on goal_pose."""
+    def send(
+        self, goals: NDArray[np.float64] | Path, *, together: bool = True, relative: bool = False
+    ) -> None:
+        """Send goals or a path.
+
+        Args:
+            goals: `[x, y, theta]` of each, shape (n, 3) (m, m, rad), or a path.
+            together: Whether to use the topic goals. Otherwise there is one, which goal_pose takes.
+            relative: Whether they are in the body frame of the robot, which has odometry.
+        """
+        times = goals.times if isinstance(goals, Path) else None
+        poses = goals.poses if isinstance(goals, Path) else goals
+        if relative and self.state.pose is not None:
+            poses = se2.compose(self.state.pose, poses)
         # The stamp distinguishes goals, also while simulated time stands.
         now = self._stamp = max(self._now(), self._stamp + 1)
-        self.topics.publish_goals(goals, now, together=together)
+        stamp = divmod(now, NANOSECONDS)
         # At once: the next command may append a waypoint.
-        self.state.goal.sent(goals, divmod(now, NANOSECONDS))
+        if isinstance(goals, Path):
+            self.topics.publish('path', poses, now, times)
+            self.state.goal.sent(Path(poses, times), stamp)
+        else:
+            self.topics.publish('goals' if together else 'goal_pose', poses, now)
+            self.state.goal.sent(poses, stamp)
         self._sent = time.monotonic()
 
     def advance(self) -> None:

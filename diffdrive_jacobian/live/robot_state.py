@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.run import number
 from diffdrive_jacobian.bags.timeline import heading_counts
-from diffdrive_jacobian.control import Arrival, LawError
+from diffdrive_jacobian.control import Arrival, LawError, Path
 from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.live import quantities
-from diffdrive_jacobian.live.goal_progress import GoalEnd, GoalProgress, Goals
+from diffdrive_jacobian.live.goal_progress import GoalEnd, GoalProgress, Goals, poses_of
 from diffdrive_jacobian.live.quantities import rounded
 from diffdrive_jacobian.messages.goal_follower import FollowedGoal
 from diffdrive_jacobian.messages.goal_status import GoalState
@@ -174,11 +174,12 @@ class RobotState:
         heading = heading_counts(values)
         return Arrival(xy_tolerance=max(tolerance, 0.0), use_heading=heading, offset=offset)
 
-    def goal_end(self, ended: FollowedGoal[Goals]) -> GoalEnd:
+    def goal_end(self, ended: FollowedGoal[Goals | Path]) -> GoalEnd:
         """Return the end of known goals that have just ended, and where the robot is."""
         assert ended.goal is not None
-        index = self.goal.index if ended.goal is self.goal.goals else 0
-        goal = ended.goal[-1 if ended.state is GoalState.SUCCEEDED else index]
+        goals = poses_of(ended.goal)
+        index = self.goal.index if goals is self.goal.goals else 0
+        goal = goals[-1 if ended.state is GoalState.SUCCEEDED else index]
         distance, true_distance = (
             math.nan if pose is None else quantities.errors(pose, goal, self.arrival.offset)[0]
             for pose in (self.pose, self.truth)
@@ -230,12 +231,15 @@ class RobotState:
         if self.pose is None:
             return None
         arrival, geometry = self.arrival, self.geometry
-        target = self.goal.current
+        path = self.goal.path if self.goal.active else None
+        target = self.goal.current if path is None else None
         distance = bearing = heading = true_distance = None
         if target is not None:
             _, bearing = quantities.errors(self.pose, target, arrival.offset)
             if arrival.use_heading and self.goal.last:
                 heading = wrap_angle(target[2] - self.pose[2])
+        if path is not None:
+            distance = path.remaining
         # A reached goal has a distance, but no direction.
         target = self.goal.reached if target is None else target
         if target is not None:
@@ -259,8 +263,10 @@ class RobotState:
             'true_distance': rounded(true_distance),
             'bearing_error': rounded(bearing),
             'goal_heading_error': rounded(heading),
+            'across': rounded(None if path is None else path.across),
+            'path_heading_error': rounded(None if path is None else path.heading),
             'truth': rounded(self.truth),
-            'law': self._law(self.goal.current),
+            'law': self._law(target if self.goal.active else None),
             'readings': [
                 [name, rounded(self.readings.get(name)), unit]
                 for topic in SENSORS
@@ -277,6 +283,10 @@ class RobotState:
     def _law(self, target: NDArray[np.float64] | None) -> dict[str, Any]:
         """Return the name of the law, its gains, and what it computes here without limits."""
         values = self.controller_values
+        if self.goal.path is not None:
+            name = str(values.get('path_controller', ''))[:64]
+            # The twist is that of the look-ahead or the time of the node, which are not known here.
+            return {'name': name, 'gains': {}, 'twist': None}
         name = str(values.get('controller', ''))[:64]
         # Only built-in ones: another one may be slow, and runs in the controller.
         controller = BUILT_IN.get(name)

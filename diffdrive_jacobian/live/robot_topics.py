@@ -7,8 +7,7 @@ from itertools import islice
 from typing import Any, TypeVar
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from nav_msgs.msg import Goals
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -22,6 +21,7 @@ from diffdrive_jacobian.messages.codecs import TWIST, Codec, Command
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.names import full_name
 from diffdrive_jacobian.messages.topics import TOPICS
+from diffdrive_jacobian.nodes.goal_client import MESSAGES, goals_message
 from diffdrive_jacobian.ros.rclpy_internals import Polled, waiting_messages
 from diffdrive_jacobian.ros.serialization import MAX_SIZE, ignoring_invalid
 from diffdrive_jacobian.ros.topic_errors import explaining_failure
@@ -150,20 +150,11 @@ class RobotTopics:
         data = self._serialized_twist(Command(twist, now))
         self._publisher(message_class(self._twist.type_name), 'cmd_vel').publish(data)
 
-    def publish_goals(self, goals: NDArray[np.float64], now: int, *, together: bool) -> None:
-        """Publish goals, `[x, y, theta]` each, shape (n, 3), at a time (ns).
-
-        Args:
-            goals: The goals. One is published as goal_pose unless `together`.
-            now: The time.
-            together: Whether to use the topic goals.
-        """
-        poses = [PoseStamped() for _ in goals]
-        for pose, goal in zip(poses, goals, strict=True):
-            messages.set_pose(pose.pose, goal)
-        message = Goals(goals=poses) if together else poses[0]
-        messages.set_time(message.header.stamp, now)
-        self._publisher(type(message), 'goals' if together else 'goal_pose').publish(message)
+    def publish(
+        self, topic: str, goals: NDArray[np.float64], now: int, times: NDArray[np.float64] | None = None
+    ) -> None:
+        """Publish goals or a path; the arguments are those of `goals_message`."""
+        self._publisher(MESSAGES[topic], topic).publish(goals_message(topic, goals, now, times))
 
     def publish_pose(self, pose: NDArray[np.float64], frame: str, now: int) -> None:
         """Publish where the robot is, `[x, y, theta]` in a frame, at a time (ns)."""
@@ -181,7 +172,7 @@ class RobotTopics:
 
     def prepare(self) -> None:
         """Create the publishers of goals, so that their readers are discovered before they are used."""
-        for kind, topic in ((PoseStamped, 'goal_pose'), (Goals, 'goals')):
+        for topic, kind in MESSAGES.items():
             self._publisher(kind, topic)
 
     def _publisher(self, kind: type, topic: str) -> Publisher:

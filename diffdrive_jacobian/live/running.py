@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from diffdrive_jacobian.control import Path
 from diffdrive_jacobian.drives import in_lockstep, in_real_time
 from diffdrive_jacobian.drives.driving import recorder_of
 from diffdrive_jacobian.live.goal_progress import GoalEnd
@@ -54,8 +55,9 @@ def watch_nodes(*, ros_arguments: Sequence[str], port: int, signals: Signals, re
 
 
 def drive_live(
-    goals: NDArray[np.float64],
+    goals: NDArray[np.float64] | Path,
     *,
+    relative: bool = False,
     lockstep: bool,
     isolated: bool,
     parameters: Mapping[str, Any],
@@ -71,7 +73,8 @@ def drive_live(
 
     Args:
         goals: `[x, y, theta]` of goals that are sent when a page is open, shape (n, 3), n may be 0
-            (m, m, rad).
+            (m, m, rad). Or a path.
+        relative: Whether they are in the body frame of the robot where it is then.
         lockstep: Whether time is simulated. The page then has pause, step and speed.
         isolated: Whether no other process can communicate with the nodes.
         parameters: Parameters of go_to_goal.
@@ -106,7 +109,7 @@ def drive_live(
             lambda: LivePage(session, context, polled=not isolated, pacing=pacing, goal_ended=goal_ended)
         )
         discover = recorder_of(runner, recording)
-        waiting = [goals] if len(goals) else []
+        waiting = [goals] if isinstance(goals, Path) or len(goals) else []
 
         def work() -> bool:
             discover()
@@ -114,7 +117,7 @@ def drive_live(
             robot = next(iter(page.robots.values()), None)
             # Whoever opened the page wants to see the whole drive.
             if waiting and session.watched and robot is not None and robot.ready:
-                robot.send(waiting.pop())
+                robot.send(waiting.pop(), relative=relative)
             return signals.count > 0
 
         try:

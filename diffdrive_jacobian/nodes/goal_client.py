@@ -11,6 +11,7 @@ import numpy as np
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Goals, Odometry
+from nav_msgs.msg import Path as PathMessage
 from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.duration import Duration
@@ -18,7 +19,9 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
 
-from diffdrive_jacobian.control import Arrival
+from diffdrive_jacobian.control import Arrival, Path
+from diffdrive_jacobian.control.path_progress import PathProgress
+from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.codecs import (
     GOAL_STATUS,
@@ -35,12 +38,13 @@ from diffdrive_jacobian.messages.names import is_named, node_of
 from diffdrive_jacobian.ros.node import THROTTLE
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
 from diffdrive_jacobian.ros.topic_errors import explaining_failure
+from diffdrive_jacobian.time_units import nanoseconds
 
 SILENCE = 3.0
 """A controller that has not answered for this long was killed or hangs (s)."""
 DRIVEN_POINT_PARAMETERS = ('controller', 'offset')
 """Parameters of a controller that determine which point of the robot it drives."""
-MESSAGES: dict[str, type] = {'goal_pose': PoseStamped, 'goals': Goals}
+MESSAGES: dict[str, type] = {'goal_pose': PoseStamped, 'goals': Goals, 'path': PathMessage}
 """Topic of goals to its type."""
 
 
@@ -70,16 +74,46 @@ STATE = Codec(
 """What a client reads of odometry. The twist only tells whether the robot moves: it may be anything."""
 
 
+def goals_message(
+    topic: str,
+    goals: NDArray[np.float64],
+    now: int,
+    times: NDArray[np.float64] | None = None,
+    frame: str = '',
+) -> Any:
+    """Return the message with goals for a topic.
+
+    Args:
+        topic: One of `MESSAGES`. goal_pose takes one goal.
+        goals: `[x, y, theta]` of each, shape (n, 3) (m, m, rad).
+        now: Stamp of the message (ns).
+        times: Times of the poses of a trajectory since the stamp, shape (n) (s). None: without stamps.
+        frame: Frame of the goals.
+    """
+    poses = [PoseStamped() for _ in goals]
+    for pose, goal in zip(poses, goals, strict=True):
+        messages.set_pose(pose.pose, goal)
+    for pose, time_ in zip(poses, () if times is None else times.tolist(), strict=False):
+        messages.set_time(pose.header.stamp, now + nanoseconds(time_))
+    message = poses[0]
+    if topic != 'goal_pose':
+        message = Goals(goals=poses) if topic == 'goals' else PathMessage(poses=poses)
+    messages.set_time(message.header.stamp, now)
+    message.header.frame_id = frame
+    return message
+
+
 class GoalClient(Node):  # type: ignore[misc]
     """Sends goals and follows their status and the odometry of the robot."""
 
     def __init__(
         self,
         name: str,
-        goals: NDArray[np.float64],
+        goals: NDArray[np.float64] | Path,
         context: Context,
         *,
         topic: Literal['goal_pose', 'goals'] = 'goals',
+        relative: bool = False,
         frame: str = '',
         readers: int = 1,
         monotonic: Callable[[], float] = time.monotonic,
@@ -89,9 +123,10 @@ class GoalClient(Node):  # type: ignore[misc]
 
         Args:
             name: Name of the node.
-            goals: `[x, y, theta]` of each goal in order, shape (n, 3) (m, m, rad).
+            goals: `[x, y, theta]` of each goal in order, shape (n, 3) (m, m, rad), or a path.
             context: Context of the node.
-            topic: Where they are published. goal_pose takes one goal.
+            topic: Where goals are published. goal_pose takes one goal. A path is published on path.
+            relative: Whether the coordinates are in the body frame of the robot when they are sent.
             frame: Frame of the goals. Empty: the frame of the odometry.
             readers: Number of subscriptions that the topic must have before the goals can be sent.
             monotonic: Returns a time that never goes back (s), in lockstep world time.
@@ -101,14 +136,19 @@ class GoalClient(Node):  # type: ignore[misc]
             ParameterError: A topic has another type in this process.
             ValueError: `goals` has another shape than the topic takes.
         """
-        if goals.ndim != 2 or goals.shape[1] != 3 or not len(goals):
-            raise ValueError(f'goals must have shape (n, 3) with n > 0, got {goals.shape}')
-        if topic == 'goal_pose' and len(goals) != 1:
-            raise ValueError(f'goal_pose takes one goal, got {len(goals)}')
+        poses = goals.poses if isinstance(goals, Path) else goals
+        if poses.ndim != 2 or poses.shape[1] != 3 or not len(poses):
+            raise ValueError(f'goals must have shape (n, 3) with n > 0, got {poses.shape}')
+        if topic == 'goal_pose' and len(poses) != 1:
+            raise ValueError(f'goal_pose takes one goal, got {len(poses)}')
         super().__init__(name, context=context, **kwargs)
-        self.goals = goals
+        self.goals = poses
         self.index = 0
         """Index of the goal that is being driven to."""
+        self.path: PathProgress | None = None
+        """The path and the progress along it. None: goals are sent."""
+        if isinstance(goals, Path):
+            self.path = PathProgress(goals)
         self.arrival = Arrival()
         """Determines which point of the robot is to arrive. The default is the axle centre."""
         self.robot: RobotOdometry | None = None
@@ -118,11 +158,13 @@ class GoalClient(Node):  # type: ignore[misc]
         """Time of the last odometry, or since when it is expected (s, monotonic)."""
         self._frame = frame
         self._readers = readers
-        self._topic = topic
+        self.topic = 'path' if isinstance(goals, Path) else topic
+        """Where the goals are published."""
+        self._relative = relative
         self._send_on_odometry = False
         self._follower: GoalFollower[NDArray[np.float64]] = GoalFollower()
-        with explaining_failure(self, MESSAGES[topic], topic):
-            self._publisher = self.create_publisher(MESSAGES[topic], topic, 10)
+        with explaining_failure(self, MESSAGES[self.topic], self.topic):
+            self._publisher = self.create_publisher(MESSAGES[self.topic], self.topic, 10)
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         with explaining_failure(self, GoalStatus, 'goal_status'):
             received = ignoring_invalid(GOAL_STATUS, GoalStatus, self._on_status)
@@ -136,11 +178,14 @@ class GoalClient(Node):  # type: ignore[misc]
 
     @property
     def distance(self) -> float:
-        """Distance from the point that is to arrive to the current goal (m). Infinite before the first
-        odometry.
+        """Distance from the point that is to arrive to the current goal, or what remains of a path (m).
+
+        Infinite before the first odometry.
         """
         if self.robot is None:
             return math.inf
+        if self.path is not None:
+            return self.path.remaining
         return float(self.arrival.distance(*self.robot.pose, *self.goals[self.index, :2]))
 
     @property
@@ -159,9 +204,13 @@ class GoalClient(Node):  # type: ignore[misc]
     def send(self) -> None:
         """Publish the goals. Their stamp distinguishes them from older ones."""
         self._send_on_odometry = False
-        message = self._goals()
-        messages.set_time(message.header.stamp, self.get_clock().now().nanoseconds)
-        message.header.frame_id = self._frame
+        if self._relative and self.robot is not None:
+            self._relative, self.goals = False, se2.compose(self.robot.pose, self.goals)
+            if self.path is not None:
+                self.path = PathProgress(Path(self.goals, self.path.path.times))
+        times = None if self.path is None else self.path.path.times
+        now = self.get_clock().now().nanoseconds
+        message = goals_message(self.topic, self.goals, now, times, self._frame)
         # The latched status of an older goal with this stamp is none of these.
         self._follower = GoalFollower()
         self._follower.sent(self.goals, (message.header.stamp.sec, message.header.stamp.nanosec))
@@ -192,12 +241,6 @@ class GoalClient(Node):  # type: ignore[misc]
         acknowledged: bool = self._publisher.wait_for_all_acked(Duration(seconds=timeout))
         return acknowledged
 
-    def _goals(self) -> PoseStamped | Goals:
-        poses = [PoseStamped() for _ in self.goals]
-        for pose, goal in zip(poses, self.goals, strict=True):
-            messages.set_pose(pose.pose, goal)
-        return Goals(goals=poses) if self._topic == 'goals' else poses[0]
-
     # --- Controllers
 
     def controllers(self) -> dict[bytes, str]:
@@ -220,7 +263,7 @@ class GoalClient(Node):  # type: ignore[misc]
         """Describe what is missing before goals can be sent. None: nothing."""
         if self.get_clock().now().nanoseconds == 0:
             return 'use_sim_time is true, but nothing is published on /clock'
-        topic, status = self.resolve_topic_name(self._topic), self.resolve_topic_name('goal_status')
+        topic, status = self.resolve_topic_name(self.topic), self.resolve_topic_name('goal_status')
         readers = [
             reader
             for reader in self.get_subscriptions_info_by_topic(topic)
@@ -236,6 +279,8 @@ class GoalClient(Node):  # type: ignore[misc]
                 f'no node is subscribed to {topic} and publishes {status}; is go_to_goal running, in '
                 'the same namespace and the same ROS_DOMAIN_ID?'
             )
+        if self._relative and self.robot is None:
+            return f'no odometry on {self.resolve_topic_name("odom")}, where the path is to begin'
         return None
 
     # --- Messages
@@ -252,6 +297,8 @@ class GoalClient(Node):  # type: ignore[misc]
         self.seen = self._monotonic()
         if self._send_on_odometry:
             self.send()
+        if self.path is not None and self.status is GoalState.EXECUTING:
+            self.path.moved(state.pose)
 
 
 def driven_offset(values: Mapping[str, Any]) -> float:

@@ -1,4 +1,4 @@
-"""A goal that is sent to a controller in another process, and followed until it has ended."""
+"""A goal or a path that is sent to a controller in another process, and followed until it has ended."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import Enum, auto
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from diffdrive_jacobian.control import Path
 from diffdrive_jacobian.control.controllers import BUILT_IN
+from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.nodes import standstill
 from diffdrive_jacobian.nodes.goal_client import (
@@ -30,8 +32,8 @@ from diffdrive_jacobian.ros.runner import ros_context, running
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import printable
 
-NAME = 'send_goal'
-"""Name of the node."""
+NAME, PATH_NAME = 'send_goal', 'send_path'
+"""Names of the node that sends a goal and of the one that sends a path."""
 PATIENCE = 10.0
 """Default of the longest wait for a controller (s)."""
 ANSWER_PATIENCE = 5.0
@@ -79,7 +81,10 @@ class GoalResult:
     status: GoalState = GoalState.UNKNOWN
     """Last status that the controller reported."""
     distance: float | None = None
-    """Distance from the driven point to the goal at the end (m). None: no odometry was received."""
+    """Distance from the driven point to the goal at the end, of a path what remained of it (m). None: no
+    odometry was received."""
+    across: float | None = None
+    """Greatest distance of the robot from the path (m). None: it was a goal, or was not driven to."""
     reason: str = ''
     """For NOT_SENT what is missing, for LOST what happened to the controller."""
     canceled: bool | None = None
@@ -172,30 +177,99 @@ def send_goal(
         UserError: The ROS arguments are invalid, or the node cannot be created.
         ValueError: `goal` has another shape, or `ros_arguments` are given with `runner`.
     """
+    goals = np.asarray(goal, dtype=np.float64)[np.newaxis]
+    sending = _Sending(frame, readers, patience, timeout, follow, heading_matters)
+    return _send(NAME, goals, sending, runner, ros_arguments, signals, progress)
+
+
+def send_path(
+    path: Path,
+    *,
+    relative: bool = False,
+    runner: NodeRunner | None = None,
+    frame: str = '',
+    readers: int = 1,
+    patience: float = PATIENCE,
+    timeout: float = math.inf,
+    follow: bool = True,
+    ros_arguments: Sequence[str] = (),
+    signals: Signals | None = None,
+    progress: RemoteProgress | None = None,
+) -> GoalResult:
+    """Send a path to a controller in another process, and follow it until it has ended.
+
+    Args:
+        path: The path; with times a trajectory.
+        relative: Whether its coordinates are those in the body frame of the robot where it is now.
+            Otherwise they are in `frame`.
+        runner: As for `send_goal`.
+        frame: Likewise.
+        readers: Number of subscriptions that path must have before it is sent.
+        patience: As for `send_goal`.
+        timeout: Likewise.
+        follow: Likewise.
+        ros_arguments: Likewise.
+        signals: Likewise.
+        progress: Likewise.
+
+    Raises:
+        UserError: The ROS arguments are invalid, or the node cannot be created.
+        ValueError: The path has more than 10,000 poses, or `ros_arguments` are given with `runner`.
+    """
+    if len(path.poses) > MAX_PATH_POSES:
+        raise ValueError(f'path must have at most {MAX_PATH_POSES} poses, got {len(path.poses)}')
+    sending = _Sending(frame, readers, patience, timeout, follow, relative=relative)
+    return _send(PATH_NAME, path, sending, runner, ros_arguments, signals, progress)
+
+
+class _Sending(NamedTuple):
+    """How goals are sent: arguments of `send_goal` and `send_path`."""
+
+    frame: str
+    readers: int
+    patience: float
+    timeout: float
+    follow: bool
+    heading_matters: bool = False
+    relative: bool = False
+
+
+def _send(
+    name: str,
+    goals: NDArray[np.float64] | Path,
+    how: _Sending,
+    runner: NodeRunner | None,
+    ros_arguments: Sequence[str],
+    signals: Signals | None,
+    progress: RemoteProgress | None,
+) -> GoalResult:
     if runner is not None and ros_arguments:
         raise ValueError('ros_arguments are those of the runner, if one is given')
     with ExitStack() as stack:
         if runner is None:
-            if not follow:
+            if not how.follow:
                 # The acknowledgement is what is waited for.
                 stack.enter_context(fast_heartbeats())
-            context = stack.enter_context(ros_context([NAME, *ros_arguments]))
+            context = stack.enter_context(ros_context([name, *ros_arguments]))
             runner = stack.enter_context(running(context, isolated=False))
-        used, goals = runner, np.asarray(goal, dtype=np.float64)[np.newaxis]
+        used = runner
         client = used.add(
             lambda: GoalClient(
-                NAME,
+                name,
                 goals,
                 used.context,
                 topic='goal_pose',
-                frame=frame,
-                readers=readers,
+                relative=how.relative,
+                frame=how.frame,
+                readers=how.readers,
                 monotonic=used.seconds,
                 start_parameter_services=False,
             )
         )
         session = _Session(client, used, signals or Signals(), progress or _Silent())
-        return session.run(patience, timeout, follow=follow, heading_matters=heading_matters)
+        return session.run(
+            how.patience, how.timeout, follow=how.follow, heading_matters=how.heading_matters
+        )
 
 
 class _Session:
@@ -279,7 +353,7 @@ class _Session:
         while not self._client.confirmed(CONFIRMATION_PERIOD):
             if self._signals.count or self._runner.seconds() > deadline:
                 return False
-            topic = self._client.resolve_topic_name('goal_pose')
+            topic = self._client.resolve_topic_name(self._client.topic)
             self._progress.waiting(f'not every subscription to {topic} has acknowledged the goal')
         return True
 
@@ -380,9 +454,10 @@ class _Session:
         client = self._client
         return GoalResult(
             result=result,
-            topic=client.resolve_topic_name('goal_pose'),
+            topic=client.resolve_topic_name(client.topic),
             status=client.status,
             distance=self._distance() if distance is None else distance,
+            across=client.path.greatest if client.path and client.robot else None,
             reason=reason,
             canceled=canceled,
         )

@@ -79,9 +79,13 @@ STYLES: tuple[Any, ...] = ('-', (0, (5, 1.5)), '-.', (0, (1.2, 1)), (0, (7, 1.5,
 LIMIT = (0, (6, 3))
 HEADING = (0, (1, 1.2))
 GREY, COMMAND = '#777777', '#d2d2d2'
+PLANNED, PLANNED_POINTS = '#c8b273', 2000
 _FIXED = {
     'distance': 'distance to goal [m]',
     'bearing_error': 'bearing error [rad]',
+    'across': 'across path [m]',
+    'along': 'along path [m]',
+    'path_heading_error': 'heading to path [rad]',
     'v': r'speed $v$ [m/s]',
     'omega': r'yaw rate $\omega$ [rad/s]',
     'right': r'right wheel $\omega_R$ [rad/s]',
@@ -165,6 +169,7 @@ def figure(runs: Sequence[Run], violations: Sequence[ViolationMark] = ()) -> Fig
     timelines = [timeline(run) for run in runs]
     quantities = [
         *(('distance', 'bearing_error') if any(len(run.goals) for run in runs) else ()),
+        *path_quantities(timelines),
         *('v', 'omega'),
         *(('right', 'left') if any(len(run.wheels) + len(run.wheel_commands) for run in runs) else ()),
         *(
@@ -192,6 +197,7 @@ def figure(runs: Sequence[Run], violations: Sequence[ViolationMark] = ()) -> Fig
         ):
             _draw_path(plane, one, label, color, style)
             draw_ground_truth(plane, one.run, *([color] if len(runs) > 1 else []))
+            draw_planned_paths(plane, one)
             for quantity, panel in panels.items():
                 _draw_over_time(panel, one, quantity, color, style, alone=len(runs) == 1)
         if len(runs) == 1:
@@ -209,6 +215,23 @@ def figure(runs: Sequence[Run], violations: Sequence[ViolationMark] = ()) -> Fig
         if notes := _notes(runs, labels):
             drawing.supxlabel(notes, fontsize=8.0, color=GREY)
     return drawing
+
+
+def path_quantities(timelines: Sequence[Timeline]) -> tuple[str, ...]:
+    """Return the two errors that are drawn: along where there is a trajectory, else of the heading."""
+    if not any(one.paths for one in timelines):
+        return ()
+    trajectory = any(np.isfinite(one.along).any() for one in timelines)
+    return 'across', 'along' if trajectory else 'path_heading_error'
+
+
+def draw_planned_paths(plane: Axes, one: Timeline) -> None:
+    """Draw the paths that were sent, below the path that was driven."""
+    for path in one.paths:
+        places = path.poses_at(np.linspace(0.0, path.length, PLANNED_POINTS))[:, :2]
+        # A closed path repeats its beginning, not its end.
+        places[-1] = path.poses[-1, :2]
+        plane.plot(*places.T, color=PLANNED, lw=5.0, alpha=0.6, zorder=1.2)
 
 
 def _notes(runs: Sequence[Run], labels: Sequence[str]) -> str:
@@ -364,6 +387,8 @@ def _marks(timelines: Sequence[Timeline]) -> list[Line2D]:
     if any(len(one.run.goals) for one in timelines):
         label = 'goal with its tolerance'
         marks.append(Line2D([], [], ls='', marker=r'$\oplus$', ms=12, color='black', label=label))
+    if any(one.paths for one in timelines):
+        marks.append(Line2D([], [], lw=5.0, color=PLANNED, alpha=0.6, label='planned path'))
     if alone and 0 < np.count_nonzero(np.diff(timelines[0].goal)) <= MARKED:
         marks.append(Line2D([], [], ls=':', lw=0.9, color=GREY, label='goal begins or ends'))
     if alone and any(len(commanded(timelines[0], quantity)) for quantity in LABELS):

@@ -22,6 +22,7 @@ _FIXED = (
     *('time_s', 'x_m', 'y_m', 'theta_rad', 'v_mps', 'omega_radps'),
     *('distance_m', 'bearing_error_rad', 'v_command_mps', 'omega_command_radps'),
     *('omega_right_radps', 'omega_left_radps', 'goal_heading_error_rad'),
+    *('path_progress_m', 'along_path_m', 'across_path_m', 'path_heading_error_rad'),
 )
 COLUMNS = (
     *_FIXED,
@@ -54,6 +55,7 @@ def table(run: Run) -> NDArray[np.float64]:
             _latest(one, commands),
             _interpolated(one, run.wheels),
             one.goal_heading_error,
+            *(one.progress, one.along, one.across, one.path_heading_error),
             *(_latest(one, getattr(run, topic.series)) for topic in SENSORS),
         ]
     )

@@ -16,6 +16,7 @@ from diffdrive_jacobian.properties._node_time import end_of_faults
 from diffdrive_jacobian.properties.arrival import ArrivesOnceFaultsEnd, KeepsDriving
 from diffdrive_jacobian.properties.base import Property, Watch
 from diffdrive_jacobian.properties.goals import NoCommandAfterCancel, NoStaleGoals, ReachesGoal, Settles
+from diffdrive_jacobian.properties.paths import StaysOnPath
 from diffdrive_jacobian.properties.places import PoseFinite, StaysNear, StaysWithin
 from diffdrive_jacobian.properties.protocol import StatusProtocol
 from diffdrive_jacobian.properties.speed import AccelerationWithin, NeverFasterThan
@@ -38,6 +39,7 @@ __all__ = [
     'Settles',
     'StatusProtocol',
     'StaysNear',
+    'StaysOnPath',
     'StaysWithin',
     'StopsAfterLastCommand',
     'StopsAfterLostOdometry',

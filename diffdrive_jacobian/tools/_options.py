@@ -14,15 +14,18 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from diffdrive_jacobian.errors import UserError
-from diffdrive_jacobian.messages.conversion import MAX_POSITION
+from diffdrive_jacobian.messages.conversion import MAX_PATH_POSES, MAX_POSITION
 from diffdrive_jacobian.numerics import fields
 from diffdrive_jacobian.numerics.fields import Check, between, finite, inside, integer, one_of
 from diffdrive_jacobian.parameters.configurations import configurations
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.tools._cli import ROS_HINT, is_number
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.control import Path as PlannedPath
 
 T = TypeVar('T')
 
@@ -185,6 +188,38 @@ def add_controller(
     """
     described = text if default is None else f'{text} (default: %(default)s)'
     parser.add_argument('--controller', choices=names, metavar='NAME', default=default, help=described)
+
+
+def add_path(parser: argparse.ArgumentParser, name: str, what: str = '') -> None:
+    """Add the argument or the option for a path, which `given_path` reads."""
+    parser.add_argument(
+        name,
+        metavar='PATH',
+        help=f'{what}circle:RADIUS, line:LENGTH or eight:SIZE (m), or a .csv or .yaml file of poses',
+    )
+
+
+def given_path(parser: argparse.ArgumentParser, options: argparse.Namespace) -> PlannedPath:
+    """Return the path that was given; a trajectory has no `--speed`."""
+    # Not above: --help needs no NumPy.
+    from diffdrive_jacobian.control.path_source import PathError, planned_path
+
+    try:
+        path = planned_path(options.path)
+    except PathError as error:
+        parser.error(str(error))
+    if len(path.poses) > MAX_PATH_POSES:
+        parser.error(f'a path must have at most {MAX_PATH_POSES} poses, got {len(path.poses)}')
+    if path.times is not None and options.speed is not None:
+        parser.error(f'--speed has no effect on the trajectory {options.path}, whose poses have times')
+    return path
+
+
+def is_relative(path: str) -> bool:
+    """Return whether a path is a shape, which begins at the robot."""
+    from diffdrive_jacobian.control.path_source import is_shape
+
+    return is_shape(path)
 
 
 def add_heading(parser: argparse.ArgumentParser, text: str) -> None:

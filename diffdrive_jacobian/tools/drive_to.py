@@ -1,4 +1,4 @@
-"""Drive the virtual robot to goals: robot, controller and wheel bridge in one process."""
+"""Drive the virtual robot to goals or along a path, with robot and controller in one process."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.control import Path as PlannedPath
+from diffdrive_jacobian.control.controllers import ALL_PATH_CONTROLLERS
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.nodes import CONTROLLERS, NODE_PARAMETERS
 from diffdrive_jacobian.plots.output_files import NOT_OVERWRITTEN
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.recording.recording import Recording
 
 PROGRAM = 'drive_to'
+Goals: TypeAlias = NDArray[np.float64] | PlannedPath
 
 
 def main(arguments: Sequence[str], signals: Signals) -> int:
@@ -34,6 +37,11 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     options = _cli.parse(parser, own, parameters=NODE_PARAMETERS)
     if len(options.coordinates) % 2:
         parser.error(f'coordinates must be pairs X Y, got {len(options.coordinates)} of them')
+    if options.path is None:
+        for option in ('--speed', '--path-controller'):
+            _cli.refuse_without(parser, options, option, '--path')
+    elif options.coordinates or options.heading is not None:
+        parser.error('--path excludes X Y and --heading')
     heading = _options.given_heading(parser, options)
     for option in ('--output', '--force'):
         _cli.refuse_with(parser, options, option, '--no-record')
@@ -41,21 +49,29 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     if options.lockstep and options.open:
         parser.error('--lockstep and --open exclude each other: other processes have another clock')
     if not options.live:
-        if not options.coordinates:
-            parser.error('the following arguments are required: X Y (only --live needs no goal)')
+        if not options.coordinates and options.path is None:
+            parser.error(
+                'the following arguments are required: X Y or --path (only --live needs no goal)'
+            )
         if options.port or options.no_browser:
             parser.error('--port and --no-browser are options of --live')
     elif options.timeout != parser.get_default('timeout'):
         parser.error('--timeout has no effect with --live, which ends by Ctrl-C')
+    path = None if options.path is None else _options.given_path(parser, options)
     ros = ['--ros-args', '--log-level', 'warn', '--', *_options.with_params_file(ros, options)]
-    if options.live:
-        return _drive_with_page(options, heading, ros, signals)
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
         from diffdrive_jacobian.drives import DriveError, drive, waypoints_through
         from diffdrive_jacobian.recording.record import saved_on_error
 
-    goals = waypoints_through(np.reshape(options.coordinates, (-1, 2)), heading or 0.0)
+    goals: Goals = np.empty((0, 3))
+    if path is not None:
+        goals = path
+    elif options.coordinates:
+        goals = waypoints_through(np.reshape(options.coordinates, (-1, 2)), heading or 0.0)
+    relative = path is not None and _options.is_relative(options.path)
+    if options.live:
+        return _drive_with_page(options, goals, relative, ros, signals)
     try:
         recording = _recording(options)
     except OSError as error:
@@ -66,10 +82,14 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         return _cli.complain(PROGRAM, f'{picture} exists already; {NOT_OVERWRITTEN}')
     outcome = None
     try:
-        with saved_on_error(recording), _Progress(goals, ros, wall=not options.lockstep) as progress:
+        with (
+            saved_on_error(recording),
+            _Progress(goals, options.path, ros, wall=not options.lockstep) as progress,
+        ):
             try:
                 outcome = drive(
                     goals,
+                    relative=relative,
                     lockstep=options.lockstep,
                     isolated=not options.open,
                     timeout=options.timeout,
@@ -93,33 +113,36 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
 
 
 def _drive_with_page(
-    options: argparse.Namespace, heading: float | None, ros: Sequence[str], signals: Signals
+    options: argparse.Namespace,
+    goals: Goals,
+    relative: bool,
+    ros: Sequence[str],
+    signals: Signals,
 ) -> int:
     """Drive with the page until Ctrl-C; return the exit code.
 
     Args:
         options: The options.
-        heading: Heading at the last goal (rad); None: none was given.
+        goals: Goals, or a path.
+        relative: Whether they are in the body frame of the robot where it starts.
         ros: ROS arguments of all nodes.
         signals: Counter of the signals.
     """
     # Not above: --help needs no ROS.
-    from diffdrive_jacobian.drives import DriveError, waypoints_through
+    from diffdrive_jacobian.drives import DriveError
     from diffdrive_jacobian.recording.record import saved_on_error
 
-    recording = None
+    recording, given = None, bool(options.coordinates or options.path)
     try:
         with _page.explaining_page_errors(options.port):
             from diffdrive_jacobian.live.running import drive_live
 
-        goals: NDArray[np.float64] = np.empty((0, 3))
-        if options.coordinates:
-            goals = waypoints_through(np.reshape(options.coordinates, (-1, 2)), heading or 0.0)
         recording = _recording(options)
         # Where the page cannot be served, the recording is discarded.
         with saved_on_error(recording), _page.explaining_page_errors(options.port):
             drive_live(
                 goals,
+                relative=relative,
                 lockstep=options.lockstep,
                 isolated=not options.open,
                 parameters=_controller_parameters(options),
@@ -129,8 +152,8 @@ def _drive_with_page(
                 signals=signals,
                 ready=_page.announcing(
                     options,
-                    waiting='the drive starts' if len(goals) else '',
-                    notice=_page.DRIVES if len(goals) else _page.STEERS,
+                    waiting='the drive starts' if given else '',
+                    notice=_page.DRIVES if given else _page.STEERS,
                 ),
                 nodes_created=lambda names: _options.warn_of_unused_files(PROGRAM, ros, names),
                 goal_ended=_print_goal_end,
@@ -162,11 +185,11 @@ def _recording(options: argparse.Namespace) -> Recording | None:
 class _Progress:
     """Prints the progress of a drive."""
 
-    def __init__(self, goals: NDArray[np.float64], ros: Sequence[str], *, wall: bool) -> None:
+    def __init__(self, goals: Goals, path: str | None, ros: Sequence[str], *, wall: bool) -> None:
         # Slow to import.
         from diffdrive_jacobian.tools._progress import GoalBar
 
-        self._goals = goals
+        self._goals, self._path = goals, path
         self._ros = ros
         self._seconds = 0.0
         self._bar = GoalBar() if wall else GoalBar(lambda: self._seconds)
@@ -183,13 +206,21 @@ class _Progress:
 
     def driving(self, seconds: float, index: int, distance: float, wheels: tuple[float, float]) -> None:
         self._seconds = seconds
-        x, y, _ = self._goals[index]
-        self._bar.show(f'goal {index + 1}/{len(self._goals)} ({x:g}, {y:g})', distance, wheels)
+        what = f'path {self._path}'
+        if not isinstance(self._goals, PlannedPath):
+            x, y, _ = self._goals[index]
+            what = f'goal {index + 1}/{len(self._goals)} ({x:g}, {y:g})'
+        self._bar.show(what, distance, wheels)
 
 
 def _controller_parameters(options: argparse.Namespace) -> dict[str, Any]:
     """Return the controller's parameters that were given by an option of their own."""
-    given = {'xy_goal_tolerance': options.tolerance, 'controller': options.controller}
+    given = {
+        'xy_goal_tolerance': options.tolerance,
+        'controller': options.controller,
+        'path_controller': options.path_controller,
+        'path_speed': options.speed,
+    }
     if options.heading is not None:
         given['use_goal_heading'] = True
     return {name: value for name, value in given.items() if value is not None}
@@ -240,9 +271,14 @@ def _print_outcome(outcome: Outcome, options: argparse.Namespace) -> int:
         point = f' with the driven point (x {outcome.offset:g} m in the body frame)'
         point = point if outcome.offset else ''
         simulated = ' of simulated time' if options.lockstep else ''
+        distances = describe_distances(outcome.distance, outcome.true_distance) + point
+        if options.path is not None:
+            distances = (
+                f'{outcome.distance:.3f} m before the end of the path, after at most '
+                f'{outcome.across:.3f} m from it'
+            )
         where = (
-            f'the robot stopped at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, '
-            f'{describe_distances(outcome.distance, outcome.true_distance)}{point}, '
+            f'the robot stopped at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, {distances}, '
             f'after {outcome.seconds:.1f} s{simulated}'
         )
     if outcome.arrived:
@@ -291,10 +327,11 @@ def _print_goal_end(end: GoalEnd) -> None:
 def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
-        usage=f'{PROGRAM} X Y [X Y ...] [options] [--ros-args ...]',
-        description='Drive the virtual robot to goals, in order: robot, controller and wheel bridge '
-        'in one process, the whole Jacobian chain in use. Exit code 0: arrived; 1: not arrived, '
-        'or the recording is not complete; 2: wrong arguments; 130: interrupted.',
+        usage=f'{PROGRAM} X Y [X Y ...] [options] [--ros-args ...]\n'
+        f'       {PROGRAM} --path PATH [options] [--ros-args ...]',
+        description='Drive the virtual robot to goals, in order, or along a path: robot, controller and '
+        'wheel bridge in one process, the whole Jacobian chain in use. Exit code 0: arrived; 1: not '
+        'arrived, or the recording is not complete; 2: wrong arguments; 130: interrupted.',
     )
     parser.add_argument(
         'coordinates',
@@ -318,6 +355,19 @@ def _parser() -> _cli.Parser:
         parser,
         CONTROLLERS,
         'controller: %(choices)s (default: go_to_goal, unless a file names another)',
+    )
+    _options.add_path(parser, '--path', 'drive along a path: ')
+    _options.add_value(
+        parser,
+        '--speed',
+        'M/S',
+        'speed along a path without times (m/s) (default: 0.2, unless a file sets it)',
+    )
+    parser.add_argument(
+        '--path-controller',
+        choices=ALL_PATH_CONTROLLERS,
+        metavar='NAME',
+        help='controller of the path: %(choices)s (default: pure_pursuit, unless a file names another)',
     )
     _options.add_params_file(parser)
     _options.add_output(

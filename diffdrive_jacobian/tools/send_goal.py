@@ -2,22 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
-import math
-import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
-from diffdrive_jacobian.errors import UserError
-from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.text import printable
-from diffdrive_jacobian.tools import _cli, _options
-from diffdrive_jacobian.tools._messages import Waiting
+from diffdrive_jacobian.tools import _cli, _options, _sending
 from diffdrive_jacobian.tools._startup import long_lived
-
-if TYPE_CHECKING:
-    from diffdrive_jacobian.nodes.remote_goal import GoalResult
 
 PROGRAM = 'send_goal'
 
@@ -29,109 +18,20 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     options = _cli.parse(parser, own)
     heading = _options.given_heading(parser, options)
     _cli.refuse_with(parser, options, '--timeout', '--no-wait')
-    if options.timeout is None:
-        options.timeout = math.inf
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
         from diffdrive_jacobian.nodes.remote_goal import send_goal
 
-    try:
-        with _Progress(f'goal ({options.x:g}, {options.y:g})') as progress:
-            result = send_goal(
-                [options.x, options.y, heading or 0.0],
-                frame=options.frame,
-                readers=options.readers or 1,
-                patience=options.wait,
-                timeout=options.timeout,
-                follow=not options.no_wait,
-                heading_matters=heading is not None,
-                ros_arguments=ros,
-                signals=signals,
-                progress=progress,
-            )
-    except UserError as error:
-        return _cli.complain(PROGRAM, error)
-    print(*_report(result, options), sep='\n')
-    if result.interrupted:
-        return _cli.INTERRUPTED
-    return _cli.DONE if result.arrived or result.acknowledged else _cli.FAILED
-
-
-class _Progress:
-    """Prints the progress of a goal."""
-
-    def __init__(self, goal: str) -> None:
-        # Slow to import.
-        from diffdrive_jacobian.tools._progress import GoalBar
-
-        self._goal = goal
-        self._bar = GoalBar()
-        self._waiting = Waiting()
-
-    def __enter__(self) -> _Progress:
-        self._bar.__enter__()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.__exit__()
-
-    def waiting(self, reason: str) -> None:
-        self._waiting.show(reason)
-
-    def heading_ignored(self, controller: str) -> None:
-        print(
-            f'{PROGRAM}: warning: {printable(controller)} ignores --heading: set its parameter '
-            'use_goal_heading to true, or its controller to pose',
-            file=sys.stderr,
-            flush=True,
-        )
-
-    def driving(self, distance: float) -> None:
-        self._bar.show(self._goal, distance)
-
-    def no_odometry(self, topic: str, seconds: float) -> None:
-        print(f'no odometry on {topic} for {seconds:g} s: is the robot running?', flush=True)
-
-    def standing(self, seconds: float) -> None:
-        print(f'the robot has not moved for {seconds:g} s: call doctor to find out why', flush=True)
-
-
-def _report(result: GoalResult, options: argparse.Namespace) -> list[str]:
-    """Return lines that describe what became of a goal."""
-    from diffdrive_jacobian.nodes.remote_goal import ANSWER_PATIENCE, Result
-
-    where = '' if result.distance is None else f', {result.distance:.3f} m from the goal'
-    lines = {
-        Result.NOT_SENT: f'not sent within {options.wait:g} s: {result.reason}',
-        Result.UNCONFIRMED: f'sent, but not acknowledged by every subscription to {result.topic}',
-        Result.SENT: f'sent: goal ({options.x:g}, {options.y:g}) on {result.topic}',
-        Result.NO_ANSWER: f'no answer: the controller published no goal_status within '
-        f'{ANSWER_PATIENCE:g} s',
-        Result.ENDED: f'{result.status.word}{where}{_hint(result)}',
-        Result.LOST: f'lost: {result.reason}{where}',
-        Result.TIMEOUT: f'not arrived within --timeout {options.timeout:g} s{where}',
-        Result.INTERRUPTED: 'interrupted: nothing was sent' if result.canceled is None else '',
-    }
-    line = lines[result.result]
-    if result.canceled is None:
-        return [line]
-    if not result.canceled:
-        stopped = 'the controller has not confirmed that it canceled: the robot may still drive'
-    elif result.distance is None:
-        stopped = (
-            f'{result.status.word}: no odometry was received, so it is not known whether a robot drove'
-        )
-    else:
-        stopped = f'{result.status.word}: the robot was stopped'
-    return [line, stopped] if line else [stopped]
-
-
-def _hint(result: GoalResult) -> str:
-    return {
-        GoalState.ABORTED: " (the controller's log says why)",
-        GoalState.CANCELED: ' (by another process, by commands of another node, replaced by another '
-        'goal, or because the controller was shut down)',
-    }.get(result.status, '')
+    return _sending.send(
+        PROGRAM,
+        f'goal ({options.x:g}, {options.y:g})',
+        send_goal,
+        options,
+        ros,
+        signals,
+        goal=[options.x, options.y, heading or 0.0],
+        heading_matters=heading is not None,
+    )
 
 
 def _parser() -> _cli.Parser:
@@ -145,24 +45,10 @@ def _parser() -> _cli.Parser:
         parser.add_argument(
             axis, metavar=axis.upper(), type=_options.coordinate, help=f'{axis} of the goal (m)'
         )
-    _options.add_wait_matching(parser, 'goal_pose has', '1')
     _options.add_heading(
         parser,
         'heading at the goal (rad), used if the controller has use_goal_heading or is pose '
         '(default: 0.0)',
     )
-    parser.add_argument(
-        '--frame', default='', help='frame of the goal (default: the frame of the odometry)'
-    )
-    _options.add_value(
-        parser,
-        '--wait',
-        'SECONDS',
-        'longest wait for a controller and for the subscriptions of -w (s)',
-        default=10.0,
-    )
-    _options.add_timeout(parser, 'cancel the goal after this time (s) (default: never)')
-    parser.add_argument(
-        '--no-wait', action='store_true', help='only send the goal, do not wait until it has ended'
-    )
+    _sending.add_options(parser, 'goal_pose', 'goal')
     return parser

@@ -7,6 +7,12 @@ const LAWS = {
   pose: ['v = K_v ρ cos α,  ω = K_p α + K_v cos α (sin α / α)(α + h φ)', 'Aicardi 1995'],
   offset_point: ['w = J_d⁻¹ k (p_{goal} − p_d)', 'B'],
 };
+const PATH_LAWS = {
+  pure_pursuit: ['v = v_r,  ω = 2 v y / l_d²', 'Coulter 1992'],
+  kanayama: ['v = v_r cos e_θ + K_x e_x,  ω = ω_r + v_r (K_y e_y + K_θ sin e_θ)', 'Kanayama 1990'],
+  offset_point: ['w = J_d⁻¹ (ṗ_r + k (p_r − p_d))', 'B'],
+  dynamic_feedback: ['u = p̈_r + K_d (ṗ_r − ṗ) + K_p (p_r − p),  ω = (u_2 cos θ − u_1 sin θ) / ξ', 'Oriolo 2002'],
+};
 
 /** A vector or matrix whose numbers change. `classes` has one name for each row. */
 class Matrix {
@@ -68,12 +74,14 @@ export class Chain {
 
   show(robot, recorded) {
     const { chain, law, goal } = robot, active = robot.distance !== null && goal.active;
-    const target = active && goal.goals ? goal.goals[goal.index] : null;
-    setText(this.goal, target
+    const target = active && goal.goals ? goal.goals[goal.index] : null, path = goal.path;
+    setText(this.goal, target && path
+      ? `path: ${format(robot.distance)} m to go, ${format(robot.across)} m to the left of it, Δθ = ${format(robot.path_heading_error)} rad`
+      : target
       ? `(${format(target[0], 2)}, ${format(target[1], 2)}) m   →   d = ${format(robot.distance)} m,  e = ${format(robot.bearing_error)} rad${robot.goal_heading_error === null ? '' : `, heading at the goal: Δθ = ${format(robot.goal_heading_error)} rad`}`
       : robot.by_hand ? 'none: driven by hand' : recorded ? 'none' : 'none: click on the map');
     this.links.goal.node.classList.toggle('idle', !target);
-    const [formula, source] = LAWS[law.name] ?? ['[v, ω] = law(pose, goal)', law.name || 'not known'];
+    const [formula, source] = (path ? PATH_LAWS : LAWS)[law.name] ?? ['[v, ω] = law(pose, goal)', law.name || 'not known'];
     setMath(this.links.law.formula, robot.by_hand ? 'your keys' : formula);
     setText(this.links.law.heading.lastChild, robot.by_hand ? '' : source);
     setMath(this.law, this.describe(robot));

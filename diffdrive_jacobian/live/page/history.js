@@ -1,6 +1,7 @@
 // Quantities of one robot over time, for the strips.
 
-export const CURVES = ['v', 'omega', 'command_v', 'command_omega', 'right', 'left', 'distance', 'bearing_error', 'goal_heading_error'];
+export const CURVES = ['v', 'omega', 'command_v', 'command_omega', 'right', 'left', 'distance', 'bearing_error', 'goal_heading_error',
+  'across', 'path_heading_error'];
 const KEPT = 20;
 
 export class History {
@@ -34,6 +35,8 @@ export class History {
       distance: robot.distance,
       bearing_error: robot.bearing_error,
       goal_heading_error: robot.goal_heading_error,
+      across: robot.across,
+      path_heading_error: robot.path_heading_error,
     };
     this.time.push(robot.time);
     for (const name of CURVES) this.curves[name].push(values[name]);

@@ -75,6 +75,7 @@ function showPanels() {
   byId('tools').hidden = byId('actions').hidden = byId('goto').hidden = recorded;
   byId('chain').hidden = byId('legend').hidden = !robot;
   byId('truth').hidden = !robot?.truth;
+  byId('planned').hidden = !robot?.goal.path;
   setText(byId('title'), model.bag || 'diffdrive_jacobian');
   setText(byId('notes'), model.notes.join('; '));
   byId('notes').title = model.notes.join('\n');
@@ -101,7 +102,7 @@ onSelected('clear', 'clear_path');
 byId('follow').addEventListener('click', () => { view.follow = !view.follow; changed = true; showFollow(); byId('follow').blur(); });
 byId('fit').addEventListener('click', () => {
   const points = [...model.paths.values(), ...model.truePaths.values()].flat().filter((point) => point !== null);
-  for (const robot of model.robots.values()) points.push(robot.pose, ...(robot.goal.goals ?? []));
+  for (const robot of model.robots.values()) points.push(robot.pose, ...(robot.goal.goals ?? []), ...(robot.goal.path ?? []));
   view.fit(points.map(([x, y]) => [x, y]));
   showFollow();
   changed = true;

@@ -97,7 +97,8 @@ export class MapDrawing {
     if (!goals || (!active && state !== 'succeeded')) return;
     context.save();
     context.globalAlpha = selected ? 1 : 0.5;
-    if (active) {
+    if (robot.goal.path) this.drawPlanned(context, robot.goal.path, context.globalAlpha);
+    else if (active) {
       context.strokeStyle = colors.goal;
       context.setLineDash([5, 6]);
       context.lineWidth = 1.5;
@@ -116,6 +117,18 @@ export class MapDrawing {
       });
     });
     context.restore();
+  }
+
+  /** Draw the path that a robot is to drive along, wide and pale, below the one that it has driven. */
+  drawPlanned(context, points, alpha) {
+    context.globalAlpha = 0.4 * alpha;
+    context.strokeStyle = this.colors.goal;
+    context.lineWidth = 7;
+    context.lineJoin = context.lineCap = 'round';
+    context.beginPath();
+    for (const [x, y] of points) context.lineTo(...this.view.toScreen(x, y));
+    context.stroke();
+    context.globalAlpha = alpha;
   }
 
   drawGoal(context, goal, { tolerance, heading, done, label }) {

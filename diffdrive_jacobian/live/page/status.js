@@ -22,6 +22,10 @@ function described(robot, recorded) {
   if (goal.state === 'succeeded' && robot.distance !== null) return [badge, kind, `now ${format(robot.distance)} m from the goal${truly}`];
   if (!goal.active) return [badge, kind, goal.state === 'unknown' && !recorded ? 'click on the map to send one' : ''];
   if (!goal.goals) return [badge, kind, 'the goal was sent before this page listened'];
+  if (goal.path) {
+    const side = robot.across < 0 ? 'right' : 'left';
+    return [badge, kind, `${format(robot.distance)} m to go, ${format(Math.abs(robot.across) * 100, 1)} cm ${side} of the path`];
+  }
   const many = goal.goals.length > 1 ? `waypoint ${goal.index + 1} of ${goal.goals.length}, ` : '';
   return [badge, kind, `${many}${format(robot.distance)} m to go${truly}`];
 }

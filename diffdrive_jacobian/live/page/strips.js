@@ -8,6 +8,8 @@ const STRIPS = [
   { name: 'wheels', unit: 'rad/s', digits: 1, curves: [['left', 'left', 'L'], ['right', 'right', 'R']] },
   { name: 'distance', unit: 'm', curves: [['distance', 'v', 'd']], zero: true },
   { name: 'bearing error', unit: 'rad', curves: [['goal_heading_error', 'muted', 'Δθ', true], ['bearing_error', 'omega', 'e']] },
+  { name: 'across path', unit: 'm', digits: 3, curves: [['across', 'v', 'left']], ofPath: true },
+  { name: 'heading to path', unit: 'rad', curves: [['path_heading_error', 'omega', 'Δθ']], ofPath: true },
 ];
 
 /** Room for the labels (px). */
@@ -19,11 +21,12 @@ export class Strips {
     this.strips = STRIPS.map((strip) => {
       const canvas = element('canvas', { role: 'img', 'aria-label': `${strip.name} over time` });
       const values = strip.curves.map(([, color]) => element('span', { class: color === 'muted' ? 'unit' : color }));
-      section.append(element('div', { class: 'strip' },
-        element('p', {}, element('span', { class: 'name' }, strip.name, ' ', element('span', { class: 'unit' }, strip.unit)), ...values), canvas));
+      const node = element('div', { class: 'strip' },
+        element('p', {}, element('span', { class: 'name' }, strip.name, ' ', element('span', { class: 'unit' }, strip.unit)), ...values), canvas);
+      section.append(node);
       canvas.addEventListener('pointerdown', (event) => this.seek(event, canvas, onSeek));
       canvas.addEventListener('pointermove', (event) => { if (event.buttons) this.seek(event, canvas, onSeek); });
-      return { ...strip, canvas, values, span: 0 };
+      return { ...strip, node, canvas, values, span: 0 };
     });
   }
 
@@ -38,7 +41,11 @@ export class Strips {
     const robot = this.model.selected, history = robot && this.model.histories.get(robot.name);
     if (!history) return;
     const now = this.model.recorded ? this.model.world.time : robot.time;
-    for (const strip of this.strips) this.drawStrip(strip, history, now, colors);
+    const followed = history.curves.across.some((value) => value !== null);
+    for (const strip of this.strips) {
+      strip.node.hidden = Boolean(strip.ofPath) && !followed;
+      if (!strip.node.hidden) this.drawStrip(strip, history, now, colors);
+    }
   }
 
   drawStrip(strip, history, now, colors) {
