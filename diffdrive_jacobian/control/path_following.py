@@ -127,8 +127,12 @@ class PathFollower:
         """Return where the robot should be."""
         if self.path.times is not None:
             return self.path.at_time(self.elapsed)
-        rest = max(self.path.length - self.s, 0.0)
-        return self.path.at(self.s, min(how.speed, sqrt(2.0 * how.deceleration * rest)))
+        slowing = sqrt(2.0 * how.deceleration * max(self.path.length - self.s, 0.0))
+        if how.speed <= slowing:
+            return self.path.at(self.s, how.speed)
+        here = self.path.at(self.s, slowing)
+        ax, ay = how.deceleration * cos(here.theta), how.deceleration * sin(here.theta)
+        return here._replace(ax=here.ax - ax, ay=here.ay - ay)
 
     def _target(self, x: float, y: float, how: PathSettings) -> Reference:
         """Return the first point of the path at the look-ahead distance. The path goes on straight.
