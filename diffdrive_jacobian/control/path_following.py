@@ -25,9 +25,9 @@ from diffdrive_jacobian.numerics.checks import NotNegative, Positive
 from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.numerics.fields import Checked
 
-SAMPLES = 33
-"""Number of points of the path among which the one at the look-ahead distance is searched."""
-REACH = 4.0
+STEPS = 8
+"""Number of steps in which the point at the look-ahead distance is searched."""
+REACH = 4
 """Arc length that is searched for it, in look-ahead distances."""
 
 
@@ -100,9 +100,9 @@ class PathFollower:
         if here.passing and s > path.arc_lengths[here.index] + how.waypoint_tolerance:
             return here, None
         at_end = s >= path.length - how.end_tolerance
-        if self.elapsed >= path.duration or (at_end and path.times is None):
+        if self.elapsed + dt >= path.duration or (at_end and path.times is None):
             return here if self.passing else replace(here, index=len(path.poses) - 1), None
-        reference = here._reference(how)
+        reference = here.reference(how)
         away = hypot(reference.x - x, reference.y - y)
         if away > how.approach_distance:
             law.reset()
@@ -111,7 +111,7 @@ class PathFollower:
             law.reset()
             return here, turn_in_place.formula(theta, reference.theta, how.turning_gain)
         here = replace(here, elapsed=self.elapsed + dt)
-        return here, law(pose, here._target(x, y, how) if how.lookahead else here._reference(how))
+        return here, law(pose, here._target(x, y, how) if how.lookahead else here.reference(how))
 
     def _next(self, x: float, y: float, s: float, tolerance: float) -> int:
         """Return the index of the next pose to pass."""
@@ -123,37 +123,41 @@ class PathFollower:
             index += 1
         return index
 
-    def _reference(self, how: PathSettings) -> Reference:
+    def reference(self, how: PathSettings) -> Reference:
         """Return where the robot should be."""
         if self.path.times is not None:
             return self.path.at_time(self.elapsed)
-        rest = max(self.path.length - self.s, 0.0)
-        return self.path.at(self.s, min(how.speed, sqrt(2.0 * how.deceleration * rest)))
+        slowing = sqrt(2.0 * how.deceleration * max(self.path.length - self.s, 0.0))
+        if how.speed <= slowing:
+            return self.path.at(self.s, how.speed)
+        here = self.path.at(self.s, slowing)
+        ax, ay = how.deceleration * cos(here.theta), how.deceleration * sin(here.theta)
+        return here._replace(ax=here.ax - ax, ay=here.ay - ay)
 
     def _target(self, x: float, y: float, how: PathSettings) -> Reference:
         """Return the first point of the path at the look-ahead distance. The path goes on straight.
 
         If the robot is farther from the path, return the nearest point.
         """
-        path, distance = self.path, how.lookahead
-        reference = self._reference(how)
+        reference = self.reference(how)
         v = reference.v
-        if path.times is not None:
+        if self.path.times is not None:
             v = max(0.0, v + how.catching_up * (reference.s - self.s))
-        s = self.s + np.linspace(0.0, REACH * distance, SAMPLES)
-        points = path.poses_at(s)
-        beyond = np.zeros(SAMPLES) if path.closed else np.maximum(s - path.length, 0.0)
-        distances = np.hypot(
-            points[:, 0] + beyond * np.cos(points[:, 2]) - x,
-            points[:, 1] + beyond * np.sin(points[:, 2]) - y,
-        )
-        far = np.flatnonzero(distances >= distance)
-        # None is as far where the path is a narrow curl.
-        index = int(far[0]) if far.size else int(np.argmax(distances))
-        pair = slice(max(index - 1, 0), index + 1)
-        at = float(np.interp(distance, distances[pair], s[pair]))
-        target = path.at(at, v)
-        rest = 0.0 if path.closed else max(at - path.length, 0.0)
-        return target._replace(
-            x=target.x + rest * cos(target.theta), y=target.y + rest * sin(target.theta)
-        )
+        step = how.lookahead / STEPS
+        before = distance = 0.0
+        # The path may be a curl that is narrower.
+        for number in range(REACH * STEPS):
+            target = self._beyond(self.s + number * step, v)
+            before, distance = distance, hypot(target.x - x, target.y - y)
+            if distance >= how.lookahead:
+                break
+        if number and distance > how.lookahead:
+            excess = (distance - how.lookahead) / (distance - before)
+            target = self._beyond(self.s + (number - excess) * step, v)
+        return target
+
+    def _beyond(self, s: float, v: float) -> Reference:
+        """Return the path at an arc length, which may be beyond its end."""
+        place = self.path.at(s, v)
+        rest = 0.0 if self.path.closed else max(s - self.path.length, 0.0)
+        return place._replace(x=place.x + rest * cos(place.theta), y=place.y + rest * sin(place.theta))

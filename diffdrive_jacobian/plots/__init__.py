@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from diffdrive_jacobian.plots.lie_bracket_figure import lie_bracket
     from diffdrive_jacobian.plots.null_space_figure import null_space
     from diffdrive_jacobian.plots.parking_figure import parking
+    from diffdrive_jacobian.plots.path_laws_figure import path_laws
     from diffdrive_jacobian.plots.spring_figure import spring
     from diffdrive_jacobian.plots.velocity_ellipses_figure import velocity_ellipses
     from diffdrive_jacobian.plots.wheel_figure import wheel
@@ -37,6 +38,7 @@ __all__ = [
     'lie_bracket',
     'null_space',
     'parking',
+    'path_laws',
     'run_figure',
     'run_table',
     'spring',
@@ -50,6 +52,7 @@ _PICTURES = {
     'null_space': ('null_space_figure', 'three links that move while their tip does not (A)'),
     'lie_bracket': ('lie_bracket_figure', 'forward, turn, back, turn back: the gap is sideways (A)'),
     'parking': ('parking_figure', 'parallel parking by three motions (A)'),
+    'path_laws': ('path_laws_figure', 'four laws over one figure eight, and their errors (B)'),
     'velocity_ellipses': (
         'velocity_ellipses_figure',
         'velocities of the axle, a line, and of points at d, a circle at L/2 (B)',

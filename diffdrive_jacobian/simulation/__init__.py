@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         sweep,
         sweep_table,
     )
+    from diffdrive_jacobian.simulation.path_tracking import follow_path
     from diffdrive_jacobian.simulation.tracking import track_line
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     'SweepSetup',
     'closed_loops',
     'describe_sweep',
+    'follow_path',
     'sweep',
     'sweep_table',
     'track_line',
@@ -41,6 +43,7 @@ if not TYPE_CHECKING:
             'SweepSetup': 'simulation.gain_sweep',
             'closed_loops': 'simulation.closed_loop',
             'describe_sweep': 'simulation.gain_sweep',
+            'follow_path': 'simulation.path_tracking',
             'sweep': 'simulation.gain_sweep',
             'sweep_table': 'simulation.gain_sweep',
             'track_line': 'simulation.tracking',

@@ -1,0 +1,244 @@
+"""The laws of paths: what their papers prove of them, symmetry, and robots that follow paths by them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from diffdrive_jacobian.control import Path, PathController
+from diffdrive_jacobian.control.path_following import PathFollower, PathSettings
+from diffdrive_jacobian.control.path_laws import (
+    DYNAMIC_FEEDBACK,
+    KANAYAMA,
+    LEAST_SPEED,
+    PATH_CONTROLLERS,
+    PURE_PURSUIT,
+    dynamic_feedback_linearization,
+    kanayama,
+    offset_point_tracking,
+    pure_pursuit,
+)
+from diffdrive_jacobian.kinematics import diff_drive, se2
+from diffdrive_jacobian.simulation import Drift, RobotModel, follow_path
+
+RNG = np.random.default_rng(33)
+COUNT = 200
+DT = 1e-4
+V_R, OMEGA_R = 0.3, 0.4
+"""A reference on a circle."""
+
+
+def poses(count=COUNT):
+    return RNG.uniform([-1.0, -1.0, -math.pi], [1.0, 1.0, math.pi], (count, 3))
+
+
+def references(pose, v=V_R, omega=OMEGA_R):
+    """References at poses, shape (..., 3), on circles."""
+    x, y, theta = np.moveaxis(pose, -1, 0)
+    one = np.ones_like(x)
+    acceleration = [-v * omega * np.sin(theta), v * omega * np.cos(theta)]
+    return np.stack([x, y, theta, v * one, omega * one, *acceleration, 0.0 * one], axis=-1)
+
+
+def driven(pose, v, omega, dt=DT):
+    return se2.integrate(pose, np.stack([v + 0.0 * omega, omega], axis=-1), dt)
+
+
+def circling(pose, dt=DT):
+    return se2.integrate(pose, [V_R, OMEGA_R], dt)
+
+
+# --- What the papers prove
+
+
+def test_kanayama_s_function_decreases_as_it_was_proved():
+    """V_dot = -K_x e_x^2 - v_r K_theta / K_y sin^2(e_theta) <= 0."""
+    k_x, k_y, k_theta = 2.0, 9.0, 5.0
+
+    def errors(pose, reference):
+        e = se2.compose(se2.inverse(pose), reference)
+        return e[..., 0], e[..., 1], e[..., 2]
+
+    def lyapunov(pose, reference):
+        e_x, e_y, e_theta = errors(pose, reference)
+        return (e_x**2 + e_y**2) / 2.0 + (1.0 - np.cos(e_theta)) / k_y
+
+    robot, reference = poses(), poses()
+    v, omega = kanayama(robot, references(reference), k_x, k_y, k_theta)
+    # Central difference.
+    slope = (
+        lyapunov(driven(robot, v, omega), circling(reference))
+        - lyapunov(driven(robot, v, omega, -DT), circling(reference, -DT))
+    ) / (2.0 * DT)
+    e_x, _, e_theta = errors(robot, reference)
+    proved = -k_x * e_x**2 - V_R * k_theta / k_y * np.sin(e_theta) ** 2
+    assert abs(slope - proved).max() < 1e-4
+    assert proved.max() <= 0.0
+    # And over a drive.
+    before = lyapunov(robot, reference)
+    for _ in range(300):
+        v, omega = kanayama(robot, references(reference), k_x, k_y, k_theta)
+        robot, reference = driven(robot, v, omega, 1e-2), circling(reference, 1e-2)
+        after = lyapunov(robot, reference)
+        assert (after <= before + 1e-3).all()
+        before = after
+    assert np.median(before) < 1e-2
+
+
+@pytest.mark.parametrize('d', [0.1, -0.2])
+def test_the_error_of_the_offset_point_decays_exponentially(d):
+    k, robot, reference = 2.0, poses(), poses()
+
+    def error(robot, reference):
+        return diff_drive.offset_point(reference, d) - diff_drive.offset_point(robot, d)
+
+    first, dt = error(robot, reference), 1e-3
+    for _ in range(500):
+        v, omega = offset_point_tracking(robot, references(reference), k, d)
+        robot, reference = driven(robot, v, omega, dt), circling(reference, dt)
+    assert np.allclose(error(robot, reference), math.exp(-k * 0.5) * first, atol=0.02)
+
+
+def test_dynamic_feedback_makes_the_error_linear():
+    """e_ddot + K_d e_dot + K_p e = 0, here with the solution e(t) = exp(A t) e(0)."""
+    k_p, k_d, dt, steps = 4.0, 4.0, 1e-4, 5000
+    reference = poses(20)
+    # Near enough that the speed stays positive.
+    robot = se2.compose(reference, RNG.uniform(-0.05, 0.05, (20, 3)))
+    xi = np.full((20, 1), V_R)
+
+    def error(robot, xi, reference):
+        p_dot = [pose_speed(one, v) for one, v in ((reference, V_R), (robot, xi[..., 0]))]
+        return np.concatenate([(reference - robot)[..., :2], p_dot[0] - p_dot[1]], axis=-1)
+
+    def pose_speed(pose, v):
+        return np.stack([v * np.cos(pose[..., 2]), v * np.sin(pose[..., 2])], axis=-1)
+
+    first = error(robot, xi, reference)
+    for _ in range(steps):
+        v, omega, xi = dynamic_feedback_linearization(
+            robot, references(reference), k_p, k_d, state=xi, dt=dt
+        )
+        robot, reference = driven(robot, v, omega, dt), circling(reference, dt)
+    # Critically damped with the rate 2.
+    t = steps * dt
+    expected = math.exp(-2.0 * t) * (first[:, :2] * (1.0 + 2.0 * t) + first[:, 2:] * t)
+    assert abs(error(robot, xi, reference)[:, :2] - expected).max() < 1e-4
+    assert abs(first[:, :2]).max() > 0.04
+
+
+def test_dynamic_feedback_is_reset_where_it_is_singular():
+    reference = references(np.zeros(3))
+    gains = (2.0, 3.0)
+    for xi in (0.0, LEAST_SPEED / 2.0):
+        v, omega, state = dynamic_feedback_linearization(
+            np.array([0.0, 0.1, 0.0]), reference, *gains, state=[xi], dt=0.0
+        )
+        assert (v, state.tolist()) == (V_R, [V_R])
+        assert abs(omega) < 2.0
+    # A robot that is ahead does not back up.
+    v, _, _ = dynamic_feedback_linearization(
+        np.array([5.0, 0.0, 0.0]), reference, *gains, state=[V_R], dt=0.02
+    )
+    for _ in range(100):
+        v, _, state = dynamic_feedback_linearization(
+            np.array([5.0, 0.0, 0.0]), reference, *gains, state=state, dt=0.02
+        )
+        assert v >= LEAST_SPEED
+
+
+def test_pure_pursuit_drives_along_the_circle_through_the_point():
+    robot, target = poses(), poses()
+    v, omega = pure_pursuit(robot, references(target), 1e-3)
+    # The chord of an arc that turns by 2 alpha points alpha beside the heading.
+    left = se2.compose(se2.inverse(robot), target)
+    alpha = np.arctan2(left[:, 1], left[:, 0])
+    assert np.allclose(driven(robot, v, omega, 2.0 * alpha / omega)[:, :2], target[:, :2])
+    at_distance = pure_pursuit([0.0, 0.0, 0.0], references(np.array([0.3, 0.4, 0.0])), 0.5)
+    assert at_distance == pytest.approx((V_R, 2.0 * V_R * 0.4 / 0.5**2))
+
+
+# --- Symmetry
+
+
+def answers(controller, robot, reference):
+    gains = controller.values(controller.defaults)
+    if controller.state:
+        state = np.full((len(robot), 1), 0.2)
+        v, omega, state = controller.law(robot, reference, *gains, state=state, dt=0.02)
+        return np.stack([v, omega, state[:, 0]])
+    return np.stack(controller.law(robot, reference, *gains))
+
+
+@pytest.mark.parametrize('controller', PATH_CONTROLLERS, ids=lambda one: one.name)
+def test_commutes_with_motions_of_the_plane_and_with_a_mirror(controller):
+    robot, reference, motion = poses(), poses(), np.array([3.0, -2.0, 2.5])
+    twists = answers(controller, robot, references(reference))
+    moved = answers(controller, se2.compose(motion, robot), references(se2.compose(motion, reference)))
+    assert np.allclose(moved, twists, atol=1e-9)
+    mirror = np.array([1.0, -1.0, -1.0])
+    mirrored = answers(controller, robot * mirror, references(reference * mirror, omega=-OMEGA_R))
+    assert np.allclose(mirrored[1], -twists[1], atol=1e-9)
+    assert np.allclose(mirrored[[0, *range(2, len(twists))]], twists[[0, *range(2, len(twists))]])
+
+
+# --- Robots that follow
+
+
+def eight(count=200):
+    angles = np.linspace(0.0, math.tau, count + 1)
+    return Path(np.stack([np.sin(angles), np.sin(angles) * np.cos(angles)], axis=-1))
+
+
+@pytest.mark.parametrize('controller', PATH_CONTROLLERS, ids=lambda one: one.name)
+def test_follows_a_figure_eight_through_its_crossing(controller):
+    path = eight()
+    result = follow_path(controller, path)
+    assert result.finished
+    # It drives the whole of it, not from one branch to the other.
+    assert result.times[-1] == pytest.approx(path.length / 0.2, rel=0.02)
+    # Pure pursuit cuts corners.
+    most = 0.015 if controller is PURE_PURSUIT else 6e-4
+    assert abs(result.errors[:, 1]).max() < most
+
+
+@pytest.mark.parametrize('controller', PATH_CONTROLLERS, ids=lambda one: one.name)
+def test_recovers_from_slip_when_it_is_localised(controller):
+    model = RobotModel(wheel_travel_variance=1e-4, drift=Drift(seed=1))
+    path = eight()
+    trajectory = Path(path.poses, path.arc_lengths / 0.2)
+    result = follow_path(controller, trajectory, model=model, localised=True)
+    assert 1e-3 < abs(result.errors[:, :2]).max() < 0.03
+    assert not np.array_equal(result.errors, follow_path(controller, trajectory, model=model).errors)
+
+
+def test_the_look_ahead_point_is_beyond_the_end_of_an_open_path():
+    path = Path(np.array([[0.0, 0.0], [1.0, 0.0]]))
+    law = PURE_PURSUIT.bind(PURE_PURSUIT.defaults)
+    follower = PathFollower(path, s=0.9)
+    _, command = follower.follow((0.95, 0.05, 0.0), 0.02, law, law, PathSettings(lookahead=0.2))
+    v, omega = command
+    assert omega == pytest.approx(2.0 * v * -0.05 / 0.2**2, rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        ({'controller': 'kanayama'}, 'controller must be of class PathController'),
+        ({'path': [[0, 0], [1, 0]]}, 'path must be of class Path'),
+        ({'rate': 0.0}, 'rate must be positive'),
+        ({'gains': {'k_y': math.nan}}, 'k_y must be in'),
+        ({'gains': {'kp': 1.0}}, 'gains must be among k_x, k_y, k_theta, got kp'),
+    ],
+)
+def test_follow_path_says_what_is_wrong(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        follow_path(**{'controller': KANAYAMA, 'path': eight(), **arguments})
+
+
+def test_a_look_ahead_must_be_a_gain():
+    with pytest.raises(ValueError, match="lookahead must be '' or one of kp, kv, got 'l'"):
+        PathController(name='mine', law=lambda *_: (0.0, 0.0), lookahead='l')
+    assert DYNAMIC_FEEDBACK.lookahead_distance(DYNAMIC_FEEDBACK.defaults) == 0.0
