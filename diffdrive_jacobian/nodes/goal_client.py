@@ -103,6 +103,17 @@ def goals_message(
     return message
 
 
+def path_message(path: Path, stamp: int = 0, frame: str = '') -> PathMessage:
+    """Return the message with a path.
+
+    Args:
+        path: The path. The poses of a trajectory have stamps.
+        stamp: Stamp of the message (ns).
+        frame: Frame of the path.
+    """
+    return goals_message('path', path.poses, stamp, path.times, frame)
+
+
 class GoalClient(Node):  # type: ignore[misc]
     """Sends goals and follows their status and the odometry of the robot."""
 
