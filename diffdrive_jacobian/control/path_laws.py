@@ -131,8 +131,8 @@ KANAYAMA = PathController(
     summary='Kanayama et al. 1990',
     gains=(
         _gain('k_x', 2.0, '1/s', 'Gain of kanayama on the error ahead'),
-        _gain('k_y', 64.0, '1/m^2', 'Gain of kanayama on the error to the left'),
-        _gain('k_theta', 16.0, '1/m', 'Gain of kanayama on the heading error'),
+        _gain('k_y', 25.0, '1/m^2', 'Gain of kanayama on the error to the left'),
+        _gain('k_theta', 10.0, '1/m', 'Gain of kanayama on the heading error'),
     ),
     advice=_kanayama_advice,
 )
@@ -188,7 +188,7 @@ OFFSET_POINT = PathController(
     name='offset_point',
     law=offset_point_tracking,
     summary='input-output linearization at an offset point with feed-forward, document B',
-    gains=(_gain('k_point', 2.0, '1/s', 'Gain of offset_point on the error along a path'), OFFSET),
+    gains=(_gain('k_point', 1.5, '1/s', 'Gain of offset_point on the error along a path'), OFFSET),
     advice=_offset_advice,
 )
 
@@ -250,8 +250,8 @@ DYNAMIC_FEEDBACK = PathController(
     law=dynamic_feedback_linearization,
     summary='dynamic feedback linearization, Oriolo et al. 2002',
     gains=(
-        _gain('k_position', 2.0, '1/s^2', 'Gain of dynamic_feedback on the error'),
-        _gain('k_velocity', 3.0, '1/s', 'Gain of dynamic_feedback on the derivative of the error'),
+        _gain('k_position', 4.0, '1/s^2', 'Gain of dynamic_feedback on the error'),
+        _gain('k_velocity', 4.0, '1/s', 'Gain of dynamic_feedback on the derivative of the error'),
     ),
     state=(0.0,),
 )
