@@ -18,6 +18,7 @@ from diffdrive_jacobian.bags.run_reader import read_run
 from diffdrive_jacobian.bags.timeline import timeline
 from diffdrive_jacobian.control import Path, circle_path, line_path, planned_path
 from diffdrive_jacobian.drives import drive, in_lockstep
+from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.goal_client import GoalClient
 from diffdrive_jacobian.nodes.remote_goal import Result, send_path
@@ -129,6 +130,14 @@ def test_a_trajectory_is_sent_with_stamps_where_the_robot_is(ros):
     assert stamps[-1] - stamps[0] == 2 * 10**9
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == divmod(stamps[0], 10**9)
     assert client.distance == pytest.approx(1.0)
+
+
+def test_a_path_that_is_refused_has_no_errors():
+    with in_lockstep() as runner:
+        runner.add(lambda: VirtualRobot(context=runner.context))
+        runner.add(lambda: GoToGoal(context=runner.context))
+        result = send_path(line_path(5.0), runner=runner, frame='map')
+    assert (result.status, result.across) == (GoalState.ABORTED, None)
 
 
 # --- Timelines

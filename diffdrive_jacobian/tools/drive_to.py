@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -273,10 +274,9 @@ def _print_outcome(outcome: Outcome, options: argparse.Namespace) -> int:
         simulated = ' of simulated time' if options.lockstep else ''
         distances = describe_distances(outcome.distance, outcome.true_distance) + point
         if options.path is not None:
-            distances = (
-                f'{outcome.distance:.3f} m before the end of the path, after at most '
-                f'{outcome.across:.3f} m from it'
-            )
+            distances = f'{outcome.distance:.3f} m before the end of the path'
+            if not math.isnan(outcome.across):
+                distances += f', after at most {outcome.across:.3f} m from it'
         where = (
             f'the robot stopped at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, {distances}, '
             f'after {outcome.seconds:.1f} s{simulated}'
