@@ -458,9 +458,7 @@ class _Session:
             topic=client.resolve_topic_name(client.topic),
             status=client.status,
             distance=self._distance() if distance is None else distance,
-            across=None
-            if client.path is None or math.isnan(client.path.greatest)
-            else client.path.greatest,
+            across=None if math.isnan(across) else across,
             reason=reason,
             canceled=canceled,
         )
