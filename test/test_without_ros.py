@@ -75,7 +75,11 @@ def test_every_tool_is_known():
 
 @pytest.mark.parametrize('tool', [tool for tool in TOOLS if tool not in WITHOUT_ROS])
 def test_one_line_reports_the_remedy(tmp_path, tool):
-    arguments = {'send_goal': ('1', '1'), 'drive_to': ('1', '1')}.get(tool, ())
+    arguments = {
+        'send_goal': ('1', '1'),
+        'send_path': ('circle:1',),
+        'drive_to': ('1', '1'),
+    }.get(tool, ())
     if tool == 'replay_run':
         arguments = (tmp_path,)
     ended = run(tool, *arguments, cwd=tmp_path)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import hypot
+from math import hypot, nan
 from typing import Any
+
+import numpy as np
 
 from diffdrive_jacobian.control.path import Path
 
@@ -20,15 +22,15 @@ class PathProgress:
     """Distance from that point, positive to the left of the path (m)."""
     heading: float = 0.0
     """Heading of the robot minus that of the path there (rad)."""
-    greatest: float = 0.0
-    """Greatest absolute distance so far (m)."""
+    greatest: float = nan
+    """Greatest absolute distance so far (m); NaN: no pose was taken."""
 
     def moved(self, pose: Any) -> None:
         """Take a pose of the robot, `[x, y, theta]` (m, m, rad)."""
         self.s = self.path.nearest(pose[0], pose[1], self.s)
         errors = Path.errors(pose, self.path.at(self.s, 0.0))
         self.across, self.heading = float(errors.across), float(errors.heading)
-        self.greatest = max(self.greatest, abs(self.across))
+        self.greatest = float(np.fmax(self.greatest, abs(self.across)))
 
     @property
     def remaining(self) -> float:

@@ -122,7 +122,8 @@ class Outcome:
     true_distance: float
     """The same by the ground truth (m). NaN: the robot has no drift."""
     across: float
-    """Greatest distance of the robot from the path by the odometry (m). NaN: there were goals."""
+    """Greatest distance of the robot from the path by the odometry (m). NaN: it was not driven along
+    one."""
     offset: float
     """x of the driven point in the body frame (m). 0: the axle centre."""
     seconds: float

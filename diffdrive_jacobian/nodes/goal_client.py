@@ -103,6 +103,17 @@ def goals_message(
     return message
 
 
+def path_message(path: Path, stamp: int = 0, frame: str = '') -> PathMessage:
+    """Return the message with a path.
+
+    Args:
+        path: The path. The poses of a trajectory have stamps.
+        stamp: Stamp of the message (ns).
+        frame: Frame of the path.
+    """
+    return goals_message('path', path.poses, stamp, path.times, frame)
+
+
 class GoalClient(Node):  # type: ignore[misc]
     """Sends goals and follows their status and the odometry of the robot."""
 
@@ -136,10 +147,10 @@ class GoalClient(Node):  # type: ignore[misc]
             ParameterError: A topic has another type in this process.
             ValueError: `goals` has another shape than the topic takes.
         """
-        poses = goals.poses if isinstance(goals, Path) else goals
+        poses, used = (goals.poses, 'path') if isinstance(goals, Path) else (goals, topic)
         if poses.ndim != 2 or poses.shape[1] != 3 or not len(poses):
             raise ValueError(f'goals must have shape (n, 3) with n > 0, got {poses.shape}')
-        if topic == 'goal_pose' and len(poses) != 1:
+        if used == 'goal_pose' and len(poses) != 1:
             raise ValueError(f'goal_pose takes one goal, got {len(poses)}')
         super().__init__(name, context=context, **kwargs)
         self.goals = poses
@@ -158,7 +169,7 @@ class GoalClient(Node):  # type: ignore[misc]
         """Time of the last odometry, or since when it is expected (s, monotonic)."""
         self._frame = frame
         self._readers = readers
-        self.topic = 'path' if isinstance(goals, Path) else topic
+        self.topic: str = used
         """Where the goals are published."""
         self._relative = relative
         self._send_on_odometry = False

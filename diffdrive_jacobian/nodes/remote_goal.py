@@ -84,7 +84,7 @@ class GoalResult:
     """Distance from the driven point to the goal at the end, of a path what remained of it (m). None: no
     odometry was received."""
     across: float | None = None
-    """Greatest distance of the robot from the path (m). None: it was a goal, or was not driven to."""
+    """Greatest distance of the robot from the path (m). None: it was a goal, or was not driven along."""
     reason: str = ''
     """For NOT_SENT what is missing, for LOST what happened to the controller."""
     canceled: bool | None = None
@@ -452,12 +452,15 @@ class _Session:
         canceled: bool | None = None,
     ) -> GoalResult:
         client = self._client
+        across = math.nan if client.path is None else client.path.greatest
         return GoalResult(
             result=result,
             topic=client.resolve_topic_name(client.topic),
             status=client.status,
             distance=self._distance() if distance is None else distance,
-            across=client.path.greatest if client.path and client.robot else None,
+            across=None
+            if client.path is None or math.isnan(client.path.greatest)
+            else client.path.greatest,
             reason=reason,
             canceled=canceled,
         )

@@ -5,6 +5,7 @@ Names of this package, which are imported on first use:
 - `Lockstep` and its errors.
 - `Answers`, `Every`, `Idle`: what nodes in other processes send.
 - `explore`, `fault_schedules`, `poses`, ...: exploring worlds, most of which needs Hypothesis.
+- `path_message`: the message with a path.
 - `RecordedRun`, `GoldenRun`: types of the fixtures `recorded_run` and `golden_run`.
 
 Faults that a `Lockstep` injects are in the package `faults`, properties that it requires in
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     )
     from diffdrive_jacobian.lockstep.external.expectations import Answers, Every, Idle
     from diffdrive_jacobian.lockstep.world import Lockstep
+    from diffdrive_jacobian.nodes.goal_client import path_message
     from diffdrive_jacobian.testing.golden_run import GoldenRun
     from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
@@ -69,6 +71,7 @@ __all__ = [
     'gains',
     'goals',
     'numbers',
+    'path_message',
     'points',
     'poses',
     'probabilities',
@@ -91,6 +94,7 @@ _MODULES = {
     'lockstep._errors': ('IneffectiveFaultsError', 'LockstepError', 'PropertyViolation'),
     'lockstep.external.expectations': ('Answers', 'Every', 'Idle'),
     'lockstep.world': ('Lockstep',),
+    'nodes.goal_client': ('path_message',),
     'testing.golden_run': ('GoldenRun',),
     'testing.recorded_run': ('RecordedRun',),
 }

@@ -58,13 +58,14 @@ def send(
         signals: Counter of the signals that cancel it.
         arguments: Further arguments of `sending`.
     """
+    options.timeout = math.inf if options.timeout is None else options.timeout
     try:
         with Progress(program, what) as progress:
             result = sending(
                 frame=options.frame,
                 readers=options.readers or 1,
                 patience=options.wait,
-                timeout=math.inf if options.timeout is None else options.timeout,
+                timeout=options.timeout,
                 follow=not options.no_wait,
                 ros_arguments=ros,
                 signals=signals,
@@ -125,6 +126,8 @@ def report(result: GoalResult, options: argparse.Namespace, what: str) -> list[s
     where = ''
     if result.across is not None:
         where = f', {result.distance:.3f} m before the end, at most {result.across:.3f} m from the path'
+    elif result.topic.endswith('path'):
+        where = ''
     elif result.distance is not None:
         where = f', {result.distance:.3f} m from the goal'
     lines = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -273,10 +274,9 @@ def _print_outcome(outcome: Outcome, options: argparse.Namespace) -> int:
         simulated = ' of simulated time' if options.lockstep else ''
         distances = describe_distances(outcome.distance, outcome.true_distance) + point
         if options.path is not None:
-            distances = (
-                f'{outcome.distance:.3f} m before the end of the path, after at most '
-                f'{outcome.across:.3f} m from it'
-            )
+            distances = f'{outcome.distance:.3f} m before the end of the path'
+            if not math.isnan(outcome.across):
+                distances += f', after at most {outcome.across:.3f} m from it'
         where = (
             f'the robot stopped at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, {distances}, '
             f'after {outcome.seconds:.1f} s{simulated}'
@@ -327,8 +327,7 @@ def _print_goal_end(end: GoalEnd) -> None:
 def _parser() -> _cli.Parser:
     parser = _cli.Parser(
         prog=PROGRAM,
-        usage=f'{PROGRAM} X Y [X Y ...] [options] [--ros-args ...]\n'
-        f'       {PROGRAM} --path PATH [options] [--ros-args ...]',
+        usage=f'{PROGRAM} (X Y [X Y ...] | --path PATH) [options] [--ros-args ...]',
         description='Drive the virtual robot to goals, in order, or along a path: robot, controller and '
         'wheel bridge in one process, the whole Jacobian chain in use. Exit code 0: arrived; 1: not '
         'arrived, or the recording is not complete; 2: wrong arguments; 130: interrupted.',

@@ -76,6 +76,7 @@ PROGRAMS = (
         'joint_command',
     ),
     Program('send_goal', _paths('50', '0'), (130, 1), 'm to go|waiting: ', 'cmd_vel'),
+    Program('send_path', _paths('line:50'), (130, 1), 'm to go|waiting: ', 'cmd_vel'),
     Program('record_run', _paths('-o', 'NEW'), (0, 130, 1), 'recording to'),
     Program('replay_run', _paths('BAG'), (130, 0), '', 'cmd_vel'),
     Program('drive_to', _paths('5', '0', '-o', 'NEW', '--no-plot'), (130,), 'm to go|drives to|goal'),
@@ -91,6 +92,8 @@ PROGRAMS = (
 WITHOUT_ROS = (
     *('verify_run', 'plot_run', 'plot_jacobian', 'recover_run', 'sweep_gains', 'calibrate_run'),
 )
+SENDERS = ('send_goal', 'send_path')
+"""Programs that send goals to a controller in another process."""
 GOALS = '/goals'
 """Namespace of the robot to which all goals are sent."""
 MODES = ('start-up', 'running', 'busy', 'callback', 'twice')
@@ -162,7 +165,7 @@ class Campaign:
     def end(self, program: Program, mode: str) -> tuple[list[str], Ending]:
         """Start a program and end it; return what broke the promise."""
         self.number += 1
-        space = GOALS if program.name == 'send_goal' else f'/n{self.number}'
+        space = GOALS if program.name in SENDERS else f'/n{self.number}'
         new = self.folder / f'new{self.number}' / 'made'
         new.parent.mkdir()
         arguments = program.arguments(self.bag, new)
@@ -172,7 +175,7 @@ class Campaign:
                 '-r',
                 f'__ns:={space}',
             ]
-        if program.name == 'send_goal' and not self._serves_goals:
+        if program.name in SENDERS and not self._serves_goals:
             self._serve_goals()
         traffic = Traffic(self.harness, program, space)
         begun = time.monotonic()
@@ -295,7 +298,7 @@ class Traffic:
 
     def moving(self) -> bool:
         """Return whether the program commands a motion. Programs without commands need not."""
-        if self.program.name in ('replay_run', 'send_goal'):
+        if self.program.name in ('replay_run', *SENDERS):
             return True
         return not self.program.command or self.drove()
 

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist, TwistStamped
 from nav_msgs.msg import Goals, Odometry
+from nav_msgs.msg import Path as PathMessage
 from rcl_interfaces.srv import GetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
@@ -75,11 +76,13 @@ INPUTS = (
     Input('go_to_goal', 'odom', Odometry),
     Input('go_to_goal', 'goal_pose', PoseStamped),
     Input('go_to_goal', 'goals', Goals),
+    Input('go_to_goal', 'path', PathMessage),
     Input('go_to_goal', '/clock', Clock, SIMULATED),
     Input('send_goal', 'goal_status', GoalStatus),
     Input('send_goal', 'odom', Odometry),
     Input('watch_run', 'odom', Odometry),
     Input('watch_run', 'goals', Goals),
+    Input('watch_run', 'path', PathMessage),
     Input('watch_run', 'goal_status', GoalStatus),
 )
 TOOLS = {
@@ -101,6 +104,10 @@ def valid(kind: Any) -> Any:
         return kind()
     if kind is Goals:
         return Goals(goals=[valid(PoseStamped), valid(PoseStamped)])
+    if kind is PathMessage:
+        start = PoseStamped()
+        start.pose.orientation.w = 1.0
+        return PathMessage(poses=[start, valid(PoseStamped)])
     message = kind()
     pose = message.pose if kind is PoseStamped else message.pose.pose
     pose.position.x, pose.orientation.w = 3.0, 1.0

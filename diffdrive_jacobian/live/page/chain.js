@@ -7,9 +7,10 @@ const LAWS = {
   pose: ['v = K_v ρ cos α,  ω = K_p α + K_v cos α (sin α / α)(α + h φ)', 'Aicardi 1995'],
   offset_point: ['w = J_d⁻¹ k (p_{goal} − p_d)', 'B'],
 };
+const GOAL = 'd = |p_{goal} − p|,  e = ∠(p_{goal} − p) − θ';
 const PATH_LAWS = {
   pure_pursuit: ['v = v_r,  ω = 2 v y / l_d²', 'Coulter 1992'],
-  kanayama: ['v = v_r cos e_θ + K_x e_x,  ω = ω_r + v_r (K_y e_y + K_θ sin e_θ)', 'Kanayama 1990'],
+  kanayama: ['v = v_r cos e_{θ} + K_x e_x,  ω = ω_r + v_r (K_y e_y + K_{θ} sin e_{θ})', 'Kanayama 1990'],
   offset_point: ['w = J_d⁻¹ (ṗ_r + k (p_r − p_d))', 'B'],
   dynamic_feedback: ['u = p̈_r + K_d (ṗ_r − ṗ) + K_p (p_r − p),  ω = (u_2 cos θ − u_1 sin θ) / ξ', 'Oriolo 2002'],
 };
@@ -59,7 +60,7 @@ export class Chain {
     this.twistAgain = new Matrix(2, 1, pair);
     this.world = new Matrix(3, 1);
     this.links = {
-      goal: link('Goal', 'd = |p_{goal} − p|,  e = ∠(p_{goal} − p) − θ', 'A (9)', '', this.goal),
+      goal: link('Goal', GOAL, 'A (9)', '', this.goal),
       law: link('Control law', LAWS.go_to_goal[0], LAWS.go_to_goal[1], '', '[v, ω] =', this.command.node, unit('m/s, rad/s'), this.law),
       inverse: link('To the wheels', '[ω_R, ω_L] = J_w⁻¹ [v, ω]', 'A (8), E',
         symbols('J_w⁻¹', 2, '1/r', 'L/2r', '1/r', '−L/2r'), this.wanted.node, '=', this.inverse.node, this.commandAgain.node, unit('rad/s')),
@@ -75,6 +76,7 @@ export class Chain {
   show(robot, recorded) {
     const { chain, law, goal } = robot, active = robot.distance !== null && goal.active;
     const target = active && goal.goals ? goal.goals[goal.index] : null, path = goal.path;
+    setMath(this.links.goal.formula, path ? '[e_x, e_y] = R(θ)ᵀ (p_r − p),  e_{θ} = θ_r − θ' : GOAL);
     setText(this.goal, target && path
       ? `path: ${format(robot.distance)} m to go, ${format(robot.across)} m to the left of it, Δθ = ${format(robot.path_heading_error)} rad`
       : target
