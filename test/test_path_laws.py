@@ -200,7 +200,7 @@ def test_follows_a_figure_eight_through_its_crossing(controller):
     # It drives the whole of it, not from one branch to the other.
     assert result.times[-1] == pytest.approx(path.length / 0.2, rel=0.02)
     # Pure pursuit cuts corners.
-    most = 0.015 if controller is PURE_PURSUIT else 6e-4
+    most = 0.015 if controller is PURE_PURSUIT else 1e-3
     assert abs(result.errors[:, 1]).max() < most
 
 
