@@ -12,6 +12,8 @@ from diffdrive_jacobian.drives import DriveError, Outcome, drive, waypoints_thro
 from diffdrive_jacobian.drives.driving import in_lockstep
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.remote_goal import Result, send_goal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.signals import Signals
 
@@ -103,6 +105,33 @@ def test_errors_are_typed(monkeypatch):
     monkeypatch.setattr(GoToGoal, '_on_odometry', sleep)
     with pytest.raises(DriveError, match='sleeps on its clock'):
         drive([[1.0, 1.0]], lockstep=True)
+
+
+@pytest.mark.parametrize('timeout', [-1.0, 0.0, math.nan])
+def test_times_are_positive(timeout):
+    with pytest.raises(ValueError, match='timeout must be positive'):
+        drive([[1.0, 1.0]], lockstep=True, timeout=timeout)
+    with pytest.raises(ValueError, match='timeout must be positive'):
+        send_goal([1.0, 1.0, 0.0], timeout=timeout)
+    with pytest.raises(ValueError, match='patience must be positive'):
+        send_goal([1.0, 1.0, 0.0], patience=timeout)
+
+
+def test_goals_are_sent_one_after_the_other_in_one_runner():
+    with in_lockstep() as runner:
+        runner.add(lambda: VirtualRobot(context=runner.context))
+        runner.add(lambda: GoToGoal(context=runner.context))
+        for x in (0.5, 1.0):
+            assert send_goal([x, 0.0, 0.0], runner=runner).arrived
+
+
+def test_a_goal_is_sent_where_no_timer_runs():
+    with in_lockstep() as runner:
+        sent = send_goal([0.5, 0.0, 0.0], runner=runner, patience=2.0)
+        assert sent.result is Result.NOT_SENT
+        runner.add(lambda: GoToGoal(context=runner.context))
+        sent = send_goal([0.5, 0.0, 0.0], runner=runner, timeout=2.0)
+        assert (sent.result, sent.canceled) == (Result.TIMEOUT, True)
 
 
 def test_waypoints_have_the_direction_to_the_next():

@@ -23,6 +23,7 @@ from diffdrive_jacobian.nodes.goal_client import (
     loss,
 )
 from diffdrive_jacobian.nodes.standstill import Standstill
+from diffdrive_jacobian.numerics.checks import number, positive_or_infinite
 from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
 from diffdrive_jacobian.ros.liveness import Liveness
 from diffdrive_jacobian.ros.node_runner import NodeRunner
@@ -157,7 +158,8 @@ def send_goal(
 
     Args:
         goal: `[x, y, theta]`, shape (3,) (m, m, rad).
-        runner: Runs the node, in real time or in lockstep, and may run others. None: a new one does.
+        runner: Runs the node until the goal has ended, in real time (`drives.in_real_time`) or in
+            lockstep (`drives.in_lockstep`), and may run others. None: a new one does.
         frame: Frame of the goal. Empty: the frame of the odometry.
         readers: Number of subscriptions that goal_pose must have before the goal is sent.
         patience: Longest wait for the controller and for the subscriptions (s).
@@ -170,8 +172,11 @@ def send_goal(
 
     Raises:
         UserError: The ROS arguments are invalid, or the node cannot be created.
-        ValueError: `goal` has another shape, or `ros_arguments` are given with `runner`.
+        ValueError: `goal` has another shape, a time is not positive, or `ros_arguments` are given with
+            `runner`.
     """
+    number('patience', patience, positive_or_infinite)
+    number('timeout', timeout, positive_or_infinite)
     if runner is not None and ros_arguments:
         raise ValueError('ros_arguments are those of the runner, if one is given')
     with ExitStack() as stack:
@@ -194,6 +199,8 @@ def send_goal(
                 start_parameter_services=False,
             )
         )
+        # Before a runner that is created here is closed.
+        stack.callback(used.remove, client)
         session = _Session(client, used, signals or Signals(), progress or _Silent())
         return session.run(patience, timeout, follow=follow, heading_matters=heading_matters)
 

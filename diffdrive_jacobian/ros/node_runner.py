@@ -62,6 +62,11 @@ class NodeRunner(ABC):
         self._add(node)
         return node
 
+    def remove(self, node: Node) -> None:
+        """Remove and destroy a node that was added."""
+        self._nodes.remove(node)
+        self._remove(node)
+
     def turns(
         self,
         *,
@@ -127,6 +132,10 @@ class NodeRunner(ABC):
     @abstractmethod
     def _add(self, node: Node) -> None:
         """Execute the callbacks of a node from now on."""
+
+    @abstractmethod
+    def _remove(self, node: Node) -> None:
+        """Execute no more callbacks of a node, and destroy it."""
 
     @abstractmethod
     def _spin_once(self) -> None:

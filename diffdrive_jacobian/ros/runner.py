@@ -201,6 +201,10 @@ class Runner(NodeRunner):
             guard_inputs(node)
         self._executor.add_node(node)
 
+    def _remove(self, node: Node) -> None:
+        self._executor.remove_node(node)
+        node.destroy_node()
+
     def _spin_once(self) -> None:
         self._executor.spin_once(timeout_sec=CHECK_PERIOD)
 
