@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 import pytest
+from rclpy.parameter import Parameter
 
 from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.drives import DriveError, Outcome, drive, waypoints_through
-from diffdrive_jacobian.drives.driving import in_lockstep
+from diffdrive_jacobian.drives.driving import in_lockstep, in_real_time
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.remote_goal import Result, send_goal
@@ -118,11 +119,34 @@ def test_times_are_positive(timeout):
 
 
 def test_goals_are_sent_one_after_the_other_in_one_runner():
+    for run in (in_lockstep, in_real_time):
+        with run() as runner:
+            nodes = [
+                runner.add(lambda node=node: node(context=runner.context))
+                for node in (VirtualRobot, GoToGoal)
+            ]
+            nodes[1].set_parameters([Parameter('kv', value=4.0), Parameter('kp', value=12.0)])
+            for x in (0.2, 0.4):
+                assert send_goal([x, 0.0, 0.0], runner=runner).arrived
+                runner.spin(lambda: not nodes[0].count_publishers('/goal_pose'), timeout=5.0)
+                assert not nodes[0].count_publishers('/goal_pose')
+
+
+def test_an_error_of_the_progress_cancels_the_goal():
+    class Broken(Progress):
+        def waiting(self, reason):
+            pass
+
+        def driving(self, *state):
+            raise BrokenPipeError
+
     with in_lockstep() as runner:
-        runner.add(lambda: VirtualRobot(context=runner.context))
-        runner.add(lambda: GoToGoal(context=runner.context))
-        for x in (0.5, 1.0):
-            assert send_goal([x, 0.0, 0.0], runner=runner).arrived
+        robot = runner.add(lambda: VirtualRobot(context=runner.context))
+        controller = runner.add(lambda: GoToGoal(context=runner.context))
+        with pytest.raises(BrokenPipeError):
+            send_goal([5.0, 0.0, 0.0], runner=runner, progress=Broken())
+        assert controller.waypoint is None
+        assert robot.get_publishers_info_by_topic('/goal_pose') == []
 
 
 def test_a_goal_is_sent_where_no_timer_runs():

@@ -144,6 +144,11 @@ class GoalClient(Node):  # type: ignore[misc]
         return float(self.arrival.distance(*self.robot.pose, *self.goals[self.index, :2]))
 
     @property
+    def sent(self) -> bool:
+        """Whether the goals were published."""
+        return self._follower.newest is not None
+
+    @property
     def status(self) -> GoalState:
         """Last status of the goals."""
         sent = self._follower.newest

@@ -168,7 +168,8 @@ def send_goal(
         heading_matters: Whether to report a controller that ignores the heading of the goal.
         ros_arguments: ROS arguments of the node; those of `runner`, if it is given.
         signals: Counter of the signals that cancel the goal. None: no signal does.
-        progress: Receives the progress. None: nothing does.
+        progress: Receives the progress. An error that it raises cancels the goal, and is passed on.
+            None: nothing does.
 
     Raises:
         UserError: The ROS arguments are invalid, or the node cannot be created.
@@ -179,6 +180,7 @@ def send_goal(
     number('timeout', timeout, positive_or_infinite)
     if runner is not None and ros_arguments:
         raise ValueError('ros_arguments are those of the runner, if one is given')
+    created = runner is None
     with ExitStack() as stack:
         if runner is None:
             if not follow:
@@ -199,10 +201,14 @@ def send_goal(
                 start_parameter_services=False,
             )
         )
-        # Before a runner that is created here is closed.
-        stack.callback(used.remove, client)
+        if not created:
+            stack.callback(used.remove, client)
         session = _Session(client, used, signals or Signals(), progress or _Silent())
-        return session.run(patience, timeout, follow=follow, heading_matters=heading_matters)
+        try:
+            return session.run(patience, timeout, follow=follow, heading_matters=heading_matters)
+        except BaseException:
+            session.abandon()
+            raise
 
 
 class _Session:
@@ -249,6 +255,12 @@ class _Session:
             client.cancel()
             return self._result(Result.LOST, reason=lost)
         return self._cancel(Result.INTERRUPTED if signals.count else Result.TIMEOUT)
+
+    def abandon(self) -> None:
+        """Cancel the goal if it may be active: an error, as of a closed output, ends its pursuit."""
+        if self._client.sent and not self._client.ended:
+            self._client.cancel()
+            self._runner.spin(lambda: self._client.ended, timeout=ANSWER_PATIENCE, signals=self._signals)
 
     def _turns(self, seconds: float) -> Iterator[float]:
         """Execute callbacks, and yield the time (s) often, for a time (s) or until a signal."""

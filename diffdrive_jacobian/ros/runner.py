@@ -203,6 +203,8 @@ class Runner(NodeRunner):
 
     def _remove(self, node: Node) -> None:
         self._executor.remove_node(node)
+        # The EventsExecutor lets go of it only then.
+        self._executor.spin_once(timeout_sec=0.0)
         node.destroy_node()
 
     def _spin_once(self) -> None:
