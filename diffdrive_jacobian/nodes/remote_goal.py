@@ -231,6 +231,7 @@ class _Session:
             if signals.count:
                 return self._result(Result.INTERRUPTED)
             return self._result(Result.NOT_SENT, reason=obstacle)
+        self._await_readers()
         controllers = client.controllers()
         client.send()
         names = sorted(set(controllers.values()) - {''})
@@ -291,6 +292,15 @@ class _Session:
                 break
             self._progress.waiting(reason)
         return reason
+
+    def _await_readers(self) -> None:
+        """Wait until no more subscriptions are discovered: a recorder needs the goal, too."""
+        readers, since = 0, -math.inf
+        for now in self._turns(ANSWER_PATIENCE):
+            if self._client.readers != readers:
+                readers, since = self._client.readers, now
+            if now - since >= self._runner.discovery:
+                break
 
     def _await_acknowledgement(self) -> bool:
         """Wait until the goal is acknowledged by every subscription; return whether it is."""

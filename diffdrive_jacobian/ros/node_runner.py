@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 from rclpy.context import Context
 from rclpy.exceptions import NameValidationException, ParameterException
@@ -32,6 +32,9 @@ MAX_NAME_LENGTH = 247
 
 class NodeRunner(ABC):
     """Nodes of one context, and the loop that executes their callbacks."""
+
+    discovery: ClassVar[float] = 0.0
+    """Time without a newly discovered subscription after which further ones are unlikely (s)."""
 
     def __init__(self, context: Context) -> None:
         """Start without nodes.
