@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.parameters.virtual_robot import MULTIPLIERS
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits
+from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros
+from diffdrive_jacobian.parameters.virtual_robot import MULTIPLIERS, VirtualRobotParameters
 from diffdrive_jacobian.reading.ground_truth import NODE, recorded_drift
 from diffdrive_jacobian.reading.run import Run
 from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose, propagate_covariance
@@ -45,6 +48,20 @@ def recorded_model(run: Run) -> RobotModel | None:
         return None
     drift = recorded_drift(run)
     return RobotModel(wheel_separation=separation, wheel_travel_variance=variance, drift=drift)
+
+
+def recorded_dynamics(run: Run) -> RobotModel:
+    """Return a model that follows commands as the recorded robot did, without limits of the velocity.
+
+    At once, if its parameters were not recorded.
+    """
+    try:
+        recorded = from_ros(VirtualRobotParameters, run.of_node(NODE)).model()
+    except ParameterError:
+        return RobotModel()
+    if not recorded.takes_time:
+        return RobotModel()
+    return replace(recorded, limits=VelocityLimits(), command_timeout=0)
 
 
 def rule(
