@@ -193,8 +193,8 @@ def verify(
     distances = np.hypot(difference[:, 0], difference[:, 1])
     if source == 'cmd_vel_out' and not run.of_node(ROBOT) and np.any(distances > EXACT):
         notes += (
-            'the parameters of virtual_robot were not recorded: the motion of a robot with limits of the '
-            'acceleration, a lag or a delay cannot be reproduced without them',
+            'the parameters of virtual_robot were not recorded: the motion of a robot with limits of '
+            'the acceleration, a lag or a delay cannot be reproduced without them',
         )
     return Verification(
         source=source,
