@@ -22,6 +22,7 @@ from diffdrive_jacobian.lockstep.runner import LockstepRunner
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.codecs import ODOMETRY
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.remote_goal import ANSWER_PATIENCE, Result, send_goal_in
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.properties import (
@@ -33,7 +34,6 @@ from diffdrive_jacobian.properties import (
     StopsAfterLostOdometry,
     end_of_faults,
 )
-from diffdrive_jacobian.ros.remote_goal import ANSWER_PATIENCE, Result, send_goal_in
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.testing import explore, fault_schedules, goals, poses, times
 from diffdrive_jacobian.time_units import NANOSECONDS

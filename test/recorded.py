@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 
-from diffdrive_jacobian.reading import read_run
+from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.recording.recorder import Recorder, Selection
 from diffdrive_jacobian.recording.recording import Recording
 

@@ -18,11 +18,11 @@ from sensor_msgs.msg import JointState
 from test_reading import count_more, write_bag
 
 from diffdrive_jacobian.calibration import PARAMETERS, calibrate, fit
+from diffdrive_jacobian.calibration.choice import wheel_names
+from diffdrive_jacobian.calibration.data import read_wheels_and_reference
 from diffdrive_jacobian.parameters.nodes import WheelBridgeParameters
 from diffdrive_jacobian.plots import calibration_figure
 from diffdrive_jacobian.plots.calibration_figure import figure
-from diffdrive_jacobian.reading.calibration_choice import wheel_names
-from diffdrive_jacobian.reading.calibration_data import read_wheels_and_reference
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import calibrate_run as _calibrate_run
 from diffdrive_jacobian.tools import drive_to

@@ -13,8 +13,8 @@ from ros_messages import goal, joint_command, odometry
 from test_reading import SECOND, write_bag
 
 import diffdrive_jacobian
+from diffdrive_jacobian.bags.run_reader import read_run
 from diffdrive_jacobian.plots.run_table import write_csv
-from diffdrive_jacobian.reading.reader import read_run
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.sweep_gains import main as sweep_gains
 
@@ -68,4 +68,4 @@ def test_no_other_module_writes_csv():
         for path in package.rglob('*.py')
         if re.search(r'^\s*(import csv|from csv)\b|savetxt', path.read_text(), re.MULTILINE)
     }
-    assert found == {'plots/run_table.py', 'sweeps/sweep.py'}
+    assert found == {'plots/run_table.py', 'simulation/gain_sweep.py'}

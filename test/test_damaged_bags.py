@@ -25,10 +25,10 @@ from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, JournalWriter, Message, Text, journal_of
 from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.bags.metadata import MetadataError, check_connections, check_metadata
+from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.time_series import commanded, limits, measured
+from diffdrive_jacobian.bags.timeline import trace
 from diffdrive_jacobian.plots.run_figure import LABELS, draw
-from diffdrive_jacobian.reading.reader import read_run
-from diffdrive_jacobian.reading.time_series import commanded, limits, measured
-from diffdrive_jacobian.reading.trace import trace
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import plot_run, recover_run, replay_run
 

@@ -32,8 +32,8 @@ def test_an_observer_describes_what_it_sees(ros):
     from rclpy.node import Node
     from sensor_msgs.msg import JointState
 
+    from diffdrive_jacobian.diagnosis.observation import Observer
     from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-    from diffdrive_jacobian.ros.observation import Observer
 
     observer = ros.add(Observer, name='_doctor')
     ros.add(VirtualRobot, parameters={'publish_rate': 100.0})
@@ -74,7 +74,7 @@ def test_an_observer_describes_what_it_sees(ros):
 def test_an_observer_ignores_names_that_cannot_be_queried(ros, monkeypatch):
     from rclpy.node import Node
 
-    from diffdrive_jacobian.ros.observation import Observer
+    from diffdrive_jacobian.diagnosis.observation import Observer
 
     few_services = {'start_type_description_service': False}
     ros.add(Node, node_name='n' * 240, start_parameter_services=False, parameters=few_services)

@@ -11,12 +11,12 @@ from lockstep_nodes import make_complete
 from recorded import recorded
 from ros_messages import twist
 
+from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.calibration import PARAMETERS, Geometry, calibrate
+from diffdrive_jacobian.calibration.data import read_wheels_and_reference
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.reading.calibration_data import read_wheels_and_reference
-from diffdrive_jacobian.reading.reader import read_run
-from diffdrive_jacobian.reading.verification import verify
 from diffdrive_jacobian.testing import Lockstep
 
 LEFT, RIGHT, SEPARATION = TRUE = 0.985, 1.01, 1.03

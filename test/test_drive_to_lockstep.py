@@ -14,12 +14,11 @@ import numpy as np
 import pytest
 from processes import open_world
 
-from diffdrive_jacobian.bags import journal
+from diffdrive_jacobian.bags import journal, read_run
+from diffdrive_jacobian.bags.timeline import trace
 from diffdrive_jacobian.lockstep import runner as testing_runner
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.parameters.nodes import CONTROLLERS
-from diffdrive_jacobian.reading import read_run
-from diffdrive_jacobian.reading.trace import trace
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.testing import Lockstep
 from diffdrive_jacobian.tools import _progress, drive_to

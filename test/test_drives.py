@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.drives import DriveError, Outcome, drive, drive_in, waypoints_through
 from diffdrive_jacobian.drives.runners import in_lockstep
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
-from diffdrive_jacobian.reading import read_run
 from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.signals import Signals
 

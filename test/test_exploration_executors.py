@@ -27,7 +27,7 @@ from diffdrive_jacobian.exploration.replay import replay
 from diffdrive_jacobian.exploration.trial import Outcome
 from diffdrive_jacobian.faults import Loss
 from diffdrive_jacobian.properties import NeverFasterThan
-from diffdrive_jacobian.sweeps import Setup, Sweep, sweep
+from diffdrive_jacobian.simulation import Setup, Sweep, sweep
 from diffdrive_jacobian.testing import LocalExecutor, SerialExecutor, explore, fault_schedules
 
 LOSSES = fault_schedules(['speed'], kinds=[Loss], duration=1.2)

@@ -11,12 +11,12 @@ from std_msgs.msg import String
 from test_plot_run import sample
 from test_reading import SECOND, write_bag
 
+from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.time_series import commanded, measured
+from diffdrive_jacobian.bags.timeline import trace
 from diffdrive_jacobian.faults import Push, TimeJump
 from diffdrive_jacobian.plots.fault_marks import NAMED, fault_spans
 from diffdrive_jacobian.plots.run_figure import figure
-from diffdrive_jacobian.reading.reader import read_run
-from diffdrive_jacobian.reading.time_series import commanded, measured
-from diffdrive_jacobian.reading.trace import trace
 from diffdrive_jacobian.testing.recorded_run import RecordedRun
 
 

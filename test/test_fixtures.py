@@ -15,9 +15,9 @@ from geometry_msgs.msg import Twist
 from inner_sessions import OPTIONS, SETTING, draw_quickly, run_inner
 from nav_msgs.msg import Odometry
 
+from diffdrive_jacobian.bags import read_run
+from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.faults import EncoderSteps
-from diffdrive_jacobian.reading import read_run
-from diffdrive_jacobian.reading.verification import verify
 from diffdrive_jacobian.testing.artifacts import MAX_LENGTH, artifact_name, name_beside_the_file
 
 PLUGIN = 'diffdrive_jacobian.testing.fixtures'

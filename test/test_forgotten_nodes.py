@@ -15,11 +15,11 @@ from rclpy.serialization import serialize_message
 from ros_messages import goal, goals, odometry, twist, twists
 from sensor_msgs.msg import JointState
 
-from diffdrive_jacobian.diagnosis.lasting import Interleaving, LastingFault
 from diffdrive_jacobian.messages.integers import integer_warning
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.ros.lasting import Interleaving, LastingFault
 from diffdrive_jacobian.ros.node import FAULT_PATIENCE
 
 INTEGER = 5e-324

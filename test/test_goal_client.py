@@ -12,8 +12,8 @@ from nav_msgs.msg import Goals, Odometry
 from ros_messages import odometry, receive
 
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.goal_client import DRIVEN_POINT_PARAMETERS, GoalClient, driven_offset
 from diffdrive_jacobian.parameters.declaration import ParameterError
-from diffdrive_jacobian.ros.goal_client import DRIVEN_POINT_PARAMETERS, GoalClient, driven_offset
 from diffdrive_jacobian.ros.liveness import Liveness
 
 

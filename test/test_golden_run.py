@@ -14,11 +14,11 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from unique_identifier_msgs.msg import UUID
 
+from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import Channel, Message
 from diffdrive_jacobian.bags.message_definitions import definition
-from diffdrive_jacobian.reading import read_run
 from diffdrive_jacobian.testing.differences import Comparison
 from diffdrive_jacobian.testing.golden_run import GoldenRun, GoldenRunError
 

@@ -13,13 +13,13 @@ from recorded import recorded
 from ros_messages import goal, instants, placement, pose_of, twist, twist_stamped
 from std_srvs.srv import Trigger
 
+from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros
 from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
 from diffdrive_jacobian.plots.ground_truth import COLOR
 from diffdrive_jacobian.plots.run_figure import figure
-from diffdrive_jacobian.reading.verification import verify
 from diffdrive_jacobian.simulation import Drift, Robot, RobotModel
 from diffdrive_jacobian.testing import Lockstep
 from diffdrive_jacobian.tools.verify_run import report

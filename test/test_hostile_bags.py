@@ -35,12 +35,12 @@ from diffdrive_jacobian import bounded_yaml
 from diffdrive_jacobian.bags import limits
 from diffdrive_jacobian.bags.bag_reader import find_damage
 from diffdrive_jacobian.bags.bounded_reader import BoundedReader, _SqliteReader
+from diffdrive_jacobian.bags.damaged_bag import _unpacked
 from diffdrive_jacobian.bags.limits import MAX_RECORD
+from diffdrive_jacobian.bags.run_reader import BagError, open_bag, read_run
+from diffdrive_jacobian.bags.salvage_sqlite import _Pages
 from diffdrive_jacobian.bounded_yaml import MAX_DEPTH, MAX_SIZE, TooLargeError, load_yaml
 from diffdrive_jacobian.parameters.file import robot_parameters
-from diffdrive_jacobian.reading.reader import BagError, open_bag, read_run
-from diffdrive_jacobian.recovery.damaged_bag import _unpacked
-from diffdrive_jacobian.recovery.salvage_sqlite import _Pages
 from diffdrive_jacobian.ros.runner import UserError
 
 GOOD = mcap(topic_records() + message(b'\0\1\0\0' + bytes(100)))

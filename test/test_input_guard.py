@@ -21,9 +21,9 @@ from rosgraph_msgs.msg import Clock
 from type_description_interfaces.srv import GetTypeDescription
 
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.goal_client import GoalClient
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.ros.goal_client import GoalClient
 from diffdrive_jacobian.ros.runner import ros_context, running
 
 NODES = {'virtual_robot': VirtualRobot, 'go_to_goal': GoToGoal, 'wheel_bridge': WheelBridge}

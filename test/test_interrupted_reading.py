@@ -7,8 +7,8 @@ from geometry_msgs.msg import TwistStamped
 from ros_messages import joint_command, odometry, stamp
 from test_reading import SECOND, write_bag
 
+from diffdrive_jacobian.bags import read_run, verify
 from diffdrive_jacobian.bags.bag_reader import ReadingInterruptedError
-from diffdrive_jacobian.reading import read_run, verify
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import calibrate_run, plot_run, verify_run
 

@@ -7,6 +7,7 @@ from action_msgs.msg import GoalStatus
 from rclpy.serialization import serialize_message
 from test_reading import SECOND, odom, write_bag
 
+from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import Channel, Message
 from diffdrive_jacobian.bags.known_types import (
@@ -15,11 +16,10 @@ from diffdrive_jacobian.bags.known_types import (
     recorded_definition_differs,
 )
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, definition
+from diffdrive_jacobian.bags.salvage_mcap import Topic
+from diffdrive_jacobian.bags.topic_types import definition_and_hash
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.messages.topics import TOPICS
-from diffdrive_jacobian.reading import read_run
-from diffdrive_jacobian.recovery.salvage_mcap import Topic
-from diffdrive_jacobian.recovery.topic_types import definition_and_hash
 
 TYPES = sorted({kind for topic in TOPICS.values() for kind in topic.types})
 

@@ -12,6 +12,7 @@ import pytest
 from lockstep_nodes import QUICK, make_complete
 from ros_messages import twist
 
+from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.bags.bag_reader import BagError
 from diffdrive_jacobian.drives import drive
 from diffdrive_jacobian.live.bag_player import BagPlayer
@@ -19,7 +20,6 @@ from diffdrive_jacobian.live.commands import CancelGoal, Pause, Seek, SetSpeed, 
 from diffdrive_jacobian.live.recorded_runs import read_robots
 from diffdrive_jacobian.live.session import Session
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.reading import read_run
 from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.recording.selection import Selection

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.goal_client import SILENCE, GoalClient, duplicates, loss
 from diffdrive_jacobian.ros import liveness
-from diffdrive_jacobian.ros.goal_client import SILENCE, GoalClient, duplicates, loss
 from diffdrive_jacobian.ros.liveness import LONGEST_STEP, PERIOD, Liveness
 
 

@@ -17,15 +17,15 @@ from ros_messages import goal, joint_command, twist
 from ruamel.yaml import YAML
 from test_reading import SECOND, changed, odom, write_bag
 
+from diffdrive_jacobian.bags import NotABagError, NothingToSaveError, recover
 from diffdrive_jacobian.bags.journal import MAGIC, JournalError, read_journal
 from diffdrive_jacobian.bags.message_definitions import definition
+from diffdrive_jacobian.bags.run_reader import BagError, read_run
+from diffdrive_jacobian.bags.time_series import commanded, limits, measured
+from diffdrive_jacobian.bags.timeline import trace
+from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.plots.run_figure import LABELS
-from diffdrive_jacobian.reading.reader import BagError, read_run
-from diffdrive_jacobian.reading.time_series import commanded, limits, measured
-from diffdrive_jacobian.reading.trace import trace
-from diffdrive_jacobian.reading.verification import verify
-from diffdrive_jacobian.recovery import NotABagError, NothingToSaveError, recover
 
 TYPED = (BagError, JournalError, NotABagError, NothingToSaveError, ParameterError)
 VALUES = (

@@ -205,7 +205,7 @@ def robots(tmp_path_factory):
 
 
 def test_a_bag_of_several_robots_is_read_by_namespace(robots):
-    from diffdrive_jacobian.reading import BagError, read_run
+    from diffdrive_jacobian.bags import BagError, read_run
 
     with pytest.raises(BagError, match='choose one of them, or one namespace'):
         read_run(robots)
@@ -246,7 +246,7 @@ def test_plot_run_writes_one_of_several_robots(robots, capsys, monkeypatch):
 
 def test_playback_chooses_a_namespace(robots):
     from diffdrive_jacobian.bags.bag_reader import BagError, open_bag
-    from diffdrive_jacobian.replay import NothingToPlayError, Playback
+    from diffdrive_jacobian.recording import NothingToPlayError, Playback
 
     def topics(**how):
         with open_bag(robots) as reader:
@@ -324,7 +324,7 @@ def undrawn(monkeypatch):
 
 @pytest.mark.usefixtures('undrawn')
 def test_drive_to_replaces_bag_and_picture(tmp_path, monkeypatch, capsys):
-    from diffdrive_jacobian.reading import read_run
+    from diffdrive_jacobian.bags import read_run
 
     pytest.importorskip('matplotlib')
     monkeypatch.chdir(tmp_path)
@@ -445,8 +445,8 @@ def test_a_controller_that_ignores_the_heading_is_reported(follow, matters, para
     from rclpy.parameter import Parameter
 
     from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
-    from diffdrive_jacobian.ros.goal_client import GoalClient
-    from diffdrive_jacobian.ros.remote_goal import _Session
+    from diffdrive_jacobian.nodes.goal_client import GoalClient
+    from diffdrive_jacobian.nodes.remote_goal import _Session
     from diffdrive_jacobian.ros.runner import ros_context, running
 
     overrides = [Parameter(name, value=value) for name, value in parameters.items()]
@@ -463,7 +463,7 @@ def test_a_controller_that_ignores_the_heading_is_reported(follow, matters, para
 
 
 def test_a_replay_says_which_subscriptions_it_waits_for(robots, capfd):
-    from diffdrive_jacobian.replay import Playback, replay
+    from diffdrive_jacobian.recording import Playback, replay
 
     class Reasons(Progress):
         def started(self, seconds):

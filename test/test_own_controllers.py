@@ -17,6 +17,8 @@ from lockstep_nodes import ABORTED, SUCCEEDED, Controller, Topics, arrives, chan
 from ros_messages import goal, twists
 
 from diffdrive_jacobian import control
+from diffdrive_jacobian.bags import read_run
+from diffdrive_jacobian.bags.timeline import trace
 from diffdrive_jacobian.control import (
     KP,
     KV,
@@ -33,11 +35,8 @@ from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
 from diffdrive_jacobian.plots.sweep_figure import figure
-from diffdrive_jacobian.reading import read_run
-from diffdrive_jacobian.reading.trace import trace
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.simulation import closed_loops
-from diffdrive_jacobian.sweeps import Setup, sweep
+from diffdrive_jacobian.simulation import Setup, closed_loops, sweep
 from diffdrive_jacobian.tools import drive_to, sweep_gains
 from diffdrive_jacobian.tools.run_node import run_node
 

@@ -22,8 +22,7 @@ from diffdrive_jacobian.numerics.formula import formula
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.simulation import closed_loops
-from diffdrive_jacobian.sweeps import Setup, sweep, table
+from diffdrive_jacobian.simulation import Setup, closed_loops, sweep, table
 from diffdrive_jacobian.tools import sweep_gains
 from diffdrive_jacobian.tools.run_node import run_node
 

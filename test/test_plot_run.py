@@ -18,17 +18,17 @@ from processes import PROGRAM
 from ros_messages import goal, goals, joint_command, twist, twist_stamped
 from test_reading import REAL, SECOND, changed, odom, start, status, write_bag
 
+from diffdrive_jacobian.bags import time_series as _lines
+from diffdrive_jacobian.bags import timeline as _trace
+from diffdrive_jacobian.bags.run_reader import BagError, read_run
+from diffdrive_jacobian.bags.time_series import limits, line
+from diffdrive_jacobian.bags.timeline import trace
 from diffdrive_jacobian.kinematics.se2 import integrate, wrap_angle
 from diffdrive_jacobian.plots import output_files
 from diffdrive_jacobian.plots import run_figure as _figure
 from diffdrive_jacobian.plots.rendering import render
 from diffdrive_jacobian.plots.run_figure import LABELS, figure, names
 from diffdrive_jacobian.plots.run_table import COLUMNS, decimal_seconds
-from diffdrive_jacobian.reading import time_series as _lines
-from diffdrive_jacobian.reading import trace as _trace
-from diffdrive_jacobian.reading.reader import BagError, read_run
-from diffdrive_jacobian.reading.time_series import limits, line
-from diffdrive_jacobian.reading.trace import trace
 from diffdrive_jacobian.signals import CAUGHT, Signals
 from diffdrive_jacobian.tools.plot_run import main
 

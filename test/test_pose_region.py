@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from moments_reference import DRIVES, noisy_runs, reported_path
 
+from diffdrive_jacobian.bags.run import COLUMNS, Run, Series
+from diffdrive_jacobian.bags.timeline import trace
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.plots.run_figure import figure
 from diffdrive_jacobian.plots.uncertainty import ELLIPSE_LABEL, REGION_LABEL, uncertainties
-from diffdrive_jacobian.reading.run import COLUMNS, Run, Series
-from diffdrive_jacobian.reading.trace import trace
 from diffdrive_jacobian.simulation import Robot, RobotModel
 from diffdrive_jacobian.simulation.exact_moments import gaussian, propagate_moments
 from diffdrive_jacobian.simulation.pose_region import (

@@ -24,16 +24,16 @@ from ruamel.yaml import YAML
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
+from diffdrive_jacobian.bags import run as run_module
+from diffdrive_jacobian.bags import timeline as trace_module
 from diffdrive_jacobian.bags.bag_writer import build_bag
 from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Text
 from diffdrive_jacobian.bags.known_types import known_structure
 from diffdrive_jacobian.bags.message_definitions import definition
+from diffdrive_jacobian.bags.run_reader import BagError, Run, read_run
 from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.codecs import GOALS
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
-from diffdrive_jacobian.reading import run as run_module
-from diffdrive_jacobian.reading import trace as trace_module
-from diffdrive_jacobian.reading.reader import BagError, Run, read_run
 
 SECOND = 1_000_000_000
 FIELDS = (

@@ -22,8 +22,8 @@ from test_reading import count_more
 from diffdrive_jacobian.bags.message_definitions import definition
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.replay.lateness import Lateness
-from diffdrive_jacobian.replay.replayer import Replayer
+from diffdrive_jacobian.recording.lateness import Lateness
+from diffdrive_jacobian.recording.replayer import Replayer
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.testing import Lockstep
 from diffdrive_jacobian.tools import replay_run

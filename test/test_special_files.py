@@ -8,8 +8,7 @@ import shutil
 import pytest
 from test_damaged_bags import COUNT, make_bag
 
-from diffdrive_jacobian.reading import BagError, read_run
-from diffdrive_jacobian.recovery import NotABagError, recover
+from diffdrive_jacobian.bags import BagError, NotABagError, read_run, recover
 
 
 @pytest.fixture(scope='module', params=['mcap', 'sqlite3'])

@@ -9,12 +9,12 @@ import pytest
 from action_msgs.msg import GoalStatus
 from nav_msgs.msg import Odometry
 
+from diffdrive_jacobian.nodes import standstill
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
-from diffdrive_jacobian.ros import standstill
-from diffdrive_jacobian.ros.goal_client import GoalClient
-from diffdrive_jacobian.ros.remote_goal import GoalResult, Result, _Session, _Silent
+from diffdrive_jacobian.nodes.goal_client import GoalClient
+from diffdrive_jacobian.nodes.remote_goal import GoalResult, Result, _Session, _Silent
+from diffdrive_jacobian.nodes.standstill import Standstill
 from diffdrive_jacobian.ros.runner import discovery_off, ros_context, running
-from diffdrive_jacobian.ros.standstill import Standstill
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools import send_goal
 

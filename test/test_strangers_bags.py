@@ -15,10 +15,10 @@ from ros_messages import odometry
 from test_reading import write_bag
 from test_recover import recover
 
+from diffdrive_jacobian.bags import BagError, read_run
 from diffdrive_jacobian.bags.bag_reader import find_damage
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.file import robot_parameters
-from diffdrive_jacobian.reading import BagError, read_run
 
 GOOD = mcap(topic_records() + message(serialize_message(odometry(1.0, 0.0, 0.0))))
 HEADROOM = 300 * MIB

@@ -32,14 +32,20 @@ from diffdrive_jacobian.plots import output_files
 from diffdrive_jacobian.plots import sweep_figure as _sweep_figure
 from diffdrive_jacobian.plots.sweep_figure import TITLES, figure
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.simulation import RobotModel, closed_loops
-from diffdrive_jacobian.sweeps import Setup, describe, sweep, table
-from diffdrive_jacobian.sweeps.sweep import MEASURES, columns
+from diffdrive_jacobian.simulation import (
+    RobotModel,
+    SweepSetup,
+    closed_loops,
+    describe_sweep,
+    sweep,
+    sweep_table,
+)
+from diffdrive_jacobian.simulation.gain_sweep import MEASURES, columns
 from diffdrive_jacobian.tools import sweep_gains
 from diffdrive_jacobian.tools.sweep_gains import main
 
 CONFIG = Path(__file__).parents[1] / 'config'
-SMALL = Setup(grid=5, starts=3, rate=20.0)
+SMALL = SweepSetup(grid=5, starts=3, rate=20.0)
 """The least kp with the largest kv does not arrive from everywhere."""
 QUICK = ('--grid', '3', '--starts', '2', '--duration', '20', '--rate', '10')
 small = cache(lambda: sweep(SMALL))
@@ -127,7 +133,7 @@ def final_heading_error(kp, kv):
 
 def test_beyond_the_boundary_it_spirals_in_as_the_theory_says():
     """The distance decays as exp(-kv cos^2(e) t), with the heading error e at which it settles."""
-    setup = Setup(gains={'kp': (0.5, 2.0), 'kv': (0.5, 2.0)}, grid=4, starts=4, duration=80.0)
+    setup = SweepSetup(gains={'kp': (0.5, 2.0), 'kv': (0.5, 2.0)}, grid=4, starts=4, duration=80.0)
     near, nearer = (sweep(replace(setup, tolerance=tolerance)) for tolerance in (2e-3, 2e-5))
     assert near.complete.all()
     assert nearer.complete.all()
@@ -145,7 +151,7 @@ def test_beyond_the_boundary_it_spirals_in_as_the_theory_says():
 
 
 def test_beyond_the_boundary_paths_and_times_are_longer():
-    swept = sweep(Setup(gains={'kp': (0.25, 4.0), 'kv': (0.999, 1.001)}, grid=16, starts=6))
+    swept = sweep(SweepSetup(gains={'kp': (0.25, 4.0), 'kv': (0.999, 1.001)}, grid=16, starts=6))
     spirals = swept.x < 1.0
     assert spirals.sum() == 3
     for measure in ('time', 'path_length'):
@@ -158,7 +164,7 @@ def test_beyond_the_boundary_paths_and_times_are_longer():
 
 @pytest.mark.parametrize('count', [1, 2, 7, 12, 16])
 def test_starts_lie_evenly_around_the_goal_and_face_all_directions(count):
-    poses = Setup(starts=count, distance=3.0).poses()
+    poses = SweepSetup(starts=count, distance=3.0).poses()
     assert poses.shape == (count, 3)
     assert np.hypot(poses[:, 0], poses[:, 1]) == pytest.approx(3.0)
     bearings = np.sort(np.arctan2(poses[:, 1], poses[:, 0]) % math.tau)
@@ -169,7 +175,7 @@ def test_starts_lie_evenly_around_the_goal_and_face_all_directions(count):
 
 
 def test_gains_are_decimals():
-    setup = Setup()
+    setup = SweepSetup()
     assert setup.values(KP).tolist() == [round(0.2 + 0.1 * index, 1) for index in range(59)]
     assert setup.values(KV).tolist() == [round(0.1 + 0.05 * index, 2) for index in range(59)]
     assert (setup.values(KP)[28], setup.values(KV)[8]) == (3.0, 0.5)
@@ -291,7 +297,7 @@ def test_csv_holds_the_numbers(folder, capsys):
 
 
 def test_what_did_not_arrive_is_empty_in_the_csv(capsys):
-    rows = table(sweep(replace(SMALL, grid=2, duration=1.0))).splitlines()
+    rows = sweep_table(sweep(replace(SMALL, grid=2, duration=1.0))).splitlines()
     assert rows[1:] == [f'{kp},{kv},3,0,,,,,,' for kp in (0.2, 6.0) for kv in (0.1, 3.0)]
     assert run(*QUICK, '--duration', 1, '--csv', 'a.csv') == 0
     out = capsys.readouterr().out.splitlines()
@@ -299,7 +305,7 @@ def test_what_did_not_arrive_is_empty_in_the_csv(capsys):
 
 
 def test_the_same_call_gives_the_same_numbers():
-    assert table(sweep(SMALL)) == table(small())
+    assert sweep_table(sweep(SMALL)) == sweep_table(small())
 
 
 # --- Options
@@ -318,7 +324,7 @@ def test_the_same_call_gives_the_same_numbers():
     ids=lambda value: ' '.join(value) if isinstance(value, tuple) else '',
 )
 def test_options_are_what_is_swept(monkeypatch, arguments, changes):
-    assert setup_of(monkeypatch, *arguments) == replace(Setup(robot=NO_LIMITS), **changes)
+    assert setup_of(monkeypatch, *arguments) == replace(SweepSetup(robot=NO_LIMITS), **changes)
 
 
 NO_LIMITS = RobotModel(command_timeout=500_000_000)
@@ -462,12 +468,12 @@ def test_the_users_style_does_not_matter():
 
 
 def test_it_says_which_gains_are_the_fastest():
-    assert describe(small()).startswith(
+    assert describe_sweep(small()).startswith(
         'fastest: kp 6, kv 3 (the largest kp and the largest kv of the grid): at the goal after 1.'
     )
     # Asked that seldom, it overshoots with large gains.
-    words = describe(
-        sweep(Setup(grid=7, starts=3, gains={'kp': (0.5, 5.0), 'kv': (0.5, 3.0)}, rate=2.0))
+    words = describe_sweep(
+        sweep(SweepSetup(grid=7, starts=3, gains={'kp': (0.5, 5.0), 'kv': (0.5, 3.0)}, rate=2.0))
     )
     assert 'of the grid' not in words
 
@@ -540,11 +546,11 @@ def test_invalid_parameters_are_reported(folder, capsys):
 def test_a_setup_checks_itself():
     for changes in ({'rate': math.nan}, {'duration': -1.0}, {'tolerance': math.inf}):
         with pytest.raises(ValueError, match=f'{next(iter(changes))} must be positive and finite'):
-            Setup(**changes)
+            SweepSetup(**changes)
     with pytest.raises(ValueError, match="controller must be one of 'go_to_goal', 'offset_point'"):
-        Setup(controller='other')
+        SweepSetup(controller='other')
     with pytest.raises(ValueError, match="gains must be of kv, offset, those of 'offset_point'"):
-        Setup(controller='offset_point', gains={'kp': 1.0})
+        SweepSetup(controller='offset_point', gains={'kp': 1.0})
 
 
 @pytest.mark.parametrize('option', ['-o', '--csv'])

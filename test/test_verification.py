@@ -15,14 +15,14 @@ from recorded import recorded
 from ros_messages import goal, goals, twist, twist_stamped
 from std_srvs.srv import Trigger
 
+from diffdrive_jacobian.bags import BagError, read_run
+from diffdrive_jacobian.bags.covariance_rule import EXACT_MOMENTS, NEITHER, rule, start_covariances
+from diffdrive_jacobian.bags.run import COLUMNS, Run, Series
+from diffdrive_jacobian.bags.verification import verify
 from diffdrive_jacobian.kinematics.se2 import integrate
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.reading import BagError, read_run
-from diffdrive_jacobian.reading.covariance_rule import EXACT_MOMENTS, NEITHER, rule, start_covariances
-from diffdrive_jacobian.reading.run import COLUMNS, Run, Series
-from diffdrive_jacobian.reading.verification import verify
 from diffdrive_jacobian.simulation.odometry_noise import propagate_covariance
 from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.simulation.robot_model import RobotModel

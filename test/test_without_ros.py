@@ -16,9 +16,9 @@ from rclpy.serialization import serialize_message
 from ros_messages import goal, goals, joint_command, twist_stamped
 from test_reading import SECOND, changed, odom, start, status, write_bag
 
+from diffdrive_jacobian.bags import read_run, verify
 from diffdrive_jacobian.bags.journal import Channel, JournalWriter, Message
 from diffdrive_jacobian.bags.known_types import known_definition
-from diffdrive_jacobian.reading import read_run, verify
 from diffdrive_jacobian.tools.entry_points import ROS_MODULES
 
 CONFIG = Path(__file__).parents[1] / 'config' / 'turtlebot3_burger.yaml'
@@ -33,7 +33,7 @@ WITHOUT_ROS = (
 BAG = Path(__file__).parent / 'bags' / 'turtlebot3_fake_sqlite'
 """Recorded with ros2 bag record."""
 READ = """
-from diffdrive_jacobian.reading import read_run, verify
+from diffdrive_jacobian.bags import read_run, verify
 run = read_run(sys.argv[1])
 print(len(run.odometry), run.skipped, repr(run.odometry.values.sum()), verify(run).source)
 """

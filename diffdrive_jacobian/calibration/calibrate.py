@@ -11,6 +11,7 @@ from diffdrive_jacobian.calibration.clock import time_offset
 from diffdrive_jacobian.calibration.consistency import misfit
 from diffdrive_jacobian.calibration.estimate import TIME_OFFSETS, YAW_OFFSET, Estimate
 from diffdrive_jacobian.calibration.fit import fit
+from diffdrive_jacobian.calibration.initial_estimate import rough, unit
 from diffdrive_jacobian.calibration.measurements import (
     Array,
     CalibrationError,
@@ -21,6 +22,7 @@ from diffdrive_jacobian.calibration.measurements import (
 )
 from diffdrive_jacobian.calibration.motion import Geometry, composed
 from diffdrive_jacobian.calibration.observability import UNDETERMINED, undetermined
+from diffdrive_jacobian.calibration.poses_at_rest import merged
 from diffdrive_jacobian.calibration.preparation import (
     overlapping,
     sampling_notes,
@@ -29,8 +31,6 @@ from diffdrive_jacobian.calibration.preparation import (
     without,
     without_jumps,
 )
-from diffdrive_jacobian.calibration.rest import merged
-from diffdrive_jacobian.calibration.rough import rough, unit
 from diffdrive_jacobian.numerics.elementary import wrap
 
 PARAMETERS = (

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.calibration.encoder import densified, located, poses_apart
+from diffdrive_jacobian.calibration.initial_estimate import Rough
 from diffdrive_jacobian.calibration.measurements import (
     Array,
     CalibrationError,
     Recording,
     Segment,
 )
-from diffdrive_jacobian.calibration.rough import Rough
 
 GAP = 0.5
 """A shorter pause between samples is not a gap (s)."""

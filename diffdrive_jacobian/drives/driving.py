@@ -27,12 +27,12 @@ from diffdrive_jacobian.drives.runners import NAME, in_lockstep, in_real_time
 from diffdrive_jacobian.messages.codecs import JOINT_STATE, Wheels
 from diffdrive_jacobian.messages.errors import MessageError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.goal_client import GoalClient
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.recording.selection import Selection
-from diffdrive_jacobian.ros.goal_client import GoalClient
 from diffdrive_jacobian.ros.node_runner import NodeRunner
 from diffdrive_jacobian.ros.serialization import ignoring_invalid
 from diffdrive_jacobian.signals import Signals

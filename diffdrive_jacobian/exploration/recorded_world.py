@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from diffdrive_jacobian.bags import BagError, read_run
 from diffdrive_jacobian.exploration.trial import Setting, Trial, run
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.plots.fault_marks import ViolationMark
 from diffdrive_jacobian.plots.run_figure import draw
-from diffdrive_jacobian.reading import BagError, read_run
 from diffdrive_jacobian.recording.recorder import Recorder, Selection
 from diffdrive_jacobian.recording.recording import Recording, RecordingError
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.bags.timeline import jumps
 from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.live import settings
 from diffdrive_jacobian.live.commands import Command, Pause, Seek, SetSpeed, Step
@@ -22,7 +23,6 @@ from diffdrive_jacobian.live.session import Session, Snapshot
 from diffdrive_jacobian.live.trail import MAX_POINTS, Trail
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.messages.topics import SENSORS
-from diffdrive_jacobian.reading.trace import jumps
 
 Array = NDArray[np.float64]
 PERIOD = 1.0 / 30.0

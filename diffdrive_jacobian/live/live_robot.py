@@ -38,7 +38,7 @@ from diffdrive_jacobian.messages.covariances import from_covariance
 from diffdrive_jacobian.messages.errors import MessageError
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.messages.topics import SENSORS
-from diffdrive_jacobian.ros.remote_goal import ignores_heading
+from diffdrive_jacobian.nodes.remote_goal import ignores_heading
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS, seconds
 

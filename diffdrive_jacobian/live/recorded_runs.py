@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.bag_reader import BagError, base_name, namespace_of, open_bag
+from diffdrive_jacobian.bags.run import Run, Series
+from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.timeline import Trace, seconds, trace
 from diffdrive_jacobian.messages.covariances import from_covariance
 from diffdrive_jacobian.messages.errors import MessageError
 from diffdrive_jacobian.messages.topics import TOPICS
-from diffdrive_jacobian.reading.reader import read_run
-from diffdrive_jacobian.reading.run import Run, Series
-from diffdrive_jacobian.reading.trace import Trace, seconds, trace
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 Array = NDArray[np.float64]

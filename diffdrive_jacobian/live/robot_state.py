@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.bags.run import number
+from diffdrive_jacobian.bags.timeline import heading_counts
 from diffdrive_jacobian.control import Arrival, LawError
 from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
@@ -22,8 +24,6 @@ from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
-from diffdrive_jacobian.reading.run import number
-from diffdrive_jacobian.reading.trace import heading_counts
 
 ROBOT_DEFAULTS = VirtualRobotParameters()
 CONTROLLER_DEFAULTS = GoToGoalParameters()

@@ -25,7 +25,6 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from diffdrive_jacobian.diagnosis.lasting import Interleaving
 from diffdrive_jacobian.kinematics.se2 import wrap_angle
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.codecs import (
@@ -42,7 +41,7 @@ from diffdrive_jacobian.messages.codecs import (
 from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.messages.covariances import from_covariance
 from diffdrive_jacobian.nodes.command_time import command_time
-from diffdrive_jacobian.nodes.condition import Condition
+from diffdrive_jacobian.nodes.robot_defects import Condition
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.ros.graph_faults import (
     ALTERNATION_PATIENCE,
@@ -51,6 +50,7 @@ from diffdrive_jacobian.ros.graph_faults import (
     several_publishers,
     unpublished,
 )
+from diffdrive_jacobian.ros.lasting import Interleaving
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.rclpy_internals import change_timer_period, log_info
 from diffdrive_jacobian.simulation.robot import Robot

@@ -9,7 +9,6 @@ from geometry_msgs.msg import Twist, TwistStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from diffdrive_jacobian.diagnosis.lasting import Interleaving
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.messages.codecs import (
     JOINT_STATE,
@@ -23,6 +22,7 @@ from diffdrive_jacobian.messages.conversion import MessageError
 from diffdrive_jacobian.nodes.command_time import command_time
 from diffdrive_jacobian.parameters.wheel_bridge import WheelBridgeParameters
 from diffdrive_jacobian.ros.graph_faults import ALTERNATION_PATIENCE, alternating_commands, unread
+from diffdrive_jacobian.ros.lasting import Interleaving
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
 from diffdrive_jacobian.ros.watchdog import Watchdog
 from diffdrive_jacobian.time_units import nanoseconds

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from diffdrive_jacobian.bags.time_series import line
 from diffdrive_jacobian.calibration.calibrate import Calibration
 from diffdrive_jacobian.calibration.errors import Track, compared_distance, rms, tracks
 from diffdrive_jacobian.plots.rendering import render
 from diffdrive_jacobian.plots.style import styled
-from diffdrive_jacobian.reading.time_series import line
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

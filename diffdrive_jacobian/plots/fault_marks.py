@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from diffdrive_jacobian.reading.run import Run, Series
-from diffdrive_jacobian.reading.trace import Trace, seconds
+from diffdrive_jacobian.bags.run import Run, Series
+from diffdrive_jacobian.bags.timeline import Trace, seconds
 from diffdrive_jacobian.text import printable
 
 if TYPE_CHECKING:

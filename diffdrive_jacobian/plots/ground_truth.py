@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from diffdrive_jacobian.reading.run import Run
-from diffdrive_jacobian.reading.time_series import line
-from diffdrive_jacobian.reading.trace import jumps
+from diffdrive_jacobian.bags.run import Run
+from diffdrive_jacobian.bags.time_series import line
+from diffdrive_jacobian.bags.timeline import jumps
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

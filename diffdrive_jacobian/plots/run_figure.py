@@ -17,6 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from diffdrive_jacobian.bags.run import Run
+from diffdrive_jacobian.bags.time_series import commanded, limits, line, measured
+from diffdrive_jacobian.bags.timeline import Array, Trace, tolerance, trace
 from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.plots.fault_marks import ViolationMark, mark_faults
 from diffdrive_jacobian.plots.ground_truth import draw_ground_truth, ground_truth_mark
@@ -24,9 +27,6 @@ from diffdrive_jacobian.plots.output_files import FORMATS, create
 from diffdrive_jacobian.plots.rendering import render
 from diffdrive_jacobian.plots.style import styled
 from diffdrive_jacobian.plots.uncertainty import draw_uncertainty, uncertainty_marks
-from diffdrive_jacobian.reading.run import Run
-from diffdrive_jacobian.reading.time_series import commanded, limits, line, measured
-from diffdrive_jacobian.reading.trace import Array, Trace, tolerance, trace
 
 __all__ = ['draw', 'figure']
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.bags.run import Run, Series
+from diffdrive_jacobian.bags.timeline import Trace, seconds, trace
 from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.plots.output_files import create
-from diffdrive_jacobian.reading.run import Run, Series
-from diffdrive_jacobian.reading.trace import Trace, seconds, trace
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 __all__ = ['COLUMNS', 'table', 'write_csv']

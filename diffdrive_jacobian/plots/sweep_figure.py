@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
     from numpy.typing import NDArray
 
-    from diffdrive_jacobian.sweeps.sweep import Setup, Sweep
+    from diffdrive_jacobian.simulation.gain_sweep import Sweep, SweepSetup
 
 SIZE = (13.0, 5.2)
 """Size of the picture (inches)."""
@@ -83,7 +83,7 @@ def figure(swept: Sweep) -> Figure:
     return drawn
 
 
-def describe(setup: Setup) -> str:
+def describe(setup: SweepSetup) -> str:
     """Return two lines about the settings of a sweep."""
     limits = setup.robot.limits
     bounds = [
@@ -162,7 +162,7 @@ def _edges(centres: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([centres[:1], (centres[1:] + centres[:-1]) / 2.0, centres[-1:]])
 
 
-def _draw_boundary(panel: Axes, setup: Setup) -> None:
+def _draw_boundary(panel: Axes, setup: SweepSetup) -> None:
     """Draw the boundary of the controller where it lies in the picture, with its equation if it fits."""
     from matplotlib.patheffects import withStroke
 
@@ -188,7 +188,7 @@ def _draw_boundary(panel: Axes, setup: Setup) -> None:
         )
 
 
-def _visible_boundary(setup: Setup) -> tuple[float, float]:
+def _visible_boundary(setup: SweepSetup) -> tuple[float, float]:
     """Return the first and the last kv of the boundary in the picture; not ascending: there is none."""
     boundary = setup.resolved_controller.boundary
     if boundary is None or setup.axes != (KP, KV):

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from diffdrive_jacobian.bags.timeline import Array, Indices, Trace
 from diffdrive_jacobian.messages.topics import TOPICS
-from diffdrive_jacobian.reading.trace import Array, Indices, Trace
 from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose
 from diffdrive_jacobian.simulation.pose_region import (
     ELLIPSE_LEVEL,

@@ -14,8 +14,8 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
-from diffdrive_jacobian.diagnosis.lasting import Interleaving
 from diffdrive_jacobian.messages.topics import SAME_NAMES, TOPICS
+from diffdrive_jacobian.ros.lasting import Interleaving
 from diffdrive_jacobian.ros.shared_graph import SharedGraph
 from diffdrive_jacobian.text import listed, printable
 

@@ -23,7 +23,6 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 
-from diffdrive_jacobian.diagnosis.lasting import Interleaving, LastingFault
 from diffdrive_jacobian.messages.cdr import DecodingError
 from diffdrive_jacobian.messages.codecs import Codec
 from diffdrive_jacobian.messages.integers import integer_warning
@@ -31,6 +30,7 @@ from diffdrive_jacobian.parameters.declaration import NodeParameters, ParameterE
 from diffdrive_jacobian.ros import parameters as ros_parameters
 from diffdrive_jacobian.ros.input_guard import THROTTLE as THROTTLE
 from diffdrive_jacobian.ros.input_guard import guard_inputs
+from diffdrive_jacobian.ros.lasting import Interleaving, LastingFault
 from diffdrive_jacobian.ros.rate_limit import RateLimit
 from diffdrive_jacobian.ros.rclpy_internals import declare_qos, log_info, time_reader
 from diffdrive_jacobian.ros.serialization import decoding

@@ -9,11 +9,11 @@ from builtin_interfaces.msg import Time
 from nav_msgs.msg import Goals
 from rclpy.serialization import deserialize_message
 
-from diffdrive_jacobian.diagnosis.lasting import Interleaving
 from diffdrive_jacobian.messages.cdr import DecodingError, Reader
 from diffdrive_jacobian.messages.codecs import GOALS_HEADER, Codec
 from diffdrive_jacobian.messages.errors import MessageError
 from diffdrive_jacobian.messages.structure import PLAIN
+from diffdrive_jacobian.ros.lasting import Interleaving
 from diffdrive_jacobian.ros.rclpy_internals import with_message_info
 
 V = TypeVar('V')

@@ -6,10 +6,10 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
+from diffdrive_jacobian.bags import BagError, read_run
 from diffdrive_jacobian.bags.journal import journal_of
 from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.plots.run_figure import draw
-from diffdrive_jacobian.reading import BagError, read_run
 from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording, RecordingError
 from diffdrive_jacobian.recording.selection import Selection

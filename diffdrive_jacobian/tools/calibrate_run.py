@@ -10,6 +10,10 @@ from pathlib import Path
 
 from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
 from diffdrive_jacobian.calibration import Calibration, CalibrationError, Geometry, Given, calibrate
+from diffdrive_jacobian.calibration.data import (
+    WheelsAndReference,
+    read_wheels_and_reference,
+)
 from diffdrive_jacobian.calibration.description import (
     describe,
     explain_undetermined,
@@ -19,10 +23,6 @@ from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.numerics.fields import between
 from diffdrive_jacobian.plots.calibration_figure import draw
 from diffdrive_jacobian.plots.output_files import create, new_file
-from diffdrive_jacobian.reading.calibration_data import (
-    WheelsAndReference,
-    read_wheels_and_reference,
-)
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli

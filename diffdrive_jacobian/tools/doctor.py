@@ -86,7 +86,7 @@ def _observe(options: argparse.Namespace, ros: Sequence[str], signals: Signals) 
         # Not above: --help needs no ROS, and a diagnosis without ROS is one as well.
         from rclpy import get_rmw_implementation_identifier
 
-        from diffdrive_jacobian.ros.observation import observe
+        from diffdrive_jacobian.diagnosis.observation import observe
 
     if not options.json:
         print(

@@ -9,14 +9,14 @@ from functools import partial
 from pathlib import Path
 
 from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
+from diffdrive_jacobian.bags.run import Run
+from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.timeline import trace
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.messages.topics import READABLE
 from diffdrive_jacobian.plots.output_files import FORMATS, NOT_OVERWRITTEN, check_directory
 from diffdrive_jacobian.plots.run_figure import draw, names
 from diffdrive_jacobian.plots.run_table import DECIMALS, write_csv
-from diffdrive_jacobian.reading.reader import read_run
-from diffdrive_jacobian.reading.run import Run
-from diffdrive_jacobian.reading.trace import trace
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli

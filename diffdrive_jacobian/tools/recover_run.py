@@ -9,7 +9,7 @@ from pathlib import Path
 
 from diffdrive_jacobian.bags.bag_writer import STORAGES
 from diffdrive_jacobian.bags.journal import JournalError
-from diffdrive_jacobian.recovery.recover import (
+from diffdrive_jacobian.bags.recovery import (
     RECOVERED,
     NotABagError,
     NothingToSaveError,

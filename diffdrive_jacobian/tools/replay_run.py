@@ -18,7 +18,7 @@ from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._startup import long_lived
 
 if TYPE_CHECKING:
-    from diffdrive_jacobian.replay import ReplayResult
+    from diffdrive_jacobian.recording import ReplayResult
 
 PROGRAM = 'replay_run'
 VERIFY = '--verify'
@@ -28,7 +28,7 @@ MATCH_PATIENCE = 5.0
 
 def _replay(bag: Path, options: argparse.Namespace, ros: Sequence[str], signals: Signals) -> int:
     with long_lived(), signals.ending_at_once():
-        from diffdrive_jacobian.replay import COMMANDS, GOALS, NothingToPlayError, Playback, replay
+        from diffdrive_jacobian.recording import COMMANDS, GOALS, NothingToPlayError, Playback, replay
 
     playback = Playback(
         names=None if options.all_topics else GOALS if options.goals else COMMANDS,
@@ -97,7 +97,7 @@ class _Progress:
 
 def _report(result: ReplayResult, options: argparse.Namespace) -> int:
     """Print what became of a replay; return the exit code."""
-    from diffdrive_jacobian.replay import describe_too_few
+    from diffdrive_jacobian.recording import describe_too_few
 
     if not result.started:
         counts = describe_too_few(result.too_few, options.readers)

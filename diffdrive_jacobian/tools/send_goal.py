@@ -15,7 +15,7 @@ from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._startup import long_lived
 
 if TYPE_CHECKING:
-    from diffdrive_jacobian.ros.remote_goal import GoalResult
+    from diffdrive_jacobian.nodes.remote_goal import GoalResult
 
 PROGRAM = 'send_goal'
 
@@ -29,7 +29,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     _cli.refuse_with(parser, options, '--timeout', '--no-wait')
     with long_lived(), signals.ending_at_once():
         # Not above: --help needs no ROS.
-        from diffdrive_jacobian.ros.remote_goal import send_goal
+        from diffdrive_jacobian.nodes.remote_goal import send_goal
 
     try:
         with _Progress(f'goal ({options.x:g}, {options.y:g})') as progress:
@@ -95,7 +95,7 @@ class _Progress:
 
 def _report(result: GoalResult, options: argparse.Namespace) -> list[str]:
     """Return lines that describe what became of a goal."""
-    from diffdrive_jacobian.ros.remote_goal import ANSWER_PATIENCE, Result
+    from diffdrive_jacobian.nodes.remote_goal import ANSWER_PATIENCE, Result
 
     where = '' if result.distance is None else f', {result.distance:.3f} m from the goal'
     lines = {

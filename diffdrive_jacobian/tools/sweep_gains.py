@@ -18,7 +18,14 @@ from diffdrive_jacobian.plots import sweep_figure
 from diffdrive_jacobian.plots.output_files import FORMATS, create, extension, free_stem, new_file
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.simulation import RobotModel
-from diffdrive_jacobian.sweeps.sweep import MAX_LOOPS, Setup, Sweep, describe, sweep, table
+from diffdrive_jacobian.simulation.gain_sweep import (
+    MAX_LOOPS,
+    Sweep,
+    SweepSetup,
+    describe_sweep,
+    sweep,
+    sweep_table,
+)
 from diffdrive_jacobian.tools import _cli
 from diffdrive_jacobian.tools._waiting import busy
 
@@ -48,7 +55,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
         swept = _sweep(options, signals)
         with busy(PROGRAM, 'drawing'):
             drawn = b'' if picture is None else sweep_figure.draw(swept, extension(picture))
-        rows = b'' if numbers is None else table(swept).encode()
+        rows = b'' if numbers is None else sweep_table(swept).encode()
         _check(signals)
         if options.output is None and options.csv is None:
             # Other processes that started in the same second may have taken the names meanwhile.
@@ -69,7 +76,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
     except OSError as error:
         return _cannot_write(error.filename, error)
     code = _write([(numbers, rows), (picture, drawn)], replace=options.force)
-    print(describe(swept))
+    print(describe_sweep(swept))
     return code
 
 
@@ -81,7 +88,7 @@ def _sweep(options: argparse.Namespace, signals: Signals) -> Sweep:
         UserError: The parameter file is invalid.
         SweepInterruptedError: A signal was caught.
     """
-    setup = Setup(
+    setup = SweepSetup(
         controller=options.controller,
         gains=_gains(options),
         grid=options.grid,
@@ -112,7 +119,7 @@ def _controller(own: Sequence[str]) -> Controller:
         ControllerError: There is none of that name, or it cannot be loaded.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument('--controller', nargs='?', default=Setup().controller)
+    parser.add_argument('--controller', nargs='?', default=SweepSetup().controller)
     name = parser.parse_known_args(own)[0].controller
     return CONTROLLERS.find(name or '')
 
@@ -207,7 +214,7 @@ def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:
         'Existing files are not overwritten without --force. Exit code 0: done; 1: a file cannot be '
         'written; 2: wrong arguments; 130: interrupted, and nothing was written.',
     )
-    usual = Setup()
+    usual = SweepSetup()
     parser.add_argument(
         '--grid',
         metavar='N',

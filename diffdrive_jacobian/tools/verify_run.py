@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from diffdrive_jacobian.bags.bag_reader import BagError, ReadingInterruptedError
+from diffdrive_jacobian.bags.covariance_rule import EXACT_MOMENTS, FIRST_ORDER, NEITHER
+from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.verification import BY_RECORDING_TIME, EXACT, Verification, verify
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.parameters.declaration import ParameterError
 from diffdrive_jacobian.parameters.file import robot_parameters
-from diffdrive_jacobian.reading.covariance_rule import EXACT_MOMENTS, FIRST_ORDER, NEITHER
-from diffdrive_jacobian.reading.reader import read_run
-from diffdrive_jacobian.reading.verification import BY_RECORDING_TIME, EXACT, Verification, verify
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 from diffdrive_jacobian.tools import _cli

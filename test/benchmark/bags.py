@@ -69,8 +69,8 @@ def replay(bag):
     from nav_msgs.msg import Odometry
     from rclpy.node import Node
 
-    from diffdrive_jacobian.reading.reader import open_bag
-    from diffdrive_jacobian.replay import Playback, Replayer
+    from diffdrive_jacobian.bags.run_reader import open_bag
+    from diffdrive_jacobian.recording import Playback, Replayer
     from diffdrive_jacobian.ros.runner import ros_context, running
 
     playback = Playback(names=None)

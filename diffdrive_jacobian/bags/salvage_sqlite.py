@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 from diffdrive_jacobian.bags.files import SQLITE_MAGIC
 from diffdrive_jacobian.bags.journal import Message
 from diffdrive_jacobian.bags.limits import Budget, check_record
-from diffdrive_jacobian.recovery.salvage_mcap import Found, Note, Topic
+from diffdrive_jacobian.bags.salvage_mcap import Found, Note, Topic
 
 _LEAF = 0x0D
 _WIDTHS = (0, 1, 2, 3, 4, 6, 8, 8, 0, 0)  # of the serial types below 10

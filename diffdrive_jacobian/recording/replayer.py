@@ -18,8 +18,8 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from diffdrive_jacobian.bags.bag_reader import BagError, messages
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError, message_class
 from diffdrive_jacobian.messages.conversion import set_time
-from diffdrive_jacobian.replay.lateness import Lateness
-from diffdrive_jacobian.replay.playback import NODE, NothingToPlayError, Playback
+from diffdrive_jacobian.recording.lateness import Lateness
+from diffdrive_jacobian.recording.playback import NODE, NothingToPlayError, Playback
 from diffdrive_jacobian.ros.qos import publisher_profile
 from diffdrive_jacobian.ros.rclpy_internals import RCLError, reason, restart_timer
 

@@ -6,7 +6,7 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 
 from diffdrive_jacobian.bags.known_types import known_definition
 from diffdrive_jacobian.bags.message_definitions import Definition, UnknownTypeError, definition
-from diffdrive_jacobian.recovery.salvage_mcap import Topic
+from diffdrive_jacobian.bags.salvage_mcap import Topic
 
 MAX_DEFINITION = 200_000
 """Length of the longest definition of a type that is parsed; those of ROS have less than a tenth."""

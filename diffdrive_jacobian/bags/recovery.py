@@ -12,6 +12,8 @@ from pathlib import Path
 
 from diffdrive_jacobian.bags.bag_reader import find_damage
 from diffdrive_jacobian.bags.bag_writer import Summary, build_bag
+from diffdrive_jacobian.bags.damaged_bag import DamagedBag
+from diffdrive_jacobian.bags.decoding_check import DecodingCheck
 from diffdrive_jacobian.bags.files import NotABagError as NotABagError
 from diffdrive_jacobian.bags.journal import (
     JOURNAL,
@@ -25,8 +27,6 @@ from diffdrive_jacobian.bags.journal import (
     journal_of,
 )
 from diffdrive_jacobian.errors import DiffdriveError
-from diffdrive_jacobian.recovery.damaged_bag import DamagedBag
-from diffdrive_jacobian.recovery.decoding_check import DecodingCheck
 from diffdrive_jacobian.text import printable
 
 RECOVERED = '_recovered'

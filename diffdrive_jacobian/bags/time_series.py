@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from diffdrive_jacobian.bags.run import Series, number
+from diffdrive_jacobian.bags.timeline import Array, Indices, Mask, Trace, seconds
 from diffdrive_jacobian.messages.topics import SENSORS
-from diffdrive_jacobian.reading.run import Series, number
-from diffdrive_jacobian.reading.trace import Array, Indices, Mask, Trace, seconds
 
 BUCKETS = 1500
 """A longer line is reduced to the minimum and the maximum of so many parts."""

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.bags.run import Run, Series
 from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
-from diffdrive_jacobian.reading.run import Run, Series
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 Array = NDArray[np.float64]

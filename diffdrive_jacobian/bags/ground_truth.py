@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.bags.run import Run
 from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros
 from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
-from diffdrive_jacobian.reading.run import Run
 from diffdrive_jacobian.simulation.robot import Robot
 from diffdrive_jacobian.simulation.slip import Drift
 

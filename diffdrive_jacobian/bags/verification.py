@@ -19,24 +19,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.messages.conversion import MessageError, plausible_twist
-from diffdrive_jacobian.numerics.elementary import wrap
-from diffdrive_jacobian.parameters.declaration import from_ros, specifications
-from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
-from diffdrive_jacobian.reading.covariance_rule import (
+from diffdrive_jacobian.bags.covariance_rule import (
     NEITHER,
     recorded_dynamics,
     recorded_model,
     rule,
     start_covariances,
 )
-from diffdrive_jacobian.reading.ground_truth import (
+from diffdrive_jacobian.bags.ground_truth import (
     TruthDifferences,
     placed_as_recorded,
     truth_differences,
 )
-from diffdrive_jacobian.reading.reader import BagError, ReadingInterruptedError
-from diffdrive_jacobian.reading.run import Run, Series
+from diffdrive_jacobian.bags.run import Run, Series
+from diffdrive_jacobian.bags.run_reader import BagError, ReadingInterruptedError
+from diffdrive_jacobian.messages.conversion import MessageError, plausible_twist
+from diffdrive_jacobian.numerics.elementary import wrap
+from diffdrive_jacobian.parameters.declaration import from_ros, specifications
+from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
 from diffdrive_jacobian.time_units import NANOSECONDS
 

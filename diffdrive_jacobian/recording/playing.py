@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from diffdrive_jacobian.replay import Playback, replay
+from diffdrive_jacobian.recording import Playback, replay
 
 result = replay(Path('drive_2026_01_31-12_00_00'), Playback(rate=2.0))
 print(result.played, result.messages)
@@ -18,9 +18,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from diffdrive_jacobian.reading.reader import open_bag
-from diffdrive_jacobian.replay.playback import NODE, Playback
-from diffdrive_jacobian.replay.replayer import Replayer
+from diffdrive_jacobian.bags.run_reader import open_bag
+from diffdrive_jacobian.recording.playback import NODE, Playback
+from diffdrive_jacobian.recording.replayer import Replayer
 from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
 from diffdrive_jacobian.ros.node_runner import NodeRunner
 from diffdrive_jacobian.ros.runner import ros_context, running

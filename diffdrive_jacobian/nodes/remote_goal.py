@@ -14,15 +14,15 @@ from action_msgs.msg import GoalStatus
 from numpy.typing import ArrayLike, NDArray
 
 from diffdrive_jacobian.control.controllers import BUILT_IN
-from diffdrive_jacobian.ros import standstill
-from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
-from diffdrive_jacobian.ros.goal_client import (
+from diffdrive_jacobian.nodes import standstill
+from diffdrive_jacobian.nodes.goal_client import (
     DRIVEN_POINT_PARAMETERS,
     SILENCE,
     GoalClient,
     duplicates,
     loss,
 )
+from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
 from diffdrive_jacobian.ros.liveness import Liveness
 from diffdrive_jacobian.ros.node_runner import NodeRunner
 from diffdrive_jacobian.ros.runner import ros_context, running

@@ -37,10 +37,10 @@ from diffdrive_jacobian.bags.journal import (
 from diffdrive_jacobian.bags.limits import UNPACK_ERRORS, Budget, unpack_file, unpack_message
 from diffdrive_jacobian.bags.message_definitions import UnknownTypeError
 from diffdrive_jacobian.bags.metadata import MetadataError, parse_parameters
+from diffdrive_jacobian.bags.salvage_mcap import Topic, read_mcap
+from diffdrive_jacobian.bags.salvage_sqlite import read_sqlite
+from diffdrive_jacobian.bags.topic_types import definition_and_hash
 from diffdrive_jacobian.bounded_yaml import YAML_ERRORS, TooLargeError, load_yaml
-from diffdrive_jacobian.recovery.salvage_mcap import Topic, read_mcap
-from diffdrive_jacobian.recovery.salvage_sqlite import read_sqlite
-from diffdrive_jacobian.recovery.topic_types import definition_and_hash
 from diffdrive_jacobian.text import printable
 
 READERS = {'mcap': read_mcap, 'sqlite3': read_sqlite}

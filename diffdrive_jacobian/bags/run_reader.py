@@ -28,11 +28,11 @@ from diffdrive_jacobian.bags.known_types import (
     recorded_definition_differs,
     type_hashes,
 )
+from diffdrive_jacobian.bags.run import Run, Series
 from diffdrive_jacobian.messages.cdr import DecodingError, LongMessageError
 from diffdrive_jacobian.messages.codecs import Changes, FaultEvent
 from diffdrive_jacobian.messages.errors import MessageError
 from diffdrive_jacobian.messages.topics import READABLE, TOPICS, Topic
-from diffdrive_jacobian.reading.run import Run, Series
 from diffdrive_jacobian.text import printable
 
 __all__ = [

@@ -14,11 +14,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from diffdrive_jacobian.bags.ground_truth import NODE, recorded_drift
+from diffdrive_jacobian.bags.run import Run
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros
 from diffdrive_jacobian.parameters.virtual_robot import MULTIPLIERS, VirtualRobotParameters
-from diffdrive_jacobian.reading.ground_truth import NODE, recorded_drift
-from diffdrive_jacobian.reading.run import Run
 from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose, propagate_covariance
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
 from diffdrive_jacobian.time_units import NANOSECONDS

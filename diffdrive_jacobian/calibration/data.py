@@ -24,12 +24,9 @@ from diffdrive_jacobian.bags.known_types import (
     recorded_definition_differs,
     type_hashes,
 )
+from diffdrive_jacobian.calibration.choice import chosen_topic, dimensions_of, wheel_names
 from diffdrive_jacobian.calibration.measurements import Recording
-from diffdrive_jacobian.messages.cdr import DecodingError, LongMessageError
-from diffdrive_jacobian.messages.codecs import JOINT_STATE, Codec
-from diffdrive_jacobian.messages.errors import MessageError
-from diffdrive_jacobian.reading.calibration_choice import chosen_topic, dimensions_of, wheel_names
-from diffdrive_jacobian.reading.calibration_samples import (
+from diffdrive_jacobian.calibration.samples import (
     POSES,
     JointRows,
     PoseRows,
@@ -38,6 +35,9 @@ from diffdrive_jacobian.reading.calibration_samples import (
     integrated,
     unwrapped,
 )
+from diffdrive_jacobian.messages.cdr import DecodingError, LongMessageError
+from diffdrive_jacobian.messages.codecs import JOINT_STATE, Codec
+from diffdrive_jacobian.messages.errors import MessageError
 from diffdrive_jacobian.text import PATH_LIMIT, printable
 
 __all__ = ['WheelsAndReference', 'read_wheels_and_reference']

@@ -40,7 +40,7 @@ MAX_LOOPS, MAX_SAMPLES = 1_000_000, 10_000_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Setup(Checked):
+class SweepSetup(Checked):
     """Settings of a sweep.
 
     Raises:
@@ -208,7 +208,7 @@ def _gain_value(name: str, value: object) -> float | tuple[float, float]:
 class Sweep(NamedTuple):
     """Outcomes of every pair of gains from every start."""
 
-    setup: Setup
+    setup: SweepSetup
     x: Array
     """Values of the first gain that is swept, shape (n,)."""
     y: Array
@@ -249,7 +249,7 @@ class Sweep(NamedTuple):
 
 
 def sweep(
-    setup: Setup,
+    setup: SweepSetup,
     progress: Callable[[int], object] | None = None,
     *,
     executor: Executor | None = None,
@@ -275,7 +275,7 @@ def sweep(
     return Sweep(setup, setup.values(x), setup.values(y), outcomes)
 
 
-def _drive(setup: Setup, rows: slice, progress: Callable[[int], object] | None = None) -> Outcomes:
+def _drive(setup: SweepSetup, rows: slice, progress: Callable[[int], object] | None = None) -> Outcomes:
     """Return the outcomes of some rows of the grid, shape (rows, n, starts)."""
     controller = setup.resolved_controller
     x, y = setup.axes
@@ -307,7 +307,9 @@ def _drive(setup: Setup, rows: slice, progress: Callable[[int], object] | None =
     )
 
 
-def _drive_on(executor: Executor, setup: Setup, progress: Callable[[int], object] | None) -> Outcomes:
+def _drive_on(
+    executor: Executor, setup: SweepSetup, progress: Callable[[int], object] | None
+) -> Outcomes:
     """Return the outcomes of all rows, computed by an executor."""
     try:
         pickle.dumps(setup)
@@ -352,14 +354,14 @@ def _check_law(controller: Controller, starts: Array, goal: Array, gains: list[A
         ) from error
 
 
-def columns(setup: Setup) -> tuple[str, ...]:
+def columns(setup: SweepSetup) -> tuple[str, ...]:
     """Return the columns of the CSV table of a sweep."""
     gains = [f'{gain.name}{_SUFFIXES.get(gain.unit, "_" + gain.unit)}' for gain in setup.axes]
     measures = [f'{name}_{of}_{unit}' for name, unit in MEASURES.items() for of in ('mean', 'max')]
     return (*gains, 'starts', 'arrived', *measures)
 
 
-def table(swept: Sweep) -> str:
+def sweep_table(swept: Sweep) -> str:
     """Return a sweep as CSV, one row for each pair of gains, with `columns`; empty: no start arrived."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator='\n')
@@ -374,7 +376,7 @@ def table(swept: Sweep) -> str:
     return text.getvalue()
 
 
-def describe(swept: Sweep) -> str:
+def describe_sweep(swept: Sweep) -> str:
     """Return one line about the gains that are the fastest."""
     setup, found = swept.setup, swept.fastest()
     if found is None:
