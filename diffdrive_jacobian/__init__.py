@@ -5,6 +5,7 @@
 """
 
 __all__ = [
+    'bags',
     'calibration',
     'control',
     'drives',
@@ -15,11 +16,8 @@ __all__ = [
     'numerics',
     'plots',
     'properties',
-    'reading',
-    'recovery',
-    'replay',
+    'recording',
     'simulation',
-    'sweeps',
     'testing',
 ]
 

@@ -50,7 +50,7 @@ STORED = ROOT / 'test' / 'mutants.json'
 CACHE = ROOT / 'build' / 'mutants'
 PACKAGES = (
     *('kinematics', 'control', 'simulation', 'calibration'),
-    *('messages', 'lockstep', 'reading', 'recording'),
+    *('messages', 'lockstep', 'bags', 'recording'),
 )
 LEFT_OUT = {
     *('test_documents', 'test_explored_nodes', 'test_fastdds_profiles', 'test_flood', 'test_forked'),

@@ -127,8 +127,9 @@ ELSEWHERE = {
     *('resolved_rate', 'track_line'),
     *('Boundary', 'Controller', 'ControllerError', 'Controllers', 'Gain', 'LawError'),
     *('controller_names', 'find_controller', 'KP', 'KV', 'OFFSET'),
+    *('Sweep', 'SweepSetup', 'describe_sweep', 'sweep', 'sweep_table'),
 }
-"""Tested in test_resolved_rate and test_own_controllers."""
+"""Tested in test_resolved_rate, test_own_controllers and test_sweep_gains."""
 OPTIONAL = {'h', 'arrival', 'progress', 'commanded_at', 'seed', 'drift'}
 """Arguments that may be None."""
 
@@ -142,13 +143,29 @@ def name_of(call):
     return getattr(call, '__qualname__', call)
 
 
-def parameters(values):
+def arguments_and(values, *, valid=lambda name, value: False):
+    """Return a test's parameter for each call: with each argument in turn, each of these values in it.
+
+    Pairs for which `valid` returns True are left out.
+    """
     return [
-        pytest.param(call, name, value, id=f'{name_of(call)}-{name}-{index}')
+        pytest.param(
+            call,
+            [(name, value) for name in arguments for value in values if not valid(name, value)],
+            id=name_of(call),
+        )
         for call, arguments in CALLS.items()
-        for name in arguments
-        for index, value in enumerate(values)
     ]
+
+
+def may_be(name, value):
+    """Return whether something that is no number is valid for an argument."""
+    return (value is None and name in OPTIONAL) or (callable(value) and name in ('law', 'progress'))
+
+
+def refused(call, name, value):
+    with pytest.raises(ValueError, match=rf'\b{name}\b'):
+        call(**CALLS[call] | {name: value})
 
 
 def spoiled(valid, value):
@@ -189,9 +206,9 @@ def assert_named_or_finite(call, name, value):
     except ValueError as error:
         message = str(error)
     if message:
-        assert re.search(rf'\b{name}\b', message)
+        assert re.search(rf'\b{name}\b', message), (name, value)
     else:
-        assert all(map(np.isfinite, numbers(result)))
+        assert all(map(np.isfinite, numbers(result))), (name, value)
 
 
 def test_every_public_function_is_called_here():
@@ -225,35 +242,34 @@ def test_the_valid_arguments_are_valid(call):
     assert result is not None
 
 
-@pytest.mark.parametrize(('call', 'name', 'value'), parameters(NOT_NUMBERS))
-def test_what_is_no_number_is_named(call, name, value):
-    if value is None and name in OPTIONAL:
-        return
-    if callable(value) and name in ('law', 'progress'):
-        return
-    with pytest.raises(ValueError, match=rf'\b{name}\b'):
-        call(**CALLS[call] | {name: value})
+@pytest.mark.parametrize(('call', 'wrong'), arguments_and(NOT_NUMBERS, valid=may_be))
+def test_what_is_no_number_is_named(call, wrong):
+    for name, value in wrong:
+        refused(call, name, value)
 
 
-@pytest.mark.parametrize(('call', 'name', 'value'), parameters(NOT_FINITE))
-def test_what_is_not_finite_is_named(call, name, value):
-    for bad in spoiled(CALLS[call][name], value):
-        if call is VelocityLimits and np.isinf(value):
+@pytest.mark.parametrize(('call', 'wrong'), arguments_and(NOT_FINITE))
+def test_what_is_not_finite_is_named(call, wrong):
+    for name, value in wrong:
+        for bad in spoiled(CALLS[call][name], value):
+            if call is VelocityLimits and np.isinf(value):
+                # No limit.
+                assert_named_or_finite(call, name, bad)
+            else:
+                refused(call, name, bad)
+
+
+@pytest.mark.parametrize(('call', 'extreme'), arguments_and(EXTREME))
+def test_what_is_extreme_is_named_or_gives_a_finite_result(call, extreme):
+    for name, value in extreme:
+        for bad in spoiled(CALLS[call][name], value):
             assert_named_or_finite(call, name, bad)
-            continue
-        with pytest.raises(ValueError, match=rf'\b{name}\b'):
-            call(**CALLS[call] | {name: bad})
 
 
-@pytest.mark.parametrize(('call', 'name', 'value'), parameters(EXTREME))
-def test_what_is_extreme_is_named_or_gives_a_finite_result(call, name, value):
-    for bad in spoiled(CALLS[call][name], value):
-        assert_named_or_finite(call, name, bad)
-
-
-@pytest.mark.parametrize(('call', 'name', 'value'), parameters(WRONG_SHAPE))
-def test_another_shape_is_named_or_broadcasts(call, name, value):
-    assert_named_or_finite(call, name, value)
+@pytest.mark.parametrize(('call', 'other'), arguments_and(WRONG_SHAPE))
+def test_another_shape_is_named_or_broadcasts(call, other):
+    for name, value in other:
+        assert_named_or_finite(call, name, value)
 
 
 @pytest.mark.parametrize('call', FUNCTIONS, ids=name_of)

@@ -1,4 +1,63 @@
-"""File formats: rosbag2 bags, which are read within limits and written completely, and journals.
+"""Bags of recorded runs: read as arrays, verified, and recovered after a crash. No ROS is needed."""
 
-Internal: may change without notice.
-"""
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from diffdrive_jacobian import lazy
+
+if TYPE_CHECKING:
+    from diffdrive_jacobian.bags.bag_reader import (
+        BagError,
+        DamagedBagError,
+        ReadingInterruptedError,
+    )
+    from diffdrive_jacobian.bags.files import NotABagError
+    from diffdrive_jacobian.bags.recovery import (
+        NothingToSaveError,
+        Recovery,
+        RecoveryInterruptedError,
+        UncheckedError,
+        recover,
+    )
+    from diffdrive_jacobian.bags.run import Run, Series
+    from diffdrive_jacobian.bags.run_reader import read_run
+    from diffdrive_jacobian.bags.verification import Verification, verify
+
+__all__ = [
+    'BagError',
+    'DamagedBagError',
+    'NotABagError',
+    'NothingToSaveError',
+    'ReadingInterruptedError',
+    'Recovery',
+    'RecoveryInterruptedError',
+    'Run',
+    'Series',
+    'UncheckedError',
+    'Verification',
+    'read_run',
+    'recover',
+    'verify',
+]
+if not TYPE_CHECKING:
+    # Whoever reads does not need what recovers, and the recorder neither.
+    __getattr__, __dir__ = lazy.attach(
+        __name__,
+        {
+            'BagError': 'bags.bag_reader',
+            'DamagedBagError': 'bags.bag_reader',
+            'NotABagError': 'bags.files',
+            'NothingToSaveError': 'bags.recovery',
+            'ReadingInterruptedError': 'bags.bag_reader',
+            'Recovery': 'bags.recovery',
+            'RecoveryInterruptedError': 'bags.recovery',
+            'Run': 'bags.run',
+            'Series': 'bags.run',
+            'UncheckedError': 'bags.recovery',
+            'Verification': 'bags.verification',
+            'read_run': 'bags.run_reader',
+            'recover': 'bags.recovery',
+            'verify': 'bags.verification',
+        },
+    )

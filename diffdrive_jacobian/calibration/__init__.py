@@ -1,5 +1,10 @@
 """Calibration of wheel radii and wheel separation from recorded wheels and a reference of the pose."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from diffdrive_jacobian import lazy
 from diffdrive_jacobian.calibration.calibrate import PARAMETERS, Calibration, calibrate
 from diffdrive_jacobian.calibration.measurements import (
     CalibrationError,
@@ -9,6 +14,9 @@ from diffdrive_jacobian.calibration.measurements import (
 )
 from diffdrive_jacobian.calibration.motion import Geometry
 
+if TYPE_CHECKING:
+    from diffdrive_jacobian.calibration.data import WheelsAndReference, read_wheels_and_reference
+
 __all__ = [
     'PARAMETERS',
     'Calibration',
@@ -17,5 +25,16 @@ __all__ = [
     'Given',
     'Noise',
     'Recording',
+    'WheelsAndReference',
     'calibrate',
+    'read_wheels_and_reference',
 ]
+if not TYPE_CHECKING:
+    # The calibration itself needs NumPy only, no bags.
+    __getattr__, __dir__ = lazy.attach(
+        __name__,
+        {
+            'WheelsAndReference': 'calibration.data',
+            'read_wheels_and_reference': 'calibration.data',
+        },
+    )

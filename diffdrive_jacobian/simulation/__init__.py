@@ -1,4 +1,4 @@
-"""Simulation of robots, of closed loops in batches, and of manipulators along lines. No ROS."""
+"""Robots as values, closed loops in batches, sweeps of gains, manipulators along lines. No ROS."""
 
 from __future__ import annotations
 
@@ -10,15 +10,39 @@ from diffdrive_jacobian.simulation.slip import Drift
 
 if TYPE_CHECKING:
     from diffdrive_jacobian.simulation.closed_loop import closed_loops, trajectories
+    from diffdrive_jacobian.simulation.gain_sweep import (
+        Sweep,
+        SweepSetup,
+        describe_sweep,
+        sweep,
+        sweep_table,
+    )
     from diffdrive_jacobian.simulation.tracking import track_line
 
-__all__ = ['Drift', 'Robot', 'RobotModel', 'closed_loops', 'track_line', 'trajectories']
+__all__ = [
+    'Drift',
+    'Robot',
+    'RobotModel',
+    'Sweep',
+    'SweepSetup',
+    'closed_loops',
+    'describe_sweep',
+    'sweep',
+    'sweep_table',
+    'track_line',
+    'trajectories',
+]
 if not TYPE_CHECKING:
     # Nodes, which need none of them, start faster without.
     __getattr__, __dir__ = lazy.attach(
         __name__,
         {
+            'Sweep': 'simulation.gain_sweep',
+            'SweepSetup': 'simulation.gain_sweep',
             'closed_loops': 'simulation.closed_loop',
+            'describe_sweep': 'simulation.gain_sweep',
+            'sweep': 'simulation.gain_sweep',
+            'sweep_table': 'simulation.gain_sweep',
             'track_line': 'simulation.tracking',
             'trajectories': 'simulation.closed_loop',
         },
