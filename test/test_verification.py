@@ -150,6 +150,34 @@ def test_placements_resets_timeouts_and_parameters_are_driven_again(lockstep, ro
     held(run)
 
 
+def test_a_robot_that_takes_time_is_driven_again_with_its_parameters(lockstep, robot_at, tmp_path):
+    robot_at(
+        linear__x__max_acceleration=0.5,
+        linear__x__max_deceleration=-0.8,
+        angular__z__max_acceleration=2.0,
+        wheel_lag=0.1,
+        command_delay=0.05,
+        max_wheel_acceleration=20.0,
+    )
+    with recorded(lockstep, tmp_path / 'run') as made:
+        made.look()
+        for v, omega in ((0.5, 1.0), (-0.3, 1.0), (0.4, -2.0), (0.0, 0.0), (0.3, 0.3)):
+            lockstep.publish('cmd_vel', twist(v, omega))
+            lockstep.run_for(0.43)
+        lockstep.run_for(2.0)
+    run = made.run
+    verification = held(run, 1e-12)
+    assert (verification.source, verification.start) == ('cmd_vel_out', 'start_pose')
+    assert verification.covariance == 'exact moments'
+    # Not standing still.
+    assert np.ptp(run.odometry.values[:, 0]) > 0.1
+    without = verify(replace(run, parameters={}))
+    assert without.distances.max() > 0.01
+    assert 'cannot be reproduced without them' in without.notes[-1]
+    late = replace(run, start_pose=rows(run.start_pose, slice(0, 0)))
+    assert any('what it was commanded before is missing' in note for note in verify(late).notes)
+
+
 def test_time_that_goes_back_is_followed(lockstep, robot_at, tmp_path):
     robot_at()
     with recorded(lockstep, tmp_path / 'run') as made:

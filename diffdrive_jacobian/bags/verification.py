@@ -2,16 +2,18 @@
 
 The commands are applied to `simulation.Robot`, as in the node `virtual_robot`, and each odometry message
 is compared with the pose of that robot at the message's stamp. `cmd_vel_out` has each command as it was
-applied, after limits and timeout, with the time it took effect, so that no parameter is needed. Without
-it the commands take effect when they were recorded, with the limits and the timeout of the parameters.
+applied, after limits and timeout, with the time it took effect. So no parameter is needed, but for
+robots with limits of the acceleration, a lag or a delay. Without `cmd_vel_out` the commands take effect
+when they were recorded, with the limits and the timeout of the parameters.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,9 +21,10 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.run import Run, Series
 from diffdrive_jacobian.bags.run_reader import BagError, ReadingInterruptedError
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MessageError, plausible_twist
 from diffdrive_jacobian.numerics.elementary import wrap
-from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros
+from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros, specifications
 from diffdrive_jacobian.parameters.virtual_robot import MULTIPLIERS, VirtualRobotParameters
 from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
@@ -100,6 +103,8 @@ _MAX_CANDIDATES = 32
 _MAX_DELAY = 1.0
 """Beyond this delay of the odometry (median) its stamps and the recorder are of different clocks (s)."""
 _NOISE_PARAMETERS = ('wheel_separation', 'wheel_travel_variance')
+_DYNAMICS = re.compile('acceleration|deceleration|wheel_lag|command_delay')
+"""Of the names of parameters of the robot that say how it follows commands."""
 _NEVER = int(np.iinfo(np.int64).max)
 
 
@@ -219,7 +224,7 @@ def verify(
             f'{run.path} has no odometry after the first command on {source}, so that no motion can be '
             'verified (are their stamps of different clocks?)'
         )
-    notes = run.notes
+    notes = run.notes + (_missing(run, start) if source == 'cmd_vel_out' else ())
     if len(poses) < len(stamps):
         omitted = len(stamps) - len(poses)
         notes += (
@@ -240,16 +245,48 @@ def verify(
             'the first start_pose',
         )
     difference: NDArray[np.float64] = np.array(measured) - np.array(poses)
+    distances = np.hypot(difference[:, 0], difference[:, 1])
+    if source == 'cmd_vel_out' and not run.of_node(ROBOT) and np.any(distances > EXACT):
+        notes += (
+            'the parameters of virtual_robot were not recorded: the motion of a robot with limits of '
+            'the acceleration, a lag or a delay cannot be reproduced without them',
+        )
     return Verification(
         source=source,
         start=start,
         seconds=np.array(seconds),
-        distances=np.hypot(difference[:, 0], difference[:, 1]),
+        distances=distances,
         headings=np.abs(wrap(difference[:, 2])),
         notes=notes,
         covariance_difference=covariance_difference,
         truth=truth,
     )
+
+
+def _missing(run: Run, start: str) -> tuple[str, ...]:
+    """Return what is missing to reproduce the motion of a robot that follows commands with a delay."""
+    names = [
+        name for name in specifications(VirtualRobotParameters) if _DYNAMICS.search(name) is not None
+    ]
+    recorded = run.of_node(ROBOT)
+    changed = sorted(
+        {
+            name
+            for _, node, values in run.parameter_events
+            if node.split('/')[-1] == ROBOT
+            for name in names
+            if name in values and repr(values[name]) != repr(recorded.get(name))
+        }
+    )
+    notes: tuple[str, ...] = ()
+    if changed:
+        notes += (f'{", ".join(changed)} changed during the run: the changes are not simulated',)
+    if start == 'odometry' and recorded_dynamics(run).takes_time:
+        notes += (
+            'the robot follows commands with acceleration limits, a lag or a delay, and its start is '
+            'not recorded: what it was commanded before is missing',
+        )
+    return notes
 
 
 def _epochs(series: Series) -> list[int]:
@@ -301,7 +338,9 @@ def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
         events += [(received, stamp, is_start, row) for received, stamp, row in list(rows)[begin:]]
     events.sort(key=lambda event: event[0])
     begun = int(run.odometry.received[0])
-    model = recorded_model(run) or RobotModel()
+    model = recorded_dynamics(run)
+    if not model.takes_time:
+        model = recorded_model(run) or RobotModel()
     # The command that was recorded before the odometry is in effect in its first message.
     driven = (run.cmd_vel_out.stamps <= first.stamp) & (
         run.cmd_vel_out.received <= begun + _MAX_DELAY * NANOSECONDS
@@ -453,6 +492,20 @@ def recorded_model(run: Run) -> RobotModel | None:
         return None
     drift = recorded_drift(run)
     return RobotModel(wheel_separation=separation, wheel_travel_variance=variance, drift=drift)
+
+
+def recorded_dynamics(run: Run) -> RobotModel:
+    """Return a model that follows commands as the recorded robot did, without limits of the velocity.
+
+    At once, if its parameters were not recorded.
+    """
+    try:
+        recorded = from_ros(VirtualRobotParameters, run.of_node(ROBOT)).model()
+    except ParameterError:
+        return RobotModel()
+    if not recorded.takes_time:
+        return RobotModel()
+    return replace(recorded, limits=VelocityLimits(), command_timeout=0)
 
 
 def start_covariances(run: Run) -> NDArray[np.float64]:

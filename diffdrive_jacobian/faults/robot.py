@@ -128,9 +128,10 @@ class ActuatorLag(RobotFault):
     """The motors lag: the wheel speeds approach the commanded ones with first order.
 
     Of a step of the command `1 - exp(-t / seconds)` is reached after the time t. The robot stops as
-    slowly after its timeout. The motion consists of arcs of 20 ms with the mean wheel speeds in them,
-    at whose ends the wheel angles are exact. Each is one message on `cmd_vel_out`. The encoders see the
-    lag, so `odom` and `joint_states` show the true motion. Of several lags the longest one counts.
+    slowly after its timeout. The motion is exact. `cmd_vel_out` has the commands, not the lag, so
+    `verify_run` does not reproduce a recording of this fault. The encoders see the lag, so `odom` and
+    `joint_states` show the true motion. Of several lags, and the parameter `wheel_lag`, the longest one
+    counts.
 
     Attributes:
         seconds: Time constant (s).

@@ -18,7 +18,8 @@ from diffdrive_jacobian.parameters._fields import (
     wheel_separation_field,
 )
 from diffdrive_jacobian.parameters.declaration import parameter
-from diffdrive_jacobian.parameters.limits import LimitParameters, number_or
+from diffdrive_jacobian.parameters.limits import AccelerationParameters, number_or
+from diffdrive_jacobian.simulation.actuators import Actuators
 from diffdrive_jacobian.simulation.robot import RobotModel
 from diffdrive_jacobian.simulation.slip import MAX_SEED, Drift
 from diffdrive_jacobian.time_units import nanoseconds
@@ -41,7 +42,7 @@ def _true_multiplier(what: str) -> Any:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class VirtualRobotParameters(LimitParameters):
+class VirtualRobotParameters(AccelerationParameters):
     """Parameters of the node virtual_robot."""
 
     publish_rate: float = parameter(
@@ -57,6 +58,14 @@ class VirtualRobotParameters(LimitParameters):
     max_wheel_velocity: float = max_wheel_velocity_field()
     cmd_vel_timeout: float = timeout_field(
         0.5, 'Time without a command after which the robot stops [s]; 0: never.'
+    )
+    wheel_lag: float = parameter(
+        0.0,
+        'Time constant with which the wheels follow commands, of first order [s].',
+        bounds=(0.0, 100.0),
+    )
+    command_delay: float = parameter(
+        0.0, 'Time from a command to its effect on the wheels [s].', bounds=(0.0, 100.0)
     )
     x: float = parameter(
         0.0, 'Initial position x, also after a reset [m].', bounds=(-MAX_POSITION, MAX_POSITION)
@@ -129,7 +138,17 @@ class VirtualRobotParameters(LimitParameters):
             command_timeout=nanoseconds(self.cmd_vel_timeout),
             wheel_travel_variance=self.wheel_travel_variance,
             drift=self.drift(),
+            actuators=self.actuators(),
         )
+
+    def actuators(self) -> Actuators | None:
+        """Return how commands are followed; None: at once."""
+        actuators = Actuators(
+            acceleration=self.acceleration_limits(),
+            lag=self.wheel_lag,
+            delay=nanoseconds(self.command_delay),
+        )
+        return None if actuators.immediate else actuators
 
     def drift(self) -> Drift | None:
         """Return in what the true motion differs from the odometry; None: in nothing."""
