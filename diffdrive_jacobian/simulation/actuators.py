@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, NamedTuple, Protocol, TypeAlias
 
@@ -71,6 +71,15 @@ class Actuators(Checked):
     delay: Annotated[int, _delay] = 0
     """Time from a command to its effect on the motors (ns)."""
 
+    def lagging(self, seconds: float) -> Actuators:
+        """Return actuators whose lag is at least a time constant (s)."""
+        return replace(self, lag=max(self.lag, seconds))
+
+    def weakened(self, wheel: str, speed: float) -> Actuators:
+        """Return actuators whose motor of a wheel, 'right' or 'left', reaches at most a speed (rad/s)."""
+        name = f'max_{wheel}_speed'
+        return replace(self, **{name: min(speed, getattr(self, name))})
+
     @property
     def immediate(self) -> bool:
         """Whether a command is followed at once."""
@@ -99,40 +108,36 @@ class Drive(NamedTuple):
     """The twist within the limits of the acceleration."""
     motion: Profile
     """The twist of the robot."""
-    effective: int
-    """Time from which on the last command has an effect (ns)."""
 
     @classmethod
     def at(cls, stamp: int, twist: Twist) -> Drive:
         """Return a constant twist."""
         constant = Profile(stamp, [held(twist)])
-        return cls(constant, constant, stamp)
+        return cls(constant, constant)
 
-    def followed(
-        self, stamp: int, effective: int, target: Twist, actuators: Actuators, wheels: Wheels
-    ) -> Drive:
+    def followed(self, stamp: int, target: Twist, actuators: Actuators, wheels: Wheels) -> Drive:
         """Return how the speeds go on from a time when another twist is to be reached.
+
+        The motors may differ from those so far: their largest speeds and their lag are the new ones at
+        once, the limits of the acceleration after the delay, with the target.
 
         Args:
             stamp: The time (ns).
-            effective: Time from which on the new target counts, the same or later (ns).
             target: The twist, within the limits of the velocity.
             actuators: What the robot follows it with.
             wheels: Its wheels.
         """
-        now, then = self.motion.seconds(stamp), self.motion.seconds(effective)
-        demand, here = self.demanded.twist(then), self.motion.twist(then)
-        demanded = [*_ramp(demand, target, actuators.acceleration, wheels), held(target)]
-        motion: Iterable[Piece] = demanded
+        now = self.demanded.seconds(stamp)
+        then = self.demanded.seconds(stamp + actuators.delay)
+        ramp = _ramp(self.demanded.twist(then), target, actuators.acceleration, wheels)
+        demanded = [*self.demanded.between(now, then), *ramp, held(target)]
+        motion = demanded
         if actuators.max_right_speed < math.inf or actuators.max_left_speed < math.inf:
-            motion = _saturated(demanded, actuators, wheels)
+            motion = list(_saturated(demanded, actuators, wheels))
         if actuators.lag:
-            motion = _lagging(here, motion, actuators.lag)
-        return Drive(
-            Profile(stamp, [*self.demanded.between(now, then), *demanded]),
-            Profile(stamp, [*self.motion.between(now, then), *motion]),
-            effective,
-        )
+            here = self.motion.twist(self.motion.seconds(stamp))
+            motion = list(_lagging(here, motion, actuators.lag))
+        return Drive(Profile(stamp, demanded), Profile(stamp, motion))
 
 
 def held(twist: Twist) -> Piece:
