@@ -184,7 +184,7 @@ def _lagging(here: Twist, pieces: Iterable[Piece], tau: float) -> Iterator[Piece
     settling = SETTLING * tau
     for piece in pieces:
         v, omega = (
-            (a - b * tau, b, speed - (a - b * tau))
+            (a - b * tau, b, _rest(speed, a - b * tau))
             for (a, b, _), speed in zip(piece[1:3], here, strict=True)
         )
         begin = 0.0
@@ -197,3 +197,9 @@ def _lagging(here: Twist, pieces: Iterable[Piece], tau: float) -> Iterator[Piece
             yield line
             if piece.seconds < math.inf:
                 here = line.twist(line.seconds)
+
+
+def _rest(speed: float, asymptote: float) -> float:
+    """Return by how much a lagging speed differs, zero if by its rounding error alone."""
+    reached = math.isclose(speed, asymptote, rel_tol=1e-15, abs_tol=1e-16)
+    return 0.0 if reached else speed - asymptote
