@@ -76,7 +76,7 @@ class Actuators(Checked):
         return replace(self, lag=max(self.lag, seconds))
 
     def weakened(self, wheel: str, speed: float) -> Actuators:
-        """Return actuators whose motor of a wheel, 'right' or 'left', reaches at most a speed (rad/s)."""
+        """Return actuators that turn the 'right' or 'left' wheel at most at a speed (rad/s)."""
         name = f'max_{wheel}_speed'
         return replace(self, **{name: min(speed, getattr(self, name))})
 

@@ -9,8 +9,8 @@ constant and has no end.
 
 The pose after a time is an integral over v and the heading. It is computed by Gauss-Legendre quadrature
 in steps that turn by at most `MAX_TURN` and last at most `MAX_DECAY` time constants, with fewer nodes in
-short ones. The steps of a piece are equal, and begin with it. So the state at a time depends on the pieces alone, not on the times
-at which states are computed.
+short ones. The steps of a piece are equal, and begin with it. So the state at a time depends on the
+pieces alone, not on the times at which states are computed.
 """
 
 from __future__ import annotations

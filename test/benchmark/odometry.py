@@ -4,7 +4,8 @@ CPU: robot and controller (and bridge) beside bare nodes that send the same mess
 time of the process over the odometry messages that the controller received. Latency: a prober in the
 controller's process publishes odometry by a timer and receives the command; from before publish() to the
 callback, median of all. Executors: `events` and `single` are spun as our runner does it, `rclpy.spin` is
-rclpy's own, on the SingleThreadedExecutor. The `limited` robot has acceleration limits and a lag. Each figure comes from a process of its own.
+rclpy's own, on the SingleThreadedExecutor. The `limited` robot has acceleration limits and a lag. Each
+figure comes from a process of its own.
 """
 
 from __future__ import annotations
