@@ -173,6 +173,13 @@ def test_a_robot_that_takes_time_is_driven_again_with_its_parameters(lockstep, r
     assert verification.covariance_difference <= COVARIANCE_TOLERANCE
     # Not standing still.
     assert np.ptp(run.odometry.values[:, 0]) > 0.1
+    # The timeout stops it by deceleration.
+    stop = run.cmd_vel_out.stamps[-1]
+    stopping = run.odometry.values[run.odometry.stamps > stop, 3]
+    assert run.cmd_vel_out.values[-1].tolist() == [0.0, 0.0]
+    assert stopping[0] > 0.15
+    assert (np.diff(stopping[5:]) <= 0.0).all()
+    assert stopping[-1] == pytest.approx(0.0, abs=1e-6)
     without = verify(replace(run, parameters={}))
     assert without.distances.max() > 0.01
     assert 'cannot be reproduced without them' in without.notes[-1]

@@ -129,8 +129,8 @@ class Drive(NamedTuple):
         """
         now = self.demanded.seconds(stamp)
         then = self.demanded.seconds(stamp + actuators.delay)
-        ramp = _ramp(self.demanded.twist(then), target, actuators.acceleration, wheels)
-        demanded = [*self.demanded.between(now, then), *ramp, held(target)]
+        rise = ramp(self.demanded.twist(then), target, actuators.acceleration, wheels)
+        demanded = [*self.demanded.between(now, then), *rise]
         motion = demanded
         if actuators.max_right_speed < math.inf or actuators.max_left_speed < math.inf:
             motion = list(_saturated(demanded, actuators, wheels))
@@ -146,12 +146,13 @@ def held(twist: Twist) -> Piece:
     return Piece(math.inf, (v, 0.0, 0.0), (omega, 0.0, 0.0))
 
 
-def _ramp(start: Twist, target: Twist, limits: AccelerationLimits, wheels: Wheels) -> Iterator[Piece]:
-    """Return the transition from one twist to another."""
+def ramp(start: Twist, target: Twist, limits: AccelerationLimits, wheels: Wheels) -> Iterator[Piece]:
+    """Return the transition from one twist to another, which is then held for ever."""
     for seconds, end in limits.transition(start, target, wheels.wheel_speeds):
         if seconds > 0.0:
             yield _line(start, end, seconds)
         start = end
+    yield held(target)
 
 
 def _line(start: Twist, end: Twist, seconds: float) -> Piece:
