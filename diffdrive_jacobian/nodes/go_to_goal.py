@@ -376,7 +376,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._publish_command(0.0, 0.0)
             self.log_event_warning(
                 'odometry is stale',
-                f'no valid odometry on {topic} for {timeout:g} s: robot stopped{self._rolls_on()}, waiting',
+                f'no valid odometry on {topic} for {timeout:g} s: robot stopped, waiting'
+                f'{self._rolls_on()}',
             )
         else:
             self.log_event_warning(

@@ -53,9 +53,7 @@ def wheel_lag_field() -> Any:
 
 def command_delay_field() -> Any:
     """Declare the delay of commands."""
-    return parameter(
-        0.0, 'Time from a command to its effect on the wheels [s].', bounds=(0.0, 100.0)
-    )
+    return parameter(0.0, 'Time from a command to its effect on the wheels [s].', bounds=(0.0, 100.0))
 
 
 def differ(first: str, value: str, second: str, other: str) -> None:
