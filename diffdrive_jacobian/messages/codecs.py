@@ -237,12 +237,15 @@ MOTION = Codec(
     ),
 )
 """Odometry without its covariances."""
-ODOMETRY_POSE = Codec(
+ODOMETRY_STATE = Codec(
     'nav_msgs/msg/Odometry',
-    (FRAME, *pose_fields('nav_msgs/msg/Odometry')),
-    lambda frame, *pose: (frame, from_pose(*pose)),
+    (
+        *(FRAME, 'twist.twist.linear.x', 'twist.twist.angular.z'),
+        *pose_fields('nav_msgs/msg/Odometry'),
+    ),
+    lambda frame, v, omega, *pose: (frame, (v, omega), from_pose(*pose)),
 )
-"""Frame and pose of an odometry, for the controller, which needs no more of each."""
+"""Frame, twist and pose of an odometry, for the controller. The twist is not checked."""
 POSE_WITH_COVARIANCE = Codec(
     'geometry_msgs/msg/PoseWithCovarianceStamped',
     (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
@@ -95,7 +95,7 @@ class LimitParameters(NodeParameters):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class AccelerationParameters(LimitParameters):
+class TwistAccelerationParameters(LimitParameters):
     """Limits of twist and acceleration, with the names, signs and defaults of diff_drive_controller."""
 
     linear_x_max_acceleration: float = _acceleration('linear.x', 'max_acceleration', 'm/s^2')
@@ -114,12 +114,6 @@ class AccelerationParameters(LimitParameters):
     angular_z_max_deceleration_reverse: float = _acceleration(
         'angular.z', 'max_deceleration_reverse', 'rad/s^2'
     )
-    max_wheel_acceleration: float = parameter(
-        math.nan,
-        'Maximum angular acceleration of a wheel [rad/s^2]; .nan: no limit.',
-        bounds=(1e-6, 1e9),
-        nan_is_none=True,
-    )
 
     def acceleration_limits(self) -> AccelerationLimits:
         """Return the limits of the acceleration.
@@ -129,7 +123,6 @@ class AccelerationParameters(LimitParameters):
         return AccelerationLimits(
             v=self._axis('linear_x'),
             omega=self._axis('angular_z'),
-            max_wheel_acceleration=number_or(self.max_wheel_acceleration, math.inf),
         )
 
     def _axis(self, axis: str) -> AxisLimits:
@@ -143,6 +136,25 @@ class AccelerationParameters(LimitParameters):
             max_deceleration=slowing,
             max_acceleration_reverse=reverse,
             max_deceleration_reverse=number_or(slowing_reverse, -slowing),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class AccelerationParameters(TwistAccelerationParameters):
+    """Limits of twist and acceleration, those of the wheels included."""
+
+    max_wheel_acceleration: float = parameter(
+        math.nan,
+        'Maximum angular acceleration of a wheel [rad/s^2]; .nan: no limit.',
+        bounds=(1e-6, 1e9),
+        nan_is_none=True,
+    )
+
+    def acceleration_limits(self) -> AccelerationLimits:
+        """Return the limits of the acceleration."""
+        return replace(
+            TwistAccelerationParameters.acceleration_limits(self),
+            max_wheel_acceleration=number_or(self.max_wheel_acceleration, math.inf),
         )
 
 

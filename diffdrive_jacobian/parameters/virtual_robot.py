@@ -10,10 +10,12 @@ from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MAX_POSITION
 from diffdrive_jacobian.parameters._fields import (
     STAMPED,
+    command_delay_field,
     differ,
     max_wheel_velocity_field,
     multiplier_field,
     timeout_field,
+    wheel_lag_field,
     wheel_radius_field,
     wheel_separation_field,
 )
@@ -59,14 +61,8 @@ class VirtualRobotParameters(AccelerationParameters):
     cmd_vel_timeout: float = timeout_field(
         0.5, 'Time without a command after which the robot stops [s]; 0: never.'
     )
-    wheel_lag: float = parameter(
-        0.0,
-        'Time constant with which the wheels follow commands, of first order [s].',
-        bounds=(0.0, 100.0),
-    )
-    command_delay: float = parameter(
-        0.0, 'Time from a command to its effect on the wheels [s].', bounds=(0.0, 100.0)
-    )
+    wheel_lag: float = wheel_lag_field()
+    command_delay: float = command_delay_field()
     x: float = parameter(
         0.0, 'Initial position x, also after a reset [m].', bounds=(-MAX_POSITION, MAX_POSITION)
     )

@@ -22,10 +22,12 @@ from diffdrive_jacobian.numerics.checks import NotNegative, NotNegativeOrInfinit
 from diffdrive_jacobian.numerics.fields import Checked, instance
 from diffdrive_jacobian.simulation.acceleration import AccelerationLimits
 from diffdrive_jacobian.simulation.speeds import Piece, Profile, Twist
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 SETTLING = 36.0
 """Time constants after which a lagging wheel has reached its speed: exp(-36) is 2e-16."""
 
+STANDSTILL = (0.0, 0.0)
 Speeds: TypeAlias = tuple[float, float]
 """`(omega_R, omega_L)` (rad/s)."""
 
@@ -93,6 +95,48 @@ class Actuators(Checked):
             max(-most_right, min(most_right, right)) + 0.0,
             max(-most_left, min(most_left, left)) + 0.0,
         )
+
+    def rolled(self, twist: Twist, wheels: Wheels | None = None) -> Twist:
+        """Return the distance and the turn from when zero is commanded until the robot is at rest.
+
+        Args:
+            twist: The twist before, held for long enough.
+            wheels: The wheels; None: the limit of their acceleration is left out.
+        """
+        seconds = self.reaction + self._deceleration_time(twist, wheels) / 2.0
+        v, omega = twist
+        return v * seconds, omega * seconds
+
+    def stoppable(self, twist: Twist, room: Twist, period: float = 0.0) -> Twist:
+        """Return a twist, scaled such that the robot can come to rest within a distance and a turn.
+
+        The limit of the acceleration of the wheels is left out.
+
+        Args:
+            twist: The twist.
+            room: The distance and the turn, zero or positive; infinite: any (m, rad).
+            period: Time for which the twist is held before the next one (s).
+        """
+        reaction, stop = self.reaction + period, self._deceleration_time(twist, None)
+        share = 1.0
+        for speed, left in zip(map(abs, twist), room, strict=True):
+            # The largest share s <= 1 with s speed (reaction + s stop / 2) <= left.
+            if speed * (reaction + stop / 2.0) > left:
+                linear = speed * reaction
+                root = linear + math.sqrt(linear * linear + 2.0 * speed * stop * left)
+                share = min(share, 2.0 * left / root if root else 0.0)
+        v, omega = twist
+        return share * v, share * omega
+
+    @property
+    def reaction(self) -> float:
+        """Time by which a stop is later than without lag and delay (s)."""
+        return self.delay / NANOSECONDS + self.lag
+
+    def _deceleration_time(self, twist: Twist, wheels: Wheels | None) -> float:
+        wheel_speeds = (lambda *_: STANDSTILL) if wheels is None else wheels.wheel_speeds
+        parts = self.acceleration.transition(twist, STANDSTILL, wheel_speeds)
+        return sum(seconds for seconds, _ in parts)
 
     def reached(self, twist: Twist, wheels: Wheels) -> Twist:
         """Return the twist that the motors reach when one is demanded."""
