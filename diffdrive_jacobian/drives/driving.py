@@ -187,6 +187,7 @@ def drive(
     isolated: bool = True,
     timeout: float = TIMEOUT,
     parameters: Mapping[str, Any] | None = None,
+    robot_parameters: Mapping[str, Any] | None = None,
     recording: Recording | None = None,
     ros_arguments: Sequence[str] = (),
     signals: Signals | None = None,
@@ -205,6 +206,7 @@ def drive(
         isolated: Whether no other process can communicate with the nodes. Always so in lockstep.
         timeout: Longest duration, of all goals together (s).
         parameters: Parameters of go_to_goal, by name. They take precedence over `ros_arguments`.
+        robot_parameters: Likewise of virtual_robot.
         recording: Recording of what the nodes publish. The caller must finish it. None: none.
         ros_arguments: ROS arguments of all nodes, such as `['--ros-args', '-p', 'kp:=4.0']`.
         signals: Counter of the signals that end the drive. None: no signal does.
@@ -230,6 +232,7 @@ def drive(
                 runner=created,
                 timeout=timeout,
                 parameters=parameters,
+                robot_parameters=robot_parameters,
                 recording=recording,
                 signals=signals,
                 progress=progress,
@@ -239,11 +242,11 @@ def drive(
     signals = signals or Signals()
     progress = progress or _Silent()
     context = runner.context
-    wheels_drive = Parameter('command_interface', value='wheels')
-    robot = runner.add(lambda: VirtualRobot(context=context, parameter_overrides=[wheels_drive]))
+    of_robot = overrides({**(robot_parameters or {}), 'command_interface': 'wheels'})
+    robot = runner.add(lambda: VirtualRobot(context=context, parameter_overrides=of_robot))
     bridge = runner.add(lambda: WheelBridge(context=context))
-    overrides = [Parameter(name, value=value) for name, value in (parameters or {}).items()]
-    controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=overrides))
+    of_controller = overrides(parameters or {})
+    controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=of_controller))
     client = runner.add(lambda: GoalClient(NAME, goals, context))
     client.arrival = controller.arrival
     wheels = WheelSpeeds(client, robot.parameters.wheel_names)
@@ -297,6 +300,11 @@ def drive(
         offset=controller.arrival.offset,
         seconds=seconds,
     )
+
+
+def overrides(parameters: Mapping[str, Any]) -> list[Parameter]:
+    """Return parameters, by name, as a node takes them."""
+    return [Parameter(name, value=value) for name, value in parameters.items()]
 
 
 class WheelSpeeds:
