@@ -18,41 +18,14 @@ from __future__ import annotations
 import math
 from itertools import pairwise
 from math import cos, exp, expm1, isfinite, sin
+from operator import mul
 
 from diffdrive_jacobian.simulation._noise_moments import NoiseMoments, central
 from diffdrive_jacobian.simulation.exact_moments import Entries, composed, propagated_moments
-from diffdrive_jacobian.simulation.speeds import RULE, Piece, rolled, sign_changes, travelled
+from diffdrive_jacobian.simulation.speeds import Course, Piece, sign_changes, travelled
 
 MAX_NOISE = 0.25
 """Largest m of a step of the quadrature."""
-
-
-def _integration_matrix() -> list[list[float]]:
-    """Return A with `sum_j A_ij f(t_j)` the integral of f from 0 to the node `t_i`.
-
-    By the Legendre polynomials P_k: `integral of P_k = (P_k+1 - P_k-1) / (2 k + 1)`.
-    """
-    count = len(RULE)
-    legendre = []
-    for node, _ in RULE:
-        x = 2.0 * node - 1.0
-        values = [1.0, x]
-        for k in range(1, count):
-            values.append(((2 * k + 1) * x * values[k] - k * values[k - 1]) / (k + 1))
-        legendre.append(values)
-    rows = []
-    for upper in legendre:
-        integrals = [upper[1] + 1.0, *(upper[k + 1] - upper[k - 1] for k in range(1, count))]
-        rows.append(
-            [
-                weight / 2.0 * sum(i * p for i, p in zip(integrals, at, strict=False))
-                for (_, weight), at in zip(RULE, legendre, strict=True)
-            ]
-        )
-    return rows
-
-
-MATRIX = _integration_matrix()
 
 
 def moments_along(
@@ -77,89 +50,78 @@ def moments_along(
     found: Entries | None = moments
     try:
         for begin, end in pairwise(knots):
-            part = piece.part(begin, end)
-            distance = sum(rolled(rim, part, part.seconds) for rim in _rims(part, L))
+            distance = sum(
+                abs(travelled(rim, end, piece.tau) - travelled(rim, begin, piece.tau))
+                for rim in (right, left)
+            )
             count = max(1, math.ceil(k * distance / (2.0 * L * L) / MAX_NOISE))
             for number in range(count):
-                step = part.part(part.seconds * number / count, part.seconds * (number + 1) / count)
                 if found is None:
                     return None
-                found = _after(
-                    found, theta + piece.path(begin + part.seconds * number / count)[1], step, L, k
-                )
+                first = begin + (end - begin) * number / count
+                step = piece.part(first, begin + (end - begin) * (number + 1) / count)
+                found = _after(found, theta + travelled(piece.omega, first, piece.tau), step, L, k)
     except (OverflowError, ValueError):
         return None
     return found if found is not None and all(map(isfinite, found)) else None
 
 
-def _rims(piece: Piece, L: float) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+def _rims(piece: Piece, L: float) -> tuple[Course, Course]:
     """Return the speeds of the rims of the right and the left wheel."""
-    mapped = piece.mapped(((1.0, L / 2.0), (1.0, -L / 2.0)))
-    return mapped.v, mapped.omega
+    (a, b, c), (d, e, f) = piece.v, ((L / 2.0) * part for part in piece.omega)
+    return (a + d, b + e, c + f), (a - d, b - e, c - f)
 
 
 def _after(moments: Entries, theta: float, piece: Piece, L: float, k: float) -> Entries | None:
     """Return the moments after a step in which no wheel changes its direction."""
+    T = piece.seconds
     if piece.constant:
-        return propagated_moments(moments, theta, piece.twist(0.0), piece.seconds, L, k)
-    cosine, sine = cos(theta), sin(theta)
-    dx, dy, _ = piece.displacement(piece.seconds)
-    gx, gy = cosine * dx - sine * dy, sine * dx + cosine * dy
-    noise, m = _noise(piece, L, k)
-    return composed(moments, cosine, sine, gx, gy, m, central(noise, m) if m else None)
-
-
-def _noise(piece: Piece, L: float, k: float) -> tuple[NoiseMoments, float]:
-    """Compute the moments of the noise of a step, in the frame of its start, and its m."""
-    T, tau = piece.seconds, piece.tau
+        return propagated_moments(moments, theta, piece.twist(0.0), T, L, k)
     v, omega = piece.twist(T / 2.0)
     right = math.copysign(k, v + omega * L / 2.0)
     left = math.copysign(k, v - omega * L / 2.0)
     # k |v_R| + k |v_L| = p v + q omega, and k |v_R| - k |v_L| = r v + s omega.
     p, q = right + left, (right - left) * L / 2.0
     r, s = right - left, (right + left) * L / 2.0
-    nodes = []
-    for node, weight in RULE:
-        t = node * T
-        v, omega = piece.twist(t)
-        path, turn = travelled(piece.v, t, tau), travelled(piece.omega, t, tau)
-        m = (p * path + q * turn) / (2.0 * L * L)
-        vv, vw = (p * v + q * omega) / 4.0, (r * v + s * omega) / (2.0 * L)
-        nodes.append((weight, v, turn, m, vv, vw))
+    nodes, partial = piece.quadrature(T)
+    # At the nodes: weight, heading, v, v + i vw/2, vv, m, exp(-m).
+    at: list[tuple[float, complex, float, complex, float, float, float]] = []
     firsts, squares, products = [], [], []
-    of_psi = 0j
-    for weight, v, turn, m, _, vw in nodes:
-        z = complex(cos(turn), sin(turn))
-        loss, half = expm1(-m), 0.5j * vw
-        decay = 1.0 + loss
-        firsts.append(z * (v * loss + half * decay))
+    displacement = first = of_psi = 0j
+    for node, weight in nodes:
+        v, omega, path, turn = piece.state(node * T)
+        m = (p * path + q * turn) / (2.0 * L * L)
+        vw = (r * v + s * omega) / (2.0 * L)
+        half, loss = 0.5j * vw, expm1(-m)
+        z, decay = complex(cos(turn), sin(turn)), 1.0 + loss
+        # Integrands of E[gamma], E[gamma u] / exp(-m) and E[gamma* u] / exp(-m).
+        inner = z * (v * loss + half * decay)
+        firsts.append(inner)
         squares.append(z * (v * expm1(-3.0 * m) + 3.0 * half * decay**3))
         products.append(z.conjugate() * (v * expm1(m) + half / decay))
+        displacement += weight * v * z
+        first += weight * inner
         of_psi += weight * (z * decay * ((v + half) * 2j * m + vw))
+        at.append((weight, z, v, v + half, (p * v + q * omega) / 4.0, m, decay))
     xx = xy = yy = 0.0
-    first = square = product = 0j
-    for row, (weight, v, turn, m, vv, vw), f, a, b in zip(
-        MATRIX, nodes, firsts, squares, products, strict=True
+    square = product = 0j
+    for row, (weight, z, v, drift, vv, m, decay), a, b in zip(
+        partial, at, squares, products, strict=True
     ):
         # E[gamma], E[gamma u] and E[gamma* u] at the node.
-        mean = T * sum(map(_times, row, firsts))
-        decay, drift = exp(-m), v + 0.5j * vw
-        gamma_u, conjugate_u = (
-            decay * T * sum(map(_times, row, squares)),
-            decay * T * sum(map(_times, row, products)),
-        )
-        z = complex(cos(turn), sin(turn))
+        mean = T * sum(map(mul, row, firsts))
+        gamma_u = decay * T * sum(map(mul, row, squares))
+        conjugate_u = decay * T * sum(map(mul, row, products))
         with_conjugate = z * (drift * conjugate_u - v * mean.conjugate())
         with_gamma = z * (drift * gamma_u - v * mean)
-        lost = expm1(-4.0 * m)
-        double_c, double_s = z.real * z.real - z.imag * z.imag, 2.0 * z.real * z.imag
-        xx += weight * ((with_conjugate + with_gamma).real + vv * (z.real**2 + lost * double_c / 2.0))
-        yy += weight * ((with_conjugate - with_gamma).real + vv * (z.imag**2 - lost * double_c / 2.0))
-        xy += weight * (with_gamma.imag + vv * (1.0 + lost) * double_s / 2.0)
-        first, square, product = first + weight * f, square + weight * a, product + weight * b
-    path, turn = piece.path(T)
-    M = (p * path + q * turn) / (2.0 * L * L)
-    first, of_psi, decay = first * T, of_psi * T, exp(-M)
+        lost, double = expm1(-4.0 * m), z * z
+        xx += weight * ((with_conjugate + with_gamma).real + vv * (z.real**2 + lost * double.real / 2.0))
+        yy += weight * ((with_conjugate - with_gamma).real + vv * (z.imag**2 - lost * double.real / 2.0))
+        xy += weight * (with_gamma.imag + vv * (1.0 + lost) * double.imag / 2.0)
+        square, product = square + weight * a, product + weight * b
+    _, _, path, turn = piece.state(T)
+    m = (p * path + q * turn) / (2.0 * L * L)
+    first, of_psi, decay = first * T, of_psi * T, exp(-m)
     # E[gamma (exp(i psi) - 1)] and E[gamma* (exp(i psi) - 1)] at the end.
     a, b = decay * square * T - first, decay * product * T - first.conjugate()
     noise = NoiseMoments(
@@ -167,8 +129,6 @@ def _noise(piece: Piece, L: float, k: float) -> tuple[NoiseMoments, float]:
         *((a.real + b.real) / 2.0, (a.imag + b.imag) / 2.0),
         *((a.imag - b.imag) / 2.0, (b.real - a.real) / 2.0),
     )
-    return noise, M
-
-
-def _times(factor: float, value: complex) -> complex:
-    return factor * value
+    cosine, sine = cos(theta), sin(theta)
+    g = complex(cosine, sine) * displacement * T
+    return composed(moments, cosine, sine, g.real, g.imag, m, central(noise, m) if m else None)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, NamedTuple, Protocol, TypeAlias
 
@@ -72,6 +72,15 @@ class Actuators(Checked):
     """Limits of the acceleration."""
     delay: Annotated[int, _delay] = 0
     """Time from a command to its effect on the motors (ns)."""
+
+    def lagging(self, seconds: float) -> Actuators:
+        """Return actuators whose lag is at least a time constant (s)."""
+        return replace(self, lag=max(self.lag, seconds))
+
+    def weakened(self, wheel: str, speed: float) -> Actuators:
+        """Return actuators that turn the 'right' or 'left' wheel at most at a speed (rad/s)."""
+        name = f'max_{wheel}_speed'
+        return replace(self, **{name: min(speed, getattr(self, name))})
 
     @property
     def immediate(self) -> bool:
@@ -143,40 +152,36 @@ class Drive(NamedTuple):
     """The twist within the limits of the acceleration."""
     motion: Profile
     """The twist of the robot."""
-    effective: int
-    """Time from which on the last command has an effect (ns)."""
 
     @classmethod
     def at(cls, stamp: int, twist: Twist) -> Drive:
         """Return a constant twist."""
         constant = Profile(stamp, [held(twist)])
-        return cls(constant, constant, stamp)
+        return cls(constant, constant)
 
-    def followed(
-        self, stamp: int, effective: int, target: Twist, actuators: Actuators, wheels: Wheels
-    ) -> Drive:
+    def followed(self, stamp: int, target: Twist, actuators: Actuators, wheels: Wheels) -> Drive:
         """Return how the speeds go on from a time when another twist is to be reached.
+
+        The motors may differ from those so far: their largest speeds and their lag are the new ones at
+        once, the limits of the acceleration after the delay, with the target.
 
         Args:
             stamp: The time (ns).
-            effective: Time from which on the new target counts, the same or later (ns).
             target: The twist, within the limits of the velocity.
             actuators: What the robot follows it with.
             wheels: Its wheels.
         """
-        now, then = self.motion.seconds(stamp), self.motion.seconds(effective)
-        demand, here = self.demanded.twist(then), self.motion.twist(then)
-        demanded = [*_ramp(demand, target, actuators.acceleration, wheels), held(target)]
-        motion: Iterable[Piece] = demanded
+        now = self.demanded.seconds(stamp)
+        then = self.demanded.seconds(stamp + actuators.delay)
+        rise = ramp(self.demanded.twist(then), target, actuators.acceleration, wheels)
+        demanded = [*self.demanded.between(now, then), *rise]
+        motion = demanded
         if actuators.max_right_speed < math.inf or actuators.max_left_speed < math.inf:
-            motion = _saturated(demanded, actuators, wheels)
+            motion = list(_saturated(demanded, actuators, wheels))
         if actuators.lag:
-            motion = _lagging(here, motion, actuators.lag)
-        return Drive(
-            Profile(stamp, [*self.demanded.between(now, then), *demanded]),
-            Profile(stamp, [*self.motion.between(now, then), *motion]),
-            effective,
-        )
+            here = self.motion.twist(self.motion.seconds(stamp))
+            motion = list(_lagging(here, motion, actuators.lag))
+        return Drive(Profile(stamp, demanded), Profile(stamp, motion))
 
 
 def held(twist: Twist) -> Piece:
@@ -185,12 +190,13 @@ def held(twist: Twist) -> Piece:
     return Piece(math.inf, (v, 0.0, 0.0), (omega, 0.0, 0.0))
 
 
-def _ramp(start: Twist, target: Twist, limits: AccelerationLimits, wheels: Wheels) -> Iterator[Piece]:
-    """Return the transition from one twist to another."""
+def ramp(start: Twist, target: Twist, limits: AccelerationLimits, wheels: Wheels) -> Iterator[Piece]:
+    """Return the transition from one twist to another, which is then held for ever."""
     for seconds, end in limits.transition(start, target, wheels.wheel_speeds):
         if seconds > 0.0:
             yield _line(start, end, seconds)
         start = end
+    yield held(target)
 
 
 def _line(start: Twist, end: Twist, seconds: float) -> Piece:
@@ -223,7 +229,7 @@ def _lagging(here: Twist, pieces: Iterable[Piece], tau: float) -> Iterator[Piece
     settling = SETTLING * tau
     for piece in pieces:
         v, omega = (
-            (a - b * tau, b, speed - (a - b * tau))
+            (a - b * tau, b, _rest(speed, a - b * tau))
             for (a, b, _), speed in zip(piece[1:3], here, strict=True)
         )
         begin = 0.0
@@ -236,3 +242,9 @@ def _lagging(here: Twist, pieces: Iterable[Piece], tau: float) -> Iterator[Piece
             yield line
             if piece.seconds < math.inf:
                 here = line.twist(line.seconds)
+
+
+def _rest(speed: float, asymptote: float) -> float:
+    """Return by how much a lagging speed differs, zero if by its rounding error alone."""
+    reached = math.isclose(speed, asymptote, rel_tol=1e-15, abs_tol=1e-16)
+    return 0.0 if reached else speed - asymptote

@@ -403,9 +403,7 @@ class Robot:
         else:
             truth = truth.with_drift(model.drift)
         state = pose, angles, uncertainty, truth
-        effective = None if here._drive is None else max(here._stamp, here._drive.effective)
-        commanded_at = here.commanded_at
-        return here._following(model, here.stamp, state, command, limited, commanded_at, effective)
+        return here._following(model, here.stamp, state, command, limited, here.commanded_at)
 
     def restarted(self, stamp: int) -> Robot:
         """Stop at the same pose, at a time that may be earlier.
@@ -435,7 +433,6 @@ class Robot:
         command: tuple[float, float],
         target: tuple[float, float],
         commanded_at: int | None,
-        effective: int | None = None,
     ) -> Robot:
         """Return the robot in a state, from now on following a command.
 
@@ -446,16 +443,13 @@ class Robot:
             command: The command.
             target: The twist that it demands, within the limits of the model.
             commanded_at: Time at which the command took effect (ns).
-            effective: Time from which on it counts (ns); None: after the delay of the model.
         """
         actuators = model.actuators
         if actuators is None or actuators.immediate:
             twist = target if actuators is None else actuators.reached(target, model)
             return _robot(model, stamp, state, command, twist, commanded_at)
-        if effective is None:
-            effective = stamp + actuators.delay
         drive = self._drive or Drive.at(stamp, self._twist)
-        drive = drive.followed(stamp, effective, target, actuators, model)
+        drive = drive.followed(stamp, target, actuators, model)
         return _robot(model, stamp, state, command, target, commanded_at, drive)
 
     def _advanced(self, stamp: int) -> tuple[int, Robot, _State]:

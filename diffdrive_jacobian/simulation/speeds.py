@@ -8,9 +8,9 @@ That is what acceleration limits and a first-order lag of the wheels make of com
 constant and has no end.
 
 The pose after a time is an integral over v and the heading. It is computed by Gauss-Legendre quadrature
-in steps that turn by at most `MAX_TURN` and last at most `MAX_DECAY` time constants. The steps of a
-piece are equal, and begin with it. So the state at a time depends on the pieces alone, not on the times
-at which states are computed.
+in steps that turn by at most `MAX_TURN` and last at most `MAX_DECAY` time constants, with fewer nodes in
+short ones. The steps of a piece are equal, and begin with it. So the state at a time depends on the
+pieces alone, not on the times at which states are computed.
 """
 
 from __future__ import annotations
@@ -19,8 +19,10 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterator
 from itertools import pairwise
-from math import cos, exp, expm1, sin
+from math import cos, exp, expm1, sin, sqrt
 from typing import NamedTuple, TypeAlias
+
+import numpy as np
 
 from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.time_units import NANOSECONDS
@@ -33,19 +35,32 @@ MAX_TURN = 1.0
 """Largest turn of a step of the quadrature (rad)."""
 MAX_DECAY = 2.0
 """Largest duration of a step of the quadrature, in time constants of the exponential function."""
-_HALF_RULE = (
-    (0.1834346424956498, 0.362683783378362),
-    (0.525532409916329, 0.3137066458778873),
-    (0.7966664774136267, 0.2223810344533745),
-    (0.9602898564975363, 0.1012285362903763),
-)
-"""The positive nodes of the Gauss-Legendre quadrature with eight nodes on [-1, 1], and their weights."""
-RULE = tuple(
-    sorted(
-        ((1.0 + sign * node) / 2.0, weight / 2.0) for node, weight in _HALF_RULE for sign in (-1.0, 1.0)
-    )
-)
-"""Nodes and weights on [0, 1]."""
+
+
+class Quadrature(NamedTuple):
+    """Gauss-Legendre quadrature on [0, 1]."""
+
+    nodes: tuple[tuple[float, float], ...]
+    """Nodes and weights."""
+    partial: tuple[tuple[float, ...], ...]
+    """Weights of the integrals from 0 to each node, of the polynomial through the nodes."""
+
+    @classmethod
+    def of(cls, count: int) -> Quadrature:
+        """Return the quadrature with a number of nodes.
+
+        By the Legendre polynomials P_k: `integral of P_k = (P_k+1 - P_k-1) / (2 k + 1)`.
+        """
+        x, weights = np.polynomial.legendre.leggauss(count)
+        P = np.polynomial.legendre.legvander(x, count).T
+        integrals = np.array([P[1] + 1.0, *(P[k + 1] - P[k - 1] for k in range(1, count))])
+        partial = (integrals.T @ P[:count]) * weights / 4.0
+        nodes = np.stack([(x + 1.0) / 2.0, weights / 2.0], axis=-1)
+        return cls(tuple(map(tuple, nodes.tolist())), tuple(map(tuple, partial.tolist())))
+
+
+_QUADRATURES = (0.05, Quadrature.of(3)), (0.25, Quadrature.of(4)), (math.inf, Quadrature.of(8))
+"""The size of a step, and the quadrature for steps of at most that size."""
 
 
 def speed_at(course: Course, t: float, tau: float) -> float:
@@ -121,21 +136,33 @@ class Piece(NamedTuple):
             steps = max(steps, self.seconds / self.tau / MAX_DECAY)
         return self.seconds / max(1.0, math.ceil(steps))
 
+    def state(self, t: float) -> tuple[float, float, float, float]:
+        """Return the twist after the time t, and the path and the turn until then."""
+        (a, b, c), (d, e, f), tau = self.v, self.omega, self.tau
+        v, omega, path, turn = a + b * t, d + e * t, (a + b * t / 2.0) * t, (d + e * t / 2.0) * t
+        if c or f:
+            loss = expm1(-t / tau)
+            v, omega = v + c * (1.0 + loss), omega + f * (1.0 + loss)
+            path, turn = path - c * tau * loss, turn - f * tau * loss
+        return v, omega, path, turn
+
+    def quadrature(self, t: float) -> Quadrature:
+        """Return the quadrature that is exact to 1e-14 over the time t, at most a step."""
+        (_, _, c), (d, e, f) = self.v, self.omega
+        # An order n of the derivative of exp(i e t^2 / 2) has up to n!! times sqrt(e)^n.
+        size = (abs(d) + abs(f) + 1.8 * sqrt(abs(e))) * t
+        if c or f:
+            size = max(size, t / self.tau)
+        return next(quadrature for most, quadrature in _QUADRATURES if size <= most)
+
     def displacement(self, t: float) -> tuple[float, float, float]:
         """Compute `(dx, dy, dtheta)` in the body frame of the beginning, after at most a step."""
-        (a, b, c), (d, e, f), tau = self.v, self.omega, self.tau
         x = y = 0.0
-        for node, weight in RULE:
-            s = node * t
-            turn, speed = (d + e * s / 2.0) * s, a + b * s
-            if c or f:
-                decay = expm1(-s / tau)
-                turn -= f * tau * decay
-                speed += c * (1.0 + decay)
-            speed *= weight
-            x += speed * cos(turn)
-            y += speed * sin(turn)
-        return x * t, y * t, travelled(self.omega, t, tau)
+        for node, weight in self.quadrature(t).nodes:
+            v, _, _, turn = self.state(node * t)
+            x += weight * v * cos(turn)
+            y += weight * v * sin(turn)
+        return x * t, y * t, travelled(self.omega, t, self.tau)
 
 
 class Profile:
