@@ -468,19 +468,19 @@ def test_headings_that_count_must_be_given():
 
 SLOW = AccelerationLimits(
     v=AxisLimits(
-        max_acceleration=0.5,
-        max_deceleration=-0.8,
-        max_acceleration_reverse=-0.3,
-        max_deceleration_reverse=0.6,
+        max_acceleration=1.0,
+        max_deceleration=-1.5,
+        max_acceleration_reverse=-0.7,
+        max_deceleration_reverse=1.2,
     ),
-    omega=AxisLimits(max_acceleration=4.0, max_deceleration=-6.0),
+    omega=AxisLimits(max_acceleration=12.0, max_deceleration=-16.0),
 )
 MS = 1_000_000
 FOLLOWING = {
     'limits': Actuators(acceleration=SLOW),
     'wheels': Actuators(acceleration=AccelerationLimits(max_wheel_acceleration=60.0), delay=40 * MS),
     'lag': Actuators(lag=0.08),
-    'all': Actuators(acceleration=SLOW, lag=0.05, delay=33 * MS),
+    'all': Actuators(acceleration=SLOW, lag=0.02, delay=33 * MS),
 }
 
 
@@ -489,14 +489,14 @@ FOLLOWING = {
 @pytest.mark.parametrize('following', FOLLOWING)
 def test_robots_that_take_time_drive_as_one_alone(following, name, stops):
     law, gains = LAWS[name]
-    starts, targets = random_batch(7, 4)
+    starts, targets = random_batch(7, 2)
     arrival = Arrival(
         use_heading=name == 'pose',
         offset=gains[1] if name == 'offset_point' else 0.0,
         **({'trans_stopped_velocity': 0.01, 'rot_stopped_velocity': 0.05} if stops else {}),
     )
     actuators = FOLLOWING[following]
-    many = {'duration': 6.0, 'arrival': arrival, 'limits': LIMITS, 'actuators': actuators}
+    many = {'duration': 5.0, 'arrival': arrival, 'limits': LIMITS, 'actuators': actuators}
     gone = trajectories(law, starts, targets, *gains, **many)
     assert_same(closed_loops(law, starts, targets, *gains, **many), gone.outcomes)
     model = RobotModel(limits=LIMITS, actuators=actuators)
@@ -513,10 +513,10 @@ def test_robots_that_take_time_drive_as_one_alone(following, name, stops):
             robot = robot.commanded(command, robot.stamp).at(robot.stamp + 20 * MS)
         expected = math.nan if arrived is None else arrived
         assert gone.outcomes.time[index] == pytest.approx(expected, nan_ok=True)
-        if arrived is not None and arrived < 4.0:
+        if arrived is not None and arrived < 3.0:
             # What is kept of it ends at rest.
             assert np.abs(robot.twist).max() < 1e-8
-    assert gone.outcomes.arrived.sum() >= 2
+    assert gone.outcomes.arrived.any()
 
 
 def test_a_robot_that_stops_late_overshoots():

@@ -17,7 +17,7 @@ import numpy as np
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.numerics.elementary import sinc
 from diffdrive_jacobian.simulation._batch import Array, Batch, Mask, Rows
-from diffdrive_jacobian.simulation.acceleration import AxisLimits
+from diffdrive_jacobian.simulation.acceleration import SHORTEST, AxisLimits
 from diffdrive_jacobian.simulation.actuators import Actuators
 from diffdrive_jacobian.time_units import NANOSECONDS
 
@@ -118,7 +118,8 @@ class Follower:
             seconds = slowest
             for limit, speed, by in zip((limits.v, limits.omega), middle, change, strict=True):
                 seconds = np.maximum(seconds, np.abs(by) / _rate(limit, speed, by))
-            yield end, seconds * (upto - share)
+            duration = seconds * (upto - share)
+            yield end, np.where(duration >= SHORTEST, duration, 0.0)
             share, here = upto, end
         yield target, np.full_like(share, np.inf)
 
@@ -127,12 +128,14 @@ class Follower:
     ) -> Iterator[tuple[Rows, Array, Array]]:
         """Yield the steps of a piece in which the demanded twists are linear."""
         rest, tau = None, self.lag
-        steps = np.abs(speed[1]) * seconds + np.abs(slope[1]) * seconds**2 / 2.0
+        # The turn is at most that with the fastest speed, which is one at an end of the piece.
+        ends = speed[1], speed[1] + slope[1] * seconds, self.twist[1, rows]
+        steps = seconds * np.max(np.abs(ends if tau else ends[:2]), axis=0)
         if tau:
             speed = speed - slope * tau
             rest = self.twist[:, rows] - speed
             self.twist[:, rows] = speed + slope * seconds + rest * np.exp(-seconds / tau)
-            steps = np.maximum(steps + np.abs(rest[1]) * tau, seconds / tau / 2.0)
+            steps = np.maximum(steps, seconds / tau / 2.0)
         elif not slope.any():
             steps = np.zeros_like(seconds)
         steps = np.maximum(np.ceil(steps / self.largest), 1.0)
