@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from diffdrive_jacobian.control import KP, KV, OFFSET, Arrival
+from diffdrive_jacobian.control import KP, KV, OFFSET, Arrival, circle_path
 from diffdrive_jacobian.kinematics import diff_drive
 from diffdrive_jacobian.live import files, settings
 from diffdrive_jacobian.live.commands import Pause, SetSpeed, Step
@@ -417,6 +417,30 @@ def test_parameters_of_any_node_may_be_anything():
             shown = state.shown(age=0.0, by_hand=False)
             json.dumps(shown, allow_nan=False)
             assert shown['geometry'] == usual['geometry']
+
+
+def test_a_planned_path_is_shown_with_its_errors():
+    state = RobotState('/')
+    state.goal.sent(circle_path(1.0), (1, 0))
+    state.goal.reported(GoalState.EXECUTING, (1, 0))
+    state.controller_values = {'controller': 'go_to_goal', 'path_controller': 'kanayama'}
+    for x in (0.0, 0.1):
+        state.moved(x, np.array([x, -0.05, 0.2]), (1.0, 0.0), None)
+    shown = json.loads(json.dumps(state.shown(age=0.0, by_hand=False), allow_nan=False))
+    assert (shown['law']['name'], shown['bearing_error']) == ('kanayama', None)
+    away = math.hypot(0.1, 1.05) - 1.0
+    assert shown['across'] == pytest.approx(-away, abs=1e-4)
+    passed = math.atan2(0.1, 1.05)
+    assert shown['path_heading_error'] == pytest.approx(0.2 - passed, abs=1e-4)
+    assert shown['distance'] == pytest.approx(2.0 * math.pi - passed, abs=2e-3)
+    places = np.array(shown['goal']['path'])
+    np.testing.assert_allclose(np.hypot(places[:, 0], places[:, 1] - 1.0), 1.0, atol=1e-3)
+    assert len(shown['goal']['goals']) == 1
+    state.goal.sent(np.array([[2.0, 2.0, 0.0]]), (2, 0))
+    state.goal.reported(GoalState.EXECUTING, (2, 0))
+    shown = state.shown(age=0.0, by_hand=False)
+    assert (shown['across'], shown['goal'].get('path')) == (None, None)
+    assert shown['law']['name'] == 'go_to_goal'
 
 
 def test_the_path_is_interrupted_where_a_robot_is_placed():
