@@ -25,6 +25,7 @@ from diffdrive_jacobian.nodes.goal_client import (
     loss,
 )
 from diffdrive_jacobian.nodes.standstill import Standstill
+from diffdrive_jacobian.numerics.checks import number, positive_or_infinite
 from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
 from diffdrive_jacobian.ros.liveness import Liveness
 from diffdrive_jacobian.ros.node_runner import NodeRunner
