@@ -133,6 +133,19 @@ def test_slows_down_towards_the_end_and_drives_to_the_last_pose_as_to_a_goal(con
     assert controller.statuses == [(2, ACCEPTED), (2, EXECUTING), (2, SUCCEEDED)]
 
 
+def test_the_robot_can_stop_at_the_end_within_its_limits(controller):
+    """By the taper, which knows them, and by `stop_in_time`, which knows its delay, too."""
+    controller.send(STRAIGHT)
+    for x in (0.0, 0.3, 0.6):
+        controller.at(x, 0.0)
+    assert change(controller.node, linear__x__max_deceleration=-0.1).successful
+    taper = math.sqrt(2.0 * 0.1 * 0.1)
+    assert controller.at(0.9, 0.0)[0] == pytest.approx(taper)
+    assert change(controller.node, stop_in_time=True, command_delay=0.5).successful
+    v, _ = controller.at(0.9, 0.0)
+    assert v * 0.5 + v * v / 2.0 / 0.1 == pytest.approx(0.1)
+
+
 def test_the_same_path_again_goes_on_where_the_robot_is(controller):
     """As from a node that publishes its path every second."""
     controller.send(STRAIGHT)

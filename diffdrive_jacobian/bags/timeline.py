@@ -93,7 +93,7 @@ def timeline(run: Run) -> Timeline:
     targets[goal >= 0] = run.goals.values[goal[goal >= 0]]
     dx, dy = targets[:, 0] - x, targets[:, 1] - y
     to_goal = targets[:, :2] - _driven_points(run)
-    last = [sent.rows[-1] for sent, _ in routes if not sent.is_path]
+    last = [sent.rows[-1] for sent, _ in routes if sent.rows and not sent.is_path]
     paths, path, errors = _along_paths(run, routes, driven)
     counts = _over_time(run, lambda now: heading_counts(now.of_node('go_to_goal')))
     return Timeline(
@@ -194,6 +194,8 @@ def _progress(
         zip(routes, begins, [*begins, _NEVER][1:], strict=True)
     ):
         route, state = sent.rows, followed.state
+        if not route:
+            continue
         here, end = np.searchsorted(seen, [begun, until]).tolist()
         stop = end
         if state in (GoalState.CANCELED, GoalState.ABORTED):
@@ -338,7 +340,10 @@ def _sent(run: Run, series: Series, most: int, *, is_path: bool) -> Iterator[Sen
 
 
 def _routes(run: Run) -> list[Followed]:
-    """Follow goals and paths in the order in which they came; those that were refused are left out."""
+    """Follow goals and paths in the order in which they came; those that were refused are left out.
+
+    A message that was not recorded was sent when its goal was accepted, and has no rows.
+    """
     statuses = run.goal_status
     routes = sorted(
         [
@@ -365,8 +370,13 @@ def _routes(run: Run) -> list[Followed]:
     for route, (begin, end) in zip(routes, pairwise(answered), strict=True):
         followed.append((route, follower.sent(route, route.stamp)))
         for report in reports[begin:end]:
+            before = follower.driving
             follower.reported(*report)
-    return [pair for pair in followed if pair[1].fate is not Fate.REFUSED]
+            driving = follower.driving
+            if driving is not None and driving is not before and driving.goal is None:
+                unrecorded = Sent(report[2], range(0), is_path=False, stamp=driving.stamp)
+                followed.append((unrecorded, driving))
+    return [one for one in followed if one[1].fate is not Fate.REFUSED]
 
 
 def _stamps(run: Run, series: Series) -> list[Stamp]:

@@ -12,7 +12,7 @@ while the law of the path drives.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import cos, hypot, pi, sin, sqrt
+from math import cos, hypot, inf, pi, sin, sqrt
 from typing import Any
 
 import numpy as np
@@ -112,6 +112,10 @@ class PathFollower:
             return here, turn_in_place.formula(theta, reference.theta, how.turning_gain)
         here = replace(here, elapsed=self.elapsed + dt)
         return here, law(pose, here._target(x, y, how) if how.lookahead else here.reference(how))
+
+    def remaining(self) -> tuple[float, float]:
+        """Return the rest of the path (m), and the turn that is left, which is unknown: infinite."""
+        return max(self.path.length - self.s, 0.0), inf
 
     def _next(self, x: float, y: float, s: float, tolerance: float) -> int:
         """Return the index of the next pose to pass."""

@@ -25,6 +25,7 @@ from diffdrive_jacobian.nodes.goal_client import (
     loss,
 )
 from diffdrive_jacobian.nodes.standstill import Standstill
+from diffdrive_jacobian.numerics.checks import number, positive_or_infinite
 from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
 from diffdrive_jacobian.ros.liveness import Liveness
 from diffdrive_jacobian.ros.node_runner import NodeRunner
@@ -162,7 +163,8 @@ def send_goal(
 
     Args:
         goal: `[x, y, theta]`, shape (3,) (m, m, rad).
-        runner: Runs the node, in real time or in lockstep, and may run others. None: a new one does.
+        runner: Runs the node until the goal has ended, in real time (`drives.in_real_time`) or in
+            lockstep (`drives.in_lockstep`), and may run others. None: a new one does.
         frame: Frame of the goal. Empty: the frame of the odometry.
         readers: Number of subscriptions that goal_pose must have before the goal is sent.
         patience: Longest wait for the controller and for the subscriptions (s).
@@ -171,11 +173,13 @@ def send_goal(
         heading_matters: Whether to report a controller that ignores the heading of the goal.
         ros_arguments: ROS arguments of the node; those of `runner`, if it is given.
         signals: Counter of the signals that cancel the goal. None: no signal does.
-        progress: Receives the progress. None: nothing does.
+        progress: Receives the progress. An error that it raises cancels the goal, and is passed on.
+            None: nothing does.
 
     Raises:
         UserError: The ROS arguments are invalid, or the node cannot be created.
-        ValueError: `goal` has another shape, or `ros_arguments` are given with `runner`.
+        ValueError: `goal` has another shape, a time is not positive, or `ros_arguments` are given with
+            `runner`.
     """
     goals = np.asarray(goal, dtype=np.float64)[np.newaxis]
     sending = _Sending(frame, readers, patience, timeout, follow, heading_matters)
@@ -214,7 +218,8 @@ def send_path(
 
     Raises:
         UserError: The ROS arguments are invalid, or the node cannot be created.
-        ValueError: The path has more than 10,000 poses, or `ros_arguments` are given with `runner`.
+        ValueError: The path has more than 10,000 poses, a time is not positive, or `ros_arguments` are
+            given with `runner`.
     """
     if len(path.poses) > MAX_PATH_POSES:
         raise ValueError(f'path must have at most {MAX_PATH_POSES} poses, got {len(path.poses)}')
@@ -243,8 +248,11 @@ def _send(
     signals: Signals | None,
     progress: RemoteProgress | None,
 ) -> GoalResult:
+    number('patience', how.patience, positive_or_infinite)
+    number('timeout', how.timeout, positive_or_infinite)
     if runner is not None and ros_arguments:
         raise ValueError('ros_arguments are those of the runner, if one is given')
+    created = runner is None
     with ExitStack() as stack:
         if runner is None:
             if not how.follow:
@@ -266,10 +274,16 @@ def _send(
                 start_parameter_services=False,
             )
         )
+        if not created:
+            stack.callback(used.remove, client)
         session = _Session(client, used, signals or Signals(), progress or _Silent())
-        return session.run(
-            how.patience, how.timeout, follow=how.follow, heading_matters=how.heading_matters
-        )
+        try:
+            return session.run(
+                how.patience, how.timeout, follow=how.follow, heading_matters=how.heading_matters
+            )
+        except BaseException:
+            session.abandon()
+            raise
 
 
 class _Session:
@@ -292,6 +306,7 @@ class _Session:
             if signals.count:
                 return self._result(Result.INTERRUPTED)
             return self._result(Result.NOT_SENT, reason=obstacle)
+        self._await_readers()
         controllers = client.controllers()
         client.send()
         names = sorted(set(controllers.values()) - {''})
@@ -316,6 +331,12 @@ class _Session:
             client.cancel()
             return self._result(Result.LOST, reason=lost)
         return self._cancel(Result.INTERRUPTED if signals.count else Result.TIMEOUT)
+
+    def abandon(self) -> None:
+        """Cancel the goal if it may be active: an error, as of a closed output, ends its pursuit."""
+        if self._client.sent and not self._client.ended:
+            self._client.cancel()
+            self._runner.spin(lambda: self._client.ended, timeout=ANSWER_PATIENCE, signals=self._signals)
 
     def _turns(self, seconds: float) -> Iterator[float]:
         """Execute callbacks, and yield the time (s) often, for a time (s) or until a signal."""
@@ -346,6 +367,15 @@ class _Session:
                 break
             self._progress.waiting(reason)
         return reason
+
+    def _await_readers(self) -> None:
+        """Wait until no more subscriptions are discovered: a recorder needs the goal, too."""
+        readers, since = 0, -math.inf
+        for now in self._turns(ANSWER_PATIENCE):
+            if self._client.readers != readers:
+                readers, since = self._client.readers, now
+            if now - since >= self._runner.discovery:
+                break
 
     def _await_acknowledgement(self) -> bool:
         """Wait until the goal is acknowledged by every subscription; return whether it is."""

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar, cast
 
+from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.controller import (
     KP,
     KV,
@@ -29,13 +30,20 @@ from diffdrive_jacobian.control.path_following import PathSettings
 from diffdrive_jacobian.control.path_laws import PATH_CONTROLLERS
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MAX_SPEED
-from diffdrive_jacobian.parameters._fields import STAMPED, timeout_field
+from diffdrive_jacobian.parameters._fields import (
+    STAMPED,
+    command_delay_field,
+    timeout_field,
+    wheel_lag_field,
+)
 from diffdrive_jacobian.parameters.declaration import (
     ParameterError,
     default_of,
     parameter,
 )
-from diffdrive_jacobian.parameters.limits import LimitParameters
+from diffdrive_jacobian.parameters.limits import TwistAccelerationParameters, number_or
+from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.time_units import nanoseconds
 
 C = TypeVar('C', bound=ControlLaw)
 
@@ -61,9 +69,20 @@ def _gain(gain: Gain) -> Any:
     return parameter(gain.default, f'{gain.description}{unit}.', bounds=gain.bounds, above=gain.above)
 
 
+def _stopped(what: str, unit: str) -> Any:
+    return parameter(
+        math.nan,
+        f'Largest {what} with which the robot counts as arrived [{unit}]; .nan: any.',
+        bounds=(1e-6, MAX_SPEED),
+        nan_is_none=True,
+    )
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
-class GoToGoalParameters(LimitParameters):
-    """Parameters of the node go_to_goal."""
+class GoToGoalParameters(TwistAccelerationParameters):
+    """Parameters of the node go_to_goal. Limits of the acceleration, lag and delay are known, not kept:
+    they say what the robot can do.
+    """
 
     controllers: ClassVar[Controllers] = CONTROLLERS
     """The controllers that can be chosen."""
@@ -89,6 +108,15 @@ class GoToGoalParameters(LimitParameters):
     use_goal_heading: bool = parameter(
         False, 'Turn to the heading of the last goal after its position is reached.'
     )
+    trans_stopped_velocity: float = _stopped('speed', 'm/s')
+    rot_stopped_velocity: float = _stopped('yaw rate', 'rad/s')
+    wheel_lag: float = wheel_lag_field()
+    command_delay: float = command_delay_field()
+    stop_in_time: bool = parameter(
+        False,
+        'Command no speed from which the robot cannot stop at the last goal within its limits of the '
+        'acceleration, with its lag and delay.',
+    )
     path_controller: str = _controller('pure_pursuit', ALL_PATH_CONTROLLERS)
     lookahead_distance: float = _gain(declared_gains['lookahead_distance'])
     k_x: float = _gain(declared_gains['k_x'])
@@ -101,7 +129,9 @@ class GoToGoalParameters(LimitParameters):
         0.2, 'Speed along a path without times [m/s].', bounds=(1e-3, MAX_SPEED)
     )
     path_deceleration: float = parameter(
-        0.5, 'Deceleration towards the end of a path [m/s^2].', bounds=(1e-3, MAX_SPEED)
+        0.5,
+        'Deceleration towards the end of a path, at most linear.x.max_deceleration [m/s^2].',
+        bounds=(1e-3, MAX_SPEED),
     )
     path_approach_distance: float = parameter(
         0.3,
@@ -198,6 +228,27 @@ class GoToGoalParameters(LimitParameters):
         """Return the limits of the commands, at most the largest plausible twist."""
         return self.twist_limits(MAX_SPEED)
 
+    def actuators(self) -> Actuators:
+        """Return how the robot follows commands, as far as it is known."""
+        return Actuators(
+            acceleration=self.acceleration_limits(),
+            lag=self.wheel_lag,
+            delay=nanoseconds(self.command_delay),
+        )
+
+    def arrival(self) -> Arrival:
+        """Return the arrival criterion."""
+        controller = self.chosen_controller()
+        return Arrival(
+            xy_tolerance=self.xy_goal_tolerance,
+            yaw_tolerance=self.yaw_goal_tolerance,
+            # A law that takes the heading must not stop before it has reached it.
+            use_heading=self.use_goal_heading or controller.takes_heading,
+            offset=controller.driven_offset(self),
+            trans_stopped_velocity=number_or(self.trans_stopped_velocity, math.inf),
+            rot_stopped_velocity=number_or(self.rot_stopped_velocity, math.inf),
+        )
+
     def check(self) -> None:
         """Check that the driven point is not on the axle, and that the controllers can be loaded."""
         if abs(self.offset) < MIN_OFFSET:
@@ -228,7 +279,7 @@ class GoToGoalParameters(LimitParameters):
         """Return how a path is followed, not faster than the limits allow."""
         return PathSettings(
             speed=min(self.path_speed, self.limits().max_v),
-            deceleration=self.path_deceleration,
+            deceleration=min(self.path_deceleration, -self.acceleration_limits().v.max_deceleration),
             approach_distance=self.path_approach_distance,
             lookahead=self.chosen_path_controller().lookahead_distance(self),
             turning_gain=self.kp,

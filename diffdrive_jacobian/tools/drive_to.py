@@ -95,6 +95,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                     isolated=not options.open,
                     timeout=options.timeout,
                     parameters=_controller_parameters(options),
+                    robot_parameters=_options.following_parameters(options),
                     recording=recording,
                     ros_arguments=ros,
                     signals=signals,
@@ -147,6 +148,7 @@ def _drive_with_page(
                 lockstep=options.lockstep,
                 isolated=not options.open,
                 parameters=_controller_parameters(options),
+                robot_parameters=_options.following_parameters(options),
                 recording=recording,
                 ros_arguments=ros,
                 port=options.port,
@@ -217,6 +219,7 @@ class _Progress:
 def _controller_parameters(options: argparse.Namespace) -> dict[str, Any]:
     """Return the controller's parameters that were given by an option of their own."""
     given = {
+        **_options.following_parameters(options),
         'xy_goal_tolerance': options.tolerance,
         'controller': options.controller,
         'path_controller': options.path_controller,
@@ -368,6 +371,7 @@ def _parser() -> _cli.Parser:
         metavar='NAME',
         help='controller of the path: %(choices)s (default: pure_pursuit, unless a file names another)',
     )
+    _options.add_following(parser)
     _options.add_params_file(parser)
     _options.add_output(
         parser,
