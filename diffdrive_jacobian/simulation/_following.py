@@ -171,8 +171,10 @@ def _integrals(
     dx, dy, sums = np.zeros_like(seconds), np.zeros_like(seconds), np.zeros((3, len(seconds)))
 
     def turned(t: Array) -> Array:
-        turn = (speed[1] + slope[1] * t / 2.0) * t
-        return turn if rest is None else turn - rest[1] * tau * np.expm1(-t / tau)
+        turn: Array = (speed[1] + slope[1] * t / 2.0) * t
+        if rest is not None:
+            turn -= rest[1] * tau * np.expm1(-t / tau)
+        return turn
 
     if rest is None and not slope.any():
         # An arc, as in `se2.integrate`.
