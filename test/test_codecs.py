@@ -217,7 +217,7 @@ def test_values_of_parameters_are_those_of_rclpy():
     parameters = [Parameter(str(kind), Parameter.Type(kind), one) for kind, one in enumerate(values)]
     event = ParameterEvent(node='/a', changed_parameters=[one.to_parameter_msg() for one in parameters])
     found = PARAMETER_EVENT.reader(ParameterEvent)(serialize_message(event))
-    assert found == ('/a', {str(kind): one for kind, one in enumerate(values)})
+    assert found == ('/a', {str(kind): one for kind, one in enumerate(values)}, 0)
     event.changed_parameters[0].value.type = 10
     with pytest.raises(MessageError, match='must be 0 to 9, got 10'):
         value_of(PARAMETER_EVENT, event)

@@ -344,6 +344,29 @@ def test_a_weak_motor_clips_what_the_limits_demand():
         assert right == pytest.approx(min(4.0, left))
 
 
+@pytest.mark.parametrize(('axis', 'of'), [(0, V), (1, OMEGA)], ids=['v', 'omega'])
+def test_one_speed_is_that_of_diff_drive_controller_at_the_ends_of_its_cycles(axis, of):
+    """But where the sign changes: there it takes the limit of the old sign to the end of the cycle."""
+    rng, robot, cycle, command = np.random.default_rng(9), at_rest(acceleration=limits()), 0.02, 0.0
+    compared = {'rising': 0, 'crossing': 0}
+    for number in range(3000):
+        stamp = number * SECOND // 50
+        if number % 30 == 0:
+            command = round(rng.uniform(-0.6, 0.6) * (axis + 1), 2)
+            robot = robot.commanded((command, 0.0) if axis == 0 else (0.0, command), stamp)
+        before, after = robot.at(stamp).twist[axis], robot.at(stamp + SECOND // 50).twist[axis]
+        most = axis_rate(of, before, command - before) * cycle
+        theirs = before + min(max(command - before, -most), most)
+        if before * after < 0.0:
+            compared['crossing'] += 1
+            assert abs(after - theirs) < 4.0 * cycle
+        else:
+            compared['rising'] += after != before
+            assert after == pytest.approx(theirs, abs=1e-12)
+    assert compared['rising'] > 800
+    assert compared['crossing'] > 10
+
+
 def test_without_limits_the_rates_are_infinite():
     twist = (0.3, -1.2)
     plain = Robot(model=RobotModel(), stamp=0, pose=(0.0, 0.0, 0.0)).commanded(twist, 0)

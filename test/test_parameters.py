@@ -215,5 +215,5 @@ def test_limits_of_the_acceleration_default_as_in_diff_drive_controller():
         angular_z_max_acceleration=2.0, angular_z_max_acceleration_reverse=-3.0
     ).acceleration_limits()
     assert given.omega.max_deceleration == -3.0
-    assert given.omega.max_deceleration_reverse == 3.0
+    assert given.omega.max_deceleration_reverse == 2.0
     assert given.v.unlimited

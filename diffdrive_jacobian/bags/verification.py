@@ -515,25 +515,28 @@ def recorded_dynamics(run: Run) -> list[RobotModel]:
         The model at the start, and that from each message of `cmd_vel_out` on. []: the robot follows
         commands at once, or its parameters were not recorded.
     """
-    received, stamps = run.cmd_vel_out.received.tolist(), run.cmd_vel_out.stamps.tolist()
+    received, stamps = run.cmd_vel_out.received.tolist(), run.cmd_vel_out.stamps
     changes: dict[int, list[tuple[Any, ...]]] = defaultdict(list)
     times = run.parameter_stamps
     if len(times) != len(run.parameter_events):
         times = tuple(recorded for recorded, *_ in run.parameter_events)
+    margin = int(_MAX_DELAY * NANOSECONDS)
     for (recorded, node, values), stamp in zip(run.parameter_events, times, strict=True):
         if node.split('/')[-1] == ROBOT:
-            # The command is published again just before the event.
-            last = bisect_right(received, recorded + int(_MAX_DELAY * NANOSECONDS)) - 1
-            while last >= 0 and stamps[last] > stamp:
-                last -= 1
-            changes[last].append((values,))
+            # The robot publishes its command again after the event.
+            first = bisect_left(received, recorded - margin)
+            last = bisect_right(received, recorded + margin)
+            later = first + np.flatnonzero(stamps[first:last] >= stamp)
+            changes[int(later[np.argmin(stamps[later])]) if len(later) else last].append((values,))
     for recorded, fault, what in run.fault_events:
         robot = _FAULTY_ROBOT.search(fault)
         if robot is None or robot[1].split('/')[-1] == ROBOT:
-            changes[bisect_right(received, recorded) - 1].append((fault, what))
-    values, faults = dict(run.of_node(ROBOT)), []
-    model, found = RobotModel(), []
-    for number in range(-1, len(received)):
+            changes[bisect_left(received, recorded)].append((fault, what))
+    values = dict(run.of_node(ROBOT))
+    faults: list[str] = []
+    model = _dynamics(values, faults)
+    found = [model]
+    for number in range(len(received)):
         for change in changes.get(number, ()):
             if isinstance(change[0], dict):
                 values.update(change[0])
@@ -541,7 +544,7 @@ def recorded_dynamics(run: Run) -> list[RobotModel]:
                 faults.append(change[0])
             elif change[1].startswith('ends') and change[0] in faults:
                 faults.remove(change[0])
-        if number == -1 or number in changes:
+        if number in changes:
             model = _dynamics(values, faults)
         found.append(model)
     return found if any(model.takes_time for model in found) else []

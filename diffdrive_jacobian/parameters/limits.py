@@ -23,7 +23,7 @@ _RATES = {
     'max_deceleration_reverse': (
         1.0,
         'Maximum deceleration of motion in reverse, positive',
-        'minus max_deceleration',
+        'max_acceleration',
     ),
 }
 """Sign, description and meaning of NaN of each limit of the acceleration."""
@@ -130,12 +130,11 @@ class TwistAccelerationParameters(LimitParameters):
         if math.isnan(forward):
             return AxisLimits()
         reverse = number_or(reverse, -forward)
-        slowing = number_or(slowing, reverse)
         return AxisLimits(
             max_acceleration=forward,
-            max_deceleration=slowing,
+            max_deceleration=number_or(slowing, reverse),
             max_acceleration_reverse=reverse,
-            max_deceleration_reverse=number_or(slowing_reverse, -slowing),
+            max_deceleration_reverse=number_or(slowing_reverse, forward),
         )
 
 

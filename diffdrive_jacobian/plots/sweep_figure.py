@@ -119,8 +119,8 @@ def describe(setup: SweepSetup) -> str:
         there += f' and {setup.arrival.yaw_tolerance:g} rad'
     return (
         f'{setup.resolved_controller.name}: mean over {starts}, {setup.distance:g} m from the goal\n'
-        f'control rate {setup.rate:g} Hz; velocity limits: {", ".join(bounds) or "none"}; arrived within {there}'
-        + (f'\n{", ".join(accelerations)}' if accelerations else '')
+        f'control rate {setup.rate:g} Hz; velocity limits: {", ".join(bounds) or "none"}; '
+        f'arrived within {there}' + (f'\n{", ".join(accelerations)}' if accelerations else '')
     )
 
 

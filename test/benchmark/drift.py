@@ -3,8 +3,8 @@
 For each drive: the mean normalized error squared (NEES, 3 is right) of the true pose about the odometry,
 with the published covariance, over 4,000 seeds, and the standard deviations. Commands take effect within
 cells, also several in each. Some robots have acceleration limits, a lag and a delay. The last column is
-the NEES of as many runs with noisy wheels in steps of 10 ms, which do not use the slip. Then the CPU time
-of a message with and without slip, interleaved, and that of long gaps.
+the NEES of as many runs with noisy wheels in steps of 10 ms, which do not use the slip. Then the CPU
+time of a message with and without slip, interleaved, and that of long gaps.
 `--seconds 60` drives longer: half a minute of CPU time for each ten seconds. `--limited` leaves out the
 robots without limits.
 """
