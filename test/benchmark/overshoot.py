@@ -1,8 +1,8 @@
 """Overshoot and time to the goal of each built-in controller, for a robot that takes time to follow.
 
 Default gains, starts 2 m from the goal, with headings in all directions, at 50 Hz. The robot has the
-velocity limits of the TurtleBot3 Burger, the accelerations with which ROBOTIS plans its paths, then a lag
-and a delay too, and then a slow acceleration.
+velocity limits of the TurtleBot3 Burger, the accelerations with which ROBOTIS plans its paths,
+then a lag and a delay too, and then a slow acceleration.
 
     python test/benchmark/overshoot.py     the table of doc/controllers.md
 """
