@@ -349,6 +349,17 @@ def test_a_robot_that_takes_stamped_commands(live):
     live.until(lambda: live.robot()['twist'][0] == pytest.approx(0.3), timeout=2.0)
 
 
+def test_the_end_of_driving_by_hand_says_how_far_a_slow_robot_rolls(live):
+    live.world.add(make_complete(VirtualRobot, **{'linear.x.max_acceleration': 0.1}))
+    live.until(lambda: live.robot() and 'robot/linear.x.max_acceleration' in live.settings())
+    live.send(SetParameter('/', 'robot/linear.x.max_acceleration', 0.2))
+    live.until(lambda: live.settings()['robot/linear.x.max_acceleration']['value'] == 0.2)
+    live.send(DriveByHand('/', 0.2, 0.0))
+    live.until(lambda: live.robot()['twist'][0] == pytest.approx(0.2), timeout=2.0)
+    live.send(Release('/'))
+    live.until(lambda: any('rolls on for about 0.100 m' in text for text in live.texts), timeout=2.0)
+
+
 def test_without_a_page_nothing_is_computed(live):
     live.world.add(make_complete(VirtualRobot))
     live.session.leave(live.page)

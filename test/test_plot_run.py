@@ -552,6 +552,13 @@ def test_csv_holds_the_numbers_of_the_run(recorded, run, tmp_path):
     np.testing.assert_allclose(columns['bearing_error_rad'], one.bearing_error, **rounded)
     assert columns['omega_right_radps'].tolist() == run.wheels.values[:, 0].tolist()
     assert columns['omega_left_radps'].tolist() == run.wheels.values[:, 1].tolist()
+    first = np.flatnonzero(one.goal == one.goal.max())
+    goal, *places = np.vstack([run.goals.values[-1:, :2], run.odometry.values[first, :2]]) @ [1.0, 1.0j]
+    way = goal - places[0]
+    beyond = ((np.array(places) - goal) * way.conjugate()).real / abs(way)
+    np.testing.assert_allclose(columns['beyond_goal_m'][first], beyond, **rounded)
+    assert beyond[0] == pytest.approx(-abs(way))
+    assert np.ptp(beyond) > 0.1
     held = [math.nan] * 25 + [0.5] * 75 + [0.25] * 100
     np.testing.assert_array_equal(columns['v_command_mps'], held)
 

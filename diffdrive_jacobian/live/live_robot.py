@@ -39,6 +39,9 @@ from diffdrive_jacobian.messages.covariances import from_covariance
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.messages.topics import SENSORS
 from diffdrive_jacobian.nodes.remote_goal import ignores_heading
+from diffdrive_jacobian.nodes.stopping import rolls_on
+from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros
+from diffdrive_jacobian.parameters.virtual_robot import VirtualRobotParameters
 from diffdrive_jacobian.ros.service_client import ServiceClient
 from diffdrive_jacobian.text import printable
 from diffdrive_jacobian.time_units import NANOSECONDS, seconds
@@ -272,11 +275,23 @@ class LiveRobot:
             self.topics.publish_twist(self.hand.twist, self._now())
         elif act is Act.STOP:
             self.topics.publish_twist(STANDSTILL, self._now())
+            if rolling := self._rolls_on():
+                self._session.notify(f'driving by hand has ended, zero was sent{rolling}')
         elif act is Act.CANCEL_GOAL:
             self._session.notify('driving by hand: the goal is canceled')
             self._call('cancel_goal')
         elif act is Act.GIVE_UP:
             self._warn('the controller did not cancel its goal: the robot is not driven by hand')
+
+    def _rolls_on(self) -> str:
+        """Describe how far the robot rolls after zero was sent, as far as its limits are known."""
+        link = self.links.get('robot')
+        try:
+            model = from_ros(VirtualRobotParameters, link.values if link else {}).model()
+        except ParameterError:
+            # The robot is another node, with parameters of the same names.
+            return ''
+        return rolls_on(model.actuators, self.hand.twist, model)
 
     def stop(self) -> None:
         """Stop what a page drives."""

@@ -21,7 +21,7 @@ __all__ = ['COLUMNS', 'table', 'write_csv']
 _FIXED = (
     *('time_s', 'x_m', 'y_m', 'theta_rad', 'v_mps', 'omega_radps'),
     *('distance_m', 'bearing_error_rad', 'v_command_mps', 'omega_command_radps'),
-    *('omega_right_radps', 'omega_left_radps', 'goal_heading_error_rad'),
+    *('omega_right_radps', 'omega_left_radps', 'goal_heading_error_rad', 'beyond_goal_m'),
     *('path_progress_m', 'along_path_m', 'across_path_m', 'path_heading_error_rad'),
 )
 COLUMNS = (
@@ -38,8 +38,9 @@ def table(run: Run) -> NDArray[np.float64]:
 
     Time counts from the first odometry message. The command is the latest one at that time: as applied
     (`cmd_vel_out`), or as sent (`cmd_vel`) if that was not recorded. Wheel speeds are interpolated
-    linearly between the messages of `joint_states`. Of other sensors it is the latest value. Unknown
-    values are NaN.
+    linearly between the messages of `joint_states`. Of other sensors it is the latest value. Beyond the
+    goal is along the line from where the robot was when it began to drive there, negative before it: the
+    largest value is the overshoot. Unknown values are NaN.
 
     Raises:
         BagError: There is no odometry.
@@ -55,10 +56,22 @@ def table(run: Run) -> NDArray[np.float64]:
             _latest(one, commands),
             _interpolated(one, run.wheels),
             one.goal_heading_error,
+            _beyond_goal(one),
             *(one.progress, one.along, one.across, one.path_heading_error),
             *(_latest(one, getattr(run, topic.series)) for topic in SENSORS),
         ]
     )
+
+
+def _beyond_goal(one: Timeline) -> NDArray[np.float64]:
+    """Return how far the axle centre is beyond its goal at each odometry message, shape (n,) (m)."""
+    places, found = one.run.odometry.values[:, :2], np.full(len(one.time), np.nan)
+    for goal in np.unique(one.goal[one.goal >= 0]):
+        rows = np.flatnonzero(one.goal == goal)
+        target = one.run.goals.values[goal, :2]
+        line = target - places[rows[0]]
+        found[rows] = (places[rows] - target) @ (line / (np.hypot(*line) or 1.0))
+    return found
 
 
 def _latest(one: Timeline, series: Series) -> NDArray[np.float64]:

@@ -12,6 +12,8 @@ import numpy as np
 
 from diffdrive_jacobian.control.controller import KP, KV, Gain
 from diffdrive_jacobian.plots.rendering import render, styled
+from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 __all__ = ['draw', 'figure']
 
@@ -83,16 +85,33 @@ def figure(swept: Sweep) -> Figure:
 
 
 def describe(setup: SweepSetup) -> str:
-    """Return two lines about the settings of a sweep."""
-    limits = setup.robot.limits
-    bounds = [
-        f'{name} {_within(low, high)} {unit}'
-        for name, low, high, unit in (
-            ('v', limits.min_v, limits.max_v, 'm/s'),
-            (r'$\omega$', limits.min_omega, limits.max_omega, 'rad/s'),
-            ('wheels', -limits.max_wheel_speed, limits.max_wheel_speed, 'rad/s'),
+    """Return two lines about the settings of a sweep, three for a robot that takes time."""
+    limits, actuators = setup.robot.limits, setup.robot.actuators or Actuators()
+    v, omega = actuators.acceleration.v, actuators.acceleration.omega
+    wheels = actuators.acceleration.max_wheel_acceleration
+    bounds, accelerations = (
+        [
+            f'{name} {_within(low, high)} {unit}'
+            for name, low, high, unit in group
+            if math.isfinite(low) or math.isfinite(high)
+        ]
+        for group in (
+            [
+                ('v', limits.min_v, limits.max_v, 'm/s'),
+                (r'$\omega$', limits.min_omega, limits.max_omega, 'rad/s'),
+                ('wheels', -limits.max_wheel_speed, limits.max_wheel_speed, 'rad/s'),
+            ],
+            [
+                ('acceleration', v.max_deceleration, v.max_acceleration, 'm/s²'),
+                ('angular', omega.max_deceleration, omega.max_acceleration, 'rad/s²'),
+                ('of the wheels', -wheels, wheels, 'rad/s²'),
+            ],
         )
-        if math.isfinite(low) or math.isfinite(high)
+    )
+    accelerations += [
+        f'{name} {seconds:g} s'
+        for name, seconds in (('lag', actuators.lag), ('delay', actuators.delay / NANOSECONDS))
+        if seconds
     ]
     starts = f'{setup.starts} starts in all directions' if setup.starts > 1 else '1 start'
     there = f'{setup.tolerance:g} m'
@@ -100,7 +119,8 @@ def describe(setup: SweepSetup) -> str:
         there += f' and {setup.arrival.yaw_tolerance:g} rad'
     return (
         f'{setup.resolved_controller.name}: mean over {starts}, {setup.distance:g} m from the goal\n'
-        f'control rate {setup.rate:g} Hz; limits: {", ".join(bounds) or "none"}; arrived within {there}'
+        f'control rate {setup.rate:g} Hz; velocity limits: {", ".join(bounds) or "none"}; '
+        f'arrived within {there}' + (f'\n{", ".join(accelerations)}' if accelerations else '')
     )
 
 

@@ -47,7 +47,8 @@ class Follower:
         self.largest = RULES[nodes]
         # How long the oldest command still counts after a sample, and how long the next one (s).
         self.shares = late / rate, (1.0 - late) / rate
-        self.targets = deque([np.zeros((2, count))] * (periods + 1))
+        rest: Array = np.zeros((2, count))
+        self.targets: deque[Array] = deque([rest] * (periods + 1))
         self._take(np.zeros((2, count)), np.zeros((2, count)))
 
     def _take(self, demanded: Array, twist: Array) -> None:
@@ -56,10 +57,10 @@ class Follower:
 
     def at_rest(self) -> Mask:
         """Return which robots rest and have nothing to follow, shape (n,)."""
-        moving = np.abs(self.twist).max(axis=0) > AT_REST
+        moving: Mask = np.abs(self.twist).max(axis=0) > AT_REST
         for twist in (self.demanded, *self.targets):
             moving |= twist.any(axis=0)
-        return ~moving
+        return np.logical_not(moving)
 
     def shrink(self, going: Rows) -> None:
         """Remove the robots that are finished."""
@@ -168,18 +169,21 @@ def _integrals(
     Returns:
         As `Follower.steps` yields it.
     """
-    dx, dy, sums = np.zeros_like(seconds), np.zeros_like(seconds), np.zeros((3, len(seconds)))
+    dx, dy = np.zeros_like(seconds), np.zeros_like(seconds)
+    sums: Array = np.zeros((3, len(seconds)))
 
     def turned(t: Array) -> Array:
-        turn = (speed[1] + slope[1] * t / 2.0) * t
-        return turn if rest is None else turn - rest[1] * tau * np.expm1(-t / tau)
+        turn: Array = (speed[1] + slope[1] * t / 2.0) * t
+        if rest is not None:
+            turn -= rest[1] * tau * np.expm1(-t / tau)
+        return turn
 
     if rest is None and not slope.any():
         # An arc, as in `se2.integrate`.
         v, omega = speed
         half = omega * seconds / 2.0
         chord = v * seconds * sinc(half)
-        sums = np.array([np.abs(v), v * v, omega * omega]) * seconds
+        sums += np.array([np.abs(v), v * v, omega * omega]) * seconds
         return np.array([chord * np.cos(half), chord * np.sin(half), omega * seconds]), sums
     for node, weight in rule:
         t = node * seconds

@@ -59,10 +59,7 @@ class Quadrature(NamedTuple):
         return cls(tuple(map(tuple, nodes.tolist())), tuple(map(tuple, partial.tolist())))
 
 
-_LONG = Quadrature.of(8)
-RULE = _LONG.nodes
-"""Nodes and weights for a step of any size."""
-_QUADRATURES = (0.05, Quadrature.of(3)), (0.25, Quadrature.of(4)), (math.inf, _LONG)
+_QUADRATURES = (0.05, Quadrature.of(3)), (0.25, Quadrature.of(4)), (math.inf, Quadrature.of(8))
 """The size of a step, and the quadrature for steps of at most that size."""
 
 

@@ -1,0 +1,79 @@
+"""Overshoot and time to the goal of each built-in controller, for a robot that takes time to follow.
+
+Default gains, starts 2 m from the goal, with headings in all directions, at 50 Hz. The robot has the
+velocity limits of the TurtleBot3 Burger, the accelerations with which ROBOTIS plans its paths,
+then a lag and a delay too, and then a slow acceleration.
+
+    python test/benchmark/overshoot.py     the table of doc/controllers.md
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from diffdrive_jacobian.control import Arrival, VelocityLimits
+from diffdrive_jacobian.control.controllers import BUILT_IN
+from diffdrive_jacobian.simulation import SweepSetup, closed_loops
+from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits
+from diffdrive_jacobian.simulation.actuators import Actuators
+
+STARTS = 120
+LIMITS = VelocityLimits(min_v=-0.22, max_v=0.22, min_omega=-2.84, max_omega=2.84)
+OMEGA = AxisLimits(
+    max_acceleration=3.2,
+    max_deceleration=-3.2,
+    max_acceleration_reverse=-3.2,
+    max_deceleration_reverse=3.2,
+)
+
+
+def v_limits(a: float) -> AxisLimits:
+    """Return limits of the acceleration of v that are all alike (m/s^2)."""
+    return AxisLimits(
+        max_acceleration=a,
+        max_deceleration=-a,
+        max_acceleration_reverse=-a,
+        max_deceleration_reverse=a,
+    )
+
+
+PLANNED = AccelerationLimits(v=v_limits(2.5), omega=OMEGA)
+ROBOTS = {
+    'follows at once': None,
+    '2.5 m/s², 3.2 rad/s²': Actuators(acceleration=PLANNED),
+    'the same, lag 0.1 s, delay 0.1 s': Actuators(acceleration=PLANNED, lag=0.1, delay=100_000_000),
+    '0.05 m/s², 3.2 rad/s²': Actuators(acceleration=AccelerationLimits(v=v_limits(0.05), omega=OMEGA)),
+}
+
+
+def main() -> None:
+    """Print the table."""
+    print('| controller | robot | arrived | time, mean, max | overshoot, max | rest, max |')
+    print('|---|---|---:|---:|---:|---:|')
+    for name, controller in BUILT_IN.items():
+        starts = SweepSetup(controller=name, starts=STARTS).poses()
+        arrival = Arrival(
+            use_heading=controller.takes_heading, offset=controller.driven_offset(controller.defaults)
+        )
+        goal = np.zeros(3 if controller.takes_heading else 2)
+        for robot, actuators in ROBOTS.items():
+            found = closed_loops(
+                controller,
+                starts,
+                goal,
+                *controller.values(controller.defaults),
+                arrival=arrival,
+                limits=LIMITS,
+                actuators=actuators,
+            )
+            x, y, theta = found.pose.T
+            rest = arrival.distance(x, y, theta, 0.0, 0.0)
+            print(
+                f'| {name} | {robot} | {np.mean(found.arrived):.0%} | {np.nanmean(found.time):.1f} s, '
+                f'{np.nanmax(found.time):.1f} s | {1000.0 * found.overshoot.max():.0f} mm '
+                f'| {1000.0 * rest.max():.0f} mm |'
+            )
+
+
+if __name__ == '__main__':
+    main()
