@@ -368,6 +368,17 @@ def test_what_was_altered_is_found_with_its_place(drive):
         assert getattr(found, differences).max() == pytest.approx(1e-3)
 
 
+@pytest.mark.parametrize('missed', [1, 10])
+def test_a_recorder_that_missed_the_first_commands_does_not_blame_the_robot(drive, missed):
+    run = drive()
+    late = replace(run, cmd_vel_out=rows(run.cmd_vel_out, slice(missed, None)))
+    found = held(late)
+    assert any('moved before the first command that was recorded' in note for note in found.notes)
+    assert found.start == 'odometry'
+    assert len(found.distances) >= len(run.odometry) - missed - 100
+    assert not any('before the first command' in note for note in held(run).notes)
+
+
 def test_half_a_second_without_commands_is_found_by_recording_time_too(drive):
     run = drive()
     seconds = (run.cmd_vel.received - run.odometry.stamps[0]) / 1e9

@@ -244,6 +244,11 @@ def verify(
             'verified (are their stamps of different clocks?)'
         )
     notes = run.notes + (_missing(run, start) if source == 'cmd_vel_out' else ())
+    if source == 'cmd_vel_out' and _known_since(run):
+        notes += (
+            'the robot moved before the first command that was recorded: what it was commanded before '
+            'is missing',
+        )
     if len(poses) < len(stamps):
         omitted = len(stamps) - len(poses)
         notes += (
@@ -332,12 +337,15 @@ def _nearest(anchors: list[_Anchor], odometry: Series, index: int) -> Robot | No
 
 def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
     """Return the robot after each event of `cmd_vel_out` and `start_pose`, one list for each restart."""
-    first = _beginning(run)
+    begins = _known_since(run)
+    first, begun = _beginning(run, begins), int(run.odometry.received[begins])
     starts = run.start_pose
     skipped = _starts_before_recording(run)
     whole = not skipped and len(starts) > 0
     if skipped and _stood_since(run, skipped - 1):
         whole, skipped = True, skipped - 1
+    if begins:
+        whole, skipped = False, int(np.count_nonzero(starts.received <= begun))
     placed = start_covariances(run)
     model = recorded_model(run) or RobotModel()
     first_model, *models = recorded_dynamics(run) or [model] * (len(run.cmd_vel_out) + 1)
@@ -350,7 +358,6 @@ def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
         rows = zip(series.received.tolist(), series.stamps.tolist(), changed, values, strict=True)
         events += list(rows)[begin:]
     events.sort(key=lambda event: event[0])
-    begun = int(run.odometry.received[0])
     model = first_model
     # The command that was recorded before the odometry is in effect in its first message.
     driven = (run.cmd_vel_out.stamps <= first.stamp) & (
@@ -382,11 +389,28 @@ def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
     return ('start_pose' if whole else 'odometry'), epochs
 
 
-def _beginning(run: Run) -> Robot:
-    """Return the robot with the pose and the twist of the first odometry message."""
-    x, y, theta, v, omega = run.odometry.values[0].tolist()
-    robot = Robot(model=RobotModel(), stamp=int(run.odometry.stamps[0]), pose=np.array([x, y, theta]))
-    return robot.commanded((v, omega), robot.stamp)
+def _known_since(run: Run) -> int:
+    """Return the odometry message from which on the commands are known, usually the first.
+
+    Where the twist changes before the first recorded command, the recorder has missed one, because it
+    was discovered late.
+    """
+    odometry, first = run.odometry, run.cmd_vel_out.stamps[0]
+    # At the time of the command the odometry is from before it, unless it has its twist.
+    applied = (odometry.values[:, 3:5] == run.cmd_vel_out.values[0]).all(axis=1)
+    later = (odometry.stamps > first) | ((odometry.stamps == first) & applied)
+    later |= np.diff(odometry.stamps, prepend=odometry.stamps[0]) < 0
+    before = odometry.values[: int(np.argmax(later)) if later.any() else 0, 3:5]
+    changes = np.flatnonzero(np.diff(before, axis=0).any(axis=1))
+    return int(changes[-1]) + 1 if len(changes) else 0
+
+
+def _beginning(run: Run, index: int) -> Robot:
+    """Return the robot with the pose and the twist of an odometry message."""
+    x, y, theta, v, omega = run.odometry.values[index].tolist()
+    stamp = int(run.odometry.stamps[index])
+    robot = Robot(model=RobotModel(), stamp=stamp, pose=np.array([x, y, theta]))
+    return robot.commanded((v, omega), stamp)
 
 
 def _starts_before_recording(run: Run) -> int:
