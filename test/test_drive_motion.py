@@ -157,6 +157,15 @@ def test_the_pose_is_that_of_an_integration_in_extended_precision(tau):
         assert abs(math.remainder(found[2] - float(expected[2]), math.tau)) < 1e-12
 
 
+def test_a_speed_that_changes_by_its_rounding_takes_no_time():
+    axis = AccelerationLimits(v=AxisLimits(max_acceleration=0.5, max_deceleration=-0.5))
+    robot = at_rest(acceleration=axis, lag=0.1).commanded((0.3, 0.0), 0).at(SECOND)
+    for change in (0.0, 1e-16, 1e-12, 3e-9):
+        # omega has no limit of its own, and changes while v does.
+        turned = robot.commanded((0.3 + change, 1.0), SECOND).at(2 * SECOND)
+        assert turned.pose[2] == pytest.approx(1.0 - 0.1 * (1.0 - math.exp(-10.0)), abs=2e-8)
+
+
 def test_from_rest_to_a_speed_and_back_in_closed_form():
     robot = at_rest(acceleration=limits()).commanded((0.4, 0.0), 0)
     assert robot.at(SECOND // 2).twist == (0.25, 0.0)

@@ -2,7 +2,7 @@
 
 From one sample to the next a robot follows at most two commands, because each has an effect after a
 delay. Towards each its speeds are `a + b t + c exp(-t / tau)` in at most four pieces. The displacement
-along a piece is computed by the quadrature of `speeds`.
+along a piece is computed by Gauss-Legendre quadrature, as in `speeds`.
 
 Twists are arrays of shape (2, n): v (m/s) and omega (rad/s) of n robots.
 """
@@ -15,16 +15,20 @@ from collections.abc import Iterator
 import numpy as np
 
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
+from diffdrive_jacobian.numerics.elementary import sinc
 from diffdrive_jacobian.simulation._batch import Array, Batch, Mask, Rows
-from diffdrive_jacobian.simulation.acceleration import AxisLimits
+from diffdrive_jacobian.simulation.acceleration import SHORTEST, AxisLimits
 from diffdrive_jacobian.simulation.actuators import Actuators
-from diffdrive_jacobian.simulation.speeds import MAX_DECAY, MAX_TURN, RULE
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 AT_REST = 1e-9
 """Speed below which a robot counts as being at rest (m/s, rad/s)."""
 ROUNDING = 1e-9
 """By how much a delay may differ from a multiple of the period, in periods."""
+
+RULES = {4: 0.25, 8: 1.0}
+"""Numbers of nodes, and the largest step with each: its turn (rad), or half its duration (time
+constants). The error of a step is then below 1e-12 of its length."""
 
 
 class Follower:
@@ -36,6 +40,11 @@ class Follower:
         delay = actuators.delay / NANOSECONDS * rate
         periods = int(delay + ROUNDING)
         late = delay - periods if delay - periods > ROUNDING else 0.0
+        # More nodes pay where a decay needs many steps.
+        nodes = 8 if self.lag else 4
+        x, weights = np.polynomial.legendre.leggauss(nodes)
+        self.rule = [*zip((1.0 + x) / 2.0, weights / 2.0, strict=True)]
+        self.largest = RULES[nodes]
         # How long the oldest command still counts after a sample, and how long the next one (s).
         self.shares = late / rate, (1.0 - late) / rate
         self.targets = deque([np.zeros((2, count))] * (periods + 1))
@@ -101,13 +110,16 @@ class Follower:
         slowest = wheels / limits.max_wheel_acceleration
         share, here = np.zeros(start.shape[1]), start
         for upto in (*np.sort(zero, axis=0), np.ones_like(share)):
+            if np.array_equal(upto, share):
+                continue
             end = np.where(zero == upto, 0.0, start + change * upto)
             end = np.where(upto < 1.0, end, target)
             middle = (here + end) / 2.0
             seconds = slowest
             for limit, speed, by in zip((limits.v, limits.omega), middle, change, strict=True):
                 seconds = np.maximum(seconds, np.abs(by) / _rate(limit, speed, by))
-            yield end, seconds * (upto - share)
+            duration = seconds * (upto - share)
+            yield end, np.where(duration >= SHORTEST, duration, 0.0)
             share, here = upto, end
         yield target, np.full_like(share, np.inf)
 
@@ -116,21 +128,24 @@ class Follower:
     ) -> Iterator[tuple[Rows, Array, Array]]:
         """Yield the steps of a piece in which the demanded twists are linear."""
         rest, tau = None, self.lag
-        steps = np.abs(speed[1]) * seconds + np.abs(slope[1]) * seconds**2 / 2.0
+        # The turn is at most that with the fastest speed, which is one at an end of the piece.
+        ends = speed[1], speed[1] + slope[1] * seconds, self.twist[1, rows]
+        steps = seconds * np.max(np.abs(ends if tau else ends[:2]), axis=0)
         if tau:
             speed = speed - slope * tau
             rest = self.twist[:, rows] - speed
             self.twist[:, rows] = speed + slope * seconds + rest * np.exp(-seconds / tau)
-            steps += (np.abs(rest[1]) + np.abs(slope[1] * seconds)) * tau
-            steps = np.maximum(steps, seconds / tau / MAX_DECAY * MAX_TURN)
-        steps = np.maximum(np.ceil(steps / MAX_TURN), 1.0)
+            steps = np.maximum(steps, seconds / tau / 2.0)
+        elif not slope.any():
+            steps = np.zeros_like(seconds)
+        steps = np.maximum(np.ceil(steps / self.largest), 1.0)
         step = seconds / steps
         for number in range(int(steps.max())):
             some = steps > number
             begin = number * step[some]
             begins = speed[:, some] + slope[:, some] * begin
             decaying = None if rest is None else rest[:, some] * np.exp(-begin / tau)
-            yield rows[some], *_integrals(step[some], begins, slope[:, some], decaying, tau)
+            yield rows[some], *_integrals(self.rule, step[some], begins, slope[:, some], decaying, tau)
 
 
 def _rate(limit: AxisLimits, speed: Array, change: Array) -> Array:
@@ -141,7 +156,12 @@ def _rate(limit: AxisLimits, speed: Array, change: Array) -> Array:
 
 
 def _integrals(
-    seconds: Array, speed: Array, slope: Array, rest: Array | None, tau: float
+    rule: list[tuple[float, float]],
+    seconds: Array,
+    speed: Array,
+    slope: Array,
+    rest: Array | None,
+    tau: float,
 ) -> tuple[Array, Array]:
     """Integrate the twists `speed + slope t + rest exp(-t / tau)` over a step.
 
@@ -154,7 +174,14 @@ def _integrals(
         turn = (speed[1] + slope[1] * t / 2.0) * t
         return turn if rest is None else turn - rest[1] * tau * np.expm1(-t / tau)
 
-    for node, weight in RULE:
+    if rest is None and not slope.any():
+        # An arc, as in `se2.integrate`.
+        v, omega = speed
+        half = omega * seconds / 2.0
+        chord = v * seconds * sinc(half)
+        sums = np.array([np.abs(v), v * v, omega * omega]) * seconds
+        return np.array([chord * np.cos(half), chord * np.sin(half), omega * seconds]), sums
+    for node, weight in rule:
         t = node * seconds
         v, omega = speed + slope * t + (0.0 if rest is None else rest * np.exp(-t / tau))
         turn = turned(t)

@@ -30,6 +30,10 @@ Twist = tuple[float, float]
 """`(v, omega)` (m/s, rad/s)."""
 
 
+SHORTEST = 1e-9
+"""Shortest duration of a part of a transition, the resolution of times (s)."""
+
+
 def _negative(name: str, value: object) -> float:
     """Require a negative number; minus infinity is allowed."""
     try:
@@ -110,7 +114,7 @@ class AccelerationLimits(Checked):
         Yields:
             The duration of each part (s), not zero, and the twist at its end. Within a part both speeds
             are linear in time. Nothing, if the target is reached at once. A jump, where there is no
-            limit, is a part of no duration.
+            limit, is a part of no duration, and so is what takes less than `SHORTEST`.
         """
         (v, omega), dv, domega = start, target[0] - start[0], target[1] - start[1]
         wheels = max(map(abs, wheel_speeds(dv, domega)))
@@ -131,7 +135,8 @@ class AccelerationLimits(Checked):
                 abs(domega) / self.omega.rate(middle[1], domega),
                 wheels / self.max_wheel_acceleration,
             )
-            yield seconds * (end - share), there
+            duration = seconds * (end - share)
+            yield duration if duration >= SHORTEST else 0.0, there
             share, here = end, there
 
 

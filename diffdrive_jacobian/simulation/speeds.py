@@ -133,9 +133,13 @@ class Piece(NamedTuple):
         if self.constant:
             return self.seconds
         a, b, c = self.omega
-        turn = abs(a) * self.seconds + abs(b) * self.seconds**2 / 2.0 + abs(c) * self.tau
-        steps = turn / MAX_TURN
+        steps = (abs(a) + abs(b) * self.seconds / 2.0) * self.seconds / MAX_TURN
         if self.v[2] or c:
+            # The speed lies between that at the beginning and those that it follows. (In a short piece
+            # with a large b the terms of the speed are much larger than their sum.)
+            first = a + b * self.tau
+            fastest = max(abs(a + c), abs(first), abs(first + b * self.seconds))
+            steps = fastest * self.seconds / MAX_TURN
             steps = max(steps, self.seconds / self.tau / MAX_DECAY)
         return self.seconds / max(1.0, math.ceil(steps))
 
