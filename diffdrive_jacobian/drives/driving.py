@@ -30,6 +30,7 @@ from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.goal_client import GoalClient
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.numerics.checks import number, positive_or_infinite
 from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.recording.selection import Selection
@@ -197,8 +198,9 @@ def drive(
     Args:
         goals: `[x, y]` of each goal, shape (n, 2), or `[x, y, theta]`, shape (n, 3) (m, m, rad). theta
             matters for controllers that use the heading, and with the parameter `use_goal_heading`.
-        runner: Runs the nodes, and may run others: `in_real_time` or `in_lockstep`. None: one is created
-            as `lockstep`, `isolated` and `ros_arguments` say, and closed at the end.
+        runner: Runs the nodes, and may run others: `in_real_time` or `in_lockstep`. The nodes stay in
+            it. None: one is created as `lockstep`, `isolated` and `ros_arguments` say, and closed at
+            the end.
         lockstep: Whether to drive in simulated time, as fast as possible and with the same result each
             time. rclpy must not be initialised then.
         isolated: Whether no other process can communicate with the nodes. Always so in lockstep.
@@ -213,9 +215,10 @@ def drive(
     Raises:
         UserError: A node cannot run with the parameters or ROS arguments given.
         DriveError: In lockstep, a callback blocks, or simulated time cannot advance.
-        ValueError: `goals` has another shape, `lockstep` is not isolated, or one of the arguments for a
-            new runner is given together with `runner`.
+        ValueError: `goals` has another shape, `timeout` is not positive, `lockstep` is not isolated, or
+            one of the arguments for a new runner is given together with `runner`.
     """
+    number('timeout', timeout, positive_or_infinite)
     goals = np.asarray(goals, dtype=np.float64)
     if goals.ndim != 2 or goals.shape[1] != 3:
         goals = waypoints_through(goals)
