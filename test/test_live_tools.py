@@ -111,7 +111,7 @@ def test_drive_to_live_in_real_time(world):
         (watch_run, ['bag', '--rate', '-2'], 'must be in [0.01, 1000], got -2.0'),
         (watch_run, ['bag', '--rate', '1e9'], 'must be in [0.01, 1000], got 1000000000.0'),
         (watch_run, ['bag', '--ros-args', '-p', 'x:=1'], 'a BAG needs no ROS arguments'),
-        (drive_to, [], 'X Y (only --live needs no goal)'),
+        (drive_to, [], 'X Y or --path (only --live needs no goal)'),
         (drive_to, ['1', '1', '--no-browser'], 'are options of --live'),
         (drive_to, ['1', '1', '--port', '8000'], 'are options of --live'),
         (drive_to, ['1', '1', '--live', '--lockstep', '--open'], 'exclude each other'),

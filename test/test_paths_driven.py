@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 import signal
 
 import numpy as np
@@ -57,6 +58,12 @@ def test_drive_to_drives_along_a_circle_without_stopping(tmp_path, capsys):
     plane, *panels = figure([one.run]).axes
     assert [panel.get_ylabel() for panel in panels[:2]] == ['across path [m]', 'heading to path [rad]']
     assert any(np.allclose(np.ptp(line.get_data(), axis=1), 2.0, atol=1e-3) for line in plane.lines)
+
+
+def test_the_true_distance_of_a_robot_that_drifts_is_reported(capsys):
+    arguments = ['--path', 'line:0.5', '--lockstep', '--no-record', '--ros-args', '-p']
+    assert main([*arguments, 'simulate_slip:=true'], Signals()) == 0
+    assert re.search(r'm from it by odometry, truly 0\.\d+ m from its end', capsys.readouterr().out)
 
 
 def test_a_run_of_a_table_can_be_driven_again(tmp_path):

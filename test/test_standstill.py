@@ -16,7 +16,7 @@ from diffdrive_jacobian.nodes.remote_goal import GoalResult, Result, _Session, _
 from diffdrive_jacobian.nodes.standstill import Standstill
 from diffdrive_jacobian.ros.runner import discovery_off, ros_context, running
 from diffdrive_jacobian.signals import Signals
-from diffdrive_jacobian.tools import send_goal
+from diffdrive_jacobian.tools import _sending
 
 
 def test_each_standstill_is_detected_once():
@@ -85,12 +85,12 @@ def test_the_report_does_not_claim_that_an_unknown_robot_was_stopped(capsys):
     options = argparse.Namespace(timeout=7.0, wait=10.0, x=1.0, y=1.0)
     values = {'result': Result.TIMEOUT, 'topic': '/goal_pose', 'status': GoalState.CANCELED}
     unknown = GoalResult(**values, canceled=True)
-    assert send_goal._report(unknown, options) == [
+    assert _sending.report(unknown, options, 'goal (1, 1)') == [
         'not arrived within --timeout 7 s',
         'canceled: no odometry was received, so it is not known whether a robot drove',
     ]
     known = GoalResult(**values, canceled=True, distance=1.0)
-    assert send_goal._report(known, options)[1] == 'canceled: the robot was stopped'
-    with send_goal._Progress('goal (1, 1)') as progress:
+    assert _sending.report(known, options, 'goal (1, 1)')[1] == 'canceled: the robot was stopped'
+    with _sending.Progress('send_goal', 'goal (1, 1)') as progress:
         progress.standing(5.0)
     assert capsys.readouterr().out == ('the robot has not moved for 5 s: call doctor to find out why\n')

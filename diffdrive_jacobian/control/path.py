@@ -196,9 +196,9 @@ class Path:
         Raises:
             ValueError: An arc length is not finite.
         """
-        s = self._inside(array('s', s, *np.shape(s)))
-        index = self._arcs.start.searchsorted(s, 'right') - 1
-        beyond = s - self._arcs.start[index]
+        inside: Floats = self._inside(array('s', s, *np.shape(s)))
+        index = self._arcs.start.searchsorted(inside, 'right') - 1
+        beyond = inside - self._arcs.start[index]
         turn = self._arcs.curvature[index] * beyond
         return se2.compose(
             self._arcs.pose[index], se2.exp(np.stack([beyond, np.zeros_like(turn), turn], axis=-1))

@@ -148,7 +148,8 @@ def _shape(point: Callable[[Floats], tuple[Floats, Floats]], length: float) -> P
     `length` is that of the curve, or more where its points are not evenly spaced.
     """
     count = min(max(math.ceil(length / SPACING), FEWEST), MOST)
-    path = Path(np.column_stack(point(np.linspace(0.0, 2.0 * math.pi, count + 1))))
+    angles: Floats = np.linspace(0.0, 2.0 * math.pi, count + 1, dtype=np.float64)
+    path = Path(np.column_stack(point(angles)))
     # The end of a closed path is its beginning.
     inside = np.minimum(path.arc_lengths, np.nextafter(path.length, 0.0))
     headings = path.poses_at(inside)[:, 2]

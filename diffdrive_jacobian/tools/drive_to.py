@@ -280,6 +280,8 @@ def _print_outcome(outcome: Outcome, options: argparse.Namespace) -> int:
             distances = f'{outcome.distance:.3f} m before the end of the path'
             if not math.isnan(outcome.across):
                 distances += f', after at most {outcome.across:.3f} m from it'
+            if not math.isnan(outcome.true_distance):
+                distances += f' by odometry, truly {outcome.true_distance:.3f} m from its end'
         where = (
             f'the robot stopped at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, {distances}, '
             f'after {outcome.seconds:.1f} s{simulated}'

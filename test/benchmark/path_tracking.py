@@ -15,12 +15,12 @@ from pathlib import Path as File
 from typing import Any, NamedTuple
 
 import numpy as np
-from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits
 
 from diffdrive_jacobian.control import Path
 from diffdrive_jacobian.control.path_laws import PATH_CONTROLLERS
 from diffdrive_jacobian.control.path_source import planned_path
 from diffdrive_jacobian.simulation import Drift, RobotModel, follow_path
+from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits
 from diffdrive_jacobian.simulation.actuators import Actuators
 
 PAGE = File(__file__).parents[2] / 'doc' / 'mathematics.md'
