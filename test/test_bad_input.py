@@ -131,7 +131,7 @@ ELSEWHERE = {
     *('controller_names', 'find_controller', 'KP', 'KV', 'OFFSET'),
     *('Sweep', 'SweepSetup', 'describe_sweep', 'sweep', 'sweep_table'),
 }
-"""Tested in files of their own: test_resolved_rate, test_path_laws, test_path_source, test_sweep_gains."""
+"""Tested in test_resolved_rate, test_path_laws, test_path_source and test_sweep_gains, among others."""
 OPTIONAL = {'h', 'arrival', 'progress', 'commanded_at', 'seed', 'drift'}
 """Arguments that may be None."""
 
