@@ -125,12 +125,13 @@ OTHERS = {
 CALLS = FUNCTIONS | OTHERS
 ELSEWHERE = {
     *('resolved_rate', 'track_line'),
-    *('Path', 'PathController', 'Reference', 'follow_path'),
+    *('Path', 'PathController', 'PathError', 'Reference', 'follow_path'),
+    *('circle_path', 'figure_eight_path', 'line_path', 'planned_path'),
     *('Boundary', 'Controller', 'ControllerError', 'Controllers', 'Gain', 'LawError'),
     *('controller_names', 'find_controller', 'KP', 'KV', 'OFFSET'),
     *('Sweep', 'SweepSetup', 'describe_sweep', 'sweep', 'sweep_table'),
 }
-"""Tested in test_resolved_rate, test_path, test_path_laws, test_own_controllers and test_sweep_gains."""
+"""Tested in test_resolved_rate, test_path_laws, test_path_source and test_sweep_gains, among others."""
 OPTIONAL = {'h', 'arrival', 'progress', 'commanded_at', 'seed', 'drift'}
 """Arguments that may be None."""
 

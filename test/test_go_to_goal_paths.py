@@ -136,9 +136,10 @@ def test_slows_down_towards_the_end_and_drives_to_the_last_pose_as_to_a_goal(con
 def test_the_robot_can_stop_at_the_end_within_its_limits(controller):
     """By the taper, which knows them, and by `stop_in_time`, which knows its delay, too."""
     controller.send(STRAIGHT)
-    for x in (0.0, 0.3, 0.6):
+    for x in (0.0, 0.2, 0.4, 0.6, 0.8):
         controller.at(x, 0.0)
-    assert change(controller.node, linear__x__max_deceleration=-0.1).successful
+    limits = {'linear__x__max_acceleration': 1.0, 'linear__x__max_deceleration': -0.1}
+    assert change(controller.node, **limits).successful
     taper = math.sqrt(2.0 * 0.1 * 0.1)
     assert controller.at(0.9, 0.0)[0] == pytest.approx(taper)
     assert change(controller.node, stop_in_time=True, command_delay=0.5).successful

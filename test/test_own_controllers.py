@@ -492,7 +492,7 @@ def blocks(language):
     found = re.findall(rf'```{language}\n(.*?)```', PAGE.read_text(), re.DOTALL)
     names = [re.match(r'# (\w+)\.py\n', block) for block in found]
     return {
-        name[1] if name else number: block
+        name[1] if name else f'block_{number}': block
         for number, (name, block) in enumerate(zip(names, found, strict=True))
     }
 

@@ -114,6 +114,7 @@ ELSEWHERE = {
     'names',
     'find_controller',
     'controller_names',
+    *('circle_path', 'figure_eight_path', 'line_path', 'planned_path'),
 }
 """Functions without a batch, or tested in a file of their own."""
 POSITIVE = {'r', 'L', 'threshold', 'max_velocity', 'max_correction'}
