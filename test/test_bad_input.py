@@ -93,7 +93,10 @@ FUNCTIONS = {
 OTHERS = {
     VelocityLimits: {'min_v': -1.0, 'max_v': 1.0, 'min_omega': -1.0, 'max_omega': 1.0}
     | {'max_wheel_speed': 9.0},
-    Arrival: {'xy_tolerance': 0.02, 'yaw_tolerance': 0.02, 'use_heading': True, 'offset': 0.1},
+    Arrival: {
+        **{'xy_tolerance': 0.02, 'yaw_tolerance': 0.02, 'use_heading': True, 'offset': 0.1},
+        **{'trans_stopped_velocity': 0.1, 'rot_stopped_velocity': 0.1},
+    },
     Waypoints: {'poses': [POSE], 'index': 0, 'turning': False},
     WAYPOINTS.follow: {'pose': POSE, 'law': law, 'arrival': Arrival(), 'turning_gain': 3.0},
     StraightLine: {'start': [0.0, 0.0], 'end': [1.0, 0.0], 'speed': 0.1},
@@ -233,7 +236,7 @@ def test_every_public_function_is_called_here():
         }
         tested = {call.__name__ for call in CALLS if getattr(call, '__self__', None) == instance}
         # These are without checks, for every message.
-        assert methods - {'reached', 'wheel_speeds', 'twist'} <= tested | {
+        assert methods - {'reached', 'stopped', 'wheel_speeds', 'twist'} <= tested | {
             call.__name__ for call in CALLS if isinstance(getattr(call, '__self__', None), cls)
         }
 

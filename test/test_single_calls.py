@@ -106,7 +106,7 @@ CALLS = [
 ]
 ELSEWHERE = {
     'solve',
-    'reached',
+    *('reached', 'stopped', 'remaining'),
     'follow',
     'resumed',
     'position',
