@@ -23,6 +23,7 @@ Range = tuple[float, float]
 """Smallest and largest value."""
 MAX_CHOICES = 32
 """Largest number of controllers that are offered."""
+TAKES_TIME = 'Time to follow commands'
 
 
 class SettingError(DiffdriveError, ValueError):
@@ -47,6 +48,8 @@ class Setting:
     unit: str = ''
     kind: Literal['number', 'limit', 'choice', 'flag'] = 'number'
     """`limit`: a number, or NaN for none."""
+    group: str = ''
+    """Heading below which it is folded away while none of the group is in use; '': always shown."""
 
     def slider(self, served: Range | None) -> Range:
         """Return the range of the slider for a node that serves a range in its descriptor.
@@ -91,13 +94,17 @@ _OFFERED = (
             high=6.0, kind='limit', hint='Both speeds are scaled alike, so the path stays the same'),
     Setting(role='robot', name='max_wheel_velocity', label='Wheel limit', unit='rad/s', low=1.0,
             high=40.0, kind='limit', hint='Both wheels are scaled alike'),
-    Setting(role='robot', name='linear.x.max_acceleration', label='Limit of dv/dt', unit='m/s²',
+    Setting(role='robot', group=TAKES_TIME, name='linear.x.max_acceleration',
+            label='Limit of dv/dt', unit='m/s²',
             low=0.05, high=3.0, kind='limit', hint='The path stays a circle from and to rest'),
-    Setting(role='robot', name='angular.z.max_acceleration', label='Limit of dω/dt', unit='rad/s²',
+    Setting(role='robot', group=TAKES_TIME, name='angular.z.max_acceleration',
+            label='Limit of dω/dt', unit='rad/s²',
             low=0.1, high=10.0, kind='limit', hint='The path stays a circle from and to rest'),
-    Setting(role='robot', name='wheel_lag', label='Wheel lag', unit='s', low=0.0, high=1.0,
+    Setting(role='robot', group=TAKES_TIME, name='wheel_lag',
+            label='Wheel lag', unit='s', low=0.0, high=1.0,
             hint='Time constant with which the wheels follow'),
-    Setting(role='robot', name='command_delay', label='Delay', unit='s', low=0.0, high=1.0,
+    Setting(role='robot', group=TAKES_TIME, name='command_delay',
+            label='Delay', unit='s', low=0.0, high=1.0,
             hint='Time from a command to its effect'),
     Setting(role='robot', name='wheel_travel_variance', label='Wheel noise', unit='m', low=0.0,
             high=0.002, hint='Variance per distance: how fast the uncertainty region grows'),
@@ -186,6 +193,7 @@ def shown(
             'key': setting.key,
             'label': setting.label,
             'hint': setting.hint,
+            'group': setting.group,
             'unit': setting.unit,
             'kind': setting.kind,
             'low': low,

@@ -29,12 +29,28 @@ export class Settings {
     if (layout !== this.shown) {
       this.shown = layout;
       this.rows.clear();
-      byId('sliders').replaceChildren(...rows.map((row) => this.create(row)));
+      byId('sliders').replaceChildren(...this.grouped(rows));
     }
     for (const row of rows) {
       const changed = this.sent.get(row.key)?.time ?? -Infinity;
       if (force || performance.now() - changed > REST) this.rows.get(row.key)(row.value);
     }
+  }
+
+  /** Create rows; those of a group are folded away while none of them is in use. */
+  grouped(rows) {
+    const groups = new Map(), nodes = [];
+    for (const row of rows) {
+      const node = this.create(row);
+      if (row.group && !groups.has(row.group)) {
+        const open = rows.some((one) => one.group === row.group && one.value);
+        groups.set(row.group, element('details', { open }, element('summary', {}, row.group)));
+        nodes.push(groups.get(row.group));
+      }
+      if (row.group) groups.get(row.group).append(node);
+      else nodes.push(node);
+    }
+    return nodes;
   }
 
   create(row) {

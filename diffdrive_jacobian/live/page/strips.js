@@ -6,8 +6,8 @@ const STRIPS = [
   { name: 'v', unit: 'm/s', curves: [['command_v', 'muted', 'set', true], ['v', 'v', 'v']] },
   { name: 'ω', unit: 'rad/s', curves: [['command_omega', 'muted', 'set', true], ['omega', 'omega', 'ω']] },
   { name: 'wheels', unit: 'rad/s', digits: 1, curves: [['left', 'left', 'L'], ['right', 'right', 'R']] },
-  { name: 'distance', unit: 'm', curves: [['distance', 'v', 'd']], zero: true },
-  { name: 'bearing error', unit: 'rad', curves: [['goal_heading_error', 'muted', 'Δθ', true], ['bearing_error', 'omega', 'e']] },
+  { name: 'distance', unit: 'm', curves: [['distance', 'v', 'd']], zero: true, ofPath: false },
+  { name: 'bearing error', unit: 'rad', curves: [['goal_heading_error', 'muted', 'Δθ', true], ['bearing_error', 'omega', 'e']], ofPath: false },
   { name: 'across path', unit: 'm', digits: 3, curves: [['across', 'v', 'left']], ofPath: true },
   { name: 'heading to path', unit: 'rad', curves: [['path_heading_error', 'omega', 'Δθ']], ofPath: true },
 ];
@@ -41,9 +41,9 @@ export class Strips {
     const robot = this.model.selected, history = robot && this.model.histories.get(robot.name);
     if (!history) return;
     const now = this.model.recorded ? this.model.world.time : robot.time;
-    const followed = history.curves.across.some((value) => value !== null);
+    const onPath = Boolean(robot.goal.path);
     for (const strip of this.strips) {
-      strip.node.hidden = Boolean(strip.ofPath) && !followed;
+      strip.node.hidden = 'ofPath' in strip && strip.ofPath !== onPath;
       if (!strip.node.hidden) this.drawStrip(strip, history, now, colors);
     }
   }
