@@ -108,11 +108,15 @@ def test_bad_files(tmp_path, name, content, message):
         planned_path(str(tmp_path / name))
 
 
-@pytest.mark.parametrize(
-    'text', ['circle', 'circle:', 'circle:0', 'circle:-1', 'eight:nan', 'line:inf', 'line:a']
-)
+@pytest.mark.parametrize('text', ['circle:0', 'circle:-1', 'eight:nan', 'line:inf', 'line:a'])
 def test_bad_sizes(text):
     with pytest.raises(PathError, match=f"size of a shape must be a positive number .m., got '{text}'"):
+        planned_path(text)
+
+
+@pytest.mark.parametrize('text', ['circle', 'line:'])
+def test_sizes_are_needed(text):
+    with pytest.raises(PathError, match=f"{text.strip(':')} needs its size .m., as in .*, got '{text}'"):
         planned_path(text)
 
 

@@ -35,7 +35,7 @@ def test_drive_to_drives_along_a_circle_without_stopping(tmp_path, capsys):
     bag = tmp_path / 'circle'
     arguments = ['--path', 'circle:1.0', '--speed', '0.4', '--lockstep', '-o', str(bag), '--no-plot']
     assert main(arguments, Signals()) == 0
-    assert 'm before the end of the path, after at most 0.00' in capsys.readouterr().out
+    assert 'm from the end of the path, after at most 0.00' in capsys.readouterr().out
     one = timeline(read_run(bag))
     ((planned,), series) = one.paths, one.run.odometry.values
     assert planned.length == pytest.approx(2.0 * math.pi)

@@ -115,6 +115,8 @@ def planned_path(text: str) -> Path:
         PathError: The text is neither, the file cannot be read, or its poses are no path.
     """
     shape, _, size = text.partition(':')
+    if shape in SHAPES and not size:
+        raise PathError(f'{shape} needs its size (m), as in {shape}:1.0, got {short(text, repr)}')
     if shape in SHAPES:
         try:
             return SHAPES[shape](number('size', float(size), positive))

@@ -125,6 +125,8 @@ class Outcome:
     across: float
     """Greatest distance of the robot from the path by the odometry (m). NaN: it was not driven along
     one."""
+    tolerance: float
+    """Distance that counted as arrived (m). A robot that takes time to stop may have left it again."""
     offset: float
     """x of the driven point in the body frame (m). 0: the axle centre."""
     seconds: float
@@ -309,6 +311,7 @@ def drive(
         distance=client.distance,
         true_distance=true_distance,
         across=math.nan if client.path is None else client.path.greatest,
+        tolerance=controller.arrival.xy_tolerance,
         offset=controller.arrival.offset,
         seconds=seconds,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import uuid
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -225,6 +226,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._odom_frame = ''
         # Twist by the odometry.
         self._twist = STANDSTILL
+        # The commands that are under way, with their times (ns).
+        self._commands: deque[tuple[int, float, float]] = deque()
         # Rate of the odometry (Hz), and the times of the messages from which it is measured (ns).
         self._rate = math.inf
         self._times: list[int] = []
@@ -433,7 +436,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
                 if self.parameters.stop_in_time:
                     path, waypoints = goal.path, goal.waypoints
                     room = waypoints.remaining(pose, self._arrival) if path is None else path.remaining()
-                    command = self._actuators.stoppable(command, room, 1.0 / self._rate)
+                    coming = self._under_way(now)
+                    command = self._actuators.stoppable(command, room, 1.0 / self._rate, coming)
         except ValueError as error:
             self.log_event_warning('law', f'goal aborted: {error}')
             self._publish_command(0.0, 0.0)
@@ -542,7 +546,22 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
                 'goal waits', f'the goal waits for odometry on {topic}: is the robot running?'
             )
 
+    def _under_way(self, now: int) -> tuple[float, float]:
+        """Return the distance and the turn by commands that have yet to reach the wheels."""
+        begin, end = now - self._actuators.delay, now
+        distance = turn = 0.0
+        for sent, v, omega in reversed(self._commands):
+            seconds = (end - max(sent, begin)) / NANOSECONDS
+            distance, turn, end = distance + v * seconds, turn + omega * seconds, sent
+            if sent <= begin:
+                break
+        return distance, turn
+
     def _publish_command(self, v: float, omega: float) -> None:
+        now = self.now()
+        while len(self._commands) > 1 and self._commands[1][0] <= now - self._actuators.delay:
+            self._commands.popleft()
+        self._commands.append((now, v, omega))
         self._driving = (v, omega) != (0.0, 0.0)
         command = self._serialized(Command((v, omega), self.now()))
         self._others.sent(command)

@@ -189,14 +189,17 @@ class GoalClient(Node):  # type: ignore[misc]
 
     @property
     def distance(self) -> float:
-        """Distance from the point that is to arrive to the current goal, or what remains of a path (m).
+        """Distance from the point that is to arrive to the current goal (m).
 
-        Infinite before the first odometry.
+        Of a path what remains of it, and after the arrival the distance from its end. Infinite before
+        the first odometry.
         """
         if self.robot is None:
             return math.inf
         if self.path is not None:
-            return self.path.remaining
+            if self.status is not GoalState.SUCCEEDED:
+                return self.path.remaining
+            return float(self.arrival.distance(*self.robot.pose, *self.goals[-1, :2]))
         return float(self.arrival.distance(*self.robot.pose, *self.goals[self.index, :2]))
 
     @property

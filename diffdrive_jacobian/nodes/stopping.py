@@ -12,6 +12,8 @@ from diffdrive_jacobian.simulation.actuators import Actuators, Wheels
 
 NEGLIGIBLE = 5e-4
 """Motion that is not described (m, rad)."""
+LEAST_SHARE = 0.02
+"""A gain that is a smaller share of the present one is not recommended."""
 
 
 def rolls_on(
@@ -71,10 +73,13 @@ def overshoot_warnings(
         if speed <= fastest or begin >= farthest:
             continue
         best = 1.0 / (actuators.reaction + speed / (2.0 * deceleration))
-        what = 'goals further away' if unit == 'm' else 'turns by more'
+        what, further = ('goals', 'further away') if unit == 'm' else ('turns', 'by more')
+        which = f'{what} {further} than {begin:.3g} {unit}' if begin else f'all {what}'
+        # Without a limit of the velocity there are always goals that are too far away.
+        lower = f'{name} below {best:.3g}, ' if best > LEAST_SHARE * gain else ''
         found.append(
-            f'{name} {gain:g} lets the robot drive too fast to stop with its limits of the '
-            f'acceleration, its lag and delay: {what} than {begin:.3g} {unit} may be overshot; choose '
-            f'{name} below {best:.3g}, a lower limit of the velocity, or stop_in_time'
+            f'{name} {gain:g} lets the robot drive too fast to stop, as it takes time to follow '
+            f'commands: {which} may be overshot; choose {lower}a lower limit of the velocity, or '
+            'stop_in_time'
         )
     return found

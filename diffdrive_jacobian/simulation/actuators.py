@@ -107,7 +107,9 @@ class Actuators(Checked):
         v, omega = twist
         return v * seconds, omega * seconds
 
-    def stoppable(self, twist: Twist, room: Twist, period: float = 0.0) -> Twist:
+    def stoppable(
+        self, twist: Twist, room: Twist, period: float = 0.0, coming: Twist | None = None
+    ) -> Twist:
         """Return a twist, scaled such that the robot can come to rest within a distance and a turn.
 
         The limit of the acceleration of the wheels is left out.
@@ -116,8 +118,13 @@ class Actuators(Checked):
             twist: The twist.
             room: The distance and the turn, zero or positive; infinite: any (m, rad).
             period: Time for which the twist is held before the next one (s).
+            coming: Distance and turn by commands that are under way, as the delay lets them be. None: as
+                if all were this twist.
         """
         reaction, stop = self.reaction + period, self._deceleration_time(twist, None)
+        if coming is not None:
+            reaction -= self.delay / NANOSECONDS
+            room = max(0.0, room[0] - abs(coming[0])), max(0.0, room[1] - abs(coming[1]))
         share = 1.0
         for speed, left in zip(map(abs, twist), room, strict=True):
             # The largest share s <= 1 with s speed (reaction + s stop / 2) <= left.

@@ -125,7 +125,8 @@ def report(result: GoalResult, options: argparse.Namespace, what: str) -> list[s
 
     where = ''
     if result.across is not None:
-        where = f', {result.distance:.3f} m before the end, at most {result.across:.3f} m from the path'
+        side = 'from' if result.arrived else 'before'
+        where = f', {result.distance:.3f} m {side} the end, at most {result.across:.3f} m from the path'
     elif result.topic.endswith('path'):
         where = ''
     elif result.distance is not None:

@@ -277,7 +277,8 @@ def _print_outcome(outcome: Outcome, options: argparse.Namespace) -> int:
         simulated = ' of simulated time' if options.lockstep else ''
         distances = describe_distances(outcome.distance, outcome.true_distance) + point
         if options.path is not None:
-            distances = f'{outcome.distance:.3f} m before the end of the path'
+            side = 'from' if outcome.arrived else 'before'
+            distances = f'{outcome.distance:.3f} m {side} the end of the path'
             if not math.isnan(outcome.across):
                 distances += f', after at most {outcome.across:.3f} m from it'
             if not math.isnan(outcome.true_distance):
@@ -288,6 +289,11 @@ def _print_outcome(outcome: Outcome, options: argparse.Namespace) -> int:
         )
     if outcome.arrived:
         print(f'arrived: {where}')
+        if outcome.distance > outcome.tolerance:
+            print(
+                f'the robot rolled out of the tolerance of {outcome.tolerance:g} m: the parameters '
+                'stop_in_time and trans_stopped_velocity avoid that'
+            )
         return _cli.DONE
     if outcome.interrupted:
         print(f'interrupted: {where}')

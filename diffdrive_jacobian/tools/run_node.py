@@ -37,7 +37,7 @@ NODES: dict[str, Program] = {
     ),
     'go_to_goal': Program(
         'GoToGoal',
-        'Drive a robot to goals. Subscribes to odom, goal_pose and goals. Publishes cmd_vel and '
+        'Drive a robot to goals. Subscribes to odom, goal_pose, goals and path. Publishes cmd_vel and '
         'goal_status. The service cancel_goal cancels a goal. While a goal is active, each odometry '
         'message is answered by one command. Without a goal nothing is published on cmd_vel, so that '
         'other nodes can drive.',
