@@ -134,7 +134,7 @@ def test_slows_down_towards_the_end_and_drives_to_the_last_pose_as_to_a_goal(con
 
 
 def test_the_robot_can_stop_at_the_end_within_its_limits(controller):
-    """By the taper, which knows them, and by `stop_in_time`, which knows its delay, too."""
+    """By the taper, which knows them."""
     controller.send(STRAIGHT)
     for x in (0.0, 0.2, 0.4, 0.6, 0.8):
         controller.at(x, 0.0)
@@ -142,9 +142,15 @@ def test_the_robot_can_stop_at_the_end_within_its_limits(controller):
     assert change(controller.node, **limits).successful
     taper = math.sqrt(2.0 * 0.1 * 0.1)
     assert controller.at(0.9, 0.0)[0] == pytest.approx(taper)
-    assert change(controller.node, stop_in_time=True, command_delay=0.5).successful
-    v, _ = controller.at(0.9, 0.0)
-    assert v * 0.5 + v * v / 2.0 / 0.1 == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize('place', [(1.0, 0.0), (0.7, 2.0), (3.0, 0.0)])
+def test_a_robot_far_from_the_start_does_not_skip_the_path(controller, place):
+    controller.send(path(*((0.5 * index - 4.0, 0.0) for index in range(11)), stamp=2))
+    for _ in range(20):
+        controller.at(*place)
+    assert controller.node.waypoint <= 1
+    assert controller.statuses == [(2, ACCEPTED), (2, EXECUTING)]
 
 
 def test_the_same_path_again_goes_on_where_the_robot_is(controller):

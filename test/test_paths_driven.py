@@ -30,6 +30,35 @@ from diffdrive_jacobian.recording.record import open_recording
 from diffdrive_jacobian.signals import Signals
 from diffdrive_jacobian.tools.drive_to import main
 
+TAKES_TIME = {'linear.x.max_acceleration': 0.3, 'wheel_lag': 0.2, 'command_delay': 0.2}
+
+
+@pytest.mark.parametrize('robot', [TAKES_TIME, {'command_delay': 0.5}])
+@pytest.mark.parametrize('planned', [line_path(1.0), circle_path(0.5)])
+def test_a_robot_that_takes_time_stops_at_the_end(planned, robot):
+    known = {**robot, 'stop_in_time': True}
+    outcome = drive(planned, lockstep=True, parameters=known, robot_parameters=robot)
+    assert outcome.arrived
+    assert not outcome.moving
+    assert outcome.distance < 0.021
+    assert drive(planned, lockstep=True, robot_parameters=robot).distance > 0.04
+
+
+def test_a_robot_that_still_moves_is_not_said_to_have_stopped(capsys):
+    arguments = ['0.5', '0', '--lockstep', '--no-record', '--command-delay', '1', '--wheel-lag', '5']
+    assert main(arguments, Signals()) == 0
+    out = capsys.readouterr().out
+    assert 'arrived: the robot still moved at x' in out
+    assert 'the robot rolled out of the tolerance of 0.02 m' in out
+
+
+@pytest.mark.parametrize('law', ['pure_pursuit', 'kanayama', 'offset_point', 'dynamic_feedback'])
+def test_a_path_that_turns_back_is_driven_to_its_end(law):
+    there_and_back = Path(np.array([(0.0, 0.0), (0.5, 0.0), (1.0, 0.0), (0.5, 0.0), (0.0, 0.0)]))
+    outcome = drive(there_and_back, lockstep=True, timeout=60.0, parameters={'path_controller': law})
+    assert outcome.arrived
+    assert outcome.seconds > 9.0
+
 
 def test_drive_to_drives_along_a_circle_without_stopping(tmp_path, capsys):
     bag = tmp_path / 'circle'

@@ -203,6 +203,7 @@ def test_changes_of_the_dynamics_are_driven_again(lockstep, robot_at, tmp_path):
             (0.4, {'command_delay': 0.0, 'wheel_lag': 0.0}),
             (-0.3, {'linear__x__max_acceleration': math.nan}),
             (0.3, {'max_wheel_acceleration': 9.0, 'wheel_radius': 0.04}),
+            (0.9, {'linear__x__max_acceleration': 2.0, 'command_delay': 0.2}),
         ):
             lockstep.publish('cmd_vel', twist(v, 0.7))
             lockstep.run_for(0.07)

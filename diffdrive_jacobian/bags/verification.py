@@ -551,7 +551,11 @@ def recorded_dynamics(run: Run) -> list[RobotModel]:
             first = bisect_left(received, recorded - margin)
             last = bisect_right(received, recorded + margin)
             later = first + np.flatnonzero(stamps[first:last] >= stamp)
-            changes[int(later[np.argmin(stamps[later])]) if len(later) else last].append((values,))
+            # Of several changes at one time each has a message of its own.
+            earliest = stamps[later] == np.min(stamps[later], initial=_NEVER)
+            together = later[earliest].tolist() or [last]
+            free = [index for index in together if index not in changes]
+            changes[int((free or together)[0 if free else -1])].append((values,))
     for recorded, fault, what in run.fault_events:
         robot = _FAULTY_ROBOT.search(fault)
         if robot is None or robot[1].split('/')[-1] == ROBOT:

@@ -204,7 +204,7 @@ class Path:
             self._arcs.pose[index], se2.exp(np.stack([beyond, np.zeros_like(turn), turn], axis=-1))
         )
 
-    def nearest(self, x: float, y: float, near: float | None = None) -> float:
+    def nearest(self, x: float, y: float, near: float | None = None, *, forward: bool = False) -> float:
         """Return the arc length of the nearest point, in a window about a place.
 
         The window keeps a robot on its branch where a path crosses itself or passes close to itself. On
@@ -215,6 +215,8 @@ class Path:
             y: Likewise.
             near: Arc length of the place, such as the result for the position before (m). None: the
                 whole path is searched.
+            forward: Whether only what follows the place is searched. So a robot gets past a place where
+                the path turns back.
 
         Raises:
             ValueError: An argument is not a finite number.
@@ -225,7 +227,7 @@ class Path:
             window = min(WINDOW, self.length / 4.0)
             near = number('near', near, finite)
             near = near if self.closed else min(max(near, 0.0), high)
-            low, high = near - window, near + window
+            low, high = near - (0.0 if forward else window), near + window
             if not self.closed:
                 low, high = max(low, 0.0), min(high, self.length)
         arcs, count = self._arcs, len(self._arcs.start)

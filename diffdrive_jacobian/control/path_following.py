@@ -95,7 +95,11 @@ class PathFollower:
         """
         x, y, theta = pose
         path = self.path
-        s = path.nearest(x, y, self.s)
+        s = path.nearest(x, y, self.s, forward=True)
+        nearest = path.at(s, 0.0)
+        if hypot(nearest.x - x, nearest.y - y) > how.approach_distance:
+            # On the way to the path there is no progress along it.
+            s = self.s
         here = replace(self, s=s, index=self._next(x, y, s, how.waypoint_tolerance))
         if here.passing and s > path.arc_lengths[here.index] + how.waypoint_tolerance:
             return here, None

@@ -104,6 +104,8 @@ SETTLING = 0.1
 """Odometry this much later than the last command shows its effect (s)."""
 DISCOVERY_PERIOD = 0.5
 """Time between two searches for new topics to record (s)."""
+STANDING = 1e-3
+"""Speed and yaw rate up to which a robot is said to have stopped (m/s, rad/s)."""
 STOP_PATIENCE = 2.0
 """Longest time in which the robot may come to rest at the end, and report that (s)."""
 
@@ -118,6 +120,8 @@ class Outcome:
     """Whether a signal ended the drive."""
     pose: NDArray[np.float64] | None
     """`[x, y, theta]` where the robot stopped, shape (3,) (m, m, rad). None: there was no odometry."""
+    moving: bool
+    """Whether it still moved then noticeably, `STOP_PATIENCE` after the end."""
     distance: float
     """Distance from the driven point to the last goal by the odometry, of a path what remained (m)."""
     true_distance: float
@@ -308,6 +312,7 @@ def drive(
         status=status,
         interrupted=signals.count > 0,
         pose=None if client.robot is None else client.robot.pose,
+        moving=client.robot is not None and client.robot.fastest > STANDING,
         distance=client.distance,
         true_distance=true_distance,
         across=math.nan if client.path is None else client.path.greatest,

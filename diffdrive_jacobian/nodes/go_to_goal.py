@@ -62,8 +62,10 @@ class Goal:
     frame: str
     """Frame of its poses; empty: that of the odometry."""
     waypoints: Waypoints
+    whole: Path | None = None
+    """The path that was sent; None: waypoints."""
     path: PathFollower | None = None
-    """The path that is followed; None: the waypoints are driven to one by one."""
+    """The path that is followed; None: the waypoints are driven to one by one, or the last pose."""
     stepped: int = 0
     """Time of the last step along the path (ns)."""
     executing: bool = False
@@ -73,11 +75,11 @@ class Goal:
 
     def same_path(self, other: Goal) -> bool:
         """Return whether both are on the same path."""
-        if self.path is None or other.path is None or self.frame != other.frame:
+        if self.whole is None or other.whole is None or self.frame != other.frame:
             return False
         one, two = (
             (path.poses, np.zeros(0) if path.times is None else path.times)
-            for path in (self.path.path, other.path.path)
+            for path in (self.whole, other.whole)
         )
         return all(map(np.array_equal, one, two))
 
@@ -297,7 +299,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             poses = [*zip(*columns, strict=True)]
             self._warn_of_integers('path', poses)
             frame, path = read_path(frame, frames, poses, zip(secs, nanosecs, strict=True))
-            return Goal(info, frame, Waypoints(path.poses), PathFollower(path))
+            return Goal(info, frame, Waypoints(path.poses), path, PathFollower(path))
 
         self._receive('path', data, PathMessage, MAX_PATH_POSES, read)
 
@@ -335,17 +337,19 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
 
     def _accept(self, goal: Goal) -> None:
         """Replace the active goal, if there is one. On the same path the robot goes on where it is."""
-        if self._goal is not None:
-            self._publish_status(self._goal.info, GoalStatus.STATUS_CANCELED)
-            if self._goal.same_path(goal):
-                goal.path, goal.stepped = self._goal.path, self._goal.stepped
+        before = self._goal
+        if before is not None:
+            self._publish_status(before.info, GoalStatus.STATUS_CANCELED)
+        if before is not None and before.same_path(goal):
+            goal.path, goal.waypoints, goal.stepped = before.path, before.waypoints, before.stepped
+        else:
+            self._law.reset()
+            self._path_law.reset()
+            self._times.clear()
         if not self._driving:
             # While the robot moves the watchdog runs already, and a new goal is no sign of odometry.
             self._watchdog.start(nanoseconds(self.parameters.odom_timeout))
         self._goal = goal
-        self._law.reset()
-        self._path_law.reset()
-        self._times.clear()
         self._others.start()
         self._publish_status(goal.info, GoalStatus.STATUS_ACCEPTED)
         self.log_event_info('goal accepted', f'goal accepted: {described(goal)}')
@@ -504,7 +508,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._match_frames(goal)
             if goal.path is not None:
                 self._match_start(goal.path, pose)
-            elif self.parameters.pass_waypoints and len(goal.waypoints.poses) > 1:
+            elif goal.whole is None and self.parameters.pass_waypoints and len(goal.waypoints.poses) > 1:
                 goal.path = _through(pose, goal.waypoints)
         except MessageError as error:
             self.log_event_warning('goal refused', f'goal refused: {error}')

@@ -57,10 +57,17 @@ class RobotOdometry(NamedTuple):
     """Whether its twist is not zero."""
     stamp: int
     """Timestamp of the message (ns)."""
+    fastest: float
+    """The larger of speed and yaw rate (m/s, rad/s)."""
 
 
 def _state(sec: int, nanosec: int, v: float, omega: float, *pose: float) -> RobotOdometry:
-    return RobotOdometry(np.array(from_pose(*pose)), (v, omega) != (0.0, 0.0), from_time(sec, nanosec))
+    return RobotOdometry(
+        pose=np.array(from_pose(*pose)),
+        moving=(v, omega) != (0.0, 0.0),
+        stamp=from_time(sec, nanosec),
+        fastest=max(abs(v), abs(omega)),
+    )
 
 
 STATE = Codec(

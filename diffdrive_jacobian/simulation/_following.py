@@ -18,7 +18,7 @@ from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.numerics.elementary import sinc
 from diffdrive_jacobian.simulation._batch import Array, Batch, Mask, Rows
 from diffdrive_jacobian.simulation.acceleration import SHORTEST, AxisLimits
-from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.simulation.actuators import SETTLING, Actuators
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 AT_REST = 1e-9
@@ -128,14 +128,31 @@ class Follower:
         self, rows: Rows, seconds: Array, speed: Array, slope: Array
     ) -> Iterator[tuple[Rows, Array, Array]]:
         """Yield the steps of a piece in which the demanded twists are linear."""
-        rest, tau = None, self.lag
-        # The turn is at most that with the fastest speed, which is one at an end of the piece.
-        ends = speed[1], speed[1] + slope[1] * seconds, self.twist[1, rows]
-        steps = seconds * np.max(np.abs(ends if tau else ends[:2]), axis=0)
-        if tau:
-            speed = speed - slope * tau
-            rest = self.twist[:, rows] - speed
-            self.twist[:, rows] = speed + slope * seconds + rest * np.exp(-seconds / tau)
+        tau = self.lag
+        if not tau:
+            yield from self._steps(rows, seconds, speed, slope, None)
+            return
+        speed = speed - slope * tau
+        rest = self.twist[:, rows] - speed
+        self.twist[:, rows] = speed + slope * seconds + rest * np.exp(-seconds / tau)
+        decaying = np.minimum(seconds, SETTLING * tau)
+        yield from self._steps(rows, decaying, speed, slope, rest)
+        long = seconds > decaying
+        if long.any():
+            speed, slope = (speed + slope * decaying)[:, long], slope[:, long]
+            yield from self._steps(rows[long], (seconds - decaying)[long], speed, slope, None)
+
+    def _steps(
+        self, rows: Rows, seconds: Array, speed: Array, slope: Array, rest: Array | None
+    ) -> Iterator[tuple[Rows, Array, Array]]:
+        """Yield the steps of the twists `speed + slope t + rest exp(-t / tau)`."""
+        tau = self.lag
+        # The turn is at most that with the fastest speed, which is one at an end.
+        ends = [speed[1], speed[1] + slope[1] * seconds]
+        if rest is not None:
+            ends.append(speed[1] + rest[1])
+        steps = seconds * np.max(np.abs(ends), axis=0)
+        if rest is not None:
             steps = np.maximum(steps, seconds / tau / 2.0)
         elif not slope.any():
             steps = np.zeros_like(seconds)

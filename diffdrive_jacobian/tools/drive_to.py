@@ -283,8 +283,9 @@ def _print_outcome(outcome: Outcome, options: argparse.Namespace) -> int:
                 distances += f', after at most {outcome.across:.3f} m from it'
             if not math.isnan(outcome.true_distance):
                 distances += f' by odometry, truly {outcome.true_distance:.3f} m from its end'
+        did = 'still moved' if outcome.moving else 'stopped'
         where = (
-            f'the robot stopped at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, {distances}, '
+            f'the robot {did} at x {x:.3f} m, y {y:.3f} m, heading {theta:.3f} rad, {distances}, '
             f'after {outcome.seconds:.1f} s{simulated}'
         )
     if outcome.arrived:
