@@ -193,6 +193,7 @@ class GoalClient(Node):  # type: ignore[misc]
         # rclpy reports a name that is too long only here.
         self.resolve_service_name('cancel_goal')
         self._cancel = self.create_client(Trigger, 'cancel_goal')
+        self._canceling: Any = None
 
     @property
     def distance(self) -> float:
@@ -258,7 +259,13 @@ class GoalClient(Node):  # type: ignore[misc]
 
     def cancel(self) -> None:
         """Request the controller to cancel its goal."""
-        self._cancel.call_async(Trigger.Request())
+        self._canceling = self._cancel.call_async(Trigger.Request())
+
+    @property
+    def cancel_answer(self) -> str:
+        """What the controller answered to the request to cancel; '': nothing yet."""
+        answered = self._canceling is not None and self._canceling.done()
+        return str(self._canceling.result().message) if answered else ''
 
     def confirmed(self, timeout: float) -> bool:
         """Wait until the goals are acknowledged by every subscription.

@@ -87,7 +87,8 @@ class GoalResult:
     across: float | None = None
     """Greatest distance of the robot from the path (m). None: it was a goal, or was not driven along."""
     reason: str = ''
-    """For NOT_SENT what is missing, for LOST what happened to the controller."""
+    """For NOT_SENT what is missing, for LOST what happened to the controller; where it canceled, its
+    answer, which may say how far the robot rolls on."""
     canceled: bool | None = None
     """Whether the controller confirmed that it canceled the goal. None: it was not asked to."""
 
@@ -468,7 +469,10 @@ class _Session:
             if client.ended:
                 break
             self._progress.waiting('the controller has not confirmed that it canceled')
-        return self._result(result, distance=distance, canceled=client.ended)
+        # The status may be received first.
+        self._runner.spin(lambda: bool(client.cancel_answer), timeout=CONFIRMATION_PERIOD)
+        answer = client.cancel_answer
+        return self._result(result, distance=distance, canceled=client.ended, reason=answer)
 
     def _distance(self) -> float | None:
         return None if self._client.robot is None else self._client.distance

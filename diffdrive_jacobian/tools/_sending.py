@@ -152,7 +152,8 @@ def report(result: GoalResult, options: argparse.Namespace, what: str) -> list[s
             f'{result.status.word}: no odometry was received, so it is not known whether a robot drove'
         )
     else:
-        stopped = f'{result.status.word}: the robot was stopped'
+        _, _, rolls = result.reason.partition('; ')
+        stopped = f'{result.status.word}: {rolls or "the robot was stopped"}'
     return [line, stopped] if line else [stopped]
 
 
