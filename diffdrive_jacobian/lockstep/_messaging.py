@@ -14,7 +14,6 @@ from diffdrive_jacobian.lockstep._nodes import Nodes
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.lockstep._simulated_time import SimulatedTime
 from diffdrive_jacobian.lockstep.external.graph import compatible, qos_name
-from diffdrive_jacobian.lockstep.external.others import Isolated
 from diffdrive_jacobian.messages.names import node_of, type_name
 from diffdrive_jacobian.ros.rclpy_internals import SERVICES_OF_RCLPY
 
@@ -60,12 +59,7 @@ class Messaging:
             self._publishers[key] = self._with_type(topic, create, type(message), topic, profile)
         publisher = self._publishers[key]
         self._time.settle_unless_busy()
-        self._time.connect()
         subscriptions = publisher.get_subscription_count()
-        if subscriptions == 0 and not latched and not self._time.busy:
-            self._time.others.await_subscription(publisher)
-            self._time.connect()
-            subscriptions = publisher.get_subscription_count()
         # Both: a node that was not added may have come in place of one that was removed.
         counts = subscriptions, len(self._scheduler.links.to(publisher.topic_name))
         if counts != self._all_served.get(publisher) or subscriptions == 0:
@@ -150,9 +144,6 @@ class Messaging:
     def call(self, service_type: Any, name: str, request: Any, timeout: float) -> Any:
         """Call a service, as `Lockstep.call`."""
         name = self._node.resolve_service_name(name)
-        self._time.connect()
-        others = Isolated() if self._is_served(name) else self._time.others
-        others.await_service(name)
         services = dict(self._node.get_service_names_and_types())
         wanted = type_name(service_type)
         if wanted not in services.get(name, []):
@@ -164,21 +155,11 @@ class Messaging:
             )
         client = self._node.create_client(service_type, name)
         try:
-            others.until(client.service_is_ready, timeout, lambda: f'{name} is not ready')
             future = client.call_async(request or service_type.Request())
-            others.until(future.done, timeout, lambda: f'no response of {name}')
             self._time.run_until(future.done, timeout, f'a response of {name}')
             return future.result()
         finally:
             self._node.destroy_client(client)
-
-    def _is_served(self, service: str) -> bool:
-        """Return whether a node of the world provides a service."""
-        return any(
-            node.resolve_service_name(server.srv_name) == service
-            for node in self._scheduler.nodes
-            for server in node.services
-        )
 
     def _with_type(self, topic: str, create: Callable[..., Any], *args: Any) -> Any:
         try:

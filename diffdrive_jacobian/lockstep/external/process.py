@@ -125,6 +125,12 @@ class ExternalProcess:
         except OSError as error:
             raise LockstepError(f'{self.command} cannot be started: {error}') from error
 
+    def check_running(self, node: str = '') -> None:
+        """Raise LockstepError if it has ended by itself. `node` says what depends on it."""
+        if self.returncode is not None and not self.ended_by_test:
+            what = f'{node}: ' if node else ''
+            raise LockstepError(f'{what}{self.describe()}')
+
     @property
     def pid(self) -> int:
         """Process id."""
@@ -139,24 +145,15 @@ class ExternalProcess:
             os.killpg(self.pid, signal.SIGKILL)
         return self._process.poll()
 
-    @property
-    def stdout(self) -> str:
-        """What it has printed on the standard output."""
-        return self._printed(0)
-
-    @property
-    def stderr(self) -> str:
-        """What it has printed on the standard error stream."""
-        return self._printed(1)
-
-    def _printed(self, number: int) -> str:
+    def printed(self, number: int) -> str:
+        """Return what it has printed on the standard output (0) or the standard error stream (1)."""
         text = self._kept.get(number)
         return self._files[number].read_text(errors='replace') if text is None else text
 
     def close(self) -> None:
         """End it, and keep what it printed."""
         self.stop()
-        self._kept = {number: self._printed(number) for number in range(len(self._files))}
+        self._kept = {number: self.printed(number) for number in range(len(self._files))}
 
     def signal(self, number: int) -> None:
         """Send a signal to it and its children. Nothing happens if it has ended."""
@@ -166,8 +163,6 @@ class ExternalProcess:
     def stop(self, timeout: float = CLOSING) -> int:
         """End it by SIGINT, and kill it if it does not end. Return the exit code.
 
-        The answers that were declared with it are not awaited any more.
-
         Args:
             timeout: Longest time for its end (s).
         """
@@ -176,7 +171,7 @@ class ExternalProcess:
         return self._join(timeout)
 
     def kill(self) -> None:
-        """Kill it. The answers that were declared with it are not awaited any more."""
+        """Kill it."""
         self.ended_by_test = True
         self._join(0.0)
 
@@ -190,16 +185,21 @@ class ExternalProcess:
         return code
 
     def describe(self) -> str:
-        """Return its state, and the end of what it printed if it has ended."""
+        """Return its state, and the end of what it printed."""
         code = self.returncode
         if code is None:
             state = f'{self.command} (pid {self.pid}) is running'
         elif code < 0:
             state = f'{self.command} was ended by {_signal_name(-code)}'
+        elif code > 128 and (name := _signal_of_child(code)):
+            state = f'{self.command} has exited with {code}: what it started was ended by {name}'
         else:
             state = f'{self.command} has exited with {code}'
-        printed = (self._printed(1) or self._printed(0)).splitlines()
-        return '\n    '.join([state, *printed[-SHOWN_LINES:]])
+        lines = [state]
+        for number, name in enumerate(('stdout', 'stderr')):
+            if shown := self.printed(number).splitlines()[-SHOWN_LINES:]:
+                lines += [f'  {name}:', *(f'    {line}' for line in shown)]
+        return '\n'.join(lines)
 
 
 @contextmanager
@@ -253,3 +253,15 @@ def _signal_name(number: int) -> str:
         return signal.Signals(number).name
     except ValueError:
         return f'signal {number}'
+
+
+def _signal_of_child(code: int) -> str:
+    """Return the signal that has ended a child, by the exit code of its parent; empty: none.
+
+    A shell exits with 128 + signal, and `ros2 run` with 256 - signal.
+    """
+    fatal = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGKILL)
+    for number in (code - 128, 256 - code):
+        if number in fatal:
+            return _signal_name(number)
+    return ''

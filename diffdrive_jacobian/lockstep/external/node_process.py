@@ -1,0 +1,690 @@
+"""A process whose nodes take part in a lockstep world, unchanged, each with a node that stands for it.
+
+Each process has a ROS domain of its own, in which the world has an endpoint for each of its topics and
+services. So its nodes keep all their names, and no process receives what another one sends directly. In
+the world stands a `StandIn` for each of its nodes, with the same name, topics and services. What that
+receives is sent to the process, one message at a time, and the world waits until the process is quiet.
+What it has sent meanwhile is published by the stand-in. So faults, properties and recordings treat it as
+any other node.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from rcl_interfaces.srv import GetParameters
+from rclpy.client import Client
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.serialization import serialize_message
+from rosgraph_msgs.msg import Clock
+
+from diffdrive_jacobian.lockstep._errors import LockstepError, described
+from diffdrive_jacobian.lockstep._gate import FREE
+from diffdrive_jacobian.lockstep._link import Link, Source, Stage
+from diffdrive_jacobian.lockstep._nodes import Nodes
+from diffdrive_jacobian.lockstep._scheduler import Scheduler
+from diffdrive_jacobian.lockstep.external.graph import (
+    CLOCK_TYPE,
+    PID,
+    NodeGraph,
+    import_type,
+    nodes_beside,
+    profile_of,
+)
+from diffdrive_jacobian.lockstep.external.process import CLOSING, ExternalProcess, free_domain
+from diffdrive_jacobian.lockstep.external.quiet import Quiet, descendants, threads_of_this_process
+from diffdrive_jacobian.lockstep.external.relays import (
+    DEPTH,
+    Arrived,
+    CalledService,
+    FromTopic,
+    OfferedService,
+    Relay,
+    ToTopic,
+    without_echo,
+)
+from diffdrive_jacobian.messages.conversion import set_time
+from diffdrive_jacobian.messages.names import node_of
+from diffdrive_jacobian.ros.rclpy_internals import (
+    graph_changed,
+    raw_sender,
+    send_request,
+    take_response,
+)
+from diffdrive_jacobian.ros.runner import DISCOVERY, environment, ros_context
+from diffdrive_jacobian.time_units import NANOSECONDS
+
+PERIOD = 0.01
+"""Period at which the graph is looked at while a process starts (s)."""
+REPETITION = 0.2
+"""Period at which a request is repeated while a process starts (s): a response may be lost then."""
+UNCONFIRMED = 0.5
+"""Time for nodes without parameter services to discover the endpoints of the world (s)."""
+SILENCE = 0.2
+"""Time for which a process that has started must not send anything by itself (s)."""
+END = 2.0
+"""Time in which a process ends after a process of its nodes has (s)."""
+ATTEMPTS = 2
+"""Number of domains that are tried, if a program that the world has not started comes into one."""
+
+
+class ForeignNodeError(LockstepError):
+    """There is a node in the domain that is in no process of the world."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """How a process is started: the arguments of `Lockstep.start`."""
+
+    command: Sequence[str | os.PathLike[str]]
+    use_sim_time: bool
+    cwd: str | os.PathLike[str] | None
+    env: Mapping[str, str]
+    clock_period: float
+    queue_depth: int
+    timeout: float
+    patience: float
+
+    def __post_init__(self) -> None:
+        """Check the command."""
+        if isinstance(self.command, (str, os.PathLike)) or not self.command:
+            raise LockstepError(
+                "start takes a program and its arguments, ['ros2', 'run', 'my_package', 'my_node'], got "
+                f'{described(self.command)}'
+            )
+
+    @property
+    def arguments(self) -> list[str]:
+        """The program and all its arguments."""
+        timed = ('--ros-args', '-p', 'use_sim_time:=true') if self.use_sim_time else ()
+        return [*(os.fspath(part) for part in self.command), *timed]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surroundings:
+    """What a process needs of the world.
+
+    Attributes:
+        scheduler: Executes the nodes.
+        nodes: The nodes of the world.
+        extend: Receives the wall time (s) that was spent waiting for the process.
+        is_open: Returns whether the world was not closed.
+    """
+
+    scheduler: Scheduler
+    nodes: Nodes
+    extend: Callable[[float], None]
+    is_open: Callable[[], bool]
+
+
+class StandIn(Node):  # type: ignore[misc]
+    """A node of the world for a node of a process. If it is destroyed, the process is ended."""
+
+    def __init__(self, graph: NodeGraph, end: Callable[[StandIn], None]) -> None:
+        """Create it with the name of the node, without topics."""
+        super().__init__(
+            graph.name,
+            namespace=graph.namespace,
+            use_global_arguments=False,
+            enable_rosout=False,
+            start_parameter_services=False,
+            parameter_overrides=[
+                Parameter('use_sim_time', value=True),
+                Parameter('start_type_description_service', value=False),
+            ],
+        )
+        self._end = end
+
+    def destroy_node(self) -> None:
+        """Destroy the node, and end the process."""
+        self._end(self)
+        super().destroy_node()
+
+
+class NodeProcess:
+    """A process with nodes in the world, as of `Lockstep.start`. It is ended with the world."""
+
+    def __init__(self, command: Command, surroundings: Surroundings, directory: Path) -> None:
+        """Start nothing yet. What it prints is kept in the directory, that of the world alone."""
+        self._command = command
+        self._directory = directory
+        self._scheduler = surroundings.scheduler
+        self._nodes = surroundings.nodes
+        self._extend, self._is_open = surroundings.extend, surroundings.is_open
+        self._clocks = surroundings.scheduler.clocks
+        self._stand_ins: dict[str, StandIn] = {}
+        self._ended: list[ExternalProcess] = []
+        self._latched: list[Arrived] = []
+        self._closing = ExitStack()
+        self.child: ExternalProcess
+        self._relays: list[Relay] = []
+        self._clock_publishers: dict[str, Publisher] = {}
+        self._participants: set[int] = set()
+        self._given = -1
+        self._called: dict[str, tuple[str, StandIn]] = {}
+        self._connected = False
+        self._scheduler.links.filter(self._drop_echoes, first=True)
+        self._nodes.on_change.append(self._on_change)
+        self._services_changed = True
+
+    # --- What the test sees
+
+    @property
+    def nodes(self) -> list[Node]:
+        """The nodes of the world that stand for those of the process."""
+        return list(self._stand_ins.values())
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self.child.pid
+
+    @property
+    def returncode(self) -> int | None:
+        """Exit code, negative if a signal ended it. None: it runs. Its children end with it."""
+        return self.child.returncode
+
+    @property
+    def stdout(self) -> str:
+        """What it has printed on the standard output, also before a fault has started it again."""
+        return ''.join(one.printed(0) for one in (*self._ended, self.child))
+
+    @property
+    def stderr(self) -> str:
+        """What it has printed on the standard error stream, as `stdout`."""
+        return ''.join(one.printed(1) for one in (*self._ended, self.child))
+
+    @property
+    def command(self) -> str:
+        """The command line."""
+        return self.child.command
+
+    def signal(self, number: int) -> None:
+        """Send a signal to it and its children. Nothing happens if it has ended."""
+        self.child.signal(number)
+
+    def stop(self, timeout: float = CLOSING) -> int:
+        """End it by SIGINT, and kill it if it does not end. Return the exit code.
+
+        What it publishes at its end is received by the others.
+
+        Args:
+            timeout: Longest time for its end (s).
+        """
+        code = self.child.stop(timeout)
+        if self._connected:
+            self._wait()
+            self._forward(self._take())
+        self._leave()
+        return code
+
+    def kill(self) -> None:
+        """Kill it. Nothing that was sent to it is processed."""
+        self._scheduler.killed.update(self._stand_ins.values())
+        self.child.kill()
+        self._leave()
+
+    def describe(self) -> str:
+        """Return its state, and the end of what it printed."""
+        return self.child.describe()
+
+    # --- Start and end
+
+    def start(self) -> list[StandIn]:
+        """Start the process, wait until its nodes are discovered, and return their stand-ins.
+
+        Raises:
+            LockstepError: They are not within the timeout, or cannot take part.
+        """
+        begin = time.monotonic()
+        if hasattr(self, 'child'):
+            self._ended.append(self.child)
+        for attempt in range(ATTEMPTS):
+            try:
+                self._launch()
+                self._connect(time.monotonic() + self._command.timeout)
+                break
+            except BaseException as error:
+                if hasattr(self, 'child'):
+                    self.child.kill()
+                self._leave()
+                if not isinstance(error, ForeignNodeError) or attempt == ATTEMPTS - 1:
+                    raise
+        self._extend(time.monotonic() - begin)
+        return list(self._stand_ins.values())
+
+    def _launch(self) -> None:
+        """Start the process, and create what is needed to receive from it."""
+        command = self._command
+        self._domain = free_domain()
+        variables = {DISCOVERY[0]: 'LOCALHOST', 'ROS_DOMAIN_ID': str(self._domain)}
+        before = threads_of_this_process()
+        with environment({**dict.fromkeys(DISCOVERY), **variables}):
+            context = self._closing.enter_context(ros_context(['lockstep']))
+        self._outside = outside = Node(
+            'lockstep_of_world',
+            context=context,
+            use_global_arguments=False,
+            enable_rosout=False,
+            start_parameter_services=False,
+            parameter_overrides=[Parameter('start_type_description_service', value=False)],
+        )
+        self._closing.callback(outside.destroy_node)
+        receiving = threads_of_this_process() - before
+        hash_seed = {} if 'PYTHONHASHSEED' in os.environ else {'PYTHONHASHSEED': '0'}
+        self.child = ExternalProcess(
+            command.arguments,
+            {**variables, **hash_seed, **command.env},
+            self._directory,
+            None if command.cwd is None else os.fspath(command.cwd),
+        )
+        self._quiet = Quiet(self.child.pid, receiving)
+        self._closing.callback(self._quiet.close)
+
+    def join(self) -> None:
+        """Add the nodes to the world. They receive the time."""
+        for name, node in self._stand_ins.items():
+            self._nodes.created(node, partial(self._restart, name))
+            if node not in self._scheduler.nodes:
+                self._nodes.check_new(node)
+                self._nodes.add(node, observer=False)
+        self._connected = True
+        self._quiet.learning = False
+        (first, *_) = self._stand_ins.values()
+        first.create_timer(self._command.clock_period, self._give_time)
+        first.executor.create_task(self._begin)
+
+    def _begin(self) -> None:
+        """Forward what the process has latched before it took part, and give it the time."""
+        latched, self._latched = self._latched, []
+        self._forward(latched)
+        self._give_time()
+
+    def _restart(self, name: str) -> Node:
+        """Start the process again, after a fault has killed it. Return the node of a name."""
+        stand_ins = self.start()
+        found = next((one for one in stand_ins if one.get_fully_qualified_name() == name), None)
+        if found is None:
+            raise LockstepError(f'{self.command} was started again, and has no node {name} now')
+        self.join()
+        return found
+
+    def _on_destroyed(self, stand_in: StandIn) -> None:
+        """End the process: a test or a fault has destroyed one of its nodes."""
+        if not self._is_open() or stand_in not in self._stand_ins.values():
+            return
+        if stand_in in self._scheduler.killed:
+            self.kill()
+        else:
+            self.stop()
+
+    def _leave(self) -> None:
+        """Remove the nodes from the world."""
+        self._connected = False
+        stand_ins, self._stand_ins = self._stand_ins, {}
+        for node in stand_ins.values():
+            node.destroy_node()
+        for relay in self._relays:
+            relay.close()
+        self._relays, self._called = [], {}
+        self._clock_publishers, self._participants = {}, set()
+        self._given = -1
+        self._closing.close()
+
+    def close(self) -> None:
+        """Forget the nodes. The process has ended."""
+        self.child.close()
+        self._leave()
+
+    # --- Discovery
+
+    def _connect(self, end: float) -> None:
+        """Wait until the nodes of the process and the world have discovered each other."""
+        while True:
+            while not (self._learn() and self._is_matched()):
+                self.child.check_running()
+                if time.monotonic() > end:
+                    raise LockstepError(self._not_discovered())
+                time.sleep(PERIOD)
+            known = len(self._relays)
+            self._confirm(end)
+            graph_changed(self._outside)
+            if self._learn() and len(self._relays) == known:
+                break
+        self._check_timed()
+        self._wait()
+        # Others than latched ones came before anybody could be subscribed.
+        self._latched = [arrived for arrived in self._take() if arrived.latched]
+        time.sleep(SILENCE)
+        self._wait()
+        late = self._take()
+        self._latched += [arrived for arrived in late if arrived.latched]
+        self._refuse([arrived for arrived in late if not arrived.latched])
+
+    def _is_matched(self) -> bool:
+        """Return whether the world has discovered all endpoints of the process."""
+        return all(relay.is_matched() for relay in self._relays) and all(
+            publisher.get_subscription_count() for publisher in self._clock_publishers.values()
+        )
+
+    def _learn(self) -> bool:
+        """Create what the topics and services of the process need. Return whether it has nodes."""
+        graphs = nodes_beside(self._outside)
+        offered = {name for graph in graphs for name in graph.services}
+        for graph in graphs:
+            self._check_started_by_world(graph)
+            name = graph.full_name
+            if name not in self._stand_ins:
+                self._stand_ins[name] = StandIn(graph, self._on_destroyed)
+            node = self._stand_ins[name]
+            self._learn_topics(graph, node)
+            for service, kind in graph.services.items():
+                if not self._has(OfferedService, service):
+                    imported = import_type(kind, f'service {service} of {name}')
+                    self._relays.append(
+                        OfferedService(self._outside, node, service, imported, self._deliver)
+                    )
+            for service, kind in graph.clients.items():
+                if service not in offered:
+                    self._called.setdefault(service, (kind, node))
+        self._offer_called()
+        self._relays.sort(key=_order)
+        published = {relay.topic: relay for relay in self._relays if isinstance(relay, FromTopic)}
+        for relay in self._relays:
+            if isinstance(relay, ToTopic):
+                relay.back = published.get(relay.topic)
+        return bool(graphs)
+
+    def _learn_topics(self, graph: NodeGraph, node: StandIn) -> None:
+        outside, name = self._outside, graph.full_name
+        present = {relay.topic for relay in self._relays if isinstance(relay, FromTopic)}
+        for topic in graph.publishers.keys() - present:
+            kind = import_type(graph.publishers[topic], f'topic {topic} of {name}')
+            infos = outside.get_publishers_info_by_topic(topic)
+            profile = profile_of(infos, name, DEPTH)
+            self._relays.append(FromTopic(outside, node, topic, kind, profile))
+        present = {relay.topic for relay in self._relays if isinstance(relay, ToTopic)}
+        for topic, type_name in graph.subscriptions.items():
+            if type_name == CLOCK_TYPE and topic.rpartition('/')[2] == 'clock':
+                if topic not in self._clock_publishers:
+                    self._clock_publishers[topic] = outside.create_publisher(Clock, topic, 1)
+            elif topic not in present:
+                kind = import_type(type_name, f'topic {topic} of {name}')
+                infos = outside.get_subscriptions_info_by_topic(topic)
+                profile = profile_of(infos, name, self._command.queue_depth)
+                self._relays.append(ToTopic(outside, node, topic, kind, profile, self._deliver))
+
+    def _has(self, kind: type[Relay], name: str) -> bool:
+        return any(
+            isinstance(relay, kind) and getattr(relay, 'name', '') == name for relay in self._relays
+        )
+
+    def _on_change(self) -> None:
+        self._services_changed = True
+
+    def _offer_called(self) -> None:
+        """Offer the process the services that it calls and that other nodes of the world have."""
+        self._services_changed = False
+        own = self._stand_ins.values()
+        there = {
+            service.service_name
+            for node in self._scheduler.nodes
+            if node not in own
+            for service in node.services
+        }
+        for name, (type_name, node) in self._called.items():
+            if name in there and not self._has(CalledService, name):
+                kind = import_type(type_name, f'service {name} that {node.get_name()} calls')
+                self._relays.append(CalledService(self._outside, node, name, kind, self._deliver))
+
+    def _check_started_by_world(self, graph: NodeGraph) -> None:
+        """Check that a node is in the process or one that it has started."""
+        infos = [
+            info
+            for topic in graph.publishers.keys() | graph.subscriptions.keys()
+            for info in (
+                *self._outside.get_publishers_info_by_topic(topic),
+                *self._outside.get_subscriptions_info_by_topic(topic),
+            )
+            if node_of(info) == graph.full_name
+        ]
+        numbers = {int.from_bytes(bytes(info.endpoint_gid)[PID], 'little') for info in infos}
+        pids = {pid for pid in descendants(self.child.pid) if pid & 0xFFFF in numbers}
+        if numbers and not pids:
+            raise ForeignNodeError(
+                f'node {graph.full_name} is in domain {self._domain}, but in no process that '
+                f'{self.command} has started and that runs on: a daemon, a container or another machine '
+                'cannot take part in lockstep'
+            )
+        self._participants |= pids
+        if len(self._participants) > 1:
+            raise LockstepError(
+                f'{self.command} has started several processes with nodes: '
+                f'{", ".join(map(str, sorted(self._participants)))}; start each of them by itself, '
+                'because messages between them would not be received one at a time'
+            )
+
+    def _confirm(self, end: float) -> None:
+        """Wait until the nodes respond, which shows that they have discovered what the world has.
+
+        They discover endpoints in the order of their creation, so those of new clients come last.
+        """
+        names = [
+            relay.name
+            for relay in self._relays
+            if isinstance(relay, OfferedService) and relay.client.srv_type is GetParameters
+        ]
+        for name in names:
+            client = self._outside.create_client(GetParameters, name)
+            try:
+                self._await_response(client, end)
+            finally:
+                self._outside.destroy_client(client)
+        if len(names) < len(self._stand_ins):
+            time.sleep(UNCONFIRMED)
+
+    def _await_response(self, client: Client, end: float) -> None:
+        """Ask a node for a parameter until it responds."""
+        repeat = 0.0
+        while take_response(client) is None:
+            self.child.check_running()
+            now = time.monotonic()
+            if now > end:
+                raise LockstepError(
+                    f'{client.service_name} does not respond: the executor of the node does not spin; '
+                    f'{self._quiet.describe()}\n{self.describe()}'
+                )
+            if now > repeat and client.service_is_ready():
+                send_request(client, GetParameters.Request(names=['use_sim_time']))
+                repeat = now + REPETITION
+            time.sleep(PERIOD / 10)
+
+    def _check_timed(self) -> None:
+        """Check that the nodes receive the time."""
+        if not self._command.use_sim_time:
+            return
+        timed = {
+            node_of(info)
+            for topic in self._clock_publishers
+            for info in self._outside.get_subscriptions_info_by_topic(topic)
+        }
+        if untimed := sorted(self._stand_ins.keys() - timed):
+            raise LockstepError(
+                f'{", ".join(untimed)} of {self.command} is not subscribed to /clock: its parameter '
+                'use_sim_time must be true; if it needs no time: start(..., use_sim_time=False)'
+            )
+
+    def _not_discovered(self) -> str:
+        waited = f'within {self._command.timeout:g} s of wall time (timeout=)'
+        if self._relays:
+            missing = sorted(
+                getattr(one, 'topic', getattr(one, 'name', ''))
+                for one in self._relays
+                if not one.is_matched()
+            )
+            return f'{self.command}: not discovered {waited}: {", ".join(missing)}\n{self.describe()}'
+        others = _domains(self.child.pid) - {self._domain}
+        hint = 'it has created none, or not yet'
+        if others:
+            hint = (
+                f'it is in ROS domain {", ".join(map(str, sorted(others)))} instead of {self._domain}: '
+                'it must not set ROS_DOMAIN_ID, which start() sets for it'
+            )
+        return f'no node of {self.command} was discovered {waited}: {hint}\n{self.describe()}'
+
+    # --- Exchange
+
+    def _deliver(self, send: Callable[[], object]) -> None:
+        """Give the process the time, send something to it, and forward what it sends meanwhile."""
+        self._give_time()
+        self._exchange(send)
+
+    def _give_time(self) -> object:
+        """Give the process the time, unless it has it. Return FREE if it has sent nothing."""
+        now = self._clocks.now
+        if now == self._given:
+            return FREE
+        self._given = now
+        message = Clock()
+        set_time(message.clock, now)
+        data = serialize_message(message)
+
+        def send() -> None:
+            for publisher in self._clock_publishers.values():
+                raw_sender(publisher)(data)
+
+        return None if self._exchange(send) else FREE
+
+    def _exchange(self, send: Callable[[], object]) -> int:
+        """Send something to the process, wait until it is quiet, and forward what it has sent.
+
+        Returns:
+            How many messages it has sent.
+        """
+        if not self._connected:
+            return 0
+        if self._services_changed:
+            self._offer_called()
+            self._relays.sort(key=_order)
+        self._check_silent()
+        begin = time.monotonic()
+        send()
+        self._wait()
+        arrived = self._take()
+        self._extend(time.monotonic() - begin)
+        self._forward(arrived)
+        if any(map(self._quiet.has_ended, (self.child.pid, *self._participants))):
+            self._on_end()
+        elif graph_changed(self._outside):
+            self._learn_more()
+        return len(arrived)
+
+    def _learn_more(self) -> None:
+        """Create what is needed for topics and services that the process has created meanwhile."""
+        known = len(self._relays)
+        self._learn()
+        if len(self._relays) > known:
+            self._connect(time.monotonic() + self._command.timeout)
+            latched, self._latched = self._latched, []
+            self._forward(latched)
+
+    def _wait(self) -> None:
+        """Wait until the process and the threads that receive from it are quiet."""
+        try:
+            self._quiet.wait(self._command.patience, lambda: None)
+        except LockstepError as error:
+            names = ', '.join(self._stand_ins) or self.command
+            raise LockstepError(
+                f'{names} {error}\n  a loop that polls or sleeps on wall time cannot run in lockstep; '
+                'for a callback that takes longer: start(..., patience=)\n' + self.describe()
+            ) from None
+
+    def _take(self) -> list[Arrived]:
+        """Return what has arrived: messages by the names of their topics, responses, requests."""
+        return [arrived for relay in self._relays for arrived in relay.take()]
+
+    @staticmethod
+    def _forward(arrived: Sequence[Arrived]) -> None:
+        for one in arrived:
+            one.forward()
+
+    def check(self) -> None:
+        """Check that it runs, and has sent nothing while nothing was delivered to it."""
+        if self._connected:
+            self.child.check_running(', '.join(self._stand_ins))
+            self._check_silent()
+
+    def _check_silent(self) -> None:
+        self._refuse(self._take())
+
+    def _refuse(self, arrived: Sequence[Arrived]) -> None:
+        """Raise LockstepError if something has arrived."""
+        if arrived:
+            names = ', '.join(self._stand_ins)
+            what = ', '.join(dict.fromkeys(one.what for one in arrived))
+            raise LockstepError(
+                f'{names} {what} at {self._clocks.now / NANOSECONDS:g} s, while nothing was delivered '
+                'to it: what it sends then differs from run to run. Likely a timer on wall time '
+                '(create_wall_timer), a thread of its own, or a callback that had not ended, because it '
+                'waited for something else than a message\n' + self.describe()
+            )
+
+    def _on_end(self) -> None:
+        """Note that the process has ended while something was delivered to it."""
+        end = time.monotonic() + END
+        while (code := self.child.returncode) is None and time.monotonic() < end:
+            time.sleep(PERIOD)
+        if code == 0:
+            self._leave()
+            return
+        self.child.check_running(', '.join(self._stand_ins))
+        raise LockstepError(f'a node of {self.describe()}\n  has ended')
+
+    def _drop_echoes(self, end: Source | Link) -> Stage | None:
+        """Return the stage that keeps from the process what it has received directly."""
+        own = self._stand_ins.values()
+        if not isinstance(end, Link) or end.owner not in own:
+            return None
+        topics = {relay.topic for relay in self._relays if isinstance(relay, FromTopic)}
+        if end.topic not in topics:
+            return None
+        observers = self._scheduler.links.observers_of_published(end.topic)
+        return without_echo(
+            observers.append, lambda publisher: any(publisher in node.publishers for node in own)
+        )
+
+
+def _order(relay: Relay) -> tuple[int, str]:
+    """Return the place of a relay: DDS does not promise an order between topics, so it is by name."""
+    if isinstance(relay, (FromTopic, ToTopic)):
+        return 0, relay.topic
+    return (1 if isinstance(relay, OfferedService) else 2), relay.name
+
+
+def _domains(pid: int) -> set[int]:
+    """Return the ROS domains in which a process and its children receive, by their UDP ports."""
+    sockets = set()
+    for one in descendants(pid):
+        for descriptor in Path(f'/proc/{one}/fd').glob('*'):
+            try:
+                target = os.readlink(descriptor)
+            except OSError:
+                continue
+            if target.startswith('socket:['):
+                sockets.add(target[8:-1])
+    found = set()
+    for line in Path('/proc/net/udp').read_text().splitlines()[1:]:
+        words = line.split()
+        port = int(words[1].rpartition(':')[2], 16)
+        # Higher ones are given to clients, lower ones are no ports of discovery.
+        if words[9] in sockets and 7400 <= port < 32768:
+            found.add((port - 7400) // 250)
+    return found
