@@ -47,10 +47,6 @@ ENDED = (b'Z', b'X')
 """States of threads that have ended."""
 
 
-class _EndedError(Exception):
-    """A thread has ended while it was looked at."""
-
-
 class _Thread(NamedTuple):
     """The open files of a thread below /proc."""
 
@@ -168,25 +164,26 @@ class Quiet:
                     self._busy = thread
                     return False
             return True
-        except (_EndedError, ProcessLookupError):
-            # The next look is at what is left.
+        except ProcessLookupError:
+            # A thread has ended. The next look is at what is left.
             self._busy = None
             self._sizes = dict.fromkeys(self._sizes, 0)
             return False
 
     def _is_busy(self, thread: _Thread) -> bool:
-        """Return whether a thread runs, is about to, or sleeps for a time."""
-        try:
-            _, _, rest = os.pread(thread.stat, 512, 0).rpartition(b') ')
-            state = rest[:1]
-            if state != b'S':
-                self._why = STATES.get(state, f'has the state {state.decode()}')
-                return state not in ENDED or not self._was_ended(thread)
-            if thread.call < 0:
-                return False
-            return self._waits_in_callback(thread, os.pread(thread.call, 256, 0).split())
-        except ProcessLookupError:
-            raise _EndedError from None
+        """Return whether a thread runs, is about to, or sleeps for a time.
+
+        Raises:
+            ProcessLookupError: It has ended.
+        """
+        _, _, rest = os.pread(thread.stat, 512, 0).rpartition(b') ')
+        state = rest[:1]
+        if state != b'S':
+            self._why = STATES.get(state, f'has the state {state.decode()}')
+            return state not in ENDED or not self._was_ended(thread)
+        if thread.call < 0:
+            return False
+        return self._waits_in_callback(thread, os.pread(thread.call, 256, 0).split())
 
     def _waits_in_callback(self, thread: _Thread, call: list[bytes]) -> bool:
         """Return whether a thread sleeps for a time, or waits with a timeout as it does not when idle.
@@ -281,7 +278,7 @@ class Quiet:
         except (FileNotFoundError, ProcessLookupError):
             for descriptor in descriptors:
                 os.close(descriptor)
-            raise _EndedError from None
+            raise ProcessLookupError from None
 
     # --- Failures
 
