@@ -36,7 +36,9 @@ def is_open(number):
 
 def main(path, python, script, *arguments):
     """Run the script, and end as it does."""
-    if script == 'python' and 'LOCKSTEP_WORLD' in os.environ:
+    with open(f'/proc/{os.getppid()}/cmdline', 'rb') as file:
+        watched = b'lockstep/external/launch.py' in file.read()
+    if script == 'python' and watched:
         # Lockstep watches a process that it has started, and the children of that, no fork of another.
         os.execv(sys.executable, [sys.executable, *arguments])
     inherited = [number for number in map(int, os.listdir('/proc/self/fd')) if is_open(number)]

@@ -8,7 +8,9 @@ import signal
 import socket
 import sys
 import threading
+import time
 from collections import Counter
+from pathlib import Path
 
 import external_nodes
 import pytest
@@ -25,6 +27,7 @@ from std_srvs.srv import Trigger
 from diffdrive_jacobian.bags.bag_reader import open_bag
 from diffdrive_jacobian.exploration.digest import MessageDigest
 from diffdrive_jacobian.faults import ClockPause, Corrupt, Delay, Hang, Kill, Loss, Slow, TimeJump
+from diffdrive_jacobian.lockstep.external import node_process
 from diffdrive_jacobian.lockstep.external import process as external_process
 from diffdrive_jacobian.lockstep.external import quiet as quietness
 from diffdrive_jacobian.lockstep.external.process import ExternalProcess
@@ -36,6 +39,17 @@ from diffdrive_jacobian.testing import Lockstep, LockstepError, PropertyViolatio
 SECOND = 1_000_000_000
 GO_TO_GOAL = [sys.executable, '-c', PROGRAM.format('go_to_goal')]
 QUICK = ['--ros-args', '-p', 'kp:=24.0', '-p', 'kv:=12.0']
+
+
+WORLD = """
+import sys, time
+from diffdrive_jacobian.lockstep.external.quiet import descendants
+from diffdrive_jacobian.testing import Lockstep
+with Lockstep() as world:
+    process = world.start(sys.argv[1:])
+    print(*descendants(process.child.root), flush=True)
+    time.sleep(60.0)
+"""
 
 
 def command(*names):
@@ -366,7 +380,7 @@ def test_a_process_that_is_never_quiet_is_named_with_its_thread(lockstep):
     lockstep.start(command('busy'), patience=0.5)
     with pytest.raises(
         LockstepError,
-        match=r"/busy not quiet within 0.5 s .*: thread \d+ \('\w+'\) of .* is running",
+        match=r"/busy not quiet within 0.5 s: thread \d+ \('\w+'\) of .* is running",
     ):
         lockstep.publish('busy/odom', odometry())
 
@@ -374,9 +388,7 @@ def test_a_process_that_is_never_quiet_is_named_with_its_thread(lockstep):
 def test_a_thread_that_polls_on_wall_time_is_named():
     with (
         Lockstep() as world,
-        pytest.raises(
-            LockstepError, match=r'not quiet within 1 s of wall time: thread .* (sleeps|is running)'
-        ),
+        pytest.raises(LockstepError, match=r'not quiet within 1 s: thread .* (sleeps|is running)'),
     ):
         world.start(command('napping'), patience=1.0)
 
@@ -428,7 +440,7 @@ def test_a_process_that_is_no_node_is_not_waited_for_when_it_has_ended():
 def test_a_process_that_starts_too_slowly():
     refused(
         ['sh', '-c', 'echo still here >&2; sleep 20'],
-        r'no node of sh .* was discovered within 0.5 s of wall time \(timeout=\): it has created none',
+        r'no node of sh .* was discovered within 0.5 s \(timeout=\): it has created none',
         timeout=0.5,
     )
 
@@ -458,16 +470,30 @@ def test_several_processes_with_nodes_are_refused():
         run(world)
 
 
-def test_a_process_that_is_not_a_child_is_refused():
-    daemon = ' '.join(['setsid', '-f', *command('echo'), '; sleep 60'])
-    refused(['sh', '-c', daemon], r'node /echo is in domain \d+, but in no process that')
+def test_a_daemon_of_a_process_takes_part(lockstep):
+    """It is a descendant of what the world has started, and ended with the world."""
+    daemon = ' '.join(['setsid', '-f', *command('echo'), '--ros-args', '-p', 'use_sim_time:=true'])
+    lockstep.start(['sh', '-c', f'{daemon}; sleep infinity'], use_sim_time=False)
+    commands = lockstep.listen(TwistStamped, 'echo/cmd_vel')
+    lockstep.publish('echo/odom', odometry(1.0))
+    assert speeds(commands) == [1.0]
+
+
+def test_a_process_that_the_world_has_not_started_is_refused(monkeypatch):
+    domain = external_process.free_domain()
+    monkeypatch.setattr(node_process, 'free_domain', lambda: domain)
+    foreign = ExternalProcess(command('mute'), {'ROS_DOMAIN_ID': str(domain)})
+    try:
+        refused(command('echo'), r'node /mute is in domain \d+, but in no process that')
+    finally:
+        foreign.close()
 
 
 def test_a_type_that_is_not_installed_is_named(monkeypatch):
     monkeypatch.delattr('nav_msgs.msg.Odometry')
     refused(
         command('echo'),
-        r'the type nav_msgs/msg/Odometry of topic /echo/odom of /echo cannot be imported in Python',
+        r'the type nav_msgs/msg/Odometry of /echo/odom of /echo cannot be imported in Python',
     )
 
 
@@ -531,12 +557,12 @@ def test_another_system_is_refused(lockstep, monkeypatch):
 
 
 @pytest.fixture
-def started(tmp_path):
+def started():
     """Return a function that starts a shell command, which is ended with the test."""
     processes = []
 
     def start(text):
-        processes.append(ExternalProcess(['sh', '-c', text], {}, tmp_path, None))
+        processes.append(ExternalProcess(['sh', '-c', text]))
         return processes[-1]
 
     yield start
@@ -559,23 +585,28 @@ def test_a_process_and_its_children_are_ended(started):
     assert polite.printed(0) == 'hi\nbye\n'
 
 
-def test_a_process_in_a_session_of_its_own_is_ended_with_the_world(tmp_path):
-    """As the daemon of ros2, and what that has started. It goes on if another world ends."""
-    alive = tmp_path / 'alive'
-    os.mkfifo(alive)
-    reading = os.open(alive, os.O_RDONLY | os.O_NONBLOCK)
-    daemon = f'setsid sh -c "exec 3> {alive}; echo hi; sleep 60; echo bye" & sleep 60'
-    (tmp_path / 'other').mkdir()
-    launcher = ExternalProcess(['sh', '-c', daemon], {}, tmp_path, None)
+def test_a_process_in_a_session_of_its_own_is_ended_with_the_world(started):
+    """As the daemon of ros2, and what that has started."""
+    launcher = started('setsid sh -c "echo hi; sleep 60" & sleep 60')
     until_says_hi(launcher)
+    left = set(quietness.descendants(launcher.root))
+    assert len(left) >= 4
     launcher.kill()
-    external_process.end_all([ExternalProcess(['true'], {}, tmp_path / 'other', None)])
-    with pytest.raises(BlockingIOError):
-        os.read(reading, 1)
-    external_process.end_all([launcher])
-    # At the end of the file: nobody has it open for writing.
-    assert os.read(reading, 1) == b''
-    os.close(reading)
+    assert not any(Path(f'/proc/{pid}').exists() for pid in left)
+
+
+def test_nothing_is_left_of_a_world_that_is_killed(tmp_path):
+    """As by a time limit of the tests."""
+    (tmp_path / 'world.py').write_text(WORLD)
+    world = ExternalProcess([sys.executable, str(tmp_path / 'world.py'), *command('echo')])
+    while not (words := world.printed(0).split()):
+        world.check_running()
+    left = set(map(int, words))
+    assert len(left) >= 2
+    os.kill(world.pid, signal.SIGKILL)
+    while any(Path(f'/proc/{pid}').exists() for pid in left):
+        time.sleep(0.01)
+    world.close()
 
 
 def test_a_process_receives_sigint_that_the_tests_ignore(started):
@@ -590,20 +621,26 @@ def test_a_process_receives_sigint_that_the_tests_ignore(started):
 
 
 def test_a_domain_with_a_port_in_use_is_not_chosen(monkeypatch):
-    domains = {external_process.free_domain() for _ in range(10)}
+    domains = sorted({external_process.free_domain() for _ in range(10)})
     assert len(domains) > 1
     assert 0 not in domains
-    monkeypatch.setattr(external_process, 'DOMAINS', range(90, 92))
     monkeypatch.delenv('PYTEST_XDIST_WORKER', raising=False)
     monkeypatch.delenv('PYTEST_XDIST_WORKER_COUNT', raising=False)
+    first, second = domains[:2]
+    monkeypatch.setattr(external_process, 'DOMAINS', [first, second])
+    taken = {external_process._ports(first)[4]}
+    # Of the fourth participant: the first may have ended before.
+    monkeypatch.setattr(external_process, '_is_free', lambda port: port not in taken)
+    assert {external_process.free_domain() for _ in range(4)} == {second}
+    taken.add(external_process._ports(second)[0])
+    with pytest.raises(LockstepError, match=f'from {first} to {second} are all in use'):
+        external_process.free_domain()
+
+
+def test_a_port_in_use_is_noticed():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        # Of the fourth participant: the first may have ended before.
-        taken.bind(('', 7400 + 250 * 90 + 10 + 2 * 3))
-        assert {external_process.free_domain() for _ in range(4)} == {91}
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-            other.bind(('', external_process._ports(91)[0]))
-            with pytest.raises(LockstepError, match=r'from 90 to 91 are all in use'):
-                external_process.free_domain()
+        taken.bind(('', 0))
+        assert not external_process._is_free(taken.getsockname()[1])
 
 
 # --- Repeated runs

@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.duration import Infinite
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
+from diffdrive_jacobian.diagnosis.description import Quality
+from diffdrive_jacobian.diagnosis.graph import mismatch
 from diffdrive_jacobian.lockstep._errors import LockstepError, described
 from diffdrive_jacobian.lockstep._link import is_latched
 from diffdrive_jacobian.lockstep._nodes import Nodes
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.lockstep._simulated_time import SimulatedTime
-from diffdrive_jacobian.lockstep.external.graph import compatible, qos_name
 from diffdrive_jacobian.messages.names import node_of, type_name
 from diffdrive_jacobian.ros.rclpy_internals import SERVICES_OF_RCLPY
+from diffdrive_jacobian.time_units import NANOSECONDS
 
 LISTENING_DEPTH = 1000
 """Queue size of `listen`: the number of messages of a topic at one simulated time."""
@@ -84,13 +87,13 @@ class Messaging:
         offered = publisher.qos_profile
         for info in self._node.get_subscriptions_info_by_topic(given):
             requested = info.qos_profile
-            if info.topic_type == type_name(publisher.msg_type) and not compatible(offered, requested):
+            if info.topic_type == type_name(publisher.msg_type) and not _compatible(offered, requested):
                 volatile = offered.durability != DurabilityPolicy.TRANSIENT_LOCAL
                 hint = ': publish(..., latched=True)' if volatile and is_latched(info) else ''
                 raise LockstepError(
                     f'{publisher.topic_name} is subscribed to by {node_of(info)} with the quality of '
-                    f'service {qos_name(requested)}, and published with {qos_name(offered)}, which does '
-                    f'not reach it{hint}\n{self._report()}'
+                    f'service {_qos_name(requested)}, and published with {_qos_name(offered)}, which '
+                    f'does not reach it{hint}\n{self._report()}'
                 )
 
     def _check_all_served(self, topic: str) -> None:
@@ -181,3 +184,24 @@ def _is_message(value: Any) -> bool:
 def _is_of_rclpy(types: list[str]) -> bool:
     """Return whether a service is one that rclpy provides for every node."""
     return types[0].startswith(SERVICES_OF_RCLPY)
+
+
+def _compatible(offered: QoSProfile, requested: QoSProfile) -> bool:
+    """Return whether a publisher and a subscription with these profiles are matched."""
+    return not mismatch(Quality.of(offered), Quality.of(requested))
+
+
+def _qos_name(profile: QoSProfile) -> str:
+    """Return what decides whether a profile is compatible, in words."""
+    latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    words = [profile.reliability.name.lower(), 'transient local' if latched else 'volatile']
+    if profile.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC:
+        words.append('liveliness manual by topic')
+    for name, limit in (
+        ('lease', profile.liveliness_lease_duration),
+        ('deadline', profile.deadline),
+    ):
+        # 0 and infinite: there is none.
+        if 0 < limit.nanoseconds < Infinite.nanoseconds:
+            words.append(f'{name} {limit.nanoseconds / NANOSECONDS:g} s')
+    return ', '.join(words)

@@ -33,7 +33,8 @@ from diffdrive_jacobian.lockstep._report import describe
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.lockstep._simulated_time import SimulatedTime, checked_nanoseconds
 from diffdrive_jacobian.lockstep.external.node_process import Command, NodeProcess, Surroundings
-from diffdrive_jacobian.lockstep.external.others import Processes
+from diffdrive_jacobian.lockstep.external.process import end_all
+from diffdrive_jacobian.lockstep.external.quiet import check_platform
 from diffdrive_jacobian.ros.fastdds_profiles import open_to_others, withdraw
 from diffdrive_jacobian.ros.rclpy_internals import refuse_init
 from diffdrive_jacobian.ros.runner import UserError, discovery_off, ros_context
@@ -131,9 +132,9 @@ class Lockstep:
             check_open=self._check_open,
             report=self.report,
         )
-        self._processes = Processes()
-        self._closing.callback(self._processes.close)
-        self._time.check_processes = self._processes.check
+        self._processes: list[NodeProcess] = []
+        self._closing.callback(self._close_processes)
+        self._time.check_processes = self._check_processes
         self._surroundings = Surroundings(
             scheduler=scheduler,
             nodes=self._nodes,
@@ -173,6 +174,15 @@ class Lockstep:
         self._scheduler.close()
         for node in nodes:
             node.destroy_node()
+
+    def _close_processes(self) -> None:
+        end_all([process.child for process in self._processes])
+        for process in self._processes:
+            process.close()
+
+    def _check_processes(self) -> None:
+        for process in self._processes:
+            process.check()
 
     def _check_open(self) -> None:
         if Lockstep._open is not self:
@@ -406,7 +416,7 @@ class Lockstep:
         text = describe(
             scheduler.links.sources(), scheduler.nodes, scheduler.existing, self.now, self.world_time
         )
-        text = '\n  '.join([text, *self._processes.describe()])
+        text = '\n  '.join([text, *(process.describe() for process in self._processes)])
         return '\n'.join([text, *self._faults.describe()])
 
     # --- Faults
@@ -547,8 +557,9 @@ class Lockstep:
             env: Further environment variables.
             clock_period: Period at which it receives the time (s). Its timers expire at multiples of it.
             queue_depth: Queue size of its subscriptions, which it does not tell.
-            timeout: Longest wall time until its nodes have been discovered (s).
-            patience: Longest wall time for a callback (s).
+            timeout: Longest time until its nodes have been discovered (s).
+            patience: Longest time for a callback (s). For both, time during which it waited for a
+                processor does not count.
 
         Returns:
             The process.
@@ -559,12 +570,7 @@ class Lockstep:
             ValueError: A duration is not positive, or too long.
         """
         self._check_open()
-        for name, value in (
-            ('clock_period', clock_period),
-            ('timeout', timeout),
-            ('patience', patience),
-        ):
-            checked_nanoseconds(name, value)
+        check_platform()
         parameters = Command(
             command=command,
             use_sim_time=use_sim_time,
@@ -575,14 +581,17 @@ class Lockstep:
             timeout=timeout,
             patience=patience,
         )
-        process = self._processes.start(parameters, self._surroundings)
+        process = NodeProcess(parameters, self._surroundings)
+        process.start()
+        self._processes.append(process)
+        process.join()
         self._time.arrive()
         return process
 
     @property
     def processes(self) -> list[NodeProcess]:
         """The processes that were started."""
-        return list(self._processes.all)
+        return list(self._processes)
 
 
 def _refuse_init(*_: Any, **__: Any) -> None:

@@ -6,21 +6,12 @@ import importlib
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-from rclpy.duration import Infinite
 from rclpy.node import Node
-from rclpy.qos import (
-    DurabilityPolicy,
-    LivelinessPolicy,
-    QoSProfile,
-    ReliabilityPolicy,
-)
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from diffdrive_jacobian.diagnosis.description import Quality
-from diffdrive_jacobian.diagnosis.graph import mismatch
 from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.messages.names import full_name, node_of
-from diffdrive_jacobian.time_units import NANOSECONDS
 
 UNKNOWN = '_NODE_NAME_UNKNOWN_'
 """Name of a node whose endpoints have been discovered before its name."""
@@ -112,24 +103,3 @@ def import_type(name: str, used_by: str) -> Any:
             f'the type {name} of {used_by} cannot be imported in Python: {error}; source the setup file '
             'of the workspace that has it before pytest is started'
         ) from error
-
-
-def compatible(offered: QoSProfile, requested: QoSProfile) -> bool:
-    """Return whether a publisher and a subscription with these profiles are matched."""
-    return not mismatch(Quality.of(offered), Quality.of(requested))
-
-
-def qos_name(profile: QoSProfile) -> str:
-    """Return what decides whether a profile is compatible, in words."""
-    latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-    words = [profile.reliability.name.lower(), 'transient local' if latched else 'volatile']
-    if profile.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC:
-        words.append('liveliness manual by topic')
-    for name, limit in (
-        ('lease', profile.liveliness_lease_duration),
-        ('deadline', profile.deadline),
-    ):
-        # 0 and infinite: there is none.
-        if 0 < limit.nanoseconds < Infinite.nanoseconds:
-            words.append(f'{name} {limit.nanoseconds / NANOSECONDS:g} s')
-    return ', '.join(words)

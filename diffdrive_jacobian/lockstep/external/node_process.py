@@ -17,9 +17,9 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rcl_interfaces.srv import GetParameters
-from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -31,6 +31,7 @@ from diffdrive_jacobian.lockstep._gate import FREE
 from diffdrive_jacobian.lockstep._link import Link, Source, Stage
 from diffdrive_jacobian.lockstep._nodes import Nodes
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
+from diffdrive_jacobian.lockstep._simulated_time import checked_nanoseconds
 from diffdrive_jacobian.lockstep.external.graph import (
     CLOCK_TYPE,
     PID,
@@ -40,15 +41,24 @@ from diffdrive_jacobian.lockstep.external.graph import (
     profile_of,
 )
 from diffdrive_jacobian.lockstep.external.process import CLOSING, ExternalProcess, free_domain
-from diffdrive_jacobian.lockstep.external.quiet import Quiet, descendants, threads_of_this_process
+from diffdrive_jacobian.lockstep.external.quiet import (
+    Allowance,
+    Quiet,
+    descendants,
+    threads_of_this_process,
+)
 from diffdrive_jacobian.lockstep.external.relays import (
+    CALL,
     DEPTH,
+    INPUT,
+    SERVICE,
+    TOPIC,
     Arrived,
-    CalledService,
-    FromTopic,
-    OfferedService,
     Relay,
-    ToTopic,
+    called_service,
+    from_topic,
+    offered_service,
+    to_topic,
     without_echo,
 )
 from diffdrive_jacobian.messages.conversion import set_time
@@ -64,12 +74,12 @@ from diffdrive_jacobian.time_units import NANOSECONDS
 
 PERIOD = 0.01
 """Period at which the graph is looked at while a process starts (s)."""
-REPETITION = 0.2
+REPETITION = 1.0
 """Period at which a request is repeated while a process starts (s): a response may be lost then."""
-UNCONFIRMED = 0.5
-"""Time for nodes without parameter services to discover the endpoints of the world (s)."""
 SILENCE = 0.2
 """Time for which a process that has started must not send anything by itself (s)."""
+UNCONFIRMED = 0.5
+"""Time for nodes without parameter services to discover the endpoints of the world (s)."""
 END = 2.0
 """Time in which a process ends after a process of its nodes has (s)."""
 ATTEMPTS = 2
@@ -100,12 +110,18 @@ class Command:
                 "start takes a program and its arguments, ['ros2', 'run', 'my_package', 'my_node'], got "
                 f'{described(self.command)}'
             )
+        for name in ('clock_period', 'timeout', 'patience'):
+            checked_nanoseconds(name, getattr(self, name))
 
-    @property
-    def arguments(self) -> list[str]:
-        """The program and all its arguments."""
+    def start(self, domain: Mapping[str, str]) -> ExternalProcess:
+        """Start the process, with environment variables for its ROS domain."""
         timed = ('--ros-args', '-p', 'use_sim_time:=true') if self.use_sim_time else ()
-        return [*(os.fspath(part) for part in self.command), *timed]
+        hash_seed = {} if 'PYTHONHASHSEED' in os.environ else {'PYTHONHASHSEED': '0'}
+        return ExternalProcess(
+            [*(os.fspath(part) for part in self.command), *timed],
+            {**domain, **hash_seed, **self.env},
+            None if self.cwd is None else os.fspath(self.cwd),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,28 +168,31 @@ class StandIn(Node):  # type: ignore[misc]
 class NodeProcess:
     """A process with nodes in the world, as of `Lockstep.start`. It is ended with the world."""
 
-    def __init__(self, command: Command, surroundings: Surroundings, directory: Path) -> None:
-        """Start nothing yet. What it prints is kept in the directory, that of the world alone."""
+    def __init__(self, command: Command, surroundings: Surroundings) -> None:
+        """Start nothing yet."""
         self._command = command
-        self._directory = directory
         self._scheduler = surroundings.scheduler
         self._nodes = surroundings.nodes
         self._extend, self._is_open = surroundings.extend, surroundings.is_open
         self._clocks = surroundings.scheduler.clocks
-        self._stand_ins: dict[str, StandIn] = {}
         self._ended: list[ExternalProcess] = []
-        self._latched: list[Arrived] = []
         self._closing = ExitStack()
-        self.child: ExternalProcess
-        self._relays: list[Relay] = []
-        self._clock_publishers: dict[str, Publisher] = {}
-        self._participants: set[int] = set()
-        self._given = -1
-        self._called: dict[str, tuple[str, StandIn]] = {}
-        self._connected = False
+        self._reset()
         self._scheduler.links.filter(self._drop_echoes, first=True)
         self._nodes.on_change.append(self._on_change)
+        self.child: ExternalProcess
+
+    def _reset(self) -> None:
+        self._connected = False
+        self._stand_ins: dict[str, StandIn] = {}
+        self._relays: dict[tuple[int, str], Relay] = {}
+        self._latched: list[Arrived] = []
+        self._sent: dict[str, list[bytes]] = {}
+        self._clock_publishers: dict[str, Publisher] = {}
+        self._participants: set[int] = set()
+        self._called: dict[str, tuple[str, StandIn]] = {}
         self._services_changed = True
+        self._given = -1
 
     # --- What the test sees
 
@@ -246,16 +265,15 @@ class NodeProcess:
         """
         begin = time.monotonic()
         if hasattr(self, 'child'):
+            self.child.close()
             self._ended.append(self.child)
         for attempt in range(ATTEMPTS):
             try:
                 self._launch()
-                self._connect(time.monotonic() + self._command.timeout)
+                self._connect()
                 break
             except BaseException as error:
-                if hasattr(self, 'child'):
-                    self.child.kill()
-                self._leave()
+                self.close()
                 if not isinstance(error, ForeignNodeError) or attempt == ATTEMPTS - 1:
                     raise
         self._extend(time.monotonic() - begin)
@@ -263,13 +281,12 @@ class NodeProcess:
 
     def _launch(self) -> None:
         """Start the process, and create what is needed to receive from it."""
-        command = self._command
         self._domain = free_domain()
-        variables = {DISCOVERY[0]: 'LOCALHOST', 'ROS_DOMAIN_ID': str(self._domain)}
+        domain = {DISCOVERY[0]: 'LOCALHOST', 'ROS_DOMAIN_ID': str(self._domain)}
         before = threads_of_this_process()
-        with environment({**dict.fromkeys(DISCOVERY), **variables}):
+        with environment({**dict.fromkeys(DISCOVERY), **domain}):
             context = self._closing.enter_context(ros_context(['lockstep']))
-        self._outside = outside = Node(
+        self._outside = Node(
             'lockstep_of_world',
             context=context,
             use_global_arguments=False,
@@ -277,16 +294,10 @@ class NodeProcess:
             start_parameter_services=False,
             parameter_overrides=[Parameter('start_type_description_service', value=False)],
         )
-        self._closing.callback(outside.destroy_node)
+        self._closing.callback(self._outside.destroy_node)
         receiving = threads_of_this_process() - before
-        hash_seed = {} if 'PYTHONHASHSEED' in os.environ else {'PYTHONHASHSEED': '0'}
-        self.child = ExternalProcess(
-            command.arguments,
-            {**variables, **hash_seed, **command.env},
-            self._directory,
-            None if command.cwd is None else os.fspath(command.cwd),
-        )
-        self._quiet = Quiet(self.child.pid, receiving)
+        self.child = self._command.start(domain)
+        self._quiet = Quiet(self.child.root, receiving)
         self._closing.callback(self._quiet.close)
 
     def join(self) -> None:
@@ -297,7 +308,6 @@ class NodeProcess:
                 self._nodes.check_new(node)
                 self._nodes.add(node, observer=False)
         self._connected = True
-        self._quiet.learning = False
         (first, *_) = self._stand_ins.values()
         first.create_timer(self._command.clock_period, self._give_time)
         first.executor.create_task(self._begin)
@@ -328,34 +338,34 @@ class NodeProcess:
 
     def _leave(self) -> None:
         """Remove the nodes from the world."""
-        self._connected = False
-        stand_ins, self._stand_ins = self._stand_ins, {}
-        for node in stand_ins.values():
+        nodes, relays = self.nodes, self._relays
+        self._reset()
+        for node in nodes:
             node.destroy_node()
-        for relay in self._relays:
+        for relay in relays.values():
             relay.close()
-        self._relays, self._called = [], {}
-        self._clock_publishers, self._participants = {}, set()
-        self._given = -1
         self._closing.close()
 
     def close(self) -> None:
-        """Forget the nodes. The process has ended."""
-        self.child.close()
+        """Kill the process if it has not ended, and forget its nodes."""
+        if hasattr(self, 'child'):
+            self.child.kill()
+            self.child.close()
         self._leave()
 
     # --- Discovery
 
-    def _connect(self, end: float) -> None:
+    def _connect(self) -> None:
         """Wait until the nodes of the process and the world have discovered each other."""
+        allowance = Allowance(self._quiet, self._command.timeout)
         while True:
             while not (self._learn() and self._is_matched()):
                 self.child.check_running()
-                if time.monotonic() > end:
+                if allowance.is_used_up():
                     raise LockstepError(self._not_discovered())
                 time.sleep(PERIOD)
             known = len(self._relays)
-            self._confirm(end)
+            self._confirm(allowance)
             graph_changed(self._outside)
             if self._learn() and len(self._relays) == known:
                 break
@@ -368,10 +378,11 @@ class NodeProcess:
         late = self._take()
         self._latched += [arrived for arrived in late if arrived.latched]
         self._refuse([arrived for arrived in late if not arrived.latched])
+        self._quiet.learn()
 
     def _is_matched(self) -> bool:
         """Return whether the world has discovered all endpoints of the process."""
-        return all(relay.is_matched() for relay in self._relays) and all(
+        return all(relay.is_matched() for relay in self._relays.values()) and all(
             publisher.get_subscription_count() for publisher in self._clock_publishers.values()
         )
 
@@ -387,45 +398,37 @@ class NodeProcess:
             node = self._stand_ins[name]
             self._learn_topics(graph, node)
             for service, kind in graph.services.items():
-                if not self._has(OfferedService, service):
-                    imported = import_type(kind, f'service {service} of {name}')
-                    self._relays.append(
-                        OfferedService(self._outside, node, service, imported, self._deliver)
-                    )
+                self._relay(SERVICE, service, kind, node, offered_service, self._deliver)
             for service, kind in graph.clients.items():
                 if service not in offered:
                     self._called.setdefault(service, (kind, node))
         self._offer_called()
-        self._relays.sort(key=_order)
-        published = {relay.topic: relay for relay in self._relays if isinstance(relay, FromTopic)}
-        for relay in self._relays:
-            if isinstance(relay, ToTopic):
-                relay.back = published.get(relay.topic)
         return bool(graphs)
 
     def _learn_topics(self, graph: NodeGraph, node: StandIn) -> None:
         outside, name = self._outside, graph.full_name
-        present = {relay.topic for relay in self._relays if isinstance(relay, FromTopic)}
-        for topic in graph.publishers.keys() - present:
-            kind = import_type(graph.publishers[topic], f'topic {topic} of {name}')
-            infos = outside.get_publishers_info_by_topic(topic)
-            profile = profile_of(infos, name, DEPTH)
-            self._relays.append(FromTopic(outside, node, topic, kind, profile))
-        present = {relay.topic for relay in self._relays if isinstance(relay, ToTopic)}
-        for topic, type_name in graph.subscriptions.items():
-            if type_name == CLOCK_TYPE and topic.rpartition('/')[2] == 'clock':
+        for topic, kind in graph.publishers.items():
+            profile = profile_of(outside.get_publishers_info_by_topic(topic), name, DEPTH)
+            sent = self._sent.setdefault(topic, [])
+            self._relay(TOPIC, topic, kind, node, from_topic, profile, sent)
+        for topic, kind in graph.subscriptions.items():
+            if kind == CLOCK_TYPE and topic.rpartition('/')[2] == 'clock':
                 if topic not in self._clock_publishers:
                     self._clock_publishers[topic] = outside.create_publisher(Clock, topic, 1)
-            elif topic not in present:
-                kind = import_type(type_name, f'topic {topic} of {name}')
-                infos = outside.get_subscriptions_info_by_topic(topic)
-                profile = profile_of(infos, name, self._command.queue_depth)
-                self._relays.append(ToTopic(outside, node, topic, kind, profile, self._deliver))
+                continue
+            depth = self._command.queue_depth
+            profile = profile_of(outside.get_subscriptions_info_by_topic(topic), name, depth)
+            sent = self._sent.setdefault(topic, [])
+            self._relay(INPUT, topic, kind, node, to_topic, profile, self._deliver, sent)
 
-    def _has(self, kind: type[Relay], name: str) -> bool:
-        return any(
-            isinstance(relay, kind) and getattr(relay, 'name', '') == name for relay in self._relays
-        )
+    def _relay(
+        self, role: int, name: str, kind: str, node: StandIn, create: Callable[..., Relay], *args: Any
+    ) -> None:
+        """Create a relay unless it is there. DDS does not promise an order between topics: by name."""
+        if (role, name) not in self._relays:
+            imported = import_type(kind, f'{name} of {node.get_fully_qualified_name()}')
+            self._relays[role, name] = create(self._outside, node, name, imported, *args)
+            self._relays = dict(sorted(self._relays.items()))
 
     def _on_change(self) -> None:
         self._services_changed = True
@@ -433,17 +436,15 @@ class NodeProcess:
     def _offer_called(self) -> None:
         """Offer the process the services that it calls and that other nodes of the world have."""
         self._services_changed = False
-        own = self._stand_ins.values()
         there = {
             service.service_name
             for node in self._scheduler.nodes
-            if node not in own
+            if node not in self._stand_ins.values()
             for service in node.services
         }
-        for name, (type_name, node) in self._called.items():
-            if name in there and not self._has(CalledService, name):
-                kind = import_type(type_name, f'service {name} that {node.get_name()} calls')
-                self._relays.append(CalledService(self._outside, node, name, kind, self._deliver))
+        for name, (kind, node) in self._called.items():
+            if name in there:
+                self._relay(CALL, name, kind, node, called_service, self._deliver)
 
     def _check_started_by_world(self, graph: NodeGraph) -> None:
         """Check that a node is in the process or one that it has started."""
@@ -457,12 +458,12 @@ class NodeProcess:
             if node_of(info) == graph.full_name
         ]
         numbers = {int.from_bytes(bytes(info.endpoint_gid)[PID], 'little') for info in infos}
-        pids = {pid for pid in descendants(self.child.pid) if pid & 0xFFFF in numbers}
+        pids = {pid for pid in descendants(self.child.root) if pid & 0xFFFF in numbers}
         if numbers and not pids:
             raise ForeignNodeError(
                 f'node {graph.full_name} is in domain {self._domain}, but in no process that '
-                f'{self.command} has started and that runs on: a daemon, a container or another machine '
-                'cannot take part in lockstep'
+                f'{self.command} has started and that runs on: a container or another machine cannot '
+                'take part in lockstep'
             )
         self._participants |= pids
         if len(self._participants) > 1:
@@ -472,68 +473,61 @@ class NodeProcess:
                 'because messages between them would not be received one at a time'
             )
 
-    def _confirm(self, end: float) -> None:
+    def _confirm(self, allowance: Allowance) -> None:
         """Wait until the nodes respond, which shows that they have discovered what the world has.
 
         They discover endpoints in the order of their creation, so those of new clients come last.
         """
         names = [
-            relay.name
-            for relay in self._relays
-            if isinstance(relay, OfferedService) and relay.client.srv_type is GetParameters
+            relay.client.service_name
+            for relay in self._relays.values()
+            if relay.client is not None and relay.client.srv_type is GetParameters
         ]
         for name in names:
-            client = self._outside.create_client(GetParameters, name)
-            try:
-                self._await_response(client, end)
-            finally:
-                self._outside.destroy_client(client)
+            self._await_response(name, allowance)
         if len(names) < len(self._stand_ins):
             time.sleep(UNCONFIRMED)
+            self._wait()
 
-    def _await_response(self, client: Client, end: float) -> None:
-        """Ask a node for a parameter until it responds."""
-        repeat = 0.0
-        while take_response(client) is None:
+    def _await_response(self, name: str, allowance: Allowance) -> None:
+        """Ask a node for a parameter until it has responded to the last request, so to all of them."""
+        client = self._outside.create_client(GetParameters, name)
+        begin, number, response = time.monotonic(), 0, None
+        while not number or response is None or response[0] != number:
             self.child.check_running()
-            now = time.monotonic()
-            if now > end:
+            if allowance.is_used_up():
                 raise LockstepError(
-                    f'{client.service_name} does not respond: the executor of the node does not spin; '
+                    f'{name} does not respond: the executor of the node does not spin; '
                     f'{self._quiet.describe()}\n{self.describe()}'
                 )
-            if now > repeat and client.service_is_ready():
-                send_request(client, GetParameters.Request(names=['use_sim_time']))
-                repeat = now + REPETITION
+            overdue = response is None and time.monotonic() > begin + number * REPETITION
+            if overdue and client.service_is_ready():
+                number = send_request(client, GetParameters.Request(names=['use_sim_time']))
             time.sleep(PERIOD / 10)
+            response = take_response(client) or response
+        self._outside.destroy_client(client)
 
     def _check_timed(self) -> None:
         """Check that the nodes receive the time."""
-        if not self._command.use_sim_time:
-            return
         timed = {
             node_of(info)
             for topic in self._clock_publishers
             for info in self._outside.get_subscriptions_info_by_topic(topic)
         }
-        if untimed := sorted(self._stand_ins.keys() - timed):
+        untimed = sorted(self._stand_ins.keys() - timed)
+        if self._command.use_sim_time and untimed:
             raise LockstepError(
                 f'{", ".join(untimed)} of {self.command} is not subscribed to /clock: its parameter '
                 'use_sim_time must be true; if it needs no time: start(..., use_sim_time=False)'
             )
 
     def _not_discovered(self) -> str:
-        waited = f'within {self._command.timeout:g} s of wall time (timeout=)'
-        if self._relays:
-            missing = sorted(
-                getattr(one, 'topic', getattr(one, 'name', ''))
-                for one in self._relays
-                if not one.is_matched()
-            )
+        waited = f'within {self._command.timeout:g} s (timeout=)'
+        missing = [name for (_, name), relay in self._relays.items() if not relay.is_matched()]
+        if missing:
             return f'{self.command}: not discovered {waited}: {", ".join(missing)}\n{self.describe()}'
-        others = _domains(self.child.pid) - {self._domain}
         hint = 'it has created none, or not yet'
-        if others:
+        if others := _domains(self.child.root) - {self._domain}:
             hint = (
                 f'it is in ROS domain {", ".join(map(str, sorted(others)))} instead of {self._domain}: '
                 'it must not set ROS_DOMAIN_ID, which start() sets for it'
@@ -573,15 +567,16 @@ class NodeProcess:
             return 0
         if self._services_changed:
             self._offer_called()
-            self._relays.sort(key=_order)
-        self._check_silent()
+        self._refuse(self._take())
         begin = time.monotonic()
         send()
         self._wait()
         arrived = self._take()
+        for sent in self._sent.values():
+            sent.clear()
         self._extend(time.monotonic() - begin)
         self._forward(arrived)
-        if any(map(self._quiet.has_ended, (self.child.pid, *self._participants))):
+        if any(map(self._quiet.has_ended, (self.child.root, *self._participants))):
             self._on_end()
         elif graph_changed(self._outside):
             self._learn_more()
@@ -592,14 +587,14 @@ class NodeProcess:
         known = len(self._relays)
         self._learn()
         if len(self._relays) > known:
-            self._connect(time.monotonic() + self._command.timeout)
+            self._connect()
             latched, self._latched = self._latched, []
             self._forward(latched)
 
     def _wait(self) -> None:
         """Wait until the process and the threads that receive from it are quiet."""
         try:
-            self._quiet.wait(self._command.patience, lambda: None)
+            self._quiet.wait(self._command.patience)
         except LockstepError as error:
             names = ', '.join(self._stand_ins) or self.command
             raise LockstepError(
@@ -609,7 +604,7 @@ class NodeProcess:
 
     def _take(self) -> list[Arrived]:
         """Return what has arrived: messages by the names of their topics, responses, requests."""
-        return [arrived for relay in self._relays for arrived in relay.take()]
+        return [arrived for relay in self._relays.values() for arrived in relay.take()]
 
     @staticmethod
     def _forward(arrived: Sequence[Arrived]) -> None:
@@ -620,10 +615,7 @@ class NodeProcess:
         """Check that it runs, and has sent nothing while nothing was delivered to it."""
         if self._connected:
             self.child.check_running(', '.join(self._stand_ins))
-            self._check_silent()
-
-    def _check_silent(self) -> None:
-        self._refuse(self._take())
+            self._refuse(self._take())
 
     def _refuse(self, arrived: Sequence[Arrived]) -> None:
         """Raise LockstepError if something has arrived."""
@@ -639,8 +631,8 @@ class NodeProcess:
 
     def _on_end(self) -> None:
         """Note that the process has ended while something was delivered to it."""
-        end = time.monotonic() + END
-        while (code := self.child.returncode) is None and time.monotonic() < end:
+        allowance = Allowance(self._quiet, END)
+        while (code := self.child.returncode) is None and not allowance.is_used_up():
             time.sleep(PERIOD)
         if code == 0:
             self._leave()
@@ -651,22 +643,12 @@ class NodeProcess:
     def _drop_echoes(self, end: Source | Link) -> Stage | None:
         """Return the stage that keeps from the process what it has received directly."""
         own = self._stand_ins.values()
-        if not isinstance(end, Link) or end.owner not in own:
+        if not isinstance(end, Link) or end.owner not in own or (TOPIC, end.topic) not in self._relays:
             return None
-        topics = {relay.topic for relay in self._relays if isinstance(relay, FromTopic)}
-        if end.topic not in topics:
-            return None
-        observers = self._scheduler.links.observers_of_published(end.topic)
         return without_echo(
-            observers.append, lambda publisher: any(publisher in node.publishers for node in own)
+            self._scheduler.links.observers_of_published(end.topic).append,
+            lambda publisher: any(publisher in node.publishers for node in own),
         )
-
-
-def _order(relay: Relay) -> tuple[int, str]:
-    """Return the place of a relay: DDS does not promise an order between topics, so it is by name."""
-    if isinstance(relay, (FromTopic, ToTopic)):
-        return 0, relay.topic
-    return (1 if isinstance(relay, OfferedService) else 2), relay.name
 
 
 def _domains(pid: int) -> set[int]:
@@ -675,16 +657,14 @@ def _domains(pid: int) -> set[int]:
     for one in descendants(pid):
         for descriptor in Path(f'/proc/{one}/fd').glob('*'):
             try:
-                target = os.readlink(descriptor)
+                sockets.add(os.readlink(descriptor))
             except OSError:
                 continue
-            if target.startswith('socket:['):
-                sockets.add(target[8:-1])
     found = set()
     for line in Path('/proc/net/udp').read_text().splitlines()[1:]:
         words = line.split()
         port = int(words[1].rpartition(':')[2], 16)
         # Higher ones are given to clients, lower ones are no ports of discovery.
-        if words[9] in sockets and 7400 <= port < 32768:
+        if f'socket:[{words[9]}]' in sockets and 7400 <= port < 32768:
             found.add((port - 7400) // 250)
     return found

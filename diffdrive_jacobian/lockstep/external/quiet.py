@@ -1,15 +1,14 @@
-"""When another process has processed what it received: all its threads wait, without a break.
+"""When other processes have processed what they received: all their threads wait, without a break.
 
-`Quiet` looks at the threads of a process and of all that it has started, and at those of this process
-that receive from it, in two rounds. The first reads of each thread for how long it has run
-(`/proc/PID/task/TID/schedstat`), the second whether it sleeps (`stat`), in which system call
-(`syscall`), and again for how long it has run. Of a thread for which both times are equal, and that
-sleeps in the second round, it is known that it did not run in between, and was not about to. So if this
-holds for all of them, there was a moment between the rounds at which none did anything, and no message
-was on its way from one to the other.
+`Quiet` looks at a process with all that it has started, and at the threads of this process that receive
+from them. It reads for how long each has run, then in which system call each thread waits, and then
+again for how long they have run. If all threads wait and nothing has run in between, then all of them
+waited when the first reading was complete, and no message was on its way from one to another.
 
-A thread that sleeps for a time, as in `time.sleep`, goes on by itself. It counts as busy. So does one
-that waits with a timeout at another place of its stack than in an idle process: it is in a callback.
+A thread that sleeps for a time goes on by itself, so it counts as busy. So does one that waits with a
+timeout, which is in a callback, unless it is DDS that waits, as in an idle executor, or it is a thread
+that does so in an idle process. Who waits is seen on the stack: the return addresses of waits with a
+timeout are at the same places as in the threads of Fast DDS.
 """
 
 from __future__ import annotations
@@ -18,68 +17,108 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from array import array
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
 
-SLEEPS = {
-    'x86_64': ({b'35', b'230'}, {b'7', b'23', b'270', b'271'}),
-    'aarch64': ({b'101', b'115'}, {b'72', b'73'}),
+
+class _Machine(NamedTuple):
+    """Numbers of system calls."""
+
+    sleeps: tuple[bytes, ...]
+    """nanosleep, clock_nanosleep."""
+    files: dict[bytes, int]
+    """poll, select: with the place of the number of files among the arguments."""
+    waits: dict[bytes, int]
+    """futex, poll, select, epoll: with the place of the timeout. -1: recv, wait, which have none."""
+
+
+MACHINES = {
+    'x86_64': _Machine(
+        (b'35', b'230'),
+        {b'7': 1, b'271': 1, b'23': 0, b'270': 0},
+        {
+            **{b'202': 3, b'7': 2, b'271': 2, b'23': 4, b'270': 4, b'232': 3, b'281': 3},
+            **{b'45': -1, b'47': -1, b'61': -1, b'247': -1},
+        },
+    ),
+    'aarch64': _Machine(
+        (b'101', b'115'),
+        {b'73': 1, b'72': 0},
+        {
+            **{b'98': 3, b'73': 2, b'72': 4, b'22': 3},
+            **{b'207': -1, b'212': -1, b'260': -1, b'95': -1},
+        },
+    ),
 }
-"""Numbers of the system calls that sleep (nanosleep, clock_nanosleep), and of those that do if they have
-no file to wait for (poll, select, pselect6, ppoll), for each machine."""
-TIMED = {
-    'x86_64': {b'202': 3, b'7': 2, b'271': 2, b'270': 4, b'23': 4, b'232': 3, b'281': 3},
-    'aarch64': {b'98': 3, b'73': 2, b'72': 4, b'22': 3},
-}
-"""Numbers of the system calls that wait (futex, poll, select, epoll), with the place of their timeout
-among the arguments, for each machine."""
 ENDLESS = (b'0x0', b'0xffffffff', b'0xffffffffffffffff')
 """Timeouts that are none."""
+DDS = 'libfastrtps.so'
+"""Library whose waits are those of an idle node."""
+STACK = 512
+"""Size of the part of a stack that is looked at (bytes)."""
 TRIES = 30
 """Number of attempts that follow each other at once. Later ones leave the processor to others."""
-PAUSE = 0.0001
+PAUSE = 0.0002
 """Time between later attempts (s)."""
+LONGEST = 10
+"""Largest ratio of the wall time that a process gets to the time that it is given."""
 STATES = {b'R': 'is running', b'D': 'waits for a disk', b'T': 'is stopped', b't': 'is being debugged'}
-ENDED = (b'Z', b'X')
-"""States of threads that have ended."""
 
 
-class _Thread(NamedTuple):
-    """The open files of a thread below /proc."""
+class _Thread:
+    """A thread of another process, or one of this process that receives."""
 
-    pid: int
-    tid: int
-    own: bool
-    """Whether it is a thread of this process."""
-    stat: int
-    counter: int
-    call: int
-    children: int
+    __slots__ = ('call', 'children', 'idle', 'own', 'pid', 'tid')
+
+    def __init__(self, pid: int, tid: int, *, own: bool = False) -> None:
+        """Open its files.
+
+        Raises:
+            LockstepError: It may not be observed.
+            ProcessLookupError: It has ended.
+        """
+        self.pid, self.tid, self.own = pid, tid, own
+        self.idle = b''
+        """System call in which it has been found not to be busy."""
+        self.call = self.children = -1
+        try:
+            self.call = os.open(f'/proc/{pid}/task/{tid}/syscall', os.O_RDONLY)
+            self.children = os.open(f'/proc/{pid}/task/{tid}/children', os.O_RDONLY)
+            os.pread(self.call, 256, 0)
+        except PermissionError as error:
+            self.close()
+            raise LockstepError(
+                f'/proc/{pid}/syscall cannot be read, which shows whether a thread sleeps: a container '
+                'needs --cap-add=SYS_PTRACE, and /proc/sys/kernel/yama/ptrace_scope must be 0 or 1'
+            ) from error
+        except OSError:
+            self.close()
+            raise ProcessLookupError from None
 
     def close(self) -> None:
         """Close the files."""
-        for descriptor in (self.stat, self.counter, self.children, self.call):
+        for descriptor in (self.call, self.children):
             if descriptor >= 0:
                 os.close(descriptor)
+
+    def read(self, name: str) -> bytes:
+        """Return the content of a file below /proc."""
+        return Path(f'/proc/{self.pid}/task/{self.tid}/{name}').read_bytes()
 
 
 def check_platform() -> None:
     """Raise LockstepError if the threads of other processes cannot be observed on this machine."""
     machine = platform.machine()
-    if sys.platform != 'linux' or machine not in SLEEPS:
+    if sys.platform != 'linux' or machine not in MACHINES:
         raise LockstepError(
             'nodes in other processes need Linux on x86_64 or aarch64, which shows in /proc whether a '
             f'process has processed its input; this is {sys.platform} on {machine}'
         )
-    try:
-        _read(os.open('/proc/self/schedstat', os.O_RDONLY), close=True)
-    except OSError as error:
-        raise LockstepError(
-            f'this kernel does not show when a thread has run: /proc/self/schedstat: {error.strerror}'
-        ) from error
 
 
 def threads_of_this_process() -> set[int]:
@@ -100,23 +139,23 @@ class Quiet:
         Raises:
             LockstepError: The process may not be observed.
         """
-        self._sleeps, self._polls = SLEEPS[platform.machine()]
-        self._timed = TIMED[platform.machine()]
-        self.learning = True
-        """Whether the process is idle, so that its threads wait where they do when they are."""
-        self._idle: set[tuple[int, int, bytes]] = set()
-        """Threads and stack pointers, of waits with a timeout in an idle process."""
+        self._machine = MACHINES[platform.machine()]
+        self._links = {pid: 0}
+        """Number of links of the folder of the threads, by process: it changes with their number."""
+        self._own = [_Thread(os.getpid(), tid, own=True) for tid in own]
         self._threads: dict[tuple[int, int], _Thread] = {}
-        self._sizes: dict[int, int] = {pid: 0}
-        """Number of links of the folder of the threads, by process."""
-        self._own = [self._open(os.getpid(), tid, own=True) for tid in own]
         self._busy: _Thread | None = None
         self._why = ''
-        self._ended: set[tuple[int, int]] = set()
+        self._places: set[int] | None = None
+        """Places on the stack of return addresses of waits with a timeout. None: not known yet."""
+        self._dds: dict[int, list[range]] = {}
+        self._polling: set[int] = set()
+        """Threads that wait with a timeout in an idle process, but not in DDS."""
+        self._ended: set[int] = set()
 
     def has_ended(self, pid: int) -> bool:
         """Return whether a process of those that are observed had ended when it was looked at last."""
-        return pid not in self._sizes or (pid, pid) in self._ended
+        return pid not in self._links or pid in self._ended
 
     def close(self) -> None:
         """End the observation."""
@@ -126,26 +165,25 @@ class Quiet:
 
     # --- Waiting
 
-    def wait(self, patience: float, check: Callable[[], None]) -> None:
+    def wait(self, patience: float) -> None:
         """Wait until all is quiet.
 
         Args:
-            patience: Longest wall time (s).
-            check: Called now and then. It raises an error if there is nothing to wait for.
+            patience: Longest time (s), as of `Allowance`.
 
         Raises:
             LockstepError: It does not become quiet.
         """
-        end = time.monotonic() + patience
         tries = 0
+        allowance: Allowance | None = None
         while not self.is_quiet():
             tries += 1
             if tries < TRIES:
                 os.sched_yield()
                 continue
-            check()
-            if time.monotonic() > end:
-                raise LockstepError(f'not quiet within {patience:g} s of wall time: {self.describe()}')
+            allowance = allowance or Allowance(self, patience)
+            if allowance.is_used_up():
+                raise LockstepError(f'not quiet within {patience:g} s: {self.describe()}')
             time.sleep(PAUSE)
 
     def is_quiet(self) -> bool:
@@ -153,134 +191,161 @@ class Quiet:
         try:
             if self._busy is not None and self._is_busy(self._busy):
                 return False
-            self._update()
-            threads = [*self._threads.values(), *self._own]
-            counters = [os.pread(thread.counter, 64, 0) for thread in threads]
-            # Between the rounds: one that is new now was not in the first.
-            if self._update() or self._has_new_children(threads):
+            self._busy = None
+            before = self._times()
+            if self._update():
                 return False
-            for thread, counter in zip(threads, counters, strict=True):
-                if self._is_busy(thread) or os.pread(thread.counter, 64, 0) != counter:
+            for thread in (*self._threads.values(), *self._own):
+                if self._is_busy(thread):
                     self._busy = thread
                     return False
-            return True
+            return self._times() == before and not any(map(self._is_stopped, self._links))
         except ProcessLookupError:
             # A thread has ended. The next look is at what is left.
             self._busy = None
-            self._sizes = dict.fromkeys(self._sizes, 0)
+            self._links = dict.fromkeys(self._links, 0)
+            with suppress(ProcessLookupError):
+                self._update()
             return False
 
+    def _times(self) -> list[int]:
+        """Return for how long the processes, and the threads of this one, have run (ns).
+
+        Of what runs now the last part may be missing, but not when it has stopped to run.
+        """
+        try:
+            return [
+                *(time.clock_gettime_ns(~pid << 3 | 2) for pid in self._links),
+                *(time.clock_gettime_ns(~thread.tid << 3 | 6) for thread in self._own),
+            ]
+        except OSError:
+            raise ProcessLookupError from None
+
+    def _is_stopped(self, pid: int) -> bool:
+        """Return whether a process is stopped or debugged, in whatever system call that is."""
+        thread = self._threads[pid, pid]
+        state = _state(thread)
+        if state not in (b'T', b't'):
+            return False
+        self._busy, self._why = thread, STATES[state]
+        return True
+
     def _is_busy(self, thread: _Thread) -> bool:
-        """Return whether a thread runs, is about to, or sleeps for a time.
+        """Return whether a thread runs, is about to, or will go on by itself.
 
         Raises:
             ProcessLookupError: It has ended.
         """
-        _, _, rest = os.pread(thread.stat, 512, 0).rpartition(b') ')
-        state = rest[:1]
-        if state != b'S':
-            self._why = STATES.get(state, f'has the state {state.decode()}')
-            return state not in ENDED or not self._was_ended(thread)
-        if thread.call < 0:
+        call = os.pread(thread.call, 256, 0)
+        if call == thread.idle:
             return False
-        return self._waits_in_callback(thread, os.pread(thread.call, 256, 0).split())
-
-    def _waits_in_callback(self, thread: _Thread, call: list[bytes]) -> bool:
-        """Return whether a thread sleeps for a time, or waits with a timeout as it does not when idle.
-
-        Args:
-            thread: The thread.
-            call: Number, arguments, stack pointer and program counter of its system call.
-        """
-        number = call[0]
-        if number in self._sleeps or (number in self._polls and _waits_for_no_file(number, call[1:])):
+        number, *arguments = call.split()
+        place = self._machine.waits.get(number)
+        if number == b'running':
+            self._why = STATES[b'R']
+            return True
+        files = self._machine.files.get(number)
+        if number in self._machine.sleeps or (files is not None and arguments[files] == b'0x0'):
             self._why = 'sleeps'
             return True
-        place = self._timed.get(number)
-        if place is None or call[1 + place] in ENDLESS:
-            return False
-        wait = (thread.pid, thread.tid, call[-2])
-        if self.learning:
-            self._idle.add(wait)
-        self._why = 'waits in a callback, with a timeout'
-        return wait not in self._idle
-
-    def _was_ended(self, thread: _Thread) -> bool:
-        """Return whether a thread had ended when it was looked at before.
-
-        When its state changes, it has still to wake up its parent.
-        """
-        if thread[:2] in self._ended:
+        if place is None:
+            return self._is_active(thread)
+        if place >= 0 and arguments[place] not in ENDLESS and self._is_in_callback(thread, arguments):
+            self._why = 'waits in a callback, with a timeout'
             return True
-        self._ended.add(thread[:2])
+        thread.idle = call
         return False
+
+    def _is_active(self, thread: _Thread) -> bool:
+        """Return whether a thread does something in a system call, such as to wait for a disk."""
+        state = _state(thread)
+        if state in (b'Z', b'X'):
+            # Its parent has still to be woken up when its state changes.
+            new = thread.tid not in self._ended
+            self._ended.add(thread.tid)
+            return new
+        self._why = STATES.get(state, f'has the state {state.decode()}')
+        return state != b'S'
+
+    # --- Who waits with a timeout
+
+    def learn(self) -> None:
+        """Note which threads wait with a timeout, and how: the process is idle."""
+        timed = []
+        for thread in self._threads.values():
+            number, *arguments = os.pread(thread.call, 256, 0).split()
+            place = self._machine.waits.get(number, -1)
+            thread.idle = b''
+            if place >= 0 and arguments[place] not in ENDLESS:
+                timed.append((thread, arguments))
+        self._places = {
+            min(places)
+            for thread, arguments in timed
+            if thread.read('comm').startswith(b'dds.') and (places := self._addresses(thread, arguments))
+        }
+        self._polling = {
+            thread.tid for thread, arguments in timed if self._is_in_callback(thread, arguments)
+        }
+
+    def _is_in_callback(self, thread: _Thread, arguments: list[bytes]) -> bool:
+        """Return whether a thread that waits with a timeout does so neither in DDS nor always."""
+        if self._places is None or thread.own or thread.tid in self._polling:
+            return False
+        return self._places.isdisjoint(self._addresses(thread, arguments))
+
+    def _addresses(self, thread: _Thread, arguments: list[bytes]) -> set[int]:
+        """Return at which places on its stack a thread has addresses of code of DDS."""
+        pid = thread.pid
+        if pid not in self._dds:
+            self._dds[pid] = [
+                range(*(int(end, 16) for end in line.split()[0].split('-')))
+                for line in thread.read('maps').decode(errors='replace').splitlines()
+                if DDS in line and 'x' in line.split()[1]
+            ]
+        words = array('Q')
+        with suppress(OSError), open(f'/proc/{pid}/mem', 'rb', buffering=0) as memory:
+            words.frombytes(os.pread(memory.fileno(), STACK, int(arguments[-2], 16)))
+        return {place for place, word in enumerate(words) for code in self._dds[pid] if word in code}
 
     # --- Which threads there are
 
     def _update(self) -> bool:
         """Open the files of new threads, close those of ended ones. Return whether there were any."""
-        before = dict(self._sizes)
-        for pid, size in self._sizes.items():
+        changed = False
+        for pid, known in list(self._links.items()):
             try:
                 links = os.stat(f'/proc/{pid}/task').st_nlink
-            except FileNotFoundError:
-                links = -1
-            if links == size:
-                continue
-            self._sizes[pid] = links
-            try:
-                present = (
-                    {(pid, int(tid)) for tid in os.listdir(f'/proc/{pid}/task')} if links > 0 else set()
-                )
-            except FileNotFoundError:
-                present = set()
+                if links == known:
+                    continue
+                present = {(pid, int(tid)) for tid in os.listdir(f'/proc/{pid}/task')}
+            except (FileNotFoundError, ProcessLookupError):
+                links, present = 0, set()
+            changed = True
             for key in [key for key in self._threads if key[0] == pid and key not in present]:
                 self._threads.pop(key).close()
-                self._ended.discard(key)
+                self._ended.discard(key[1])
             for key in sorted(present - self._threads.keys()):
-                self._threads[key] = self._open(*key)
-            if self._busy not in self._threads.values():
-                self._busy = None
-        self._sizes = {pid: links for pid, links in self._sizes.items() if links > 0}
-        return self._sizes != before
-
-    def _has_new_children(self, threads: Iterable[_Thread]) -> bool:
-        """Add what the processes have started. Return whether there was anything new."""
-        found = {
-            int(child)
-            for thread in threads
-            if not thread.own
-            for child in os.pread(thread.children, 4096, 0).split()
-        }
-        new = found - self._sizes.keys()
-        self._sizes.update(dict.fromkeys(new, 0))
-        return bool(new)
-
-    def _open(self, pid: int, tid: int, *, own: bool = False) -> _Thread:
-        """Open the files of a thread. The calls of Fast DDS are not looked at: it never sleeps."""
-        descriptors: list[int] = []
-        folder = f'/proc/{pid}/task/{tid}'
-        try:
-            for name in ('stat', 'schedstat', 'children', 'syscall'):
-                descriptors.append(os.open(f'{folder}/{name}', os.O_RDONLY))
-            stat, counter, children, call = descriptors
-            if own or b'(dds.' in _read(stat):
-                os.close(call)
-                call = -1
-            else:
-                _read(call)
-            return _Thread(pid, tid, own, stat, counter, call, children)
-        except PermissionError as error:
-            raise LockstepError(
-                f'{folder}/syscall cannot be read, which shows whether a thread sleeps: a container '
-                'needs --cap-add=SYS_PTRACE, and /proc/sys/kernel/yama/ptrace_scope must be 0 or 1'
-            ) from error
-        except (FileNotFoundError, ProcessLookupError):
-            for descriptor in descriptors:
-                os.close(descriptor)
-            raise ProcessLookupError from None
+                self._threads[key] = _Thread(*key)
+            self._links[pid] = links
+            if not present:
+                del self._links[pid]
+                self._dds.pop(pid, None)
+        for thread in self._threads.values():
+            for child in os.pread(thread.children, 4096, 0).split():
+                if int(child) not in self._links:
+                    self._links[int(child)] = 0
+                    changed = True
+        return changed
 
     # --- Failures
+
+    def delay(self) -> float:
+        """Return for how long all threads together have waited for a processor (s)."""
+        total = 0
+        for thread in (*self._threads.values(), *self._own):
+            with suppress(OSError):
+                total += int(thread.read('schedstat').split()[1])
+        return total / 1e9
 
     def describe(self) -> str:
         """Return which thread was busy last, and how."""
@@ -292,19 +357,32 @@ class Quiet:
         return f"thread {thread.tid} ('{name}') of {command} (pid {thread.pid}) {self._why}"
 
 
-def _waits_for_no_file(number: bytes, arguments: list[bytes]) -> bool:
-    """Return whether a call of poll or select has no file, and so only waits for its timeout."""
-    # The number of files is the second argument of poll, and the first of select.
-    place = 1 if number in (b'7', b'271', b'73') else 0
-    return arguments[place] == b'0x0'
+class Allowance:
+    """A limit for the time that processes need, without that for which they waited for a processor.
+
+    So it does not depend on what else the machine does, within reason.
+    """
+
+    def __init__(self, quiet: Quiet, seconds: float) -> None:
+        """Begin now, with a number of seconds."""
+        self._quiet, self._seconds = quiet, seconds
+        self._begin, self._delay = time.monotonic(), quiet.delay()
+
+    def is_used_up(self) -> bool:
+        """Return whether it has passed."""
+        passed = time.monotonic() - self._begin
+        if passed <= self._seconds:
+            return False
+        delay = self._quiet.delay() - self._delay
+        return passed - delay > self._seconds or passed > LONGEST * self._seconds
 
 
-def _read(descriptor: int, *, close: bool = False) -> bytes:
+def _state(thread: _Thread) -> bytes:
+    """Return the letter of the state of a thread."""
     try:
-        return os.pread(descriptor, 512, 0)
-    finally:
-        if close:
-            os.close(descriptor)
+        return thread.read('stat').rpartition(b') ')[2][:1]
+    except FileNotFoundError:
+        raise ProcessLookupError from None
 
 
 def _text(file: str) -> str:
@@ -319,7 +397,7 @@ def descendants(pid: int) -> Iterator[int]:
     yield pid
     try:
         tids = os.listdir(f'/proc/{pid}/task')
-    except FileNotFoundError:
+    except OSError:
         return
     for tid in tids:
         for child in _text(f'/proc/{pid}/task/{tid}/children').split():
