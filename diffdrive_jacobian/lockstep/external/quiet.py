@@ -63,6 +63,8 @@ STACK = 512
 """Size of the part of a stack that is looked at (bytes)."""
 TRIES = 30
 """Number of attempts that follow each other at once. Later ones leave the processor to others."""
+MANY_TRIES = 200
+"""Number of attempts after which the time is taken."""
 PAUSE = 0.0002
 """Time between later attempts (s)."""
 LONGEST = 10
@@ -73,7 +75,7 @@ STATES = {b'R': 'is running', b'D': 'waits for a disk', b'T': 'is stopped', b't'
 class _Thread:
     """A thread of another process, or one of this process that receives."""
 
-    __slots__ = ('call', 'children', 'idle', 'own', 'pid', 'tid')
+    __slots__ = ('call', 'children', 'idle', 'own', 'pid', 'stat', 'tid')
 
     def __init__(self, pid: int, tid: int, *, own: bool = False) -> None:
         """Open its files.
@@ -85,10 +87,12 @@ class _Thread:
         self.pid, self.tid, self.own = pid, tid, own
         self.idle = b''
         """System call in which it has been found not to be busy."""
-        self.call = self.children = -1
+        self.call = self.children = self.stat = -1
         try:
-            self.call = os.open(f'/proc/{pid}/task/{tid}/syscall', os.O_RDONLY)
-            self.children = os.open(f'/proc/{pid}/task/{tid}/children', os.O_RDONLY)
+            folder = f'/proc/{pid}/task/{tid}'
+            self.call = os.open(f'{folder}/syscall', os.O_RDONLY)
+            self.children = os.open(f'{folder}/children', os.O_RDONLY)
+            self.stat = os.open(f'{folder}/stat', os.O_RDONLY)
             os.pread(self.call, 256, 0)
         except PermissionError as error:
             self.close()
@@ -102,7 +106,7 @@ class _Thread:
 
     def close(self) -> None:
         """Close the files."""
-        for descriptor in (self.call, self.children):
+        for descriptor in (self.call, self.children, self.stat):
             if descriptor >= 0:
                 os.close(descriptor)
 
@@ -181,8 +185,9 @@ class Quiet:
             if tries < TRIES:
                 os.sched_yield()
                 continue
-            allowance = allowance or Allowance(self, patience)
-            if allowance.is_used_up():
+            if tries == MANY_TRIES:
+                allowance = Allowance(self, patience)
+            if allowance is not None and allowance.is_used_up():
                 raise LockstepError(f'not quiet within {patience:g} s: {self.describe()}')
             time.sleep(PAUSE)
 
@@ -379,10 +384,7 @@ class Allowance:
 
 def _state(thread: _Thread) -> bytes:
     """Return the letter of the state of a thread."""
-    try:
-        return thread.read('stat').rpartition(b') ')[2][:1]
-    except FileNotFoundError:
-        raise ProcessLookupError from None
+    return os.pread(thread.stat, 512, 0).rpartition(b') ')[2][:1]
 
 
 def _text(file: str) -> str:
