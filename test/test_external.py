@@ -43,11 +43,10 @@ QUICK = ['--ros-args', '-p', 'kp:=24.0', '-p', 'kv:=12.0']
 
 WORLD = """
 import sys, time
-from diffdrive_jacobian.lockstep.external.quiet import descendants
 from diffdrive_jacobian.testing import Lockstep
 with Lockstep() as world:
     process = world.start(sys.argv[1:])
-    print(*descendants(process.child.root), flush=True)
+    print(*process._quiet.processes(), flush=True)
     time.sleep(60.0)
 """
 
@@ -589,7 +588,7 @@ def test_a_process_in_a_session_of_its_own_is_ended_with_the_world(started):
     """As the daemon of ros2, and what that has started."""
     launcher = started('setsid sh -c "echo hi; sleep 60" & sleep 60')
     until_says_hi(launcher)
-    left = set(quietness.descendants(launcher.root))
+    left = set(quietness.Quiet(launcher.root, ()).processes())
     assert len(left) >= 4
     launcher.kill()
     assert not any(Path(f'/proc/{pid}').exists() for pid in left)

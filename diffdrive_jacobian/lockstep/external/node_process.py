@@ -32,35 +32,11 @@ from diffdrive_jacobian.lockstep._link import Link, Source, Stage
 from diffdrive_jacobian.lockstep._nodes import Nodes
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.lockstep._simulated_time import checked_nanoseconds
-from diffdrive_jacobian.lockstep.external.graph import (
-    CLOCK_TYPE,
-    PID,
-    NodeGraph,
-    import_type,
-    nodes_beside,
-    profile_of,
-)
+from diffdrive_jacobian.lockstep.external import graph as graphs
+from diffdrive_jacobian.lockstep.external import relays
 from diffdrive_jacobian.lockstep.external.process import CLOSING, ExternalProcess, free_domain
-from diffdrive_jacobian.lockstep.external.quiet import (
-    Allowance,
-    Quiet,
-    descendants,
-    threads_of_this_process,
-)
-from diffdrive_jacobian.lockstep.external.relays import (
-    CALL,
-    DEPTH,
-    INPUT,
-    SERVICE,
-    TOPIC,
-    Arrived,
-    Relay,
-    called_service,
-    from_topic,
-    offered_service,
-    to_topic,
-    without_echo,
-)
+from diffdrive_jacobian.lockstep.external.quiet import Allowance, Quiet, threads_of_this_process
+from diffdrive_jacobian.lockstep.external.relays import CALL, INPUT, SERVICE, TOPIC, Arrived, Relay
 from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.messages.names import node_of
 from diffdrive_jacobian.ros.rclpy_internals import (
@@ -144,7 +120,7 @@ class Surroundings:
 class StandIn(Node):  # type: ignore[misc]
     """A node of the world for a node of a process. If it is destroyed, the process is ended."""
 
-    def __init__(self, graph: NodeGraph, end: Callable[[StandIn], None]) -> None:
+    def __init__(self, graph: graphs.NodeGraph, end: Callable[[StandIn], None]) -> None:
         """Create it with the name of the node, without topics."""
         super().__init__(
             graph.name,
@@ -338,11 +314,11 @@ class NodeProcess:
 
     def _leave(self) -> None:
         """Remove the nodes from the world."""
-        nodes, relays = self.nodes, self._relays
+        nodes, ended = self.nodes, self._relays
         self._reset()
         for node in nodes:
             node.destroy_node()
-        for relay in relays.values():
+        for relay in ended.values():
             relay.close()
         self._closing.close()
 
@@ -388,9 +364,9 @@ class NodeProcess:
 
     def _learn(self) -> bool:
         """Create what the topics and services of the process need. Return whether it has nodes."""
-        graphs = nodes_beside(self._outside)
-        offered = {name for graph in graphs for name in graph.services}
-        for graph in graphs:
+        found = graphs.nodes_beside(self._outside)
+        offered = {name for graph in found for name in graph.services}
+        for graph in found:
             self._check_started_by_world(graph)
             name = graph.full_name
             if name not in self._stand_ins:
@@ -398,35 +374,35 @@ class NodeProcess:
             node = self._stand_ins[name]
             self._learn_topics(graph, node)
             for service, kind in graph.services.items():
-                self._relay(SERVICE, service, kind, node, offered_service, self._deliver)
+                self._relay(SERVICE, service, kind, node, relays.offered_service, self._deliver)
             for service, kind in graph.clients.items():
                 if service not in offered:
                     self._called.setdefault(service, (kind, node))
         self._offer_called()
-        return bool(graphs)
+        return bool(found)
 
-    def _learn_topics(self, graph: NodeGraph, node: StandIn) -> None:
+    def _learn_topics(self, graph: graphs.NodeGraph, node: StandIn) -> None:
         outside, name = self._outside, graph.full_name
         for topic, kind in graph.publishers.items():
-            profile = profile_of(outside.get_publishers_info_by_topic(topic), name, DEPTH)
+            profile = graphs.profile_of(outside.get_publishers_info_by_topic(topic), name, relays.DEPTH)
             sent = self._sent.setdefault(topic, [])
-            self._relay(TOPIC, topic, kind, node, from_topic, profile, sent)
+            self._relay(TOPIC, topic, kind, node, relays.from_topic, profile, sent)
         for topic, kind in graph.subscriptions.items():
-            if kind == CLOCK_TYPE and topic.rpartition('/')[2] == 'clock':
+            if kind == graphs.CLOCK_TYPE and topic.rpartition('/')[2] == 'clock':
                 if topic not in self._clock_publishers:
                     self._clock_publishers[topic] = outside.create_publisher(Clock, topic, 1)
                 continue
             depth = self._command.queue_depth
-            profile = profile_of(outside.get_subscriptions_info_by_topic(topic), name, depth)
+            profile = graphs.profile_of(outside.get_subscriptions_info_by_topic(topic), name, depth)
             sent = self._sent.setdefault(topic, [])
-            self._relay(INPUT, topic, kind, node, to_topic, profile, self._deliver, sent)
+            self._relay(INPUT, topic, kind, node, relays.to_topic, profile, self._deliver, sent)
 
     def _relay(
         self, role: int, name: str, kind: str, node: StandIn, create: Callable[..., Relay], *args: Any
     ) -> None:
         """Create a relay unless it is there. DDS does not promise an order between topics: by name."""
         if (role, name) not in self._relays:
-            imported = import_type(kind, f'{name} of {node.get_fully_qualified_name()}')
+            imported = graphs.import_type(kind, f'{name} of {node.get_fully_qualified_name()}')
             self._relays[role, name] = create(self._outside, node, name, imported, *args)
             self._relays = dict(sorted(self._relays.items()))
 
@@ -444,9 +420,9 @@ class NodeProcess:
         }
         for name, (kind, node) in self._called.items():
             if name in there:
-                self._relay(CALL, name, kind, node, called_service, self._deliver)
+                self._relay(CALL, name, kind, node, relays.called_service, self._deliver)
 
-    def _check_started_by_world(self, graph: NodeGraph) -> None:
+    def _check_started_by_world(self, graph: graphs.NodeGraph) -> None:
         """Check that a node is in the process or one that it has started."""
         infos = [
             info
@@ -457,8 +433,8 @@ class NodeProcess:
             )
             if node_of(info) == graph.full_name
         ]
-        numbers = {int.from_bytes(bytes(info.endpoint_gid)[PID], 'little') for info in infos}
-        pids = {pid for pid in descendants(self.child.root) if pid & 0xFFFF in numbers}
+        numbers = {int.from_bytes(bytes(info.endpoint_gid)[graphs.PID], 'little') for info in infos}
+        pids = {pid for pid in self._quiet.processes() if pid & 0xFFFF in numbers}
         if numbers and not pids:
             raise ForeignNodeError(
                 f'node {graph.full_name} is in domain {self._domain}, but in no process that '
@@ -527,7 +503,7 @@ class NodeProcess:
         if missing:
             return f'{self.command}: not discovered {waited}: {", ".join(missing)}\n{self.describe()}'
         hint = 'it has created none, or not yet'
-        if others := _domains(self.child.root) - {self._domain}:
+        if others := _domains(self._quiet.processes()) - {self._domain}:
             hint = (
                 f'it is in ROS domain {", ".join(map(str, sorted(others)))} instead of {self._domain}: '
                 'it must not set ROS_DOMAIN_ID, which start() sets for it'
@@ -645,17 +621,17 @@ class NodeProcess:
         own = self._stand_ins.values()
         if not isinstance(end, Link) or end.owner not in own or (TOPIC, end.topic) not in self._relays:
             return None
-        return without_echo(
+        return relays.without_echo(
             self._scheduler.links.observers_of_published(end.topic).append,
             lambda publisher: any(publisher in node.publishers for node in own),
         )
 
 
-def _domains(pid: int) -> set[int]:
-    """Return the ROS domains in which a process and its children receive, by their UDP ports."""
+def _domains(pids: Sequence[int]) -> set[int]:
+    """Return the ROS domains in which processes receive, by their UDP ports."""
     sockets = set()
-    for one in descendants(pid):
-        for descriptor in Path(f'/proc/{one}/fd').glob('*'):
+    for pid in pids:
+        for descriptor in Path(f'/proc/{pid}/fd').glob('*'):
             try:
                 sockets.add(os.readlink(descriptor))
             except OSError:

@@ -126,7 +126,8 @@ class ExternalProcess:
         children = Path(f'/proc/{self.root}/task/{self.root}/children')
         while self.pid == self.root and self.returncode is None:
             with suppress(OSError):
-                self.pid = int((children.read_text().split() or [self.root])[0])
+                for child in children.read_text().split()[:1]:
+                    self.pid = int(child)
             time.sleep(NAP)
 
     def check_running(self, node: str = '') -> None:

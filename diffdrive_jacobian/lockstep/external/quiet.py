@@ -18,7 +18,7 @@ import platform
 import sys
 import time
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -75,8 +75,6 @@ STATES = {b'R': 'is running', b'D': 'waits for a disk', b'T': 'is stopped', b't'
 class _Thread:
     """A thread of another process, or one of this process that receives."""
 
-    __slots__ = ('call', 'children', 'idle', 'own', 'pid', 'stat', 'tid')
-
     def __init__(self, pid: int, tid: int, *, own: bool = False) -> None:
         """Open its files.
 
@@ -87,12 +85,11 @@ class _Thread:
         self.pid, self.tid, self.own = pid, tid, own
         self.idle = b''
         """System call in which it has been found not to be busy."""
-        self.call = self.children = self.stat = -1
+        self._files: list[int] = []
         try:
-            folder = f'/proc/{pid}/task/{tid}'
-            self.call = os.open(f'{folder}/syscall', os.O_RDONLY)
-            self.children = os.open(f'{folder}/children', os.O_RDONLY)
-            self.stat = os.open(f'{folder}/stat', os.O_RDONLY)
+            for name in ('syscall', 'children', 'stat'):
+                self._files.append(os.open(f'/proc/{pid}/task/{tid}/{name}', os.O_RDONLY))
+            self.call, self.children, self._stat = self._files
             os.pread(self.call, 256, 0)
         except PermissionError as error:
             self.close()
@@ -106,13 +103,19 @@ class _Thread:
 
     def close(self) -> None:
         """Close the files."""
-        for descriptor in (self.call, self.children, self.stat):
-            if descriptor >= 0:
-                os.close(descriptor)
+        while self._files:
+            os.close(self._files.pop())
 
-    def read(self, name: str) -> bytes:
-        """Return the content of a file below /proc."""
-        return Path(f'/proc/{self.pid}/task/{self.tid}/{name}').read_bytes()
+    def state(self) -> bytes:
+        """Return the letter of its state."""
+        return os.pread(self._stat, 512, 0).rpartition(b') ')[2][:1]
+
+    def read(self, name: str) -> str:
+        """Return the content of a file below /proc; empty: it has ended."""
+        try:
+            return Path(f'/proc/{self.pid}/task/{self.tid}/{name}').read_text(errors='replace')
+        except OSError:
+            return ''
 
 
 def check_platform() -> None:
@@ -229,7 +232,7 @@ class Quiet:
     def _is_stopped(self, pid: int) -> bool:
         """Return whether a process is stopped or debugged, in whatever system call that is."""
         thread = self._threads[pid, pid]
-        state = _state(thread)
+        state = thread.state()
         if state not in (b'T', b't'):
             return False
         self._busy, self._why = thread, STATES[state]
@@ -263,7 +266,7 @@ class Quiet:
 
     def _is_active(self, thread: _Thread) -> bool:
         """Return whether a thread does something in a system call, such as to wait for a disk."""
-        state = _state(thread)
+        state = thread.state()
         if state in (b'Z', b'X'):
             # Its parent has still to be woken up when its state changes.
             new = thread.tid not in self._ended
@@ -286,7 +289,7 @@ class Quiet:
         self._places = {
             min(places)
             for thread, arguments in timed
-            if thread.read('comm').startswith(b'dds.') and (places := self._addresses(thread, arguments))
+            if thread.read('comm').startswith('dds.') and (places := self._addresses(thread, arguments))
         }
         self._polling = {
             thread.tid for thread, arguments in timed if self._is_in_callback(thread, arguments)
@@ -304,7 +307,7 @@ class Quiet:
         if pid not in self._dds:
             self._dds[pid] = [
                 range(*(int(end, 16) for end in line.split()[0].split('-')))
-                for line in thread.read('maps').decode(errors='replace').splitlines()
+                for line in thread.read('maps').splitlines()
                 if DDS in line and 'x' in line.split()[1]
             ]
         words = array('Q')
@@ -313,6 +316,13 @@ class Quiet:
         return {place for place, word in enumerate(words) for code in self._dds[pid] if word in code}
 
     # --- Which threads there are
+
+    def processes(self) -> list[int]:
+        """Return the ids of the process and of all that it has started and that lives."""
+        with suppress(ProcessLookupError):
+            while self._update():
+                pass
+        return list(self._links)
 
     def _update(self) -> bool:
         """Open the files of new threads, close those of ended ones. Return whether there were any."""
@@ -346,19 +356,17 @@ class Quiet:
 
     def delay(self) -> float:
         """Return for how long all threads together have waited for a processor (s)."""
-        total = 0
-        for thread in (*self._threads.values(), *self._own):
-            with suppress(OSError):
-                total += int(thread.read('schedstat').split()[1])
-        return total / 1e9
+        self.processes()
+        counters = [thread.read('schedstat').split() for thread in (*self._threads.values(), *self._own)]
+        return sum(int(counter[1]) for counter in counters if counter) / 1e9
 
     def describe(self) -> str:
         """Return which thread was busy last, and how."""
         if self._busy is None:
             return 'processes come and go'
         thread = self._busy
-        name = _text(f'/proc/{thread.pid}/task/{thread.tid}/comm')
-        command = _text(f'/proc/{thread.pid}/cmdline').replace('\0', ' ').strip()
+        command = thread.read('cmdline').replace('\0', ' ').strip()
+        name = thread.read('comm').strip()
         return f"thread {thread.tid} ('{name}') of {command} (pid {thread.pid}) {self._why}"
 
 
@@ -380,28 +388,3 @@ class Allowance:
             return False
         delay = self._quiet.delay() - self._delay
         return passed - delay > self._seconds or passed > LONGEST * self._seconds
-
-
-def _state(thread: _Thread) -> bytes:
-    """Return the letter of the state of a thread."""
-    return os.pread(thread.stat, 512, 0).rpartition(b') ')[2][:1]
-
-
-def _text(file: str) -> str:
-    try:
-        return Path(file).read_text(errors='replace').strip()
-    except OSError:
-        return '?'
-
-
-def descendants(pid: int) -> Iterator[int]:
-    """Yield a process and all that it has started and that lives."""
-    yield pid
-    try:
-        tids = os.listdir(f'/proc/{pid}/task')
-    except OSError:
-        return
-    for tid in tids:
-        for child in _text(f'/proc/{pid}/task/{tid}/children').split():
-            if child.isdecimal():
-                yield from descendants(int(child))
