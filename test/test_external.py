@@ -483,6 +483,10 @@ def test_a_process_that_the_world_has_not_started_is_refused(monkeypatch):
     monkeypatch.setattr(node_process, 'free_domain', lambda: domain)
     foreign = ExternalProcess(command('mute'), {'ROS_DOMAIN_ID': str(domain)})
     try:
+        # Until it has been started, and has nothing more to do.
+        while all(map(external_process._is_free, external_process._ports(domain))):
+            foreign.check_running()
+        quietness.Quiet(foreign.root, ()).wait(30.0)
         refused(command('echo'), r'node /mute is in domain \d+, but in no process that')
     finally:
         foreign.close()
