@@ -270,7 +270,7 @@ NODES = {
 
 def main(arguments):
     if 'elsewhere' in arguments:
-        os.environ['ROS_DOMAIN_ID'] = str((int(os.environ['ROS_DOMAIN_ID']) + 40) % 100 + 1)
+        os.environ['ROS_DOMAIN_ID'] = str(int(os.environ['ROS_DOMAIN_ID']) % 100 + 1)
     rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
     stopped = threading.Event()
     signal.signal(signal.SIGINT, lambda *_: stopped.set())

@@ -626,7 +626,8 @@ def test_a_process_receives_sigint_that_the_tests_ignore(started):
 def test_a_domain_with_a_port_in_use_is_not_chosen(monkeypatch):
     domains = sorted({external_process.free_domain() for _ in range(10)})
     assert len(domains) > 1
-    assert 0 not in domains
+    # Those that others use.
+    assert min(domains) > 101
     monkeypatch.delenv('PYTEST_XDIST_WORKER', raising=False)
     monkeypatch.delenv('PYTEST_XDIST_WORKER_COUNT', raising=False)
     first, second = domains[:2]

@@ -640,7 +640,7 @@ def _domains(pids: Sequence[int]) -> set[int]:
     for line in Path('/proc/net/udp').read_text().splitlines()[1:]:
         words = line.split()
         port = int(words[1].rpartition(':')[2], 16)
-        # Higher ones are given to clients, lower ones are no ports of discovery.
+        # Lower ones are no ports of discovery, higher ones are given to clients.
         if f'socket:[{words[9]}]' in sockets and 7400 <= port < 32768:
             found.add((port - 7400) // 250)
     return found

@@ -20,8 +20,8 @@ from diffdrive_jacobian.lockstep._errors import LockstepError
 from diffdrive_jacobian.ros.fastdds_profiles import VARIABLE
 from diffdrive_jacobian.ros.runner import DISCOVERY
 
-DOMAINS = range(1, 102)
-"""Domains to choose from. 0 is everybody's; those above have ports that Linux gives to clients."""
+DOMAINS = range(102, 232)
+"""Domains to choose from. Others do not use them: Linux gives ports of most of them to clients, too."""
 PARTICIPANTS = 32
 """Number of participants of a domain whose ports are looked at. Each process has one or more."""
 SHOWN_LINES = 15
