@@ -452,21 +452,25 @@ def test_a_process_in_another_domain():
     )
 
 
+def refused_at_last(arguments, match):
+    """A node may be discovered only after some seconds."""
+
+    def run(world):
+        world.start(arguments)
+        for _ in range(2000):
+            world.run_for(0.1)
+
+    with Lockstep() as world, pytest.raises(LockstepError, match=match):
+        run(world)
+
+
 def test_several_processes_with_nodes_are_refused():
     timed = '--ros-args -p use_sim_time:=true'
     echo, mute = (' '.join(command(name)) for name in ('echo', 'mute'))
-
-    def run(world):
-        world.start(['sh', '-c', f'{echo} {timed} & {mute} {timed}; wait'])
-        # The second one may be discovered later.
-        for _ in range(1000):
-            world.run_for(0.1)
-
-    with (
-        Lockstep() as world,
-        pytest.raises(LockstepError, match=r'has started several processes with nodes: \d+, \d+'),
-    ):
-        run(world)
+    refused_at_last(
+        ['sh', '-c', f'{echo} {timed} & {mute} {timed}; wait'],
+        r'has started several processes with nodes: \d+, \d+',
+    )
 
 
 def test_a_daemon_of_a_process_takes_part(lockstep):
@@ -483,11 +487,7 @@ def test_a_process_that_the_world_has_not_started_is_refused(monkeypatch):
     monkeypatch.setattr(node_process, 'free_domain', lambda: domain)
     foreign = ExternalProcess(command('mute'), {'ROS_DOMAIN_ID': str(domain)})
     try:
-        # Until it has been started, and has nothing more to do.
-        while all(map(external_process._is_free, external_process._ports(domain))):
-            foreign.check_running()
-        quietness.Quiet(foreign.root, ()).wait(30.0)
-        refused(command('echo'), r'node /mute is in domain \d+, but in no process that')
+        refused_at_last(command('echo'), r'node /mute is in domain \d+, but in no process that')
     finally:
         foreign.close()
 

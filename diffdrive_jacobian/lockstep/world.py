@@ -32,7 +32,7 @@ from diffdrive_jacobian.lockstep._properties import Properties, Property
 from diffdrive_jacobian.lockstep._report import describe
 from diffdrive_jacobian.lockstep._scheduler import Scheduler
 from diffdrive_jacobian.lockstep._simulated_time import SimulatedTime, checked_nanoseconds
-from diffdrive_jacobian.lockstep.external.node_process import Command, NodeProcess, Surroundings
+from diffdrive_jacobian.lockstep.external.node_process import Command, NodeProcess
 from diffdrive_jacobian.lockstep.external.process import end_all
 from diffdrive_jacobian.lockstep.external.quiet import check_platform
 from diffdrive_jacobian.ros.fastdds_profiles import open_to_others, withdraw
@@ -135,12 +135,7 @@ class Lockstep:
         self._processes: list[NodeProcess] = []
         self._closing.callback(self._close_processes)
         self._time.check_processes = self._check_processes
-        self._surroundings = Surroundings(
-            scheduler=scheduler,
-            nodes=self._nodes,
-            extend=guard.extend,
-            is_open=lambda: self.is_open,
-        )
+        self._extend = guard.extend
         self._messaging = Messaging(scheduler, self._nodes, self._time, self.report)
         self._faults = Faults(scheduler, self._nodes, self.settle)
         self._properties = Properties(scheduler, self._nodes, self.report)
@@ -581,7 +576,9 @@ class Lockstep:
             timeout=timeout,
             patience=patience,
         )
-        process = NodeProcess(parameters, self._surroundings)
+        process = NodeProcess(
+            parameters, self._nodes, self._scheduler, self._extend, lambda: self.is_open
+        )
         process.start()
         self._processes.append(process)
         process.join()

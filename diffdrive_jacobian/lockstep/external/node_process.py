@@ -100,23 +100,6 @@ class Command:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Surroundings:
-    """What a process needs of the world.
-
-    Attributes:
-        scheduler: Executes the nodes.
-        nodes: The nodes of the world.
-        extend: Receives the wall time (s) that was spent waiting for the process.
-        is_open: Returns whether the world was not closed.
-    """
-
-    scheduler: Scheduler
-    nodes: Nodes
-    extend: Callable[[float], None]
-    is_open: Callable[[], bool]
-
-
 class StandIn(Node):  # type: ignore[misc]
     """A node of the world for a node of a process. If it is destroyed, the process is ended."""
 
@@ -144,13 +127,26 @@ class StandIn(Node):  # type: ignore[misc]
 class NodeProcess:
     """A process with nodes in the world, as of `Lockstep.start`. It is ended with the world."""
 
-    def __init__(self, command: Command, surroundings: Surroundings) -> None:
-        """Start nothing yet."""
-        self._command = command
-        self._scheduler = surroundings.scheduler
-        self._nodes = surroundings.nodes
-        self._extend, self._is_open = surroundings.extend, surroundings.is_open
-        self._clocks = surroundings.scheduler.clocks
+    def __init__(
+        self,
+        command: Command,
+        nodes: Nodes,
+        scheduler: Scheduler,
+        extend: Callable[[float], None],
+        is_open: Callable[[], bool],
+    ) -> None:
+        """Start nothing yet.
+
+        Args:
+            command: How to start it.
+            nodes: The nodes of the world.
+            scheduler: Executes the nodes.
+            extend: Receives the wall time (s) that was spent waiting for the process.
+            is_open: Returns whether the world was not closed.
+        """
+        self._command, self._nodes, self._scheduler = command, nodes, scheduler
+        self._extend, self._is_open = extend, is_open
+        self._clocks = scheduler.clocks
         self._ended: list[ExternalProcess] = []
         self._closing = ExitStack()
         self._reset()

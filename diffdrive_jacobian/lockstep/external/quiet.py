@@ -21,40 +21,25 @@ from array import array
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
 
-
-class _Machine(NamedTuple):
-    """Numbers of system calls."""
-
-    sleeps: tuple[bytes, ...]
-    """nanosleep, clock_nanosleep."""
-    files: dict[bytes, int]
-    """poll, select: with the place of the number of files among the arguments."""
-    waits: dict[bytes, int]
-    """futex, poll, select, epoll: with the place of the timeout. -1: recv, wait, which have none."""
-
-
-MACHINES = {
-    'x86_64': _Machine(
-        (b'35', b'230'),
-        {b'7': 1, b'271': 1, b'23': 0, b'270': 0},
-        {
-            **{b'202': 3, b'7': 2, b'271': 2, b'23': 4, b'270': 4, b'232': 3, b'281': 3},
-            **{b'45': -1, b'47': -1, b'61': -1, b'247': -1},
-        },
-    ),
-    'aarch64': _Machine(
-        (b'101', b'115'),
-        {b'73': 1, b'72': 0},
-        {
-            **{b'98': 3, b'73': 2, b'72': 4, b'22': 3},
-            **{b'207': -1, b'212': -1, b'260': -1, b'95': -1},
-        },
-    ),
+NEVER = -1
+"""Place of a timeout that there is not."""
+SLEEPS = {'x86_64': (b'35', b'230'), 'aarch64': (b'101', b'115')}
+"""Numbers of the system calls nanosleep and clock_nanosleep, by machine."""
+WAITS = {
+    'x86_64': {
+        **{b'202': 3, b'7': 2, b'271': 2, b'23': 4, b'270': 4, b'232': 3, b'281': 3},
+        **{b'45': NEVER, b'47': NEVER, b'61': NEVER, b'247': NEVER},
+    },
+    'aarch64': {
+        **{b'98': 3, b'73': 2, b'72': 4, b'22': 3},
+        **{b'207': NEVER, b'212': NEVER, b'260': NEVER, b'95': NEVER},
+    },
 }
+"""Numbers of the system calls that wait, with the place of their timeout among the arguments: futex,
+poll, select, epoll; and of recvfrom, recvmsg, wait4, waitid, which have none."""
 ENDLESS = (b'0x0', b'0xffffffff', b'0xffffffffffffffff')
 """Timeouts that are none."""
 DDS = 'libfastrtps.so'
@@ -121,7 +106,7 @@ class _Thread:
 def check_platform() -> None:
     """Raise LockstepError if the threads of other processes cannot be observed on this machine."""
     machine = platform.machine()
-    if sys.platform != 'linux' or machine not in MACHINES:
+    if sys.platform != 'linux' or machine not in WAITS:
         raise LockstepError(
             'nodes in other processes need Linux on x86_64 or aarch64, which shows in /proc whether a '
             f'process has processed its input; this is {sys.platform} on {machine}'
@@ -146,7 +131,7 @@ class Quiet:
         Raises:
             LockstepError: The process may not be observed.
         """
-        self._machine = MACHINES[platform.machine()]
+        self._sleeps, self._waits = SLEEPS[platform.machine()], WAITS[platform.machine()]
         self._links = {pid: 0}
         """Number of links of the folder of the threads, by process: it changes with their number."""
         self._own = [_Thread(os.getpid(), tid, own=True) for tid in own]
@@ -248,17 +233,20 @@ class Quiet:
         if call == thread.idle:
             return False
         number, *arguments = call.split()
-        place = self._machine.waits.get(number)
+        place = self._waits.get(number)
         if number == b'running':
             self._why = STATES[b'R']
             return True
-        files = self._machine.files.get(number)
-        if number in self._machine.sleeps or (files is not None and arguments[files] == b'0x0'):
+        if number in self._sleeps:
             self._why = 'sleeps'
             return True
         if place is None:
             return self._is_active(thread)
-        if place >= 0 and arguments[place] not in ENDLESS and self._is_in_callback(thread, arguments):
+        if (
+            place != NEVER
+            and arguments[place] not in ENDLESS
+            and self._is_in_callback(thread, arguments)
+        ):
             self._why = 'waits in a callback, with a timeout'
             return True
         thread.idle = call
@@ -282,9 +270,9 @@ class Quiet:
         timed = []
         for thread in self._threads.values():
             number, *arguments = os.pread(thread.call, 256, 0).split()
-            place = self._machine.waits.get(number, -1)
+            place = self._waits.get(number, NEVER)
             thread.idle = b''
-            if place >= 0 and arguments[place] not in ENDLESS:
+            if place != NEVER and arguments[place] not in ENDLESS:
                 timed.append((thread, arguments))
         self._places = {
             min(places)
