@@ -132,6 +132,21 @@ class Caller(Controller):
         future.add_done_callback(lambda done: self.send(float(done.result().message)))
 
 
+class Late(Controller):
+    """Creates its publisher when it receives the first odometry."""
+
+    def __init__(self, name):
+        super().__init__(name)
+        self.destroy_publisher(self.commands)
+
+    def on_odometry(self, odometry):
+        if not self.received:
+            self.commands = self.create_publisher(TwistStamped, f'{self.get_name()}/late', 10)
+            self.received = 1
+        else:
+            super().on_odometry(odometry)
+
+
 class Counting(Node):
     """Has an action, and publishes its feedback."""
 
@@ -254,6 +269,7 @@ NODES = {
     'c': Stage,
     'hearing': Hearing,
     'caller': Caller,
+    'late': Late,
     'counting': Counting,
     'sleeping': Sleeping,
     'blocking': Blocking,

@@ -161,6 +161,15 @@ def test_parameters_services_and_latched_topics_pass(lockstep):
     assert speeds(commands[2:]) == [0.0]
 
 
+def test_a_topic_that_is_created_later_passes(lockstep):
+    lockstep.start(command('late'))
+    for number in range(3):
+        lockstep.publish('late/odom', odometry(float(number)))
+        if not number:
+            commands = lockstep.listen(TwistStamped, 'late/late')
+    assert speeds(commands) == [1.0, 2.0]
+
+
 def test_a_process_calls_services_of_the_world(lockstep):
     numbers = iter(range(1, 10))
     server = Node('server')

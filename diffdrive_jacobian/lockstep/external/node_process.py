@@ -35,7 +35,12 @@ from diffdrive_jacobian.lockstep._simulated_time import checked_nanoseconds
 from diffdrive_jacobian.lockstep.external import graph as graphs
 from diffdrive_jacobian.lockstep.external import relays
 from diffdrive_jacobian.lockstep.external.process import CLOSING, ExternalProcess, free_domain
-from diffdrive_jacobian.lockstep.external.quiet import Allowance, Quiet, threads_of_this_process
+from diffdrive_jacobian.lockstep.external.quiet import (
+    Allowance,
+    Quiet,
+    own_run_times,
+    threads_of_this_process,
+)
 from diffdrive_jacobian.lockstep.external.relays import CALL, INPUT, SERVICE, TOPIC, Arrived, Relay
 from diffdrive_jacobian.messages.conversion import set_time
 from diffdrive_jacobian.messages.names import node_of
@@ -56,6 +61,8 @@ SILENCE = 0.2
 """Time for which a process that has started must not send anything by itself (s)."""
 UNCONFIRMED = 0.5
 """Time for nodes without parameter services to discover the endpoints of the world (s)."""
+UNASKED = 100
+"""Largest number of deliveries after which the graph is looked at, although nothing new was told."""
 END = 2.0
 """Time in which a process ends after a process of its nodes has (s)."""
 ATTEMPTS = 2
@@ -165,6 +172,9 @@ class NodeProcess:
         self._called: dict[str, tuple[str, StandIn]] = {}
         self._services_changed = True
         self._given = -1
+        self._exchanges = 0
+        self._listeners: list[int] = []
+        self._listened: list[int] = []
 
     # --- What the test sees
 
@@ -271,6 +281,7 @@ class NodeProcess:
         self.child = self._command.start(domain)
         self._quiet = Quiet(self.child.root, receiving)
         self._closing.callback(self._quiet.close)
+        self._listeners = self._quiet.listeners()
 
     def join(self) -> None:
         """Add the nodes to the world. They receive the time."""
@@ -550,9 +561,15 @@ class NodeProcess:
         self._forward(arrived)
         if any(map(self._quiet.has_ended, (self.child.root, *self._participants))):
             self._on_end()
-        elif graph_changed(self._outside):
+        elif self._may_have_changed() and graph_changed(self._outside):
             self._learn_more()
         return len(arrived)
+
+    def _may_have_changed(self) -> bool:
+        """Return whether the process may have told something new of its nodes: to ask takes time."""
+        self._exchanges += 1
+        before, self._listened = self._listened, own_run_times(self._listeners)
+        return before != self._listened or not self._listeners or self._exchanges % UNASKED == 0
 
     def _learn_more(self) -> None:
         """Create what is needed for topics and services that the process has created meanwhile."""

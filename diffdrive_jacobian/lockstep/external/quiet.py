@@ -118,6 +118,11 @@ def threads_of_this_process() -> set[int]:
     return set(map(int, os.listdir('/proc/self/task')))
 
 
+def own_run_times(tids: Iterable[int]) -> list[int]:
+    """Return for how long threads of this process have run (ns)."""
+    return [time.clock_gettime_ns(~tid << 3 | 6) for tid in tids]
+
+
 class Quiet:
     """Observes a process with all that it starts, and the receiving threads of this one."""
 
@@ -148,6 +153,13 @@ class Quiet:
     def has_ended(self, pid: int) -> bool:
         """Return whether a process of those that are observed had ended when it was looked at last."""
         return pid not in self._links or pid in self._ended
+
+    def listeners(self) -> list[int]:
+        """Return the threads of this process that receive what nodes tell of themselves, alone.
+
+        That is, those of rmw: the threads of Fast DDS itself have other names.
+        """
+        return [thread.tid for thread in self._own if not thread.read('comm').startswith('dds.')]
 
     def close(self) -> None:
         """End the observation."""
@@ -209,7 +221,7 @@ class Quiet:
         try:
             return [
                 *(time.clock_gettime_ns(~pid << 3 | 2) for pid in self._links),
-                *(time.clock_gettime_ns(~thread.tid << 3 | 6) for thread in self._own),
+                *own_run_times(thread.tid for thread in self._own),
             ]
         except OSError:
             raise ProcessLookupError from None
@@ -266,22 +278,17 @@ class Quiet:
     # --- Who waits with a timeout
 
     def learn(self) -> None:
-        """Note which threads wait with a timeout, and how: the process is idle."""
+        """Note which threads wait with a timeout, and how: the process is idle, and was found quiet."""
         timed = []
         for thread in self._threads.values():
-            number, *arguments = os.pread(thread.call, 256, 0).split()
+            number, *arguments = thread.idle.split() or [b'']
             place = self._waits.get(number, NEVER)
-            thread.idle = b''
             if place != NEVER and arguments[place] not in ENDLESS:
-                timed.append((thread, arguments))
-        self._places = {
-            min(places)
-            for thread, arguments in timed
-            if thread.read('comm').startswith('dds.') and (places := self._addresses(thread, arguments))
-        }
-        self._polling = {
-            thread.tid for thread, arguments in timed if self._is_in_callback(thread, arguments)
-        }
+                timed.append((thread, self._addresses(thread, arguments)))
+            thread.idle = b''
+        named = [found for thread, found in timed if thread.read('comm').startswith('dds.')]
+        self._places = {min(found) for found in named if found}
+        self._polling = {thread.tid for thread, found in timed if self._places.isdisjoint(found)}
 
     def _is_in_callback(self, thread: _Thread, arguments: list[bytes]) -> bool:
         """Return whether a thread that waits with a timeout does so neither in DDS nor always."""
