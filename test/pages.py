@@ -33,6 +33,7 @@ import ast
 import importlib
 import inspect
 import io
+import itertools
 import os
 import pkgutil
 import re
@@ -414,17 +415,37 @@ def public_page() -> str:
         if not name:
             lines += ['', f'## {package}', '', _sentence(value), '', '| name | |', '|---|---|']
         else:
-            lines.append(f'| `{name}` | {_sentence(value)} |')
+            lines.append(f'| `{name}` | {_sentence(value, path)} |')
     return '\n'.join([*lines, ''])
 
 
-def _sentence(value: object) -> str:
-    """Return the first sentence of a docstring."""
-    if not (inspect.ismodule(value) or callable(value)):
-        return str(getattr(value, 'description', ''))
-    text = ' '.join((inspect.getdoc(value) or '').partition('\n\n')[0].split())
+def _sentence(value: object, path: str = '') -> str:
+    """Return the first sentence of the docstring of a public object, at this path in the package."""
+    documented = inspect.ismodule(value) or inspect.isclass(value) or inspect.isroutine(value)
+    text = (inspect.getdoc(value) if documented else _constant_docstring(value, path)) or ''
+    text = ' '.join(text.partition('\n\n')[0].split())
     found = re.match(r'.*?\.(?= [A-Z]|$)', text)
     return (found[0] if found else text).replace('|', '\\|')
+
+
+def _constant_docstring(value: object, path: str) -> str:
+    """Return the string below the assignment of a constant."""
+    if description := getattr(value, 'description', ''):
+        return str(description)
+    package, name = path.split('.')[0], path.split('.')[-1]
+    for key, module in list(sys.modules.items()):
+        if key.startswith(f'{diffdrive_jacobian.__name__}.{package}') and name in vars(module):
+            for statement, below in itertools.pairwise(ast.parse(inspect.getsource(module)).body):
+                target = statement.targets[0] if isinstance(statement, ast.Assign) else None
+                if (
+                    isinstance(target, ast.Name)
+                    and target.id == name
+                    and vars(module)[name] is value
+                    and isinstance(below, ast.Expr)
+                    and isinstance(below.value, ast.Constant)
+                ):
+                    return str(below.value.value)
+    raise ValueError(f'the public constant {path} has no docstring')
 
 
 # --- Pictures

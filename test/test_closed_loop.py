@@ -22,6 +22,8 @@ from diffdrive_jacobian.control import (
 from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.simulation import Robot, RobotModel, closed_loop, closed_loops, trajectories
+from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits
+from diffdrive_jacobian.simulation.actuators import Actuators
 
 R, L = 0.033, 0.16
 FREE = VelocityLimits()
@@ -460,3 +462,69 @@ def test_invalid_arguments_are_named(drive, name, bad):
 def test_headings_that_count_must_be_given():
     with pytest.raises(ValueError, match=r'^goals must have shape \(\.\.\., 3\), got \(2,\)$'):
         closed_loops(go_to_goal, np.zeros(3), [1.0, 0.0], 3.0, 0.5, arrival=Arrival(use_heading=True))
+
+
+# --- Robots that take time
+
+SLOW = AccelerationLimits(
+    v=AxisLimits(
+        max_acceleration=1.0,
+        max_deceleration=-1.5,
+        max_acceleration_reverse=-0.7,
+        max_deceleration_reverse=1.2,
+    ),
+    omega=AxisLimits(max_acceleration=12.0, max_deceleration=-16.0),
+)
+MS = 1_000_000
+FOLLOWING = {
+    'limits': Actuators(acceleration=SLOW),
+    'wheels': Actuators(acceleration=AccelerationLimits(max_wheel_acceleration=60.0), delay=40 * MS),
+    'lag': Actuators(lag=0.08),
+    'all': Actuators(acceleration=SLOW, lag=0.02, delay=33 * MS),
+}
+
+
+@pytest.mark.parametrize('stops', [False, True], ids=['any speed', 'at rest'])
+@pytest.mark.parametrize('name', LAWS)
+@pytest.mark.parametrize('following', FOLLOWING)
+def test_robots_that_take_time_drive_as_one_alone(following, name, stops):
+    law, gains = LAWS[name]
+    starts, targets = random_batch(7, 2)
+    arrival = Arrival(
+        use_heading=name == 'pose',
+        offset=gains[1] if name == 'offset_point' else 0.0,
+        **({'trans_stopped_velocity': 0.01, 'rot_stopped_velocity': 0.05} if stops else {}),
+    )
+    actuators = FOLLOWING[following]
+    many = {'duration': 5.0, 'arrival': arrival, 'limits': LIMITS, 'actuators': actuators}
+    gone = trajectories(law, starts, targets, *gains, **many)
+    assert_same(closed_loops(law, starts, targets, *gains, **many), gone.outcomes)
+    model = RobotModel(limits=LIMITS, actuators=actuators)
+    for index, (start, to) in enumerate(zip(starts, targets, strict=True)):
+        robot, way, arrived = Robot(model=model, stamp=0, pose=start), Waypoints(to[np.newaxis]), None
+        for time, pose in zip(gone.times, gone.poses[:, index], strict=True):
+            assert np.abs(se2.log(se2.compose(se2.inverse(pose), robot.pose))).max() < 2e-9
+            if arrived is None:
+                way, command = way.follow(
+                    robot.pose, lambda at, goal: law(at, goal, *gains), arrival, 3.0, robot.twist
+                )
+                arrived = time if command is None else None
+            command = command or (0.0, 0.0)
+            robot = robot.commanded(command, robot.stamp).at(robot.stamp + 20 * MS)
+        expected = math.nan if arrived is None else arrived
+        assert gone.outcomes.time[index] == pytest.approx(expected, nan_ok=True)
+        if arrived is not None and arrived < 3.0:
+            # What is kept of it ends at rest.
+            assert np.abs(robot.twist).max() < 1e-8
+    assert gone.outcomes.arrived.any()
+
+
+def test_a_robot_that_stops_late_overshoots():
+    slow = Actuators(
+        acceleration=AccelerationLimits(v=AxisLimits(max_acceleration=0.2, max_deceleration=-0.1))
+    )
+    found = closed_loops(go_to_goal, [0, 0, 0], [2, 0], 3.0, 1.0, actuators=slow)
+    at_once = closed_loops(go_to_goal, [0, 0, 0], [2, 0], 3.0, 1.0)
+    assert found.overshoot > 0.2 > at_once.overshoot == 0.0
+    with pytest.raises(ValueError, match='must have no max_right_speed'):
+        closed_loops(go_to_goal, [0, 0, 0], [2, 0], 3.0, 1.0, actuators=Actuators(max_right_speed=1.0))

@@ -32,7 +32,7 @@ from diffdrive_jacobian.messages.codecs import (
     GOALS,
     JOINT_STATE,
     ODOMETRY,
-    ODOMETRY_POSE,
+    ODOMETRY_STATE,
     PARAMETER_EVENT,
     POSE,
     POSE_WITH_COVARIANCE,
@@ -122,8 +122,9 @@ def test_names_change_with_the_parameters(lockstep):
 
 @pytest.mark.parametrize('message', [Odometry(), odometry(1.0, -2.0, 0.5, frame='Karte ä')])
 def test_the_controller_reads_frame_and_pose_of_an_odometry(message):
-    frame, pose = ODOMETRY_POSE.reader(Odometry)(serialize_message(message))
+    frame, twist, pose = ODOMETRY_STATE.reader(Odometry)(serialize_message(message))
     assert frame == message.header.frame_id
+    assert twist == value_of(ODOMETRY, message).twist
     assert pose == value_of(ODOMETRY, message).pose == tuple(pose_of(message))
 
 

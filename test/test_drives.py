@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
+from rclpy.parameter import Parameter
 
 from diffdrive_jacobian.bags import read_run
 from diffdrive_jacobian.drives import DriveError, Outcome, drive, waypoints_through
-from diffdrive_jacobian.drives.driving import in_lockstep
+from diffdrive_jacobian.drives.driving import in_lockstep, in_real_time
 from diffdrive_jacobian.errors import UserError
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.remote_goal import Result, send_goal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.signals import Signals
 
@@ -103,6 +107,56 @@ def test_errors_are_typed(monkeypatch):
     monkeypatch.setattr(GoToGoal, '_on_odometry', sleep)
     with pytest.raises(DriveError, match='sleeps on its clock'):
         drive([[1.0, 1.0]], lockstep=True)
+
+
+@pytest.mark.parametrize('timeout', [-1.0, 0.0, math.nan])
+def test_times_are_positive(timeout):
+    with pytest.raises(ValueError, match='timeout must be positive'):
+        drive([[1.0, 1.0]], lockstep=True, timeout=timeout)
+    with pytest.raises(ValueError, match='timeout must be positive'):
+        send_goal([1.0, 1.0, 0.0], timeout=timeout)
+    with pytest.raises(ValueError, match='patience must be positive'):
+        send_goal([1.0, 1.0, 0.0], patience=timeout)
+
+
+def test_goals_are_sent_one_after_the_other_in_one_runner():
+    for run in (in_lockstep, in_real_time):
+        with run() as runner:
+            nodes = [
+                runner.add(lambda node=node: node(context=runner.context))
+                for node in (VirtualRobot, GoToGoal)
+            ]
+            nodes[1].set_parameters([Parameter('kv', value=4.0), Parameter('kp', value=12.0)])
+            for x in (0.2, 0.4):
+                assert send_goal([x, 0.0, 0.0], runner=runner).arrived
+                left = partial(nodes[0].count_publishers, '/goal_pose')
+                assert runner.spin(lambda left=left: not left(), timeout=5.0)
+
+
+def test_an_error_of_the_progress_cancels_the_goal():
+    class Broken(Progress):
+        def waiting(self, reason):
+            pass
+
+        def driving(self, *state):
+            raise BrokenPipeError
+
+    with in_lockstep() as runner:
+        robot = runner.add(lambda: VirtualRobot(context=runner.context))
+        controller = runner.add(lambda: GoToGoal(context=runner.context))
+        with pytest.raises(BrokenPipeError):
+            send_goal([5.0, 0.0, 0.0], runner=runner, progress=Broken())
+        assert controller.waypoint is None
+        assert robot.get_publishers_info_by_topic('/goal_pose') == []
+
+
+def test_a_goal_is_sent_where_no_timer_runs():
+    with in_lockstep() as runner:
+        sent = send_goal([0.5, 0.0, 0.0], runner=runner, patience=2.0)
+        assert sent.result is Result.NOT_SENT
+        runner.add(lambda: GoToGoal(context=runner.context))
+        sent = send_goal([0.5, 0.0, 0.0], runner=runner, timeout=2.0)
+        assert (sent.result, sent.canceled) == (Result.TIMEOUT, True)
 
 
 def test_waypoints_have_the_direction_to_the_next():

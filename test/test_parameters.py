@@ -204,3 +204,16 @@ def test_the_last_word_counts(tmp_path):
         assert node.parameters.kp == node.get_parameter('kp').value == 7.0
         assert node.parameters.xy_goal_tolerance == 0.1
         node.destroy_node()
+
+
+def test_limits_of_the_acceleration_default_as_in_diff_drive_controller():
+    assert VirtualRobotParameters(linear_x_max_deceleration=-1.0).model().actuators is None
+    given = VirtualRobotParameters(linear_x_max_acceleration=0.5).acceleration_limits().v
+    assert (given.max_acceleration, given.max_deceleration) == (0.5, -0.5)
+    assert (given.max_acceleration_reverse, given.max_deceleration_reverse) == (-0.5, 0.5)
+    given = VirtualRobotParameters(
+        angular_z_max_acceleration=2.0, angular_z_max_acceleration_reverse=-3.0
+    ).acceleration_limits()
+    assert given.omega.max_deceleration == -3.0
+    assert given.omega.max_deceleration_reverse == 2.0
+    assert given.v.unlimited

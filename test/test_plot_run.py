@@ -400,6 +400,21 @@ def test_a_goal_that_was_replaced_is_followed_by_the_next(tmp_path):
     assert goals_of(run_of(tmp_path, extra, **STRAIGHT)) == [(0.0, 0), (1.0, 1)]
 
 
+@pytest.mark.parametrize('replaced', [True, False])
+def test_a_goal_that_was_not_recorded_ends_the_one_before(tmp_path, replaced):
+    extra = [
+        (10.0, '/goal_pose', goal(5, 0, stamp=9)),
+        (10.0, '/goal_status', status(1, 9)),
+        (11.0, '/goal_status', status(5 if replaced else 4, 9)),
+        (11.5, '/goal_status', status(1, 11)),
+        (12.0, '/goal_status', status(4, 11)),
+        (13.0, '/goal_pose', goal(7, 0, stamp=13)),
+        (13.0, '/goal_status', status(1, 13)),
+    ]
+    run = run_of(tmp_path, extra, **STRAIGHT)
+    assert goals_of(run) == [(0.0, 0), (1.02 if replaced else 1.5, -1), (3.0, 1)]
+
+
 def test_a_goal_that_is_only_passed_is_driven_to_until_the_end(tmp_path):
     """It comes near the goal, drives on, and is placed elsewhere before the node reports success."""
     states = [(10.0, '/goal_status', status(2)), (13.9, '/goal_status', status(4))]

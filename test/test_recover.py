@@ -299,7 +299,10 @@ def test_an_empty_journal(tmp_path, capsys):
     write_journal(tmp_path / 'run', [])
     code, out, err = recover(capsys, tmp_path / 'run')
     assert (code, out) == (1, '')
-    assert err == f'recover_run: {tmp_path}/run.journal.mcap holds no message that can be saved\n'
+    assert err == (
+        f'recover_run: {tmp_path}/run.journal.mcap holds no message that can be saved: the recording '
+        'ended before one was received, so it can be deleted\n'
+    )
     assert os.listdir(tmp_path) == ['run.journal.mcap']
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,6 +24,7 @@ from diffdrive_jacobian.bags.verification import (
     start_covariances,
     verify,
 )
+from diffdrive_jacobian.faults import ActuatorLag, DeadWheel, SaturatedWheel
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
@@ -148,6 +150,95 @@ def test_placements_resets_timeouts_and_parameters_are_driven_again(lockstep, ro
     assert len(run.start_pose) == 3
     assert run.parameter_events[-1][2] == {'linear.x.max_velocity': 0.2}
     held(run)
+
+
+def test_a_robot_that_takes_time_is_driven_again_with_its_parameters(lockstep, robot_at, tmp_path):
+    robot_at(
+        linear__x__max_acceleration=0.5,
+        linear__x__max_deceleration=-0.8,
+        angular__z__max_acceleration=2.0,
+        wheel_lag=0.1,
+        command_delay=0.05,
+        max_wheel_acceleration=20.0,
+    )
+    with recorded(lockstep, tmp_path / 'run') as made:
+        made.look()
+        for v, omega in ((0.5, 1.0), (-0.3, 1.0), (0.4, -2.0), (0.0, 0.0), (0.3, 0.3)):
+            lockstep.publish('cmd_vel', twist(v, omega))
+            lockstep.run_for(0.43)
+        lockstep.run_for(2.0)
+    run = made.run
+    verification = held(run, 1e-12)
+    assert (verification.source, verification.start) == ('cmd_vel_out', 'start_pose')
+    assert verification.covariance_difference <= COVARIANCE_TOLERANCE
+    # Not standing still.
+    assert np.ptp(run.odometry.values[:, 0]) > 0.1
+    # The timeout stops it by deceleration.
+    stop = run.cmd_vel_out.stamps[-1]
+    stopping = run.odometry.values[run.odometry.stamps > stop, 3]
+    assert run.cmd_vel_out.values[-1].tolist() == [0.0, 0.0]
+    assert stopping[0] > 0.15
+    assert (np.diff(stopping[5:]) <= 0.0).all()
+    assert stopping[-1] == pytest.approx(0.0, abs=1e-6)
+    without = verify(replace(run, parameters={}))
+    assert without.distances.max() > 0.01
+    assert 'cannot be reproduced without them' in without.notes[-1]
+    late = replace(run, start_pose=rows(run.start_pose, slice(0, 0)))
+    assert any('what it was commanded before is missing' in note for note in verify(late).notes)
+
+
+def test_changes_of_the_dynamics_are_driven_again(lockstep, robot_at, tmp_path):
+    robot = robot_at(linear__x__max_acceleration=0.4, command_delay=0.13)
+
+    def change(**values):
+        names = ((name.replace('__', '.'), value) for name, value in values.items())
+        robot.set_parameters([Parameter(name, value=value) for name, value in names])
+
+    with recorded(lockstep, tmp_path / 'run') as made:
+        made.look()
+        for v, changes in (
+            (0.3, {'wheel_lag': 0.1}),
+            (-0.2, {'linear__x__max_acceleration': 0.9, 'linear__x__max_deceleration': -0.3}),
+            (0.5, {'command_delay': 0.31, 'cmd_vel_timeout': 0.2}),
+            (0.4, {'command_delay': 0.0, 'wheel_lag': 0.0}),
+            (-0.3, {'linear__x__max_acceleration': math.nan}),
+            (0.3, {'max_wheel_acceleration': 9.0, 'wheel_radius': 0.04}),
+        ):
+            lockstep.publish('cmd_vel', twist(v, 0.7))
+            lockstep.run_for(0.07)
+            change(**changes)
+            lockstep.run_for(0.0313)
+            # At the time of a command.
+            lockstep.publish('cmd_vel', twist(-v, 0.5))
+            change(angular__z__max_acceleration=2.0 + v)
+            lockstep.publish('cmd_vel', twist(v, -0.5))
+            lockstep.run_for(0.4)
+    run = made.run
+    assert len(run.parameter_stamps) == len(run.parameter_events) >= 12
+    held(run, 1e-12)
+    assert verify(replace(run, parameter_events=(), parameter_stamps=())).distances.max() > 0.01
+
+
+@pytest.mark.parametrize('limits', [{}, {'linear__x__max_acceleration': 0.5, 'wheel_lag': 0.05}])
+def test_faults_of_the_motors_are_driven_again(lockstep, robot_at, tmp_path, limits):
+    robot_at(**limits)
+    lockstep.inject(
+        ActuatorLag(0.2, start=0.3, duration=0.9),
+        DeadWheel('left', start=0.5, duration=1.0),
+        SaturatedWheel('right', 3.5, start=0.2, duration=1.5),
+        ActuatorLag(0.1, start=1.0),
+    )
+    with recorded(lockstep, tmp_path / 'run') as made:
+        for number in range(9):
+            lockstep.publish('cmd_vel', twist(0.3, (-1) ** number))
+            lockstep.run_for(0.25)
+    run = made.run
+    held(run, 1e-12)
+    of_another = tuple((at, f"{fault[:-1]}, robot='/b')", what) for at, fault, what in run.fault_events)
+    assert verify(replace(run, fault_events=of_another)).distances.max() > 0.01
+    without = verify(replace(run, fault_events=()))
+    assert without.distances.max() > 0.01
+    assert 'record /fault_events' in without.notes[-1]
 
 
 def test_time_that_goes_back_is_followed(lockstep, robot_at, tmp_path):

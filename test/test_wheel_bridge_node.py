@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from geometry_msgs.msg import TwistStamped
 from lockstep_nodes import SECOND, change, comes_after
@@ -11,8 +13,11 @@ from ros_messages import WHEELS, instants, twist, twist_stamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
+from diffdrive_jacobian.faults import TimeJump
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.simulation import Robot
+from diffdrive_jacobian.simulation.actuators import Actuators
 
 R, L = 0.033, 0.16
 TWISTS = [(0.5, 3.0 * math.pi / 4.0), (0.2, 0.0), (0.0, -2.0), (-0.3, 1.0), (1000.0, -1000.0)]
@@ -89,8 +94,9 @@ def test_every_parameter_counts_from_the_next_command_on(lockstep, add, out):
     assert speeds(wheel_separation_multiplier=2.0) == pytest.approx([0.0, 20.0], abs=1e-14)
     assert speeds(right_wheel_radius_multiplier=4.0) == pytest.approx([0.0, 5.0], abs=1e-14)
     assert speeds(wheel_separation_multiplier=1.0, left_wheel_radius_multiplier=0.5) == [10.0, 3.75]
-    assert speeds(max_wheel_velocity=4.0) == [4.0, 1.5]
-    assert speeds(left_wheel_name='l', right_wheel_name='r') == [4.0, 1.5]
+    slowed = pytest.approx([4.0, 1.5], rel=1e-15)
+    assert speeds(max_wheel_velocity=4.0) == slowed
+    assert speeds(left_wheel_name='l', right_wheel_name='r') == slowed
     assert out[-1].name == ['l', 'r']
     assert len(out) == 8
 
@@ -115,6 +121,57 @@ def test_silence_stops_the_wheels_once_exactly_then(lockstep, add, out, capfd, t
     assert f'no command on /cmd_vel for {timeout:g} s' in capfd.readouterr().err
     lockstep.publish('cmd_vel', twist(0.3, 0.0))
     assert list(out[-1].velocity) == [0.3 / R] * 2
+
+
+LIMITS = {
+    'linear__x__max_acceleration': 0.5,
+    'linear__x__max_deceleration': -1.0,
+    'angular__z__max_acceleration': 1.5,
+    'max_wheel_acceleration': 40.0,
+}
+
+
+def test_wheels_accelerate_as_those_of_the_robot_and_stop_by_deceleration(lockstep, add, out, capfd):
+    bridge = add(WheelBridge, **LIMITS, cmd_vel_timeout=0.7, publish_rate=40.0)
+    model = bridge.parameters.model()
+    actuators = Actuators(acceleration=bridge.parameters.acceleration_limits())
+    robot = Robot(model=replace(model, actuators=actuators), stamp=lockstep.now, pose=(0.0, 0.0, 0.0))
+    robots = [robot]
+    for v, omega, seconds in ((0.4, 1.0, 0.33), (0.4, -0.5, 0.4), (-0.2, 0.0, 0.111), (0.3, 0.0, 3.0)):
+        robots.append(robots[-1].commanded((v, omega), lockstep.now))
+        lockstep.publish('cmd_vel', twist(v, omega))
+        lockstep.run_for(seconds)
+    silent = robots[-1].stamp + 7 * SECOND // 10
+    robots.append(robots[-1].commanded((0.0, 0.0), silent))
+    stamps = instants(out)
+    for stamp, message in zip(stamps, out, strict=True):
+        latest = [one for one in robots if one.stamp <= stamp][-1].at(stamp)
+        right, left = latest.wheel_speeds
+        assert list(message.velocity) == pytest.approx([left, right], abs=1e-12)
+    assert max(map(abs, np.diff([one.velocity[0] for one in out]))) > 0.3
+    # From 0.3 m/s at 1 m/s^2.
+    assert stamps[-1] - silent == pytest.approx(0.3 * SECOND, abs=SECOND // 40 + 1)
+    assert list(out[-1].velocity) == [0.0, 0.0]
+    assert next(one for one in stamps if one > silent) == silent + SECOND // 40
+    assert 'for 0.7 s: the wheels are stopped' in capfd.readouterr().err
+
+
+def test_wheels_go_on_to_accelerate_where_time_goes_back_and_stop_at_the_end(lockstep, add, out):
+    bridge = add(WheelBridge, **LIMITS, cmd_vel_timeout=0.0)
+    lockstep.inject(TimeJump(-5.0, start=0.1))
+    lockstep.publish('cmd_vel', twist(0.4, 0.0))
+    lockstep.run_for(2.0)
+    v = [one.velocity[0] * R for one in out]
+    assert v == sorted(v)
+    assert max(np.diff(v)) == pytest.approx(0.5 * 0.02)
+    assert v[-1] == pytest.approx(0.4)
+    count = len(out)
+    lockstep.run_for(1.0)
+    assert len(out) == count
+    bridge.stop('test')
+    lockstep.settle()
+    assert list(out[-1].velocity) == [0.0, 0.0]
+    assert len(out) == count + 1
 
 
 def test_standing_wheels_are_not_stopped(lockstep, add, out):

@@ -190,7 +190,10 @@ def recover(
             complete = f'{what} is complete: nothing to recover'
             raise NothingToSaveError('; '.join([complete, *undecodable]))
         if not count:
-            raise NothingToSaveError(f'{what} holds no message that can be saved', *lost)
+            nothing = f'{what} holds no message that can be saved'
+            if is_journal(what) and not lost:
+                nothing += ': the recording ended before one was received, so it can be deleted'
+            raise NothingToSaveError(nothing, *lost)
         # The file may still grow: the same records as in the survey are written.
         surveyed = survey.kinds.total()
         summary = build_bag(

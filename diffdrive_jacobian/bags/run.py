@@ -89,6 +89,8 @@ class Run:
     """By the full name of the node, as of the beginning of the run."""
     parameter_events: tuple[tuple[int, str, dict[str, Any]], ...] = ()
     """Later changes: when each was recorded (ns), the node, the new values."""
+    parameter_stamps: tuple[int, ...] = ()
+    """The stamps of these changes (ns)."""
     fault_events: tuple[tuple[int, str, str], ...] = ()
     """What the faults of a lockstep world did: when it was recorded (ns), the fault, what it did."""
     skipped: dict[str, int] = field(default_factory=dict)

@@ -77,6 +77,7 @@ def read_run(
     path = Path(path)
     rows: dict[str, list[tuple[int, int, tuple[float, ...]]]] = defaultdict(list)
     events: list[tuple[int, str, dict[str, Any]]] = []
+    event_stamps: list[int] = []
     fault_events: list[tuple[int, str, str]] = []
     with open_bag(path) as reader:
         parameters = {
@@ -111,6 +112,7 @@ def read_run(
                 if isinstance(value, Changes):
                     if namespace in (None, namespace_of(value.node)):
                         events.append((received, value.node, value.values))
+                        event_stamps.append(value.stamp)
                 elif isinstance(value, FaultEvent):
                     fault_events.append((received, value.fault, value.what))
                 else:
@@ -140,6 +142,7 @@ def read_run(
         start_covariances=covariances['start_pose'],
         parameters=parameters,
         parameter_events=tuple(events),
+        parameter_stamps=tuple(event_stamps),
         fault_events=tuple(fault_events),
         skipped=dict(tally.skipped),
         notes=notes,

@@ -76,7 +76,7 @@ def timeline(run: Run) -> Timeline:
     targets[goal >= 0] = run.goals.values[goal[goal >= 0]]
     dx, dy = targets[:, 0] - x, targets[:, 1] - y
     to_goal = targets[:, :2] - _driven_points(run)
-    last = [route[-1] for route, _ in _routes(run)]
+    last = [route[-1] for _, route, _ in _routes(run) if route]
     counts = _over_time(run, lambda now: heading_counts(now.of_node('go_to_goal')))
     return Timeline(
         run=run,
@@ -160,8 +160,10 @@ def _progress(run: Run, breaks: Indices) -> tuple[Indices, NDArray[np.bool_]]:
     goal, reached = np.full(len(seen), -1), np.zeros(len(seen), dtype=bool)
     known = len(run.goal_status) > 0 or bool(run.of_node('go_to_goal'))
     routes = _routes(run)
-    begins = [run.goals.received[route.start] for route, _ in routes]
-    for (route, followed), begun, until in zip(routes, begins, [*begins, _NEVER][1:], strict=True):
+    begins = [begun for begun, *_ in routes]
+    for (begun, route, followed), until in zip(routes, [*begins, _NEVER][1:], strict=True):
+        if not route:
+            continue
         state = followed.state
         here, end = np.searchsorted(seen, [begun, until]).tolist()
         stop = end
@@ -233,8 +235,13 @@ def _arrival(within: Mask, success: int) -> int:
     return min(int(outside[-1]) + 1 if len(outside) else 0, success)
 
 
-def _routes(run: Run) -> list[tuple[range, FollowedGoal[range]]]:
-    """Find which goals came in one message, and follow them; those that were refused are left out."""
+def _routes(run: Run) -> list[tuple[int, range, FollowedGoal[range]]]:
+    """Find which goals came in one message, and follow them; those that were refused are left out.
+
+    Returns:
+        When each message was recorded (ns), the indices of its goals, and what became of them. Of a
+        message that was not recorded: when its goal was accepted, and no indices.
+    """
     goals, statuses = run.goals, run.goal_status
     together = (np.diff(goals.received) == 0) & (np.diff(goals.stamps) == 0)
     edges = [0, *(np.flatnonzero(~together) + 1).tolist(), len(goals)]
@@ -254,12 +261,16 @@ def _routes(run: Run) -> list[tuple[range, FollowedGoal[range]]]:
     answered.append(len(reports))
     for report in reports[: answered[0]]:
         follower.reported(*report)
-    stamps, followed = _stamps(run, goals), []
-    for route, (begin, end) in zip(routes, pairwise(answered), strict=True):
-        followed.append((route, follower.sent(route, stamps[route.start])))
+    stamps, found = _stamps(run, goals), []
+    for route, begun, (begin, end) in zip(routes, received.tolist(), pairwise(answered), strict=True):
+        found.append((begun, route, follower.sent(route, stamps[route.start])))
         for report in reports[begin:end]:
+            before = follower.driving
             follower.reported(*report)
-    return [pair for pair in followed if pair[1].fate is not Fate.REFUSED]
+            driving = follower.driving
+            if driving is not None and driving is not before and driving.goal is None:
+                found.append((report[2], range(0), driving))
+    return [one for one in found if one[2].fate is not Fate.REFUSED]
 
 
 def _stamps(run: Run, series: Series) -> list[Stamp]:

@@ -2,16 +2,21 @@
 
 The commands are applied to `simulation.Robot`, as in the node `virtual_robot`, and each odometry message
 is compared with the pose of that robot at the message's stamp. `cmd_vel_out` has each command as it was
-applied, after limits and timeout, with the time it took effect, so that no parameter is needed. Without
-it the commands take effect when they were recorded, with the limits and the timeout of the parameters.
+applied, after limits and timeout, with the time it took effect. So no parameter is needed, but for
+robots with limits of the acceleration, a lag or a delay. Those are taken from the parameters, their
+changes, and the faults of the motors in a lockstep world. Such a robot publishes its command again when
+they change, so `cmd_vel_out` also has the times of the changes. Without `cmd_vel_out` the commands take
+effect when they were recorded, with the limits and the timeout of the parameters.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from bisect import bisect_left, bisect_right
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,10 +24,12 @@ from numpy.typing import NDArray
 
 from diffdrive_jacobian.bags.run import Run, Series
 from diffdrive_jacobian.bags.run_reader import BagError, ReadingInterruptedError
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MessageError, plausible_twist
 from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros
 from diffdrive_jacobian.parameters.virtual_robot import MULTIPLIERS, VirtualRobotParameters
+from diffdrive_jacobian.simulation.actuators import Actuators
 from diffdrive_jacobian.simulation.odometry_noise import covariance_of_pose
 from diffdrive_jacobian.simulation.robot import Robot, RobotModel
 from diffdrive_jacobian.simulation.slip import Drift
@@ -100,6 +107,23 @@ _MAX_CANDIDATES = 32
 _MAX_DELAY = 1.0
 """Beyond this delay of the odometry (median) its stamps and the recorder are of different clocks (s)."""
 _NOISE_PARAMETERS = ('wheel_separation', 'wheel_travel_variance')
+_NUMBER = r'(\d+(?:\.\d+)?(?:e[+-]?\d+)?)'
+_MOTOR_FAULTS: tuple[tuple[re.Pattern[str], Callable[..., Actuators]], ...] = (
+    (
+        re.compile(rf'ActuatorLag\({_NUMBER}'),
+        lambda actuators, seconds: actuators.lagging(float(seconds)),
+    ),
+    (
+        re.compile(r"DeadWheel\('(left|right)'"),
+        lambda actuators, wheel: actuators.weakened(wheel, 0.0),
+    ),
+    (
+        re.compile(rf"SaturatedWheel\('(left|right)', {_NUMBER}"),
+        lambda actuators, wheel, speed: actuators.weakened(wheel, float(speed)),
+    ),
+)
+"""Faults that change how a robot follows commands, and how its actuators change."""
+_FAULTY_ROBOT = re.compile(r"robot='([^']*)'")
 _NEVER = int(np.iinfo(np.int64).max)
 
 
@@ -219,7 +243,7 @@ def verify(
             f'{run.path} has no odometry after the first command on {source}, so that no motion can be '
             'verified (are their stamps of different clocks?)'
         )
-    notes = run.notes
+    notes = run.notes + (_missing(run, start) if source == 'cmd_vel_out' else ())
     if len(poses) < len(stamps):
         omitted = len(stamps) - len(poses)
         notes += (
@@ -240,16 +264,37 @@ def verify(
             'the first start_pose',
         )
     difference: NDArray[np.float64] = np.array(measured) - np.array(poses)
+    distances = np.hypot(difference[:, 0], difference[:, 1])
+    if source == 'cmd_vel_out' and not run.of_node(ROBOT) and np.any(distances > EXACT):
+        notes += (
+            'the parameters of virtual_robot were not recorded: the motion of a robot with limits of '
+            'the acceleration, a lag or a delay cannot be reproduced without them',
+        )
+    elif source == 'cmd_vel_out' and not run.fault_events and np.any(distances > EXACT):
+        notes += (
+            'no faults are recorded: if this was a lockstep world with a fault of the motors, record '
+            '/fault_events',
+        )
     return Verification(
         source=source,
         start=start,
         seconds=np.array(seconds),
-        distances=np.hypot(difference[:, 0], difference[:, 1]),
+        distances=distances,
         headings=np.abs(wrap(difference[:, 2])),
         notes=notes,
         covariance_difference=covariance_difference,
         truth=truth,
     )
+
+
+def _missing(run: Run, start: str) -> tuple[str, ...]:
+    """Return what is missing to reproduce the motion of a robot that follows commands with a delay."""
+    if start == 'odometry' and recorded_dynamics(run):
+        return (
+            'the robot follows commands with acceleration limits, a lag or a delay, and its start is '
+            'not recorded: what it was commanded before is missing',
+        )
+    return ()
 
 
 def _epochs(series: Series) -> list[int]:
@@ -294,14 +339,19 @@ def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
     if skipped and _stood_since(run, skipped - 1):
         whole, skipped = True, skipped - 1
     placed = start_covariances(run)
-    events: list[tuple[int, int, bool, NDArray[np.float64]]] = []
-    for is_start, series, begin in ((True, starts, skipped), (False, run.cmd_vel_out, 0)):
+    model = recorded_model(run) or RobotModel()
+    first_model, *models = recorded_dynamics(run) or [model] * (len(run.cmd_vel_out) + 1)
+    # With the model from a command on; None: a start.
+    events: list[tuple[int, int, RobotModel | None, NDArray[np.float64]]] = []
+    for series, begin in ((starts, skipped), (run.cmd_vel_out, 0)):
+        is_start = series is starts
         values = np.hstack([series.values, placed]) if is_start else series.values
-        rows = zip(series.received.tolist(), series.stamps.tolist(), values, strict=True)
-        events += [(received, stamp, is_start, row) for received, stamp, row in list(rows)[begin:]]
+        changed = [None] * len(series) if is_start else models
+        rows = zip(series.received.tolist(), series.stamps.tolist(), changed, values, strict=True)
+        events += list(rows)[begin:]
     events.sort(key=lambda event: event[0])
     begun = int(run.odometry.received[0])
-    model = recorded_model(run) or RobotModel()
+    model = first_model
     # The command that was recorded before the odometry is in effect in its first message.
     driven = (run.cmd_vel_out.stamps <= first.stamp) & (
         run.cmd_vel_out.received <= begun + _MAX_DELAY * NANOSECONDS
@@ -309,8 +359,9 @@ def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
     epochs: list[list[_Anchor]] = [
         [] if whole else [_Anchor(first, begun, is_command=bool(driven.any()))]
     ]
-    for received, stamp, is_start, row in events:
+    for received, stamp, changed_model, row in events:
         latest = epochs[-1][-1].robot if epochs[-1] else None
+        is_start, model = changed_model is None, changed_model or model
         if is_start and (latest is None or stamp < latest.stamp):
             if latest is not None:
                 epochs.append([])
@@ -324,6 +375,8 @@ def _applied(run: Run) -> tuple[str, list[list[_Anchor]]]:
             reset = latest.placed(pose, covariance, stamp, odometry_only=True)
             robot = placed_as_recorded(run, (moved, reset))
         else:
+            if model != latest.model:
+                latest = latest.remodelled(model, stamp)
             robot = latest.commanded((float(row[0]), float(row[1])), stamp)
         epochs[-1].append(_Anchor(robot, received, is_command=not is_start))
     return ('start_pose' if whole else 'odometry'), epochs
@@ -453,6 +506,59 @@ def recorded_model(run: Run) -> RobotModel | None:
         return None
     drift = recorded_drift(run)
     return RobotModel(wheel_separation=separation, wheel_travel_variance=variance, drift=drift)
+
+
+def recorded_dynamics(run: Run) -> list[RobotModel]:
+    """Return models that follow commands as the recorded robot did, without limits of the velocity.
+
+    Returns:
+        The model at the start, and that from each message of `cmd_vel_out` on. []: the robot follows
+        commands at once, or its parameters were not recorded.
+    """
+    received, stamps = run.cmd_vel_out.received.tolist(), run.cmd_vel_out.stamps.tolist()
+    changes: dict[int, list[tuple[Any, ...]]] = defaultdict(list)
+    times = run.parameter_stamps
+    if len(times) != len(run.parameter_events):
+        times = tuple(recorded for recorded, *_ in run.parameter_events)
+    for (recorded, node, values), stamp in zip(run.parameter_events, times, strict=True):
+        if node.split('/')[-1] == ROBOT:
+            # The command is published again just before the event.
+            last = bisect_right(received, recorded + int(_MAX_DELAY * NANOSECONDS)) - 1
+            while last >= 0 and stamps[last] > stamp:
+                last -= 1
+            changes[last].append((values,))
+    for recorded, fault, what in run.fault_events:
+        robot = _FAULTY_ROBOT.search(fault)
+        if robot is None or robot[1].split('/')[-1] == ROBOT:
+            changes[bisect_right(received, recorded) - 1].append((fault, what))
+    values, faults = dict(run.of_node(ROBOT)), []
+    model, found = RobotModel(), []
+    for number in range(-1, len(received)):
+        for change in changes.get(number, ()):
+            if isinstance(change[0], dict):
+                values.update(change[0])
+            elif change[1] == 'begins':
+                faults.append(change[0])
+            elif change[1].startswith('ends') and change[0] in faults:
+                faults.remove(change[0])
+        if number == -1 or number in changes:
+            model = _dynamics(values, faults)
+        found.append(model)
+    return found if any(model.takes_time for model in found) else []
+
+
+def _dynamics(values: Mapping[str, Any], faults: Iterable[str]) -> RobotModel:
+    """Return a model from the parameters of a robot and the faults of its motors."""
+    try:
+        model = from_ros(VirtualRobotParameters, values).model()
+        actuators = model.actuators or Actuators()
+        for fault in faults:
+            for pattern, change in _MOTOR_FAULTS:
+                if (match := pattern.match(fault)) is not None:
+                    actuators = change(actuators, *match.groups())
+    except (ParameterError, ValueError):
+        return RobotModel()
+    return replace(model, limits=VelocityLimits(), command_timeout=0, actuators=actuators)
 
 
 def start_covariances(run: Run) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ document B's law the distance is measured from the offset point (doc/mathematics
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
@@ -13,6 +14,7 @@ from typing import Annotated, Any
 from diffdrive_jacobian.kinematics.diff_drive import offset_point
 from diffdrive_jacobian.numerics.checks import (
     NotNegative,
+    NotNegativeOrInfinite,
     boolean,
     constant,
     equal,
@@ -44,8 +46,8 @@ class Arrival(Checked):
     """Arrival criterion. Immutable, comparable and hashable.
 
     Raises:
-        ValueError: A tolerance is negative or not finite, the offset is not finite, or `use_heading` is
-            not a Boolean.
+        ValueError: A tolerance is negative or not finite, a velocity is negative or NaN, the offset is
+            not finite, or `use_heading` is not a Boolean.
     """
 
     xy_tolerance: NotNegative = 0.02
@@ -56,6 +58,10 @@ class Arrival(Checked):
     """Whether the heading of the last goal counts."""
     offset: Annotated[Any, partial(constant, check=finite)] = 0.0
     """X coordinate in the body frame of the point that is to arrive (m), a number or an array."""
+    trans_stopped_velocity: NotNegativeOrInfinite = math.inf
+    """Largest speed with which the last goal counts as reached, as in Nav2's goal checker (m/s)."""
+    rot_stopped_velocity: NotNegativeOrInfinite = math.inf
+    """Largest yaw rate with which it does (rad/s)."""
 
     def __eq__(self, other: object) -> bool:
         """Compare every field, arrays by shape and entries."""
@@ -67,8 +73,9 @@ class Arrival(Checked):
         """Return a hash that equal values share."""
         return hash((*self._scalars(), hashable(self.offset)))
 
-    def _scalars(self) -> tuple[float, float, bool]:
-        return self.xy_tolerance, self.yaw_tolerance, self.use_heading
+    def _scalars(self) -> tuple[float, ...]:
+        stopped = self.trans_stopped_velocity, self.rot_stopped_velocity
+        return self.xy_tolerance, self.yaw_tolerance, self.use_heading, *stopped
 
     def distance(self, x: Any, y: Any, theta: Any, x_goal: Any, y_goal: Any) -> Any:
         """Compute the distance of the driven point from a goal.
@@ -107,3 +114,12 @@ class Arrival(Checked):
             ValueError: An argument is not finite, shapes do not broadcast, or the difference overflows.
         """
         return abs(heading_error(theta, heading)) <= self.yaw_tolerance
+
+    @property
+    def must_stop(self) -> bool:
+        """Whether a robot must be slow enough to count as arrived."""
+        return min(self.trans_stopped_velocity, self.rot_stopped_velocity) < math.inf
+
+    def stopped(self, v: Any, omega: Any) -> Any:
+        """Return whether a robot with a twist is slow enough, numbers or arrays; NaN is not."""
+        return (abs(v) <= self.trans_stopped_velocity) & (abs(omega) <= self.rot_stopped_velocity)

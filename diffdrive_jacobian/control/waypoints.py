@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
@@ -9,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from diffdrive_jacobian.control.arrival import Arrival
+from diffdrive_jacobian.control.arrival import Arrival, distance_to_goal, heading_error
 from diffdrive_jacobian.control.go_to_goal import turn_in_place
 from diffdrive_jacobian.numerics.checks import (
     array,
@@ -23,6 +24,7 @@ from diffdrive_jacobian.numerics.checks import (
 from diffdrive_jacobian.numerics.fields import instance, integer
 
 Pose: TypeAlias = NDArray[np.float64] | tuple[float, float, float]
+STANDSTILL = (0.0, 0.0)
 Law: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
 """A control law with its gains: pose as given to `follow`, and goal, an array of shape (3,), to
 `(v, omega)`."""
@@ -58,7 +60,12 @@ class Waypoints:
         object.__setattr__(self, 'turning', boolean('turning', self.turning))
 
     def follow(
-        self, pose: Pose, law: Law, arrival: Arrival, turning_gain: float
+        self,
+        pose: Pose,
+        law: Law,
+        arrival: Arrival,
+        turning_gain: float,
+        twist: tuple[float, float] = STANDSTILL,
     ) -> tuple[Waypoints, tuple[Any, Any] | None]:
         """Compute the next command.
 
@@ -67,10 +74,12 @@ class Waypoints:
             law: The control law that drives to a waypoint.
             arrival: Arrival criterion.
             turning_gain: Gain of the turn in place (1/s).
+            twist: Twist of the robot, which must be slow enough if the criterion says so.
 
         Returns:
             The waypoints with their new progress, and the command `(v, omega)` (m/s, rad/s). The
-            command is None when all waypoints are reached.
+            command is None when all waypoints are reached. It is zero where the robot is at the last
+            one and has yet to stop.
 
         Raises:
             ValueError: An argument is of another class or shape, or not finite.
@@ -89,14 +98,34 @@ class Waypoints:
                 return here, law(pose, here.poses[here.index])
             if here.index + 1 < len(here.poses):
                 here = here._progressed(here.index + 1, turning=False)
+            elif not arrival.stopped(*twist):
+                return here, STANDSTILL
             elif arrival.use_heading:
                 here = here._progressed(here.index, turning=True)
             else:
                 return here, None
         heading = here._goal[2]
         if arrival.faces(theta, heading):
-            return here, None
+            return here, None if arrival.stopped(*twist) else STANDSTILL
         return here, turn_in_place(theta, heading, turning_gain)
+
+    def remaining(self, pose: Pose, arrival: Arrival) -> tuple[float, float]:
+        """Return the distance and the turn that are left.
+
+        Args:
+            pose: Pose of the robot, shape (3,).
+            arrival: Arrival criterion.
+
+        Returns:
+            The distance to the last position by way of the waypoints (m), infinite while the robot turns
+            in place; and what is left of that turn (rad), infinite before it.
+        """
+        x, y, theta = pose
+        if self.turning:
+            return math.inf, abs(heading_error.formula(theta, self._goal[2]))
+        legs = np.hypot(*np.diff(self.poses[self.index :, :2], axis=0).T)
+        first = distance_to_goal.formula(x, y, theta, *self._goal[:2], arrival.offset)
+        return float(first + legs.sum()), math.inf
 
     def resumed(self) -> Waypoints:
         """Return the waypoints with the last position to be checked again.

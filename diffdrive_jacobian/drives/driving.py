@@ -30,6 +30,7 @@ from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.goal_client import GoalClient
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.numerics.checks import number, positive_or_infinite
 from diffdrive_jacobian.recording.recorder import Recorder
 from diffdrive_jacobian.recording.recording import Recording
 from diffdrive_jacobian.recording.selection import Selection
@@ -186,6 +187,7 @@ def drive(
     isolated: bool = True,
     timeout: float = TIMEOUT,
     parameters: Mapping[str, Any] | None = None,
+    robot_parameters: Mapping[str, Any] | None = None,
     recording: Recording | None = None,
     ros_arguments: Sequence[str] = (),
     signals: Signals | None = None,
@@ -196,13 +198,15 @@ def drive(
     Args:
         goals: `[x, y]` of each goal, shape (n, 2), or `[x, y, theta]`, shape (n, 3) (m, m, rad). theta
             matters for controllers that use the heading, and with the parameter `use_goal_heading`.
-        runner: Runs the nodes, and may run others: `in_real_time` or `in_lockstep`. None: one is created
-            as `lockstep`, `isolated` and `ros_arguments` say, and closed at the end.
+        runner: Runs the nodes, and may run others: `in_real_time` or `in_lockstep`. The nodes stay in
+            it. None: one is created as `lockstep`, `isolated` and `ros_arguments` say, and closed at
+            the end.
         lockstep: Whether to drive in simulated time, as fast as possible and with the same result each
             time. rclpy must not be initialised then.
         isolated: Whether no other process can communicate with the nodes. Always so in lockstep.
         timeout: Longest duration, of all goals together (s).
         parameters: Parameters of go_to_goal, by name. They take precedence over `ros_arguments`.
+        robot_parameters: Likewise of virtual_robot.
         recording: Recording of what the nodes publish. The caller must finish it. None: none.
         ros_arguments: ROS arguments of all nodes, such as `['--ros-args', '-p', 'kp:=4.0']`.
         signals: Counter of the signals that end the drive. None: no signal does.
@@ -211,9 +215,10 @@ def drive(
     Raises:
         UserError: A node cannot run with the parameters or ROS arguments given.
         DriveError: In lockstep, a callback blocks, or simulated time cannot advance.
-        ValueError: `goals` has another shape, `lockstep` is not isolated, or one of the arguments for a
-            new runner is given together with `runner`.
+        ValueError: `goals` has another shape, `timeout` is not positive, `lockstep` is not isolated, or
+            one of the arguments for a new runner is given together with `runner`.
     """
+    number('timeout', timeout, positive_or_infinite)
     goals = np.asarray(goals, dtype=np.float64)
     if goals.ndim != 2 or goals.shape[1] != 3:
         goals = waypoints_through(goals)
@@ -227,6 +232,7 @@ def drive(
                 runner=created,
                 timeout=timeout,
                 parameters=parameters,
+                robot_parameters=robot_parameters,
                 recording=recording,
                 signals=signals,
                 progress=progress,
@@ -236,11 +242,11 @@ def drive(
     signals = signals or Signals()
     progress = progress or _Silent()
     context = runner.context
-    wheels_drive = Parameter('command_interface', value='wheels')
-    robot = runner.add(lambda: VirtualRobot(context=context, parameter_overrides=[wheels_drive]))
+    of_robot = overrides({**(robot_parameters or {}), 'command_interface': 'wheels'})
+    robot = runner.add(lambda: VirtualRobot(context=context, parameter_overrides=of_robot))
     bridge = runner.add(lambda: WheelBridge(context=context))
-    overrides = [Parameter(name, value=value) for name, value in (parameters or {}).items()]
-    controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=overrides))
+    of_controller = overrides(parameters or {})
+    controller = runner.add(lambda: GoToGoal(context=context, parameter_overrides=of_controller))
     client = runner.add(lambda: GoalClient(NAME, goals, context))
     client.arrival = controller.arrival
     wheels = WheelSpeeds(client, robot.parameters.wheel_names)
@@ -294,6 +300,11 @@ def drive(
         offset=controller.arrival.offset,
         seconds=seconds,
     )
+
+
+def overrides(parameters: Mapping[str, Any]) -> list[Parameter]:
+    """Return parameters, by name, as a node takes them."""
+    return [Parameter(name, value=value) for name, value in parameters.items()]
 
 
 class WheelSpeeds:

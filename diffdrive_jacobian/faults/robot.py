@@ -128,9 +128,9 @@ class ActuatorLag(RobotFault):
     """The motors lag: the wheel speeds approach the commanded ones with first order.
 
     Of a step of the command `1 - exp(-t / seconds)` is reached after the time t. The robot stops as
-    slowly after its timeout. The motion consists of arcs of 20 ms with the mean wheel speeds in them,
-    at whose ends the wheel angles are exact. Each is one message on `cmd_vel_out`. The encoders see the
-    lag, so `odom` and `joint_states` show the true motion. Of several lags the longest one counts.
+    slowly after its timeout. The motion is exact. `cmd_vel_out` has the commands, and `/fault_events`
+    the lag: `verify_run` needs both. The encoders see the lag, so `odom` and `joint_states` show the
+    true motion. Of several lags, and the parameter `wheel_lag`, the longest one counts.
 
     Attributes:
         seconds: Time constant (s).
@@ -140,12 +140,9 @@ class ActuatorLag(RobotFault):
 
     def apply(self, robot: VirtualRobot, injection: Injection) -> Undo:
         """Set the lag of the motors."""
-
-        def lag(model: RobotModel) -> RobotModel:
-            actuators = model.actuators or Actuators()
-            return replace(model, actuators=replace(actuators, lag=max(actuators.lag, self.seconds)))
-
-        return robot.defects.change(lag)
+        return robot.defects.change(
+            lambda model: replace(model, actuators=_actuators(model).lagging(self.seconds))
+        )
 
     def reaction_delay(self, node: Node, since: float, now: float) -> float:
         """Return the time after which the wheels have followed a command (s)."""
@@ -258,13 +255,10 @@ def _drift(model: RobotModel) -> Drift:
     return model.drift or Drift()
 
 
+def _actuators(model: RobotModel) -> Actuators:
+    return model.actuators or Actuators()
+
+
 def _saturating(wheel: str, speed: float) -> Callable[[RobotModel], RobotModel]:
     """Return a change of the model that limits the speed of a wheel (rad/s)."""
-    name = f'max_{wheel}_speed'
-
-    def saturate(model: RobotModel) -> RobotModel:
-        actuators = model.actuators or Actuators()
-        limits = {name: min(speed, getattr(actuators, name))}
-        return replace(model, actuators=replace(actuators, **limits))
-
-    return saturate
+    return lambda model: replace(model, actuators=_actuators(model).weakened(wheel, speed))

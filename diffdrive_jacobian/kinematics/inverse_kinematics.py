@@ -42,6 +42,7 @@ from diffdrive_jacobian.numerics.formula import Entries, Vector, formula
 __all__ = ['METHODS', 'IKResult', 'pose_difference', 'solve']
 
 METHODS = ('newton', 'transpose', 'levenberg_marquardt')
+"""Names of the methods that solve for a configuration."""
 
 
 class IKResult(NamedTuple):

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 
 from diffdrive_jacobian.drives import in_lockstep, in_real_time
-from diffdrive_jacobian.drives.driving import recorder_of
+from diffdrive_jacobian.drives.driving import overrides, recorder_of
 from diffdrive_jacobian.live.goal_progress import GoalEnd
 from diffdrive_jacobian.live.node import LivePage
 from diffdrive_jacobian.live.pacing import Pacing
@@ -59,6 +58,7 @@ def drive_live(
     lockstep: bool,
     isolated: bool,
     parameters: Mapping[str, Any],
+    robot_parameters: Mapping[str, Any],
     recording: Recording | None,
     ros_arguments: Sequence[str],
     port: int,
@@ -75,6 +75,7 @@ def drive_live(
         lockstep: Whether time is simulated. The page then has pause, step and speed.
         isolated: Whether no other process can communicate with the nodes.
         parameters: Parameters of go_to_goal.
+        robot_parameters: Parameters of virtual_robot.
         recording: Recording of what the nodes publish. The caller must finish it. None: none.
         ros_arguments: ROS arguments of all nodes.
         port: As for `serving`.
@@ -92,12 +93,12 @@ def drive_live(
     stage = in_lockstep(ros_arguments) if lockstep else in_real_time(ros_arguments, isolated=isolated)
     with serving(session, port, ready), stage as runner:
         context = runner.context
-        wheels = Parameter('command_interface', value='wheels')
-        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+        of_robot = overrides({**robot_parameters, 'command_interface': 'wheels'})
+        of_controller = overrides(parameters)
         nodes: list[Node] = [
-            runner.add(lambda: VirtualRobot(context=context, parameter_overrides=[wheels])),
+            runner.add(lambda: VirtualRobot(context=context, parameter_overrides=of_robot)),
             runner.add(lambda: WheelBridge(context=context)),
-            runner.add(lambda: GoToGoal(context=context, parameter_overrides=overrides)),
+            runner.add(lambda: GoToGoal(context=context, parameter_overrides=of_controller)),
         ]
         nodes_created([node.get_fully_qualified_name() for node in nodes])
         pacing = Pacing() if lockstep else None

@@ -11,6 +11,9 @@ from diffdrive_jacobian.lockstep.world import Lockstep
 from diffdrive_jacobian.ros.node_runner import NodeRunner
 from diffdrive_jacobian.time_units import NANOSECONDS
 
+LONGEST_STEP = 1.0
+"""Largest advance of the time in which nothing happens, as in a world without timers (s)."""
+
 
 @contextmanager
 def running_in_lockstep(args: Sequence[str]) -> Iterator[LockstepRunner]:
@@ -47,5 +50,8 @@ class LockstepRunner(NodeRunner):
         """
         self._world.add(node)
 
+    def _remove(self, node: Node) -> None:
+        self._world.remove(node)
+
     def _spin_once(self) -> None:
-        self._world.step()
+        self._world.step(at_most=LONGEST_STEP)

@@ -237,12 +237,15 @@ MOTION = Codec(
     ),
 )
 """Odometry without its covariances."""
-ODOMETRY_POSE = Codec(
+ODOMETRY_STATE = Codec(
     'nav_msgs/msg/Odometry',
-    (FRAME, *pose_fields('nav_msgs/msg/Odometry')),
-    lambda frame, *pose: (frame, from_pose(*pose)),
+    (
+        *(FRAME, 'twist.twist.linear.x', 'twist.twist.angular.z'),
+        *pose_fields('nav_msgs/msg/Odometry'),
+    ),
+    lambda frame, v, omega, *pose: (frame, (v, omega), from_pose(*pose)),
 )
-"""Frame and pose of an odometry, for the controller, which needs no more of each."""
+"""Frame, twist and pose of an odometry, for the controller. The twist is not checked."""
 POSE_WITH_COVARIANCE = Codec(
     'geometry_msgs/msg/PoseWithCovarianceStamped',
     (
@@ -414,6 +417,8 @@ class Changes(NamedTuple):
     """Full name of the node."""
     values: dict[str, Any]
     """New values by name; None: the parameter was not set."""
+    stamp: int
+    """When they changed (ns)."""
 
 
 class FaultEvent(NamedTuple):
@@ -445,12 +450,13 @@ def parameter_value(kind: int, *values: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def _changes(node: str, *columns: tuple[Any, ...]) -> Changes:
+def _changes(sec: int, nanosec: int, node: str, *columns: tuple[Any, ...]) -> Changes:
     count = len(_PARAMETER)
     parameters = (
         parameter for part in (columns[:count], columns[count:]) for parameter in zip(*part, strict=True)
     )
-    return Changes(node, {name: parameter_value(*value) for name, *value in parameters})
+    values = {name: parameter_value(*value) for name, *value in parameters}
+    return Changes(node, values, from_time(sec, nanosec))
 
 
 def _fault_event(text: str) -> FaultEvent:
@@ -467,7 +473,7 @@ def _fault_event(text: str) -> FaultEvent:
 PARAMETER_EVENT = Codec(
     'rcl_interfaces/msg/ParameterEvent',
     (
-        'node',
+        *('stamp.sec', 'stamp.nanosec', 'node'),
         *(f'new_parameters[].{field}' for field in _PARAMETER),
         *(f'changed_parameters[].{field}' for field in _PARAMETER),
     ),

@@ -235,7 +235,7 @@ TOPICS = {
         ),
         Topic(name=TRANSFORMS),
         Topic(name=PARAMETER_EVENTS, codecs=(codecs.PARAMETER_EVENT,), of_robot=False),
-        Topic(name=FAULT_EVENTS, codecs=(codecs.FAULT_EVENT,), recorded=False, of_robot=False),
+        Topic(name=FAULT_EVENTS, codecs=(codecs.FAULT_EVENT,), of_robot=False),
         Topic(name=CLOCK, codecs=(codecs.CLOCK,), recorded=False, of_robot=False),
         Topic(name=ROSOUT, recorded=False, of_robot=False),
     )

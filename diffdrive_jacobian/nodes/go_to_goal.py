@@ -17,13 +17,13 @@ from nav_msgs.msg import Goals, Odometry
 from std_srvs.srv import Trigger
 from unique_identifier_msgs.msg import UUID
 
-from diffdrive_jacobian.control import Arrival, Controller, Waypoints
+from diffdrive_jacobian.control import KP, KV, Arrival, Controller, Waypoints
 from diffdrive_jacobian.control.sampling import LARGEST_TURN, without_whole_turns
 from diffdrive_jacobian.kinematics.saturation import scaled_to_limits
 from diffdrive_jacobian.messages import conversion as messages
 from diffdrive_jacobian.messages.codecs import (
     GOALS,
-    ODOMETRY_POSE,
+    ODOMETRY_STATE,
     POSE,
     TWIST,
     TWIST_STAMPED,
@@ -32,6 +32,7 @@ from diffdrive_jacobian.messages.codecs import (
 from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
 from diffdrive_jacobian.messages.topic_faults import SEVERAL, UNREAD
 from diffdrive_jacobian.nodes.other_drivers import OtherDrivers
+from diffdrive_jacobian.nodes.stopping import overshoot_warnings, rolls_on
 from diffdrive_jacobian.parameters.go_to_goal import GoToGoalParameters
 from diffdrive_jacobian.ros import serialization
 from diffdrive_jacobian.ros.graph_faults import topic_check
@@ -100,6 +101,7 @@ def read_goal(
     return distinct.pop(), Waypoints(read)
 
 
+STANDSTILL = (0.0, 0.0)
 RATE_PERIODS = 10
 """Number of periods of the odometry from which its rate is measured."""
 _read_goals = serialization.reader(Goals, GOALS.fields)
@@ -136,6 +138,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._law = self._controller.bind(self.parameters)
         self._identifiers = GoalIdentifiers(self.get_fully_qualified_name())
         self._odom_frame = ''
+        # Twist by the odometry.
+        self._twist = STANDSTILL
         # Rate of the odometry (Hz), and the times of the messages from which it is measured (ns).
         self._rate = math.inf
         self._times: list[int] = []
@@ -144,7 +148,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         stamped = self.parameters.enable_stamped_cmd_vel
         self._cmd_vel = self.advertise(TwistStamped if stamped else Twist, 'cmd_vel')
         self._status = self.advertise(GoalStatus, 'goal_status', latched=True)
-        self.subscribe(Odometry, 'odom', self._on_odometry, codec=ODOMETRY_POSE)
+        self.subscribe(Odometry, 'odom', self._on_odometry, codec=ODOMETRY_STATE)
         self.subscribe(PoseStamped, 'goal_pose', self._on_goal_pose, codec=POSE)
         # As bytes, because reading a long message blocks the node for seconds.
         self.subscribe(Goals, 'goals', self._on_goals)
@@ -247,8 +251,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             response.message = 'no goal is active'
             return response
         self._publish_command(0.0, 0.0)
-        self._end(GoalStatus.STATUS_CANCELED, 'canceled')
-        response.success, response.message = True, 'goal canceled, zero sent'
+        self._end(GoalStatus.STATUS_CANCELED, f'canceled{self._rolls_on()}')
+        response.success, response.message = True, f'goal canceled, zero sent{self._rolls_on()}'
         return response
 
     def _end(self, status: int, what: str) -> None:
@@ -262,6 +266,10 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._others.stop()
             self.log_event_info(f'goal {what}', f'goal {what}')
 
+    def _rolls_on(self) -> str:
+        """Describe how far the robot rolls after zero was sent, as far as its limits are known."""
+        return rolls_on(self._actuators, self._twist)
+
     def _publish_status(self, info: GoalInfo, status: int) -> None:
         self._status.publish(GoalStatus(goal_info=info, status=status))
 
@@ -271,7 +279,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
 
     # --- Control
 
-    def _on_odometry(self, frame: str, *values: float) -> None:
+    def _on_odometry(self, frame: str, v: float, omega: float, *values: float) -> None:
         goal, now = self._goal, self.now()
         try:
             pose = messages.from_pose(*values)
@@ -285,7 +293,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         except MessageError as error:
             self.get_logger().warning(f'odometry dropped: {error}', throttle_duration_sec=THROTTLE)
             return
-        self._odom_frame = frame
+        self._odom_frame, self._twist = frame, (v, omega)
         if goal is None:
             return
         self._watchdog.feed(now)
@@ -300,10 +308,13 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._law.now = now
         try:
             goal.waypoints, command = goal.waypoints.follow(
-                pose, self._law, self._arrival, self.parameters.kp
+                pose, self._law, self._arrival, self.parameters.kp, self._twist
             )
             if command is not None:
                 command = self._limited(*command)
+                if self.parameters.stop_in_time:
+                    room = goal.waypoints.remaining(pose, self._arrival)
+                    command = self._actuators.stoppable(command, room, 1.0 / self._rate)
         except ValueError as error:
             self.log_event_warning('law', f'goal aborted: {error}')
             self._publish_command(0.0, 0.0)
@@ -365,7 +376,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
             self._publish_command(0.0, 0.0)
             self.log_event_warning(
                 'odometry is stale',
-                f'no valid odometry on {topic} for {timeout:g} s: robot stopped, waiting',
+                f'no valid odometry on {topic} for {timeout:g} s: robot stopped, waiting'
+                f'{self._rolls_on()}',
             )
         else:
             self.log_event_warning(
@@ -395,7 +407,7 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         """Stop the robot and cancel the goal, if there is one."""
         if self._goal is not None:
             self._publish_command(0.0, 0.0)
-            self._end(GoalStatus.STATUS_CANCELED, f'canceled: {why}')
+            self._end(GoalStatus.STATUS_CANCELED, f'canceled: {why}{self._rolls_on()}')
             self.flush(self._cmd_vel)
             self.flush(self._status)
 
@@ -423,13 +435,8 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
         self._law = law
         # Far from the goal a law may return more than what counts as a plausible command.
         self._limits = parameters.limits()
-        self._arrival = Arrival(
-            xy_tolerance=parameters.xy_goal_tolerance,
-            yaw_tolerance=parameters.yaw_goal_tolerance,
-            # A law that takes the heading must not stop before it has reached it.
-            use_heading=parameters.use_goal_heading or controller.takes_heading,
-            offset=controller.driven_offset(parameters),
-        )
+        self._arrival = parameters.arrival()
+        self._actuators = parameters.actuators()
         if self._limits.max_v == 0.0:
             self.log_event_warning(
                 'max_v',
@@ -448,7 +455,13 @@ class GoToGoal(ParameterizedNode[GoToGoalParameters]):
                 f'{SLOW_TURN:g} s',
             )
         self._warn_of_rate()
-        for number, warning in enumerate(controller.warnings(parameters, self._limits)):
+        warnings = controller.warnings(parameters, self._limits)
+        if not parameters.stop_in_time:
+            kv = parameters.kv if KV.name in controller.gain_names else None
+            turns = self._arrival.use_heading or KP.name in controller.gain_names
+            kp = parameters.kp if turns else None
+            warnings += overshoot_warnings(kv, kp, self._limits, self._actuators)
+        for number, warning in enumerate(warnings):
             self.log_event_warning(f'advice {number}', warning)
 
     def _warn_of_rate(self) -> None:

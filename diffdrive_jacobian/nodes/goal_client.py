@@ -144,6 +144,16 @@ class GoalClient(Node):  # type: ignore[misc]
         return float(self.arrival.distance(*self.robot.pose, *self.goals[self.index, :2]))
 
     @property
+    def sent(self) -> bool:
+        """Whether the goals were published."""
+        return self._follower.newest is not None
+
+    @property
+    def readers(self) -> int:
+        """Number of the discovered subscriptions that receive the goals."""
+        return int(self._publisher.get_subscription_count())
+
+    @property
     def status(self) -> GoalState:
         """Last status of the goals."""
         sent = self._follower.newest
@@ -227,7 +237,7 @@ class GoalClient(Node):  # type: ignore[misc]
             # A subscription with transient local durability is never matched with this publisher.
             if reader.qos_profile.durability != DurabilityPolicy.TRANSIENT_LOCAL
         ]
-        matched = self._publisher.get_subscription_count()
+        matched = self.readers
         if readers and matched < self._readers:
             return f'{topic} has {matched} of {self._readers} subscriptions'
         publishers = self.get_publishers_info_by_topic(status)

@@ -23,6 +23,7 @@ from diffdrive_jacobian.nodes.goal_client import (
     loss,
 )
 from diffdrive_jacobian.nodes.standstill import Standstill
+from diffdrive_jacobian.numerics.checks import number, positive_or_infinite
 from diffdrive_jacobian.ros.fastdds_profiles import fast_heartbeats
 from diffdrive_jacobian.ros.liveness import Liveness
 from diffdrive_jacobian.ros.node_runner import NodeRunner
@@ -157,7 +158,8 @@ def send_goal(
 
     Args:
         goal: `[x, y, theta]`, shape (3,) (m, m, rad).
-        runner: Runs the node, in real time or in lockstep, and may run others. None: a new one does.
+        runner: Runs the node until the goal has ended, in real time (`drives.in_real_time`) or in
+            lockstep (`drives.in_lockstep`), and may run others. None: a new one does.
         frame: Frame of the goal. Empty: the frame of the odometry.
         readers: Number of subscriptions that goal_pose must have before the goal is sent.
         patience: Longest wait for the controller and for the subscriptions (s).
@@ -166,14 +168,19 @@ def send_goal(
         heading_matters: Whether to report a controller that ignores the heading of the goal.
         ros_arguments: ROS arguments of the node; those of `runner`, if it is given.
         signals: Counter of the signals that cancel the goal. None: no signal does.
-        progress: Receives the progress. None: nothing does.
+        progress: Receives the progress. An error that it raises cancels the goal, and is passed on.
+            None: nothing does.
 
     Raises:
         UserError: The ROS arguments are invalid, or the node cannot be created.
-        ValueError: `goal` has another shape, or `ros_arguments` are given with `runner`.
+        ValueError: `goal` has another shape, a time is not positive, or `ros_arguments` are given with
+            `runner`.
     """
+    number('patience', patience, positive_or_infinite)
+    number('timeout', timeout, positive_or_infinite)
     if runner is not None and ros_arguments:
         raise ValueError('ros_arguments are those of the runner, if one is given')
+    created = runner is None
     with ExitStack() as stack:
         if runner is None:
             if not follow:
@@ -194,8 +201,14 @@ def send_goal(
                 start_parameter_services=False,
             )
         )
+        if not created:
+            stack.callback(used.remove, client)
         session = _Session(client, used, signals or Signals(), progress or _Silent())
-        return session.run(patience, timeout, follow=follow, heading_matters=heading_matters)
+        try:
+            return session.run(patience, timeout, follow=follow, heading_matters=heading_matters)
+        except BaseException:
+            session.abandon()
+            raise
 
 
 class _Session:
@@ -218,6 +231,7 @@ class _Session:
             if signals.count:
                 return self._result(Result.INTERRUPTED)
             return self._result(Result.NOT_SENT, reason=obstacle)
+        self._await_readers()
         controllers = client.controllers()
         client.send()
         names = sorted(set(controllers.values()) - {''})
@@ -242,6 +256,12 @@ class _Session:
             client.cancel()
             return self._result(Result.LOST, reason=lost)
         return self._cancel(Result.INTERRUPTED if signals.count else Result.TIMEOUT)
+
+    def abandon(self) -> None:
+        """Cancel the goal if it may be active: an error, as of a closed output, ends its pursuit."""
+        if self._client.sent and not self._client.ended:
+            self._client.cancel()
+            self._runner.spin(lambda: self._client.ended, timeout=ANSWER_PATIENCE, signals=self._signals)
 
     def _turns(self, seconds: float) -> Iterator[float]:
         """Execute callbacks, and yield the time (s) often, for a time (s) or until a signal."""
@@ -272,6 +292,15 @@ class _Session:
                 break
             self._progress.waiting(reason)
         return reason
+
+    def _await_readers(self) -> None:
+        """Wait until no more subscriptions are discovered: a recorder needs the goal, too."""
+        readers, since = 0, -math.inf
+        for now in self._turns(ANSWER_PATIENCE):
+            if self._client.readers != readers:
+                readers, since = self._client.readers, now
+            if now - since >= self._runner.discovery:
+                break
 
     def _await_acknowledgement(self) -> bool:
         """Wait until the goal is acknowledged by every subscription; return whether it is."""

@@ -130,7 +130,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             self._advance()
 
     def _advance(self) -> tuple[int, Robot] | None:
-        """Apply timeouts, steps of the lag or a jump of time that happened since the last call.
+        """Apply a timeout or a jump of time that happened since the last call.
 
         Returns:
             The current time (ns) and the robot. None: simulated time has not started.
@@ -153,8 +153,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             self._publish_start(robot)
             self._publish_applied(robot)
         else:
-            while (change := robot.next_change) is not None and change <= now:
-                robot = robot.at(change)
+            if robot.expiry is not None and robot.expiry <= now:
+                robot = robot.at(robot.expiry)
                 self._publish_applied(robot)
         self._robot, self._latest = robot, now
         return now, robot
@@ -219,8 +219,7 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             now, robot = advanced
             twist, stamp = read(*fields)
             timeout = robot.model.command_timeout
-            # The steps of a lag are no commands: an older command may come late.
-            time = max(robot.stamp, command_time(stamp, now, robot.changed_at, timeout))
+            time = command_time(stamp, now, robot.stamp, timeout)
         except MessageError as error:
             self.get_logger().warning(f'command dropped: {error}', throttle_duration_sec=THROTTLE)
             return
@@ -231,8 +230,8 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
         self._publish_applied(self._robot)
 
     def _publish_applied(self, robot: Robot) -> None:
-        """Publish the command that the robot follows, with the time from which it does."""
-        self._applied.publish(self._serialized_command(Command(robot.twist, robot.stamp)))
+        """Publish the twist that the robot is to reach, with the time from which it follows it."""
+        self._applied.publish(self._serialized_command(Command(robot.target, robot.stamp)))
 
     # --- Pose
 
@@ -313,7 +312,9 @@ class VirtualRobot(ParameterizedNode[VirtualRobotParameters]):
             now, robot = advanced
             wheels = self.parameters.command_interface == 'wheels'
             self._robot = robot.remodelled(model, now, wheels_commanded=wheels)
-            if self._robot.twist != robot.twist:
+            # From when on other accelerations apply is the time of this message in a bag.
+            takes_time = model.takes_time or robot.model.takes_time
+            if self._robot.target != robot.target or takes_time:
                 self._publish_applied(self._robot)
 
     def _initial_pose(self) -> NDArray[np.float64]:

@@ -9,7 +9,6 @@ from geometry_msgs.msg import Twist, TwistStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.messages.codecs import (
     JOINT_STATE,
     TWIST,
@@ -29,7 +28,11 @@ from diffdrive_jacobian.ros.graph_faults import (
     topic_check,
 )
 from diffdrive_jacobian.ros.node import NO_CLOCK, THROTTLE, ParameterizedNode
+from diffdrive_jacobian.ros.rclpy_internals import restart_timer
 from diffdrive_jacobian.ros.watchdog import Watchdog
+from diffdrive_jacobian.simulation.actuators import ramp
+from diffdrive_jacobian.simulation.robot import STANDSTILL
+from diffdrive_jacobian.simulation.speeds import Profile
 from diffdrive_jacobian.time_units import nanoseconds
 
 __all__ = ['WheelBridge']
@@ -40,6 +43,9 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
 
     It publishes one message for each command, with its stamp, or the time of receipt if it has none. If
     no command is received for the timeout, it publishes one zero.
+
+    With limits of the acceleration, each message has the speeds of its time. Further ones follow at
+    `publish_rate` until the commanded speeds are reached.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -59,7 +65,10 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         self.watch(topic_check(self, UNREAD, 'joint_command', readers))
         self.watch(alternating_commands(self, 'cmd_vel', numbers), ALTERNATION_PATIENCE)
         self._last = 0
-        self._moving = False
+        self._twist = self._target = STANDSTILL
+        # From the last command on, with limits of the acceleration.
+        self._profile: Profile | None = None
+        self._timer = self.create_timer(1.0, self._on_tick, autostart=False)
         self._watchdog = Watchdog(self, self._on_silence)
         self._watchdog.start(self._timeout)
         self.announce(subscribed=['cmd_vel'], publishing=['joint_command'])
@@ -80,25 +89,56 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         if v or omega:
             self._commands.count()
             self.warn_of_integers('a command on cmd_vel', v, omega)
-        self._publish(self._wheel_speeds(v, omega), self._last)
+        self._follow((v, omega), self._last, now)
 
-    def _wheel_speeds(self, v: float, omega: float) -> tuple[Any, Any]:
-        """Return `(omega_R, omega_L)` of the calibrated wheels, within their limit (rad/s)."""
-        parameters = self.parameters
-        L = parameters.wheel_separation * parameters.wheel_separation_multiplier
-        right, left = body_to_wheel.formula(v, omega, parameters.wheel_radius, L)
-        right /= parameters.right_wheel_radius_multiplier
-        left /= parameters.left_wheel_radius_multiplier
-        excess = max(1.0, max(abs(right), abs(left)) / parameters.wheel_speed_limit)
-        return right / excess, left / excess
+    def _follow(self, command: tuple[float, float], stamp: int, now: int) -> None:
+        """Publish the speeds of a command, or start to approach them within the limits.
 
-    def _publish(self, speeds: tuple[Any, Any], stamp: int) -> None:
-        self._moving = speeds != (0.0, 0.0)
-        self._joint_command.publish(self._serialized(speeds, stamp))
+        Args:
+            command: The twist.
+            stamp: The time of the message without limits of the acceleration (ns).
+            now: Current time (ns).
+        """
+        self._target = target = self._model.limited(command)
+        if self._acceleration.unlimited:
+            self._profile = None
+            self._publish(target, stamp)
+            return
+        profile, start = self._profile, self._twist
+        if profile is not None and profile.start <= now:
+            start = profile.twist(profile.seconds(now))
+        self._profile = Profile(now, [*ramp(start, target, self._acceleration, self._model)])
+        restart_timer(self._timer, self._period)
+        self._approach(self._profile, now)
+
+    def _approach(self, profile: Profile, now: int) -> None:
+        """Publish the present speeds."""
+        self._publish(profile.twist(profile.seconds(now)), now)
+        if now >= profile.settled_at:
+            self._timer.cancel()
+
+    def _on_tick(self) -> None:
+        now, profile = self.now(), self._profile
+        if profile is None:
+            self._timer.cancel()
+        elif now < profile.start:
+            # Time went back.
+            self._follow(self._target, now, now)
+        else:
+            self._approach(profile, now)
+
+    def _publish(self, twist: tuple[float, float], stamp: int) -> None:
+        self._twist = twist
+        self._joint_command.publish(self._serialized(self._model.wheel_speeds(*twist), stamp))
+
+    @property
+    def _moving(self) -> bool:
+        return self._twist != STANDSTILL or self._target != STANDSTILL
 
     def _on_silence(self) -> None:
         if self._moving:
-            self._publish((0.0, 0.0), self.now())
+            now = self.now()
+            self._follow(STANDSTILL, now, now)
             self.log_event_warning(
                 'silence',
                 f'no command on {self.resolve_topic_name("cmd_vel")} '
@@ -106,9 +146,11 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
             )
 
     def stop(self, why: str) -> None:
-        """Publish zero wheel speeds, unless they are zero."""
+        """Publish zero wheel speeds, unless they are zero. Nobody is left to approach them."""
         if self._moving:
-            self._publish((0.0, 0.0), self.now())
+            self._timer.cancel()
+            self._target = STANDSTILL
+            self._publish(STANDSTILL, self.now())
             self.get_logger().info(f'the wheels are stopped: {why}')
             self.flush(self._joint_command)
 
@@ -122,6 +164,9 @@ class WheelBridge(ParameterizedNode[WheelBridgeParameters]):
         """Compute from the parameters what every command needs."""
         parameters = self.parameters
         self._timeout = nanoseconds(parameters.cmd_vel_timeout)
+        self._period = nanoseconds(1.0 / parameters.publish_rate)
+        self._model = parameters.model()
+        self._acceleration = parameters.acceleration_limits()
         self._serialized: Callable[[tuple[float, float], int], bytes]
         speeds, names = [0.0, 0.0], parameters.wheel_names
         if self._joint_command.msg_type is JointState:

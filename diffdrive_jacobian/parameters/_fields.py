@@ -42,6 +42,20 @@ def timeout_field(default: float, description: str) -> Any:
     return parameter(default, description, bounds=(0.0, 3600.0))
 
 
+def wheel_lag_field() -> Any:
+    """Declare the time constant of the wheels."""
+    return parameter(
+        0.0,
+        'Time constant with which the wheels follow commands, of first order [s].',
+        bounds=(0.0, 100.0),
+    )
+
+
+def command_delay_field() -> Any:
+    """Declare the delay of commands."""
+    return parameter(0.0, 'Time from a command to its effect on the wheels [s].', bounds=(0.0, 100.0))
+
+
 def differ(first: str, value: str, second: str, other: str) -> None:
     """Raise ParameterError if the values of two parameters are equal.
 

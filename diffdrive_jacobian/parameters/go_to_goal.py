@@ -8,18 +8,26 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
+from diffdrive_jacobian.control.arrival import Arrival
 from diffdrive_jacobian.control.controller import KP, KV, OFFSET, Controller, Gain
 from diffdrive_jacobian.control.controllers import BUILT_IN, ControllerError, Controllers
 from diffdrive_jacobian.control.controllers import CONTROLLERS as CONTROLLERS
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MAX_SPEED
-from diffdrive_jacobian.parameters._fields import STAMPED, timeout_field
+from diffdrive_jacobian.parameters._fields import (
+    STAMPED,
+    command_delay_field,
+    timeout_field,
+    wheel_lag_field,
+)
 from diffdrive_jacobian.parameters.declaration import (
     ParameterError,
     default_of,
     parameter,
 )
-from diffdrive_jacobian.parameters.limits import LimitParameters
+from diffdrive_jacobian.parameters.limits import TwistAccelerationParameters, number_or
+from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.time_units import nanoseconds
 
 OF_RCLPY = ('use_sim_time', 'start_type_description_service')
 """Parameters of every node."""
@@ -43,9 +51,20 @@ def _gain(gain: Gain) -> Any:
     return parameter(gain.default, f'{gain.description}{unit}.', bounds=gain.bounds, above=gain.above)
 
 
+def _stopped(what: str, unit: str) -> Any:
+    return parameter(
+        math.nan,
+        f'Largest {what} with which the robot counts as arrived [{unit}]; .nan: any.',
+        bounds=(1e-6, MAX_SPEED),
+        nan_is_none=True,
+    )
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
-class GoToGoalParameters(LimitParameters):
-    """Parameters of the node go_to_goal."""
+class GoToGoalParameters(TwistAccelerationParameters):
+    """Parameters of the node go_to_goal. Limits of the acceleration, lag and delay are known, not kept:
+    they say what the robot can do.
+    """
 
     controllers: ClassVar[Controllers] = CONTROLLERS
     """The controllers that can be chosen."""
@@ -65,6 +84,15 @@ class GoToGoalParameters(LimitParameters):
     )
     use_goal_heading: bool = parameter(
         False, 'Turn to the heading of the last goal after its position is reached.'
+    )
+    trans_stopped_velocity: float = _stopped('speed', 'm/s')
+    rot_stopped_velocity: float = _stopped('yaw rate', 'rad/s')
+    wheel_lag: float = wheel_lag_field()
+    command_delay: float = command_delay_field()
+    stop_in_time: bool = parameter(
+        False,
+        'Command no speed from which the robot cannot stop at the last goal within its limits of the '
+        'acceleration, with its lag and delay.',
     )
     odom_timeout: float = timeout_field(
         0.5,
@@ -125,6 +153,27 @@ class GoToGoalParameters(LimitParameters):
     def limits(self) -> VelocityLimits:
         """Return the limits of the commands, at most the largest plausible twist."""
         return self.twist_limits(MAX_SPEED)
+
+    def actuators(self) -> Actuators:
+        """Return how the robot follows commands, as far as it is known."""
+        return Actuators(
+            acceleration=self.acceleration_limits(),
+            lag=self.wheel_lag,
+            delay=nanoseconds(self.command_delay),
+        )
+
+    def arrival(self) -> Arrival:
+        """Return the arrival criterion."""
+        controller = self.chosen_controller()
+        return Arrival(
+            xy_tolerance=self.xy_goal_tolerance,
+            yaw_tolerance=self.yaw_goal_tolerance,
+            # A law that takes the heading must not stop before it has reached it.
+            use_heading=self.use_goal_heading or controller.takes_heading,
+            offset=controller.driven_offset(self),
+            trans_stopped_velocity=number_or(self.trans_stopped_velocity, math.inf),
+            rot_stopped_velocity=number_or(self.rot_stopped_velocity, math.inf),
+        )
 
     def check(self) -> None:
         """Check that the driven point is not on the axle, and that the controller can be loaded."""

@@ -3,11 +3,46 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MAX_SPEED
 from diffdrive_jacobian.parameters.declaration import NodeParameters, parameter
+from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits
+
+_GREATEST = 1e6
+_RATES = {
+    'max_acceleration': (1.0, 'Maximum acceleration forward', 'no limits of the acceleration'),
+    'max_deceleration': (-1.0, 'Maximum deceleration of forward motion, negative', 'as in reverse'),
+    'max_acceleration_reverse': (
+        -1.0,
+        'Maximum acceleration in reverse, negative',
+        'minus max_acceleration',
+    ),
+    'max_deceleration_reverse': (
+        1.0,
+        'Maximum deceleration of motion in reverse, positive',
+        'max_acceleration',
+    ),
+}
+"""Sign, description and meaning of NaN of each limit of the acceleration."""
+
+
+def _acceleration(axis: str, name: str, unit: str) -> Any:
+    sign, what, otherwise = _RATES[name]
+    if axis == 'angular.z':
+        what = what.replace('forward motion', 'counter-clockwise turns')
+        what = what.replace('motion in reverse', 'clockwise turns')
+        what = what.replace('forward', 'counter-clockwise').replace('in reverse', 'clockwise')
+        otherwise = otherwise.replace('in reverse', 'clockwise')
+    return parameter(
+        math.nan,
+        f'{what} [{unit}]; .nan: {otherwise}.',
+        name=f'{axis}.{name}',
+        bounds=(1e-6, _GREATEST) if sign > 0.0 else (-_GREATEST, -1e-6),
+        nan_is_none=True,
+    )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -56,6 +91,69 @@ class LimitParameters(NodeParameters):
             max_v=max_v,
             min_omega=number_or(self.angular_z_min_velocity, -max_omega),
             max_omega=max_omega,
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TwistAccelerationParameters(LimitParameters):
+    """Limits of twist and acceleration, with the names, signs and defaults of diff_drive_controller."""
+
+    linear_x_max_acceleration: float = _acceleration('linear.x', 'max_acceleration', 'm/s^2')
+    linear_x_max_deceleration: float = _acceleration('linear.x', 'max_deceleration', 'm/s^2')
+    linear_x_max_acceleration_reverse: float = _acceleration(
+        'linear.x', 'max_acceleration_reverse', 'm/s^2'
+    )
+    linear_x_max_deceleration_reverse: float = _acceleration(
+        'linear.x', 'max_deceleration_reverse', 'm/s^2'
+    )
+    angular_z_max_acceleration: float = _acceleration('angular.z', 'max_acceleration', 'rad/s^2')
+    angular_z_max_deceleration: float = _acceleration('angular.z', 'max_deceleration', 'rad/s^2')
+    angular_z_max_acceleration_reverse: float = _acceleration(
+        'angular.z', 'max_acceleration_reverse', 'rad/s^2'
+    )
+    angular_z_max_deceleration_reverse: float = _acceleration(
+        'angular.z', 'max_deceleration_reverse', 'rad/s^2'
+    )
+
+    def acceleration_limits(self) -> AccelerationLimits:
+        """Return the limits of the acceleration.
+
+        As in diff_drive_controller an axis without `max_acceleration` has none at all.
+        """
+        return AccelerationLimits(
+            v=self._axis('linear_x'),
+            omega=self._axis('angular_z'),
+        )
+
+    def _axis(self, axis: str) -> AxisLimits:
+        forward, slowing, reverse, slowing_reverse = (getattr(self, f'{axis}_{name}') for name in _RATES)
+        if math.isnan(forward):
+            return AxisLimits()
+        reverse = number_or(reverse, -forward)
+        return AxisLimits(
+            max_acceleration=forward,
+            max_deceleration=number_or(slowing, reverse),
+            max_acceleration_reverse=reverse,
+            max_deceleration_reverse=number_or(slowing_reverse, forward),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class AccelerationParameters(TwistAccelerationParameters):
+    """Limits of twist and acceleration, those of the wheels included."""
+
+    max_wheel_acceleration: float = parameter(
+        math.nan,
+        'Maximum angular acceleration of a wheel [rad/s^2]; .nan: no limit.',
+        bounds=(1e-6, 1e9),
+        nan_is_none=True,
+    )
+
+    def acceleration_limits(self) -> AccelerationLimits:
+        """Return the limits of the acceleration."""
+        return replace(
+            TwistAccelerationParameters.acceleration_limits(self),
+            max_wheel_acceleration=number_or(self.max_wheel_acceleration, math.inf),
         )
 
 

@@ -10,15 +10,18 @@ from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.messages.conversion import MAX_POSITION
 from diffdrive_jacobian.parameters._fields import (
     STAMPED,
+    command_delay_field,
     differ,
     max_wheel_velocity_field,
     multiplier_field,
     timeout_field,
+    wheel_lag_field,
     wheel_radius_field,
     wheel_separation_field,
 )
 from diffdrive_jacobian.parameters.declaration import parameter
-from diffdrive_jacobian.parameters.limits import LimitParameters, number_or
+from diffdrive_jacobian.parameters.limits import AccelerationParameters, number_or
+from diffdrive_jacobian.simulation.actuators import Actuators
 from diffdrive_jacobian.simulation.robot import RobotModel
 from diffdrive_jacobian.simulation.slip import MAX_SEED, Drift
 from diffdrive_jacobian.time_units import nanoseconds
@@ -41,7 +44,7 @@ def _true_multiplier(what: str) -> Any:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class VirtualRobotParameters(LimitParameters):
+class VirtualRobotParameters(AccelerationParameters):
     """Parameters of the node virtual_robot."""
 
     publish_rate: float = parameter(
@@ -58,6 +61,8 @@ class VirtualRobotParameters(LimitParameters):
     cmd_vel_timeout: float = timeout_field(
         0.5, 'Time without a command after which the robot stops [s]; 0: never.'
     )
+    wheel_lag: float = wheel_lag_field()
+    command_delay: float = command_delay_field()
     x: float = parameter(
         0.0, 'Initial position x, also after a reset [m].', bounds=(-MAX_POSITION, MAX_POSITION)
     )
@@ -129,7 +134,17 @@ class VirtualRobotParameters(LimitParameters):
             command_timeout=nanoseconds(self.cmd_vel_timeout),
             wheel_travel_variance=self.wheel_travel_variance,
             drift=self.drift(),
+            actuators=self.actuators(),
         )
+
+    def actuators(self) -> Actuators | None:
+        """Return how commands are followed; None: at once."""
+        actuators = Actuators(
+            acceleration=self.acceleration_limits(),
+            lag=self.wheel_lag,
+            delay=nanoseconds(self.command_delay),
+        )
+        return None if actuators.immediate else actuators
 
     def drift(self) -> Drift | None:
         """Return in what the true motion differs from the odometry; None: in nothing."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from diffdrive_jacobian.parameters._fields import (
     STAMPED,
@@ -14,12 +14,13 @@ from diffdrive_jacobian.parameters._fields import (
     wheel_radius_field,
     wheel_separation_field,
 )
-from diffdrive_jacobian.parameters.declaration import NodeParameters, parameter
-from diffdrive_jacobian.parameters.limits import number_or
+from diffdrive_jacobian.parameters.declaration import parameter
+from diffdrive_jacobian.parameters.limits import AccelerationParameters, number_or
+from diffdrive_jacobian.simulation.robot_model import RobotModel
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class WheelBridgeParameters(NodeParameters):
+class WheelBridgeParameters(AccelerationParameters):
     """Parameters of the node wheel_bridge."""
 
     wheel_radius: float = wheel_radius_field()
@@ -30,6 +31,11 @@ class WheelBridgeParameters(NodeParameters):
     max_wheel_velocity: float = max_wheel_velocity_field()
     cmd_vel_timeout: float = timeout_field(
         0.5, 'Time without a command after which the wheels are stopped [s]; 0: never.'
+    )
+    publish_rate: float = parameter(
+        50.0,
+        'Publishing rate of joint_command while the wheels accelerate within limits [Hz].',
+        bounds=(0.1, 1000.0),
     )
     left_wheel_name: str = parameter('left_wheel_joint', 'Name of the joint of the left wheel.')
     right_wheel_name: str = parameter('right_wheel_joint', 'Name of the joint of the right wheel.')
@@ -50,7 +56,13 @@ class WheelBridgeParameters(NodeParameters):
         """Names of the left and the right wheel joint, in the order of messages."""
         return self.left_wheel_name, self.right_wheel_name
 
-    @property
-    def wheel_speed_limit(self) -> float:
-        """The limit of the wheel speeds (rad/s); infinite: none."""
-        return number_or(self.max_wheel_velocity, math.inf)
+    def model(self) -> RobotModel:
+        """Return the robot whose wheels are driven."""
+        max_wheel_speed = number_or(self.max_wheel_velocity, math.inf)
+        return RobotModel(
+            wheel_radius=self.wheel_radius,
+            wheel_separation=self.wheel_separation * self.wheel_separation_multiplier,
+            right_wheel_radius_multiplier=self.right_wheel_radius_multiplier,
+            left_wheel_radius_multiplier=self.left_wheel_radius_multiplier,
+            limits=replace(self.twist_limits(), max_wheel_speed=max_wheel_speed),
+        )

@@ -64,6 +64,9 @@ class NodeExecutor(Protocol):
     def add_node(self, node: Node) -> object:
         """Execute the callbacks of a node from now on."""
 
+    def remove_node(self, node: Node) -> None:
+        """Execute no more callbacks of a node."""
+
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Execute one callback; wait for it for at most a time (s)."""
 
@@ -121,6 +124,12 @@ class GuardedExecutor:
             self.use_single_threaded()
         if not self._fair:
             self._events.add_node(node)
+
+    def remove_node(self, node: Node) -> None:
+        """Execute no more callbacks of a node."""
+        self._nodes.remove(node)
+        executor = self._single_threaded() if self._fair else self._events
+        executor.remove_node(node)
 
     def shutdown(self) -> None:
         """Release the nodes."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 from rclpy.context import Context
 from rclpy.exceptions import NameValidationException, ParameterException
@@ -32,6 +32,9 @@ MAX_NAME_LENGTH = 247
 
 class NodeRunner(ABC):
     """Nodes of one context, and the loop that executes their callbacks."""
+
+    discovery: ClassVar[float] = 0.0
+    """Time without a newly discovered subscription after which further ones are unlikely (s)."""
 
     def __init__(self, context: Context) -> None:
         """Start without nodes.
@@ -61,6 +64,11 @@ class NodeRunner(ABC):
         self._nodes.append(node)
         self._add(node)
         return node
+
+    def remove(self, node: Node) -> None:
+        """Remove and destroy a node that was added."""
+        self._nodes.remove(node)
+        self._remove(node)
 
     def turns(
         self,
@@ -127,6 +135,10 @@ class NodeRunner(ABC):
     @abstractmethod
     def _add(self, node: Node) -> None:
         """Execute the callbacks of a node from now on."""
+
+    @abstractmethod
+    def _remove(self, node: Node) -> None:
+        """Execute no more callbacks of a node, and destroy it."""
 
     @abstractmethod
     def _spin_once(self) -> None:

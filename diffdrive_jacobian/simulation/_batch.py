@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +21,8 @@ from diffdrive_jacobian.numerics.checks import (
     number,
     positive,
 )
-from diffdrive_jacobian.numerics.fields import instance
+from diffdrive_jacobian.numerics.fields import instance, optional
+from diffdrive_jacobian.simulation.actuators import Actuators
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -34,11 +36,11 @@ class Outcomes(NamedTuple):
 
     Attributes:
         arrived: Whether it arrived in time.
-        time: Time of arrival; NaN: it did not arrive (s).
+        time: Time of arrival; NaN: it did not arrive (s). Robots that take time to stop roll on.
         path_length: Length of the path of the axle centre, forwards and backwards (m).
         control_cost: Integral of the squares of both wheel speeds over time (rad^2/s).
         overshoot: Largest distance beyond the goal, along the line from start to goal (m).
-        pose: Last pose, shape (..., 3).
+        pose: Last pose, at rest if it arrived, shape (..., 3).
     """
 
     arrived: Mask
@@ -47,6 +49,18 @@ class Outcomes(NamedTuple):
     control_cost: Array
     overshoot: Array
     pose: Array
+
+
+def _followed(name: str, value: object) -> Actuators | None:
+    """Require actuators whose motors are fast enough; None: at once."""
+    actuators: Actuators | None = optional(partial(instance, wanted=Actuators))(name, value)
+    if actuators is None:
+        return None
+    if min(actuators.max_right_speed, actuators.max_left_speed) < math.inf:
+        raise ValueError(
+            f'{name} must have no max_right_speed or max_left_speed: in batches no motor saturates'
+        )
+    return None if actuators.immediate else actuators
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +82,8 @@ class Batch:
     limits: VelocityLimits
     r: Any
     L: Any
+    actuators: Actuators | None
+    """None: the robots follow commands at once."""
     shape: tuple[int, ...]
     """Shape of the batch before it was flattened."""
 
@@ -85,6 +101,7 @@ class Batch:
         limits: VelocityLimits,
         r: ArrayLike,
         L: ArrayLike,
+        actuators: Actuators | None,
     ) -> Batch:
         """Check the arguments and flatten the batch."""
         arrival = Arrival() if arrival is None else arrival
@@ -95,6 +112,7 @@ class Batch:
             function('law', law)
         instance('arrival', arrival, Arrival)
         instance('limits', limits, VelocityLimits)
+        actuators = _followed('actuators', actuators)
         starts, goals = array('starts', starts, 3), array('goals', goals, 'm')
         if goals.shape[-1] not in (2, 3) or (arrival.use_heading and goals.shape[-1] != 3):
             wanted = '(..., 3)' if arrival.use_heading else '(..., 2) or (..., 3)'
@@ -137,6 +155,7 @@ class Batch:
             limits=VelocityLimits(**{name: flat[name] for name in limits.names()}),
             r=flat['r'],
             L=flat['L'],
+            actuators=actuators,
             shape=shape,
         )
 

@@ -16,6 +16,7 @@ from diffdrive_jacobian.kinematics.saturation import scaled_to_limits
 from diffdrive_jacobian.numerics.checks import floats
 from diffdrive_jacobian.numerics.elementary import wrap
 from diffdrive_jacobian.simulation._batch import Array, Batch, Mask, Outcomes, Rows
+from diffdrive_jacobian.simulation._following import Follower
 
 LOST = 1e6
 """A robot is given up when its distance to the goal has grown by this much (m)."""
@@ -23,6 +24,9 @@ EXACT_PERIOD = 32
 """Number of steps after which cosine and sine of the heading are computed exactly."""
 SHRINK = 0.94
 """When less than this share of the robots still drives, the others are removed from the arrays [-]."""
+
+_OF_ROBOTS = 'x', 'y', 'theta', 'c', 's', 'turning', 'stopping', 'open', 'time', 'beyond', 'too_far'
+"""Attributes of a block with one value for each robot."""
 
 Keep = Callable[[int, Rows, Array, Any, Any], None]
 """Receives step, rows, poses (k, 3), v (k,) and omega (k,); the last two are None at the end."""
@@ -46,7 +50,15 @@ class Block:
         # One array for each number that the law remembers.
         self.state: list[Array] = [np.full(count, value) for value in batch.state]
         self.dt = 0.0
-        # Sums of |v|, v^2 and omega^2, and the largest distance beyond the goal.
+        self.follower: Follower | None = None
+        if batch.actuators is not None:
+            self.follower = Follower(batch.actuators, count, batch.rate)
+        # v and omega of the odometry.
+        self.twist: tuple[Array, ...] = (np.zeros(count), np.zeros(count))
+        # Times of arrival, and which robots stop at their goals before they may count as arrived.
+        self.time: Array = np.full(count, np.nan)
+        self.stopping: Mask = np.zeros(count, dtype=np.bool_)
+        # Integrals of |v|, v^2 and omega^2, and the largest distance beyond the goal.
         self.sums: Array = np.zeros((3, count))
         self.beyond: Array = np.zeros(count)
         with np.errstate(over='ignore', invalid='ignore'):
@@ -75,12 +87,16 @@ class Block:
                 # Depends on the step alone, so that results do not depend on the other robots.
                 self.c, self.s = np.cos(self.theta), np.sin(self.theta)
             arrived, lost = self._check_ends()
+            if arrived.any():
+                self.time = np.where(arrived & np.isnan(self.time), step / batch.rate, self.time)
+            if self.follower is not None:
+                arrived = np.isfinite(self.time) & self.follower.at_rest()
             ended = arrived | lost
             ended &= self.open
             if step == batch.steps:
                 ended = self.open
             if some := bool(ended.any()):
-                yield self._outcomes(ended, arrived, step)
+                yield self._outcomes(ended)
                 self.open = self.open & ~ended
             left = np.count_nonzero(self.open) if some else 1
             v, omega = self._command() if left else (None, None)
@@ -103,10 +119,14 @@ class Block:
             if type(offset) is not float or offset != 0.0:
                 dx, dy = dx - offset * self.c, dy - offset * self.s
             squared = dx * dx + dy * dy
-        there = squared <= arrival.xy_tolerance * arrival.xy_tolerance
+        there = near = squared <= arrival.xy_tolerance * arrival.xy_tolerance
+        stopped = arrival.stopped(*self.twist) if arrival.must_stop else np.True_
         if arrival.use_heading:
-            self.turning |= there
+            self.turning |= near & stopped
             there = self.turning & arrival.faces(self.theta, goal[2])
+        if arrival.must_stop:
+            self.stopping = (there | near & ~self.turning) & ~stopped
+            there = there & stopped
         return there, squared > self.too_far
 
     def _command(self) -> tuple[Array, Array]:
@@ -128,9 +148,10 @@ class Block:
             v = np.where(self.turning, 0.0, v)
             turn = wrap(batch.goals[:, 2] - self.theta)
             omega = np.where(self.turning, batch.turning_gain * turn, omega)
-        if not self.open.all():
+        driven = self.open & np.isnan(self.time) & ~self.stopping
+        if not driven.all():
             # Finished robots stand still, whatever their law returns.
-            v, omega = np.where(self.open, v, 0.0), np.where(self.open, omega, 0.0)
+            v, omega = np.where(driven, v, 0.0), np.where(driven, omega, 0.0)
         finite = np.isfinite(v) & np.isfinite(omega)
         if not finite.all():
             row = int(np.argmin(finite))
@@ -177,6 +198,10 @@ class Block:
         As in `se2.integrate`, the position moves by the chord of the arc, in the direction of the
         heading at the middle of the step.
         """
+        if self.follower is not None:
+            self._follow(self.follower, np.array([v, omega]))
+            return
+        self.twist = v, omega
         dt = 1.0 / self.batch.rate
         # Overflow is detected in the outcomes.
         with np.errstate(over='ignore', invalid='ignore'):
@@ -197,10 +222,25 @@ class Block:
             if np.max(self.theta) > np.pi or np.min(self.theta) <= -np.pi:
                 self.theta = wrap(self.theta)
 
+    def _follow(self, follower: Follower, command: Array) -> None:
+        """Let robots that take time follow a command until the next sample."""
+        # Overflow is detected in the outcomes.
+        with np.errstate(over='ignore', invalid='ignore'):
+            for rows, (dx, dy, turn), sums in follower.steps(self.batch, command):
+                c, s = self.c[rows], self.s[rows]
+                c_turn, s_turn = np.cos(turn), np.sin(turn)
+                self.x[rows] += c * dx - s * dy
+                self.y[rows] += s * dx + c * dy
+                self.theta[rows] += turn
+                self.c[rows], self.s[rows] = c * c_turn - s * s_turn, s * c_turn + c * s_turn
+                self.sums[:, rows] += sums * self.batch.rate
+        self.theta = wrap(self.theta)
+        self.twist = tuple(follower.twist)
+
     def _poses(self, which: Mask) -> Array:
         return np.column_stack([self.x[which], self.y[which], self.theta[which]])
 
-    def _outcomes(self, done: Mask, arrived: Mask, step: int) -> tuple[Rows, Outcomes]:
+    def _outcomes(self, done: Mask) -> tuple[Rows, Outcomes]:
         """Return the rows and the outcomes of the robots that are finished."""
         batch = self.batch
         which = np.flatnonzero(done)
@@ -213,8 +253,8 @@ class Block:
             # Both wheels: (v + omega L/2)^2 + (v - omega L/2)^2, over r^2.
             control_cost = 2.0 * (squares_v + squares_omega * (L / 2.0) ** 2) / r**2
         outcomes = Outcomes(
-            arrived[which],
-            np.where(arrived[which], step / batch.rate, np.nan),
+            np.isfinite(self.time[which]),
+            self.time[which],
             path,
             control_cost,
             self.beyond[which],
@@ -237,8 +277,10 @@ class Block:
         """Remove the robots that are finished, and return the twists of the others."""
         going = np.flatnonzero(self.open)
         self.batch, self.rows = self.batch.some(going), self.rows[going]
-        for name in ('x', 'y', 'theta', 'c', 's', 'turning', 'open', 'beyond', 'too_far'):
+        for name in _OF_ROBOTS:
             setattr(self, name, getattr(self, name)[going])
         self.sums, self.along = self.sums[:, going], self.along[:, going]
+        if self.follower is not None:
+            self.follower.shrink(going)
         self.state = [one[going] for one in self.state]
         return v[going], omega[going]

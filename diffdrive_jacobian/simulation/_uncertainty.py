@@ -9,10 +9,13 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
+from diffdrive_jacobian.simulation._noise_quadrature import moments_along
 from diffdrive_jacobian.simulation.exact_moments import Entries, propagated_moments
+from diffdrive_jacobian.simulation.speeds import Piece
 
-Arc: TypeAlias = tuple[float, tuple[float, float], float, float, float]
-"""Heading at the start (rad), twist (m/s, rad/s), duration (s), wheel separation (m), k (m)."""
+Arc: TypeAlias = tuple[float, tuple[float, float] | Piece, float, float, float]
+"""Heading at the start (rad), twist (m/s, rad/s), or how it changes with time, duration (s), wheel
+separation (m), k (m)."""
 MAX_PENDING = 64
 """Number of arcs that are kept at most. One more evaluates those before it, so memory is bounded."""
 
@@ -63,7 +66,11 @@ class Uncertainty:
         for here, before, arc in reversed(waiting):
             if before._moments is not None:
                 # After an overflow there is none.
-                here._moments = propagated_moments(before._moments, *arc)
+                theta, twist, dt, L, k = arc
+                if isinstance(twist, Piece):
+                    here._moments = moments_along(before._moments, theta, twist, dt, L, k)
+                else:
+                    here._moments = propagated_moments(before._moments, theta, twist, dt, L, k)
             here._number = 0
             # Last, because then the moments count.
             here._pending = None

@@ -1,67 +1,91 @@
-"""Wheel motors that are not ideal: they saturate one by one, and follow their commands with a lag.
+"""Wheels that do not follow commands at once: acceleration limits, saturated motors, lag and delay.
 
-State of a lagging motor: its speed (rad/s). Input: the commanded speed, held from one command to the
-next, and limited to what the motor can reach. The speed follows it with first order,
+A command passes, in this order: the delay; the limits of the acceleration, which the robot knows and
+keeps with one time law for v and omega (`acceleration`); the largest speed of each motor, which it does
+not know; and the lag. The speed of a lagging wheel follows what is demanded of it with first order:
 
-    tau d omega / dt = omega_commanded - omega
+    tau d omega / dt = omega_demanded - omega
 
-The motion of a robot consists of arcs of constant wheel speeds. So the lag is a series of steps of
-`STEP`, each with the mean speed of the wheel in it. At the end of each step the wheel angles are exact.
+The lag is the same for both wheels, so v and omega follow by the same equation. What is demanded is
+piecewise linear in time. So each speed is `a + b t + c exp(-t / tau)` in each piece (`speeds`).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Annotated, NamedTuple, Protocol, TypeAlias
 
-from diffdrive_jacobian.numerics.checks import NotNegative, NotNegativeOrInfinite
-from diffdrive_jacobian.numerics.fields import Checked
+from diffdrive_jacobian.numerics.checks import NotNegative, NotNegativeOrInfinite, nanoseconds
+from diffdrive_jacobian.numerics.fields import Checked, instance
+from diffdrive_jacobian.simulation.acceleration import AccelerationLimits
+from diffdrive_jacobian.simulation.speeds import Piece, Profile, Twist
 from diffdrive_jacobian.time_units import NANOSECONDS
 
-STEP = 20_000_000
-"""Duration of the arcs of which a lagging motion consists (ns)."""
-SETTLED = 1e-4
-"""Difference from the commanded speed below which a wheel has reached it (rad/s)."""
+SETTLING = 36.0
+"""Time constants after which a lagging wheel has reached its speed: exp(-36) is 2e-16."""
 
+STANDSTILL = (0.0, 0.0)
 Speeds: TypeAlias = tuple[float, float]
 """`(omega_R, omega_L)` (rad/s)."""
 
 
-class Settling(NamedTuple):
-    """One step of wheels that approach their commanded speeds."""
+class Wheels(Protocol):
+    """The wheels of a robot, as `RobotModel` has them."""
 
-    since: int
-    """Time from which on the present command is followed (ns)."""
-    start: int
-    """Time at which the step began (ns)."""
-    speeds: Speeds
-    """Wheel speeds at that time."""
-    commanded: Speeds
-    """Wheel speeds that they approach."""
+    def wheel_speeds(self, v: float, omega: float) -> Speeds:
+        """Return the wheel speeds of a twist."""
 
-    @property
-    def end(self) -> int:
-        """Time at which the step ends (ns)."""
-        return self.start + STEP
+    def twist(self, omega_R: float, omega_L: float) -> Twist:
+        """Return the twist of wheel speeds."""
+
+
+def _delay(name: str, value: object) -> int:
+    """Require a duration that is not negative (ns)."""
+    delay = nanoseconds(name, value)
+    if delay < 0:
+        raise ValueError(f'{name} must be zero or positive (ns), got {delay}')
+    return delay
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Actuators(Checked):
-    """What the wheel motors can do.
-
-    The robot does not know it: unlike its velocity limits it does not keep the curvature of the path.
+    """How a robot carries out the twists that are commanded.
 
     Raises:
-        ValueError: A value is negative or NaN, or the lag is infinite.
+        ValueError: A value is negative or NaN, the lag is infinite, the delay is no integer, or the
+            limits are of another class.
     """
 
     max_right_speed: NotNegativeOrInfinite = math.inf
-    """Largest speed of the right wheel (rad/s); 0: its motor is dead, and the wheel stands still."""
+    """Largest speed of the right wheel (rad/s); 0: its motor is dead, and the wheel stands still. The
+    robot does not know it: unlike its velocity limits it does not keep the curvature of the path."""
     max_left_speed: NotNegativeOrInfinite = math.inf
     """Largest speed of the left wheel (rad/s)."""
     lag: NotNegative = 0.0
-    """Time constant tau (s)."""
+    """Time constant tau of both wheels (s)."""
+    acceleration: Annotated[AccelerationLimits, partial(instance, wanted=AccelerationLimits)] = field(
+        default_factory=AccelerationLimits
+    )
+    """Limits of the acceleration."""
+    delay: Annotated[int, _delay] = 0
+    """Time from a command to its effect on the motors (ns)."""
+
+    def lagging(self, seconds: float) -> Actuators:
+        """Return actuators whose lag is at least a time constant (s)."""
+        return replace(self, lag=max(self.lag, seconds))
+
+    def weakened(self, wheel: str, speed: float) -> Actuators:
+        """Return actuators that turn the 'right' or 'left' wheel at most at a speed (rad/s)."""
+        name = f'max_{wheel}_speed'
+        return replace(self, **{name: min(speed, getattr(self, name))})
+
+    @property
+    def immediate(self) -> bool:
+        """Whether a command is followed at once."""
+        return not self.lag and not self.delay and self.acceleration.unlimited
 
     def limited(self, speeds: Speeds) -> Speeds:
         """Return the speeds that the motors can reach."""
@@ -72,30 +96,155 @@ class Actuators(Checked):
             max(-most_left, min(most_left, left)) + 0.0,
         )
 
-    def after(self, settling: Settling, stamp: int) -> Speeds:
-        """Return the wheel speeds at a time not before the start of the step (ns)."""
-        rest = self._rest((stamp - settling.start) / NANOSECONDS)
-        right, left = (
-            goal + (speed - goal) * rest
-            for speed, goal in zip(settling.speeds, settling.commanded, strict=True)
+    def rolled(self, twist: Twist, wheels: Wheels | None = None) -> Twist:
+        """Return the distance and the turn from when zero is commanded until the robot is at rest.
+
+        Args:
+            twist: The twist before, held for long enough.
+            wheels: The wheels; None: the limit of their acceleration is left out.
+        """
+        seconds = self.reaction + self._deceleration_time(twist, wheels) / 2.0
+        v, omega = twist
+        return v * seconds, omega * seconds
+
+    def stoppable(self, twist: Twist, room: Twist, period: float = 0.0) -> Twist:
+        """Return a twist, scaled such that the robot can come to rest within a distance and a turn.
+
+        The limit of the acceleration of the wheels is left out.
+
+        Args:
+            twist: The twist.
+            room: The distance and the turn, zero or positive; infinite: any (m, rad).
+            period: Time for which the twist is held before the next one (s).
+        """
+        reaction, stop = self.reaction + period, self._deceleration_time(twist, None)
+        share = 1.0
+        for speed, left in zip(map(abs, twist), room, strict=True):
+            # The largest share s <= 1 with s speed (reaction + s stop / 2) <= left.
+            if speed * (reaction + stop / 2.0) > left:
+                linear = speed * reaction
+                root = linear + math.sqrt(linear * linear + 2.0 * speed * stop * left)
+                share = min(share, 2.0 * left / root if root else 0.0)
+        v, omega = twist
+        return share * v, share * omega
+
+    @property
+    def reaction(self) -> float:
+        """Time by which a stop is later than without lag and delay (s)."""
+        return self.delay / NANOSECONDS + self.lag
+
+    def _deceleration_time(self, twist: Twist, wheels: Wheels | None) -> float:
+        wheel_speeds = (lambda *_: STANDSTILL) if wheels is None else wheels.wheel_speeds
+        parts = self.acceleration.transition(twist, STANDSTILL, wheel_speeds)
+        return sum(seconds for seconds, _ in parts)
+
+    def reached(self, twist: Twist, wheels: Wheels) -> Twist:
+        """Return the twist that the motors reach when one is demanded."""
+        demanded = wheels.wheel_speeds(*twist)
+        reached = self.limited(demanded)
+        return twist if reached == demanded else wheels.twist(*reached)
+
+
+class Drive(NamedTuple):
+    """How the speeds of a robot go on from an event, if there are no further ones."""
+
+    demanded: Profile
+    """The twist within the limits of the acceleration."""
+    motion: Profile
+    """The twist of the robot."""
+
+    @classmethod
+    def at(cls, stamp: int, twist: Twist) -> Drive:
+        """Return a constant twist."""
+        constant = Profile(stamp, [held(twist)])
+        return cls(constant, constant)
+
+    def followed(self, stamp: int, target: Twist, actuators: Actuators, wheels: Wheels) -> Drive:
+        """Return how the speeds go on from a time when another twist is to be reached.
+
+        The motors may differ from those so far: their largest speeds and their lag are the new ones at
+        once, the limits of the acceleration after the delay, with the target.
+
+        Args:
+            stamp: The time (ns).
+            target: The twist, within the limits of the velocity.
+            actuators: What the robot follows it with.
+            wheels: Its wheels.
+        """
+        now = self.demanded.seconds(stamp)
+        then = self.demanded.seconds(stamp + actuators.delay)
+        rise = ramp(self.demanded.twist(then), target, actuators.acceleration, wheels)
+        demanded = [*self.demanded.between(now, then), *rise]
+        motion = demanded
+        if actuators.max_right_speed < math.inf or actuators.max_left_speed < math.inf:
+            motion = list(_saturated(demanded, actuators, wheels))
+        if actuators.lag:
+            here = self.motion.twist(self.motion.seconds(stamp))
+            motion = list(_lagging(here, motion, actuators.lag))
+        return Drive(Profile(stamp, demanded), Profile(stamp, motion))
+
+
+def held(twist: Twist) -> Piece:
+    """Return a twist that is held for ever."""
+    v, omega = twist
+    return Piece(math.inf, (v, 0.0, 0.0), (omega, 0.0, 0.0))
+
+
+def ramp(start: Twist, target: Twist, limits: AccelerationLimits, wheels: Wheels) -> Iterator[Piece]:
+    """Return the transition from one twist to another, which is then held for ever."""
+    for seconds, end in limits.transition(start, target, wheels.wheel_speeds):
+        if seconds > 0.0:
+            yield _line(start, end, seconds)
+        start = end
+    yield held(target)
+
+
+def _line(start: Twist, end: Twist, seconds: float) -> Piece:
+    v, omega = ((a, (b - a) / seconds, 0.0) for a, b in zip(start, end, strict=True))
+    return Piece(seconds, v, omega)
+
+
+def _saturated(pieces: Iterable[Piece], actuators: Actuators, wheels: Wheels) -> Iterator[Piece]:
+    """Return what the motors reach of speeds that are linear in each piece."""
+    most = actuators.max_right_speed, actuators.max_left_speed
+    for piece in pieces:
+        if piece.seconds == math.inf:
+            yield held(actuators.reached(piece.twist(0.0), wheels))
+            continue
+        ends = wheels.wheel_speeds(*piece.twist(0.0)), wheels.wheel_speeds(*piece.twist(piece.seconds))
+        # Where a wheel reaches its limit.
+        knots = {0.0, piece.seconds}
+        for first, last, bound in zip(*ends, most, strict=True):
+            for limit in (-bound, bound):
+                if min(first, last) < limit < max(first, last):
+                    knots.add(piece.seconds * (limit - first) / (last - first))
+        times = sorted(knots)
+        twists = [actuators.reached(piece.twist(time), wheels) for time in times]
+        for index in range(len(times) - 1):
+            yield _line(twists[index], twists[index + 1], times[index + 1] - times[index])
+
+
+def _lagging(here: Twist, pieces: Iterable[Piece], tau: float) -> Iterator[Piece]:
+    """Return how speeds follow others, which are linear in each piece, with first order."""
+    settling = SETTLING * tau
+    for piece in pieces:
+        v, omega = (
+            (a - b * tau, b, _rest(speed, a - b * tau))
+            for (a, b, _), speed in zip(piece[1:3], here, strict=True)
         )
-        return right, left
+        begin = 0.0
+        if v[2] or omega[2]:
+            lagging = Piece(min(piece.seconds, settling), v, omega, tau)
+            yield lagging
+            begin, here = lagging.seconds, lagging.twist(lagging.seconds)
+        if begin < piece.seconds:
+            line = Piece(math.inf, (*v[:2], 0.0), (*omega[:2], 0.0)).part(begin, piece.seconds)
+            yield line
+            if piece.seconds < math.inf:
+                here = line.twist(line.seconds)
 
-    def mean(self, settling: Settling) -> Speeds:
-        """Return the mean wheel speeds of the step."""
-        share = self.lag * NANOSECONDS / STEP * -math.expm1(-STEP / NANOSECONDS / self.lag)
-        right, left = (
-            goal + (speed - goal) * share
-            for speed, goal in zip(settling.speeds, settling.commanded, strict=True)
-        )
-        return right, left
 
-    def settled(self, speeds: Speeds, commanded: Speeds) -> bool:
-        """Return whether the wheels have reached the commanded speeds."""
-        if not self.lag:
-            return True
-        return abs(speeds[0] - commanded[0]) <= SETTLED and abs(speeds[1] - commanded[1]) <= SETTLED
-
-    def _rest(self, seconds: float) -> float:
-        """Return the share of a difference that is left after a time (s)."""
-        return math.exp(-seconds / self.lag) if self.lag else 0.0
+def _rest(speed: float, asymptote: float) -> float:
+    """Return by how much a lagging speed differs, zero if by its rounding error alone."""
+    reached = math.isclose(speed, asymptote, rel_tol=1e-15, abs_tol=1e-16)
+    return 0.0 if reached else speed - asymptote

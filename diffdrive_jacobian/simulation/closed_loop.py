@@ -3,7 +3,8 @@
 Every robot is sampled at the control rate. At each sample it either has arrived, or its law returns a
 body twist `[v, omega]` (m/s, rad/s). The twist is saturated, freed of whole turns per sample
 (`control.sampling.without_whole_turns`) and applied along the exact arc until the next sample. This is
-the loop of go_to_goal and virtual_robot without delay.
+the loop of go_to_goal and virtual_robot without delay. With `actuators` robots take time to follow, as
+`Robot` does.
 
 Starts, goals, gains, robots and limits broadcast with each other; the batch is their leading axes.
 
@@ -24,6 +25,7 @@ from diffdrive_jacobian.kinematics.saturation import VelocityLimits
 from diffdrive_jacobian.numerics.checks import function
 from diffdrive_jacobian.simulation._batch import Array, Batch, Outcomes, Rows
 from diffdrive_jacobian.simulation._block import Block, Keep
+from diffdrive_jacobian.simulation.actuators import Actuators
 
 BLOCK = 8192
 """Number of robots that are advanced together; their states fit into the processor's cache."""
@@ -38,7 +40,7 @@ class Trajectories(NamedTuple):
     Attributes:
         times: Shape (k + 1,) (s).
         poses: Shape (k + 1, ..., 3): time first, then the batch.
-        twists: `[v, omega]` from each sample to the next, shape (k, ..., 2) (m/s, rad/s).
+        twists: `[v, omega]` as commanded at each sample until the next, shape (k, ..., 2) (m/s, rad/s).
         outcomes: Outcome of each robot, as `closed_loops` returns it.
     """
 
@@ -60,6 +62,7 @@ def closed_loops(
     limits: VelocityLimits = NO_LIMITS,
     r: ArrayLike = 0.033,
     L: ArrayLike = 0.16,
+    actuators: Actuators | None = None,
     progress: Callable[[int], object] | None = None,
     on_step: Callable[[int], object] | None = None,
 ) -> Outcomes:
@@ -79,6 +82,8 @@ def closed_loops(
         limits: Velocity limits.
         r: Wheel radius, shape (...) (m).
         L: Wheel separation, shape (...) (m).
+        actuators: How all robots follow commands: limits of the acceleration, lag and delay. A robot
+            that has arrived then rolls on until it is at rest. None: at once.
         progress: Called from time to time with the number of robots that are finished.
         on_step: Called with that number at every step of every block of robots. An exception that it
             raises ends the batch and is passed on.
@@ -90,7 +95,9 @@ def closed_loops(
         ValueError: An argument has a wrong shape or value, the law returns something invalid, or an
             outcome overflows.
     """
-    batch = Batch.of(law, starts, goals, gains, rate, duration, arrival, turning_gain, limits, r, L)
+    batch = Batch.of(
+        law, starts, goals, gains, rate, duration, arrival, turning_gain, limits, r, L, actuators
+    )
     if progress is not None:
         function('progress', progress)
     if on_step is not None:
@@ -110,12 +117,15 @@ def trajectories(
     limits: VelocityLimits = NO_LIMITS,
     r: ArrayLike = 0.033,
     L: ArrayLike = 0.16,
+    actuators: Actuators | None = None,
 ) -> Trajectories:
     """Drive every robot to its goal and return every sample until the last robot is finished.
 
     Arguments and errors are those of `closed_loops`.
     """
-    batch = Batch.of(law, starts, goals, gains, rate, duration, arrival, turning_gain, limits, r, L)
+    batch = Batch.of(
+        law, starts, goals, gains, rate, duration, arrival, turning_gain, limits, r, L, actuators
+    )
     if (batch.steps + 1) * batch.size > MAX_SAMPLES:
         raise ValueError(
             f'duration must be shorter, because at most {MAX_SAMPLES:g} samples are kept, '

@@ -154,7 +154,7 @@ def propagated_moments(
             chord = alpha * (sin(half) / half if half else 1.0)
             cosine, sine = cos(theta + half), sin(theta + half)
             noise = short_arc(alpha, turn, nu, beta, m) if m else None
-            end = _composed(moments, cosine, sine, chord * cosine, chord * sine, m, noise)
+            end = composed(moments, cosine, sine, chord * cosine, chord * sine, m, noise)
         else:
             end = _extended(moments, theta, alpha, turn, m, _noise(alpha, turn, nu, beta, m))
     except (OverflowError, ValueError, ZeroDivisionError):
@@ -188,10 +188,10 @@ def _extended(
     sinc = sin(half) / half if half else 1.0
     along, across = alpha * (sin(turn) / turn if turn else 1.0), -alpha * sinc * sin(half)
     gx, gy = cosine * along - sine * across, sine * along + cosine * across
-    return _composed(moments, cosine, sine, gx, gy, m, None if noise is None else central(noise, m))
+    return composed(moments, cosine, sine, gx, gy, m, None if noise is None else central(noise, m))
 
 
-def _composed(
+def composed(
     moments: Entries,
     cosine: float,
     sine: float,

@@ -66,7 +66,7 @@ class SweepSetup(Checked):
     tolerance: Positive = 0.02
     """Distance that counts as arrived (m)."""
     robot: RobotModel = field(default_factory=RobotModel)
-    """The robot; its wheels and limits are used."""
+    """The robot; its wheels, limits and actuators are used."""
 
     def __post_init__(self) -> None:
         """Check every value, and that the sweep is not too large."""
@@ -303,6 +303,7 @@ def _drive(setup: SweepSetup, rows: slice, progress: Callable[[int], object] | N
         limits=setup.robot.limits,
         r=min(setup.robot.radii),
         L=setup.robot.wheel_separation,
+        actuators=setup.robot.actuators,
         on_step=progress,
     )
 

@@ -5,16 +5,15 @@ State at a time: pose `[x, y, theta]` (m, m, rad) with its covariance, wheel ang
 timestamps. Times are integer nanoseconds, so that Unix time loses no precision.
 
 The state is stored at the last event (command, timeout, placement). Every later state is computed from
-it along one exact arc, so the motion does not depend, to the last bit, on when states are computed.
+it along one exact arc, so the motion does not depend, to the last bit, on when states are computed. With
+`actuators` that take time (limits of the acceleration, a lag, a delay) it is computed along the `Drive`
+that began with that event, and the same holds.
 
 A state is computed in floats, its covariance when it is first read, and arrays whenever they are read. A
 node that needs no arrays reads `pose_tuple` and `covariance_tuple`.
 
 The pose is that of the odometry, computed from the turns of the wheels. The robot is truly there, unless
 its model has a `drift`. `true_pose` is where it truly is.
-
-With `actuators` that lag, the twist also changes between the events, at the end of each step of the lag
-(`next_change`).
 
 Source: doc/mathematics.md, "Motion".
 """
@@ -39,13 +38,14 @@ from diffdrive_jacobian.numerics.checks import (
 )
 from diffdrive_jacobian.numerics.fields import instance
 from diffdrive_jacobian.simulation._uncertainty import Uncertainty
-from diffdrive_jacobian.simulation.actuators import Settling, Speeds
+from diffdrive_jacobian.simulation.actuators import Drive, Speeds
 from diffdrive_jacobian.simulation.arc import arc_end
 from diffdrive_jacobian.simulation.exact_moments import Moments, gaussian
 from diffdrive_jacobian.simulation.odometry_noise import twist_covariance
 from diffdrive_jacobian.simulation.robot_model import RobotModel as RobotModel
 from diffdrive_jacobian.simulation.robot_model import pair
 from diffdrive_jacobian.simulation.slip import Truth
+from diffdrive_jacobian.simulation.speeds import Piece, displaced
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 STANDSTILL = (0.0, 0.0)
@@ -73,7 +73,7 @@ class Robot:
             '_commanded_at',
             '_expiry',
         ),
-        *('_uncertainty', '_truth', '_settling', '_ahead'),
+        *('_uncertainty', '_truth', '_drive', '_ahead', '_knot'),
     )
     _model: RobotModel
     _stamp: int
@@ -86,10 +86,12 @@ class Robot:
     _uncertainty: Uncertainty
     # None: the pose is the true one.
     _truth: Truth | None
-    # None: the wheels have reached their commanded speeds.
-    _settling: Settling | None
+    # None: the twist is held until the next event.
+    _drive: Drive | None
     # The last state that was computed from this one, because often the same one is needed next.
     _ahead: tuple[int, _State] | None
+    # Where the last state that was computed along the drive begins (s), and the state there.
+    _knot: tuple[float, _State] | None
 
     def __init__(
         self,
@@ -126,7 +128,7 @@ class Robot:
             commanded_at = nanoseconds('commanded_at', commanded_at)
         self._commanded_at = commanded_at
         self._expiry = _expiry(model, self._stamp, commanded_at)
-        self._settling = self._ahead = None
+        self._drive = self._ahead = self._knot = None
 
     def __repr__(self) -> str:
         """Return a constructor call with the values."""
@@ -187,8 +189,24 @@ class Robot:
 
     @property
     def twist(self) -> tuple[float, float]:
-        """The applied twist: the command after saturation, as the motors follow it."""
+        """The twist `(v, omega)` of the odometry at this time."""
+        drive = self._drive
+        return self._twist if drive is None else drive.motion.twist(drive.motion.seconds(self._stamp))
+
+    @property
+    def target(self) -> tuple[float, float]:
+        """The twist that the robot is to reach: the command after saturation, as far as the motors
+        reach it.
+        """
         return self._twist
+
+    @property
+    def settles_at(self) -> int:
+        """Time from which on the twist is constant without a further event (ns)."""
+        drive = self._drive
+        if drive is None:
+            return self._stamp
+        return max(self._stamp, drive.motion.settled_at)
 
     @property
     def commanded_at(self) -> int | None:
@@ -226,6 +244,11 @@ class Robot:
         truth, model = self._truth, self.model
         if truth is None:
             return self.twist
+        if self._drive is not None:
+            motion = self._drive.motion
+            return truth.twist_along(
+                motion, self.stamp, model.wheel_separation, model.wheel_travel_variance
+            )
         return truth.twist(self.stamp, self.twist, model.wheel_separation, model.wheel_travel_variance)
 
     @property
@@ -236,21 +259,6 @@ class Robot:
             ValueError: They overflow.
         """
         return Moments(*self._uncertainty.moments())
-
-    @property
-    def next_change(self) -> int | None:
-        """Next time at which the twist changes without a command, by the timeout or the lag (ns); None:
-        it does not.
-        """
-        settling, expiry = self._settling, self.expiry
-        if settling is None:
-            return expiry
-        return settling.end if expiry is None else min(settling.end, expiry)
-
-    @property
-    def changed_at(self) -> int:
-        """Time of the last command, timeout, placement or change of the model (ns)."""
-        return self.stamp if self._settling is None else self._settling.since
 
     @property
     def wheel_speeds(self) -> tuple[float, float]:
@@ -288,12 +296,9 @@ class Robot:
             ValueError: The time is earlier than this state, is not an integer, or so late that the
                 motion overflows.
         """
-        if self.model.actuators is not None:
-            return self._changed_until(stamp)
-        stamp, state, expired = self._advanced(stamp)
-        if expired:
-            return _robot(self.model, stamp, state, STANDSTILL, STANDSTILL)
-        return _robot(self.model, stamp, state, self.command, self.twist, self.commanded_at)
+        stamp, robot, state = self._advanced(stamp)
+        command, twist, commanded_at = robot._command, robot._twist, robot._commanded_at
+        return _robot(robot._model, stamp, state, command, twist, commanded_at, robot._drive)
 
     def commanded(self, command: ArrayLike, stamp: int) -> Robot:
         """Apply a command from a time on, within the limits.
@@ -308,12 +313,9 @@ class Robot:
         v, omega = pair('command', command)
         model = self.model
         twist = model.limited((v, omega))
-        if model.actuators is not None:
-            here = self._changed_until(stamp)
-            commanded_at = None if v == omega == 0.0 else here.stamp
-            return here._driven(model, here._present, (v, omega), twist, commanded_at)
-        stamp, state, _ = self._advanced(stamp)
-        return _robot(model, stamp, state, (v, omega), twist, None if v == omega == 0.0 else stamp)
+        stamp, robot, state = self._advanced(stamp)
+        commanded_at = None if v == omega == 0.0 else stamp
+        return robot._following(model, stamp, state, (v, omega), twist, commanded_at)
 
     def placed(
         self, pose: ArrayLike, covariance: ArrayLike, stamp: int, *, odometry_only: bool = False
@@ -401,9 +403,7 @@ class Robot:
         else:
             truth = truth.with_drift(model.drift)
         state = pose, angles, uncertainty, truth
-        if model.actuators is not None:
-            return here._driven(model, state, command, limited, here.commanded_at)
-        return _robot(model, here.stamp, state, command, limited, here.commanded_at)
+        return here._following(model, here.stamp, state, command, limited, here.commanded_at)
 
     def restarted(self, stamp: int) -> Robot:
         """Stop at the same pose, at a time that may be earlier.
@@ -422,95 +422,59 @@ class Robot:
 
     def _with(self, state: _State) -> Robot:
         """Return a robot that was put into another state, with the same motion."""
-        settling = self._settling
-        if settling is not None:
-            settling = settling._replace(since=self.stamp)
-        command, twist = self.command, self.twist
-        return _robot(self.model, self.stamp, state, command, twist, self.commanded_at, settling)
+        command, twist = self.command, self._twist
+        return _robot(self.model, self.stamp, state, command, twist, self.commanded_at, self._drive)
 
-    def _changed_until(self, stamp: int) -> Robot:
-        """Advance as `at` does, with actuators, through the steps of their lag and the timeout."""
-        stamp, robot = nanoseconds('stamp', stamp), self
-        while (change := robot.next_change) is not None and change <= stamp:
-            robot = robot._changed(change)
-        if stamp < robot.stamp:
-            raise ValueError(f'stamp cannot go back from {self.stamp} ns to {stamp} ns')
-        command, twist, commanded_at = robot.command, robot.twist, robot.commanded_at
-        state = robot._state(stamp)
-        return _robot(robot.model, stamp, state, command, twist, commanded_at, robot._settling)
-
-    def _changed(self, stamp: int) -> Robot:
-        """Return the robot at the time of its next change."""
-        model, command, commanded_at = self.model, self.command, self.commanded_at
-        state = self._state(stamp)
-        here = _robot(model, stamp, state, command, self.twist, commanded_at, self._settling)
-        if self.expiry == stamp:
-            return here._driven(model, state, STANDSTILL, STANDSTILL, None)
-        twist = model.limited(command)
-        return here._driven(model, state, command, twist, commanded_at, self.changed_at)
-
-    def _driven(
+    def _following(
         self,
         model: RobotModel,
+        stamp: int,
         state: _State,
         command: tuple[float, float],
-        twist: tuple[float, float],
+        target: tuple[float, float],
         commanded_at: int | None,
-        since: int | None = None,
     ) -> Robot:
-        """Return the robot in a state, from now on following a command with the actuators of a model.
+        """Return the robot in a state, from now on following a command.
 
         Args:
-            model: The model, with actuators.
+            model: The model from now on.
+            stamp: The time (ns).
             state: The state.
             command: The command.
-            twist: The twist that it demands, within the limits of the model.
+            target: The twist that it demands, within the limits of the model.
             commanded_at: Time at which the command took effect (ns).
-            since: Time from which on the command is followed (ns); None: from now on.
         """
         actuators = model.actuators
-        assert actuators is not None
-        stamp = self.stamp
-        demanded = model.wheel_speeds(*twist)
-        speeds, reached = self._motor_speeds, actuators.limited(demanded)
-        settling = None
-        if actuators.settled(speeds, reached):
-            if reached != demanded:
-                twist = model.twist(*reached)
-        else:
-            settling = Settling(stamp if since is None else since, stamp, speeds, reached)
-            twist = model.twist(*actuators.mean(settling))
-        return _robot(model, stamp, state, command, twist, commanded_at, settling)
+        if actuators is None or actuators.immediate:
+            twist = target if actuators is None else actuators.reached(target, model)
+            return _robot(model, stamp, state, command, twist, commanded_at)
+        drive = self._drive or Drive.at(stamp, self._twist)
+        drive = drive.followed(stamp, target, actuators, model)
+        return _robot(model, stamp, state, command, target, commanded_at, drive)
 
-    @property
-    def _motor_speeds(self) -> Speeds:
-        """The wheel speeds at this time (rad/s). Those of the twist are means over a step of the lag."""
-        actuators = self.model.actuators
-        if self._settling is None or actuators is None:
-            return self.wheel_speeds
-        return actuators.after(self._settling, self.stamp)
-
-    def _advanced(self, stamp: int) -> tuple[int, _State, bool]:
-        """Return a time (ns), the state at that time, and whether the timeout stopped the robot before.
+    def _advanced(self, stamp: int) -> tuple[int, Robot, _State]:
+        """Return a time (ns), the robot after its last event before it, and the state at that time.
 
         Raises:
             ValueError: As `at`.
         """
         if type(stamp) is not int or stamp > MAX_NANOSECONDS:
             stamp = nanoseconds('stamp', stamp)
-        if stamp < self.stamp:
-            raise ValueError(f'stamp cannot go back from {self.stamp} ns to {stamp} ns')
-        expiry = self.expiry
-        if expiry is None or expiry > stamp:
-            return stamp, self._state(stamp), False
-        stopped = _robot(self.model, expiry, self._state(expiry), STANDSTILL, STANDSTILL)
-        return stamp, stopped._state(stamp), True
+        if stamp < self._stamp:
+            raise ValueError(f'stamp cannot go back from {self._stamp} ns to {stamp} ns')
+        robot, expiry = self, self._expiry
+        if expiry is not None and expiry <= stamp:
+            state = self._state(expiry)
+            robot = self._following(self._model, expiry, state, STANDSTILL, STANDSTILL, None)
+        return stamp, robot, robot._state(stamp)
 
     def _state(self, stamp: int) -> _State:
         """Compute the state at a time up to the timeout."""
         ahead = self._ahead
         if ahead is not None and ahead[0] == stamp:
             return ahead[1]
+        if self._drive is not None:
+            return self._driven(self._drive, stamp)
         dt = (stamp - self.stamp) / NANOSECONDS
         twist = v, omega = self.twist
         truth, model = self._truth, self.model
@@ -532,6 +496,43 @@ class Robot:
         self._ahead = stamp, state
         return state
 
+    def _driven(self, drive: Drive, stamp: int) -> _State:
+        """Compute the state at a time up to the timeout, along a drive."""
+        model, truth = self._model, self._truth
+        L, k = model.wheel_separation, model.wheel_travel_variance
+        if truth is not None:
+            truth = truth.along(drive.motion, self._stamp, stamp, L, k)
+        time, end = drive.motion.seconds(self._stamp), drive.motion.seconds(stamp)
+        state = self._present
+        if self._knot is not None and self._knot[0] <= end:
+            time, state = self._knot
+        for piece, limit in drive.motion.steps(time, end):
+            if limit == end:
+                # The state may be asked for again at a later time.
+                self._knot = time, state
+            state, time = self._after(state, piece, L, k), limit
+        pose, angles, uncertainty, _ = state
+        state = pose, angles, uncertainty, truth
+        self._ahead = stamp, state
+        return state
+
+    def _after(self, state: _State, piece: Piece, L: float, k: float) -> _State:
+        """Compute the state after a step of a drive; the truth is left out."""
+        pose, (right, left), uncertainty, _ = state
+        dt = piece.seconds
+        if piece.constant:
+            v, omega = twist = piece.twist(0.0)
+            if twist == STANDSTILL:
+                return state
+            turned = self._model.wheel_speeds(v * dt, omega * dt)
+            uncertainty = uncertainty.after((pose[2], twist, dt, L, k))
+            pose = arc_end(*pose, v, omega, dt)
+        else:
+            turned = self._model.wheel_speeds(*piece.path(dt))
+            uncertainty = uncertainty.after((pose[2], piece, dt, L, k))
+            pose = displaced(pose, piece.displacement(dt))
+        return pose, (right + turned[0], left + turned[1]), uncertainty, None
+
 
 def _robot(
     model: RobotModel,
@@ -540,7 +541,7 @@ def _robot(
     command: tuple[float, float],
     twist: tuple[float, float],
     commanded_at: int | None = None,
-    settling: Settling | None = None,
+    drive: Drive | None = None,
 ) -> Robot:
     """Return a robot with checked values, without checking them again for every message."""
     robot = object.__new__(Robot)
@@ -548,7 +549,8 @@ def _robot(
     robot._pose, robot._wheel_angles, robot._uncertainty, robot._truth = state
     robot._command, robot._twist, robot._commanded_at = command, twist, commanded_at
     robot._expiry = _expiry(model, stamp, commanded_at)
-    robot._settling, robot._ahead = settling, None
+    robot._drive = drive
+    robot._ahead = robot._knot = None
     return robot
 
 

@@ -91,6 +91,11 @@ class RobotModel(Checked):
         return v, omega
 
     @property
+    def takes_time(self) -> bool:
+        """Whether commands are not followed at once."""
+        return self.actuators is not None and not self.actuators.immediate
+
+    @property
     def radii(self) -> tuple[float, float]:
         """Radii of the right and the left wheel (m)."""
         return (

@@ -28,6 +28,7 @@ Sources: doc/mathematics.md, "Slip"; Salmon, Moraes, Dror and Shaw, "Parallel ra
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Annotated, Any, TypeAlias
@@ -37,6 +38,7 @@ import numpy as np
 from diffdrive_jacobian.numerics.checks import Positive
 from diffdrive_jacobian.numerics.fields import Checked, integer, optional
 from diffdrive_jacobian.simulation.arc import arc_end
+from diffdrive_jacobian.simulation.speeds import Piece, Profile, moved, rolled
 from diffdrive_jacobian.time_units import NANOSECONDS
 
 CELL = 20_000_000
@@ -161,6 +163,95 @@ class Truth:
             time, slipped = end, None
             self._ahead = motion, time, pose
         return Truth(drift, pose, slipped, (twist, since))
+
+    def along(self, motion: Profile, begin: int, end: int, L: float, k: float) -> Truth:
+        """Return the truth after a motion whose speeds change with time.
+
+        In a cell a wheel slips at a constant speed from one piece of the motion to the next, such that
+        at the end of the piece what was slipped has the variance of the distance so far.
+
+        Args:
+            motion: The nominal twist.
+            begin: Time of this value (ns).
+            end: A later time (ns).
+            L: Nominal wheel separation (m).
+            k: Variance of each wheel's travel per distance (m).
+
+        Raises:
+            ValueError: The motion overflows.
+        """
+        # From the first cell on in which the twist is constant, as if it was commanded there.
+        settled = max(begin, (motion.settled_at // CELL + 1) * CELL)
+        here, time, last = self, begin, min(end, settled)
+        if self._ahead is not None and self._ahead[0] is motion and self._ahead[1] <= last:
+            _, time, pose = self._ahead
+            here = Truth(self._drift, pose)
+        while time < last:
+            cell_end = (time // CELL + 1) * CELL
+            here = here._in_cell(motion, time, min(cell_end, last), L, k)
+            time = cell_end
+            if cell_end <= last:
+                self._ahead = motion, cell_end, here.pose
+        return here.after(settled, end, motion.final, L, k) if end > settled else here
+
+    def twist_along(self, motion: Profile, stamp: int, L: float, k: float) -> tuple[float, float]:
+        """Return the true twist from a time on in such a motion, with the arguments of `along`."""
+        wheels, _, _ = next(self._slipping(motion, stamp, L, k))
+        right, left = wheels.twist(0.0)
+        return (right + left) / 2.0, (right - left) / (L * self._drift.wheel_separation_multiplier)
+
+    def _in_cell(self, motion: Profile, begin: int, end: int, L: float, k: float) -> Truth:
+        """Return the truth after a part of a cell, with the arguments of `along`."""
+        pose, slipped, cell = self.pose, None, begin // CELL
+        separation = L * self._drift.wheel_separation_multiplier
+        time, last = motion.seconds(begin), motion.seconds(end)
+        for wheels, rolling, (a_R, V_R, gain_R, a_L, V_L, gain_L) in self._slipping(motion, begin, L, k):
+            seconds = min(wheels.seconds, last - time)
+            part = wheels.part(0.0, seconds)
+            pose = moved(pose, part.mapped(((0.5, 0.5), (1.0 / separation, -1.0 / separation))))
+            if end % CELL:
+                rolled_R, rolled_L = (
+                    k * rolled(rim, rolling, seconds) for rim in (rolling.v, rolling.omega)
+                )
+                slipped = (
+                    *(0, cell, a_R + gain_R * seconds, V_R + rolled_R),
+                    *(a_L + gain_L * seconds, V_L + rolled_L),
+                )
+            time += seconds
+            if time >= last:
+                break
+        return Truth(self._drift, pose, slipped)
+
+    def _slipping(
+        self, motion: Profile, begin: int, L: float, k: float
+    ) -> Iterator[tuple[Piece, Piece, tuple[float, float, float, float, float, float]]]:
+        """Yield the pieces from a time to the end of its cell.
+
+        Yields:
+            The speeds of the true rims of right and left wheel, with and without the slip; a, V and the
+            slip for xi = 1 of the right wheel, then of the left one, at the beginning of the piece.
+        """
+        drift, cell = self._drift, begin // CELL
+        slips = drift.seed is not None and k > 0.0
+        xi_R, xi_L = normals(drift.seed, 0, cell) if drift.seed is not None else (0.0, 0.0)
+        a_R = V_R = a_L = V_L = gain_R = gain_L = 0.0
+        if self._slipped is not None and self._slipped[:2] == (0, cell):
+            _, _, a_R, V_R, a_L, V_L = self._slipped
+        m_R, m_L = drift.right_wheel_radius_multiplier, drift.left_wheel_radius_multiplier
+        rims = (m_R, m_R * L / 2.0), (m_L, -m_L * L / 2.0)
+        end = motion.seconds((cell + 1) * CELL)
+        for piece in motion.between(motion.seconds(begin), end):
+            rolling = wheels = piece.mapped(rims)
+            seconds = piece.seconds
+            if slips:
+                grown_R = V_R + k * rolled(rolling.v, rolling, seconds)
+                grown_L = V_L + k * rolled(rolling.omega, rolling, seconds)
+                gain_R = (math.sqrt(grown_R) - a_R) / seconds
+                gain_L = (math.sqrt(grown_L) - a_L) / seconds
+                wheels = rolling.faster(gain_R * xi_R, gain_L * xi_L)
+            yield wheels, rolling, (a_R, V_R, gain_R, a_L, V_L, gain_L)
+            if slips:
+                a_R, V_R, a_L, V_L = math.sqrt(grown_R), grown_R, math.sqrt(grown_L), grown_L
 
     def twist(self, stamp: int, twist: tuple[float, float], L: float, k: float) -> tuple[float, float]:
         """Return the true twist from a time on, the slip included (m/s, rad/s).

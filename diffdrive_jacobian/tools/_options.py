@@ -214,6 +214,41 @@ def given_heading(parser: argparse.ArgumentParser, options: argparse.Namespace) 
     return value
 
 
+FOLLOWING = {
+    '--max-acceleration': ('A', 'largest acceleration and deceleration (m/s^2) (default: no limit)'),
+    '--max-yaw-acceleration': ('A', 'largest angular acceleration (rad/s^2) (default: no limit)'),
+    '--wheel-lag': ('S', 'time constant with which the wheels follow commands (s) (default: 0)'),
+    '--command-delay': ('S', 'time from a command to its effect on the wheels (s) (default: 0)'),
+}
+"""Options for a robot that takes time to follow commands, with unit and help."""
+
+
+def add_following(parser: argparse.ArgumentParser) -> None:
+    """Add the options for a robot that takes time to follow commands, see `following_parameters`."""
+    for option, (unit, text) in FOLLOWING.items():
+        add_value(parser, option, unit, text)
+
+
+def following_parameters(options: argparse.Namespace) -> dict[str, float]:
+    """Return what these options are as parameters of virtual_robot and of go_to_goal."""
+    given: dict[str, float | None] = {
+        'wheel_lag': options.wheel_lag,
+        'command_delay': options.command_delay,
+    }
+    for axis, limit in (
+        ('linear.x', options.max_acceleration),
+        ('angular.z', options.max_yaw_acceleration),
+    ):
+        for name, sign in (
+            ('max_acceleration', 1.0),
+            ('max_deceleration', -1.0),
+            ('max_acceleration_reverse', -1.0),
+            ('max_deceleration_reverse', 1.0),
+        ):
+            given[f'{axis}.{name}'] = None if limit is None else sign * limit
+    return {name: value for name, value in given.items() if value is not None}
+
+
 # --- Files
 
 

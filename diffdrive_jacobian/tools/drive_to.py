@@ -74,6 +74,7 @@ def main(arguments: Sequence[str], signals: Signals) -> int:
                     isolated=not options.open,
                     timeout=options.timeout,
                     parameters=_controller_parameters(options),
+                    robot_parameters=_options.following_parameters(options),
                     recording=recording,
                     ros_arguments=ros,
                     signals=signals,
@@ -123,6 +124,7 @@ def _drive_with_page(
                 lockstep=options.lockstep,
                 isolated=not options.open,
                 parameters=_controller_parameters(options),
+                robot_parameters=_options.following_parameters(options),
                 recording=recording,
                 ros_arguments=ros,
                 port=options.port,
@@ -189,7 +191,11 @@ class _Progress:
 
 def _controller_parameters(options: argparse.Namespace) -> dict[str, Any]:
     """Return the controller's parameters that were given by an option of their own."""
-    given = {'xy_goal_tolerance': options.tolerance, 'controller': options.controller}
+    given = {
+        **_options.following_parameters(options),
+        'xy_goal_tolerance': options.tolerance,
+        'controller': options.controller,
+    }
     if options.heading is not None:
         given['use_goal_heading'] = True
     return {name: value for name, value in given.items() if value is not None}
@@ -319,6 +325,7 @@ def _parser() -> _cli.Parser:
         CONTROLLERS,
         'controller: %(choices)s (default: go_to_goal, unless a file names another)',
     )
+    _options.add_following(parser)
     _options.add_params_file(parser)
     _options.add_output(
         parser,

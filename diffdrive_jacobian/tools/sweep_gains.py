@@ -150,6 +150,7 @@ def _robot(options: argparse.Namespace) -> RobotModel:
     for name, limit in (('linear.x', options.max_velocity), ('angular.z', options.max_yaw_rate)):
         if limit is not None:
             values |= {f'{name}.max_velocity': limit, f'{name}.min_velocity': -limit}
+    values |= _options.following_parameters(options)
     return from_ros(VirtualRobotParameters, values).model()
 
 
@@ -249,6 +250,7 @@ def _parser(controller: Controller = BUILT_IN['go_to_goal']) -> _cli.Parser:
     _options.add_value(
         parser, '--max-yaw-rate', 'W', 'limit of the yaw rate (rad/s) (default: no limit)'
     )
+    _options.add_following(parser)
     _options.add_params_file(
         parser,
         'parameter file (YAML) with the limits and wheels of virtual_robot, as in config/ '

@@ -2,9 +2,11 @@
 
 For each drive: the mean normalized error squared (NEES, 3 is right) of the true pose about the odometry,
 with the published covariance, over 4,000 seeds, and the standard deviations. Commands take effect within
-cells, also several in each. Then the CPU time of a message with and without slip, interleaved, and that
-of long gaps.
-`--seconds 60` drives longer: half a minute of CPU time for each ten seconds.
+cells, also several in each. Some robots have acceleration limits, a lag and a delay. The last column is
+the NEES of as many runs with noisy wheels in steps of 10 ms, which do not use the slip. Then the CPU time
+of a message with and without slip, interleaved, and that of long gaps.
+`--seconds 60` drives longer: half a minute of CPU time for each ten seconds. `--limited` leaves out the
+robots without limits.
 """
 
 from __future__ import annotations
@@ -15,7 +17,10 @@ import os
 import statistics
 import sys
 import time
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -23,27 +28,75 @@ from rich.console import Console
 from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from moments_reference import DRIVES
+from moments_reference import DRIVES, noisy_runs
 
 from diffdrive_jacobian.simulation import Drift, Robot, RobotModel
-from diffdrive_jacobian.time_units import nanoseconds
+from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits
+from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.time_units import NANOSECONDS, nanoseconds
 
 DRIVES = DRIVES | {
     'short starts': lambda duration: [((0.22, 0.0), 0.002), ((0.0, 0.0), 0.018)] * round(50 * duration),
     'short stops': lambda duration: [((0.22, 0.0), 0.014), ((0.0, 0.0), 0.001)] * round(67 * duration),
 }
+_AXIS = {
+    'max_acceleration': 0.5,
+    'max_deceleration': -0.8,
+    'max_acceleration_reverse': -0.3,
+    'max_deceleration_reverse': 0.6,
+}
+LIMITS = AccelerationLimits(
+    v=AxisLimits(**_AXIS), omega=AxisLimits(max_acceleration=2.0), max_wheel_acceleration=20.0
+)
+_TURNS = (
+    ((0.22, 0.3), 1.3),
+    ((-0.1, -0.8), 0.9),
+    ((0.2, -0.5), 0.7),
+    ((0.0, 0.0), 0.6),
+    ((0.1, 1.2), 1.5),
+)
+LIMITED = {
+    'limits, stop and go': ('stop and go', Actuators(acceleration=LIMITS)),
+    'limits, turns': ('turns', Actuators(acceleration=LIMITS)),
+    'lag, turns': ('turns', Actuators(lag=0.2)),
+    'all, turns': ('turns', Actuators(acceleration=LIMITS, lag=0.1, delay=50_000_000)),
+}
+"""Drives of robots that take time to follow commands."""
+DRIVES['turns'] = lambda duration: [*_TURNS] * round(duration / 5.0)
 START = 7_654_321
-PERIOD = 20_000_000
+PERIOD, STEP = 20_000_000, 10_000_000
 GAPS = {'1 s': 1.0, '1 min': 60.0, '1 h': 3600.0, '1 day': 86400.0, '1 year': 3.15e7}
 
 
 def driven(model: RobotModel, name: str, duration: float) -> Robot:
     """Return a robot after a drive."""
-    robot, stamp = Robot(model=model, stamp=START, pose=np.zeros(3)), START
-    for twist, held in DRIVES[name](duration):
+    return list(states(model, name, duration))[-1]
+
+
+def states(model: RobotModel, name: str, duration: float) -> Iterator[Robot]:
+    """Yield the robot after each command of a drive, and at its end."""
+    drive, actuators = LIMITED.get(name, (name, None))
+    stamp = START
+    robot = Robot(model=replace(model, actuators=actuators), stamp=stamp, pose=np.zeros(3))
+    for twist, held in DRIVES[drive](duration):
         robot = robot.commanded(tuple(map(float, twist)), stamp)
+        yield robot
         stamp += nanoseconds(held)
-    return robot.at(stamp)
+    yield robot.at(stamp)
+
+
+def noisy(name: str, duration: float, count: int) -> np.ndarray:
+    """Return the errors of runs with noisy wheels in short steps of constant twist, shape (n, 3)."""
+    model, steps = RobotModel(), []
+    for one, other in pairwise(states(model, name, duration)):
+        number = math.ceil((other.stamp - one.stamp) / STEP)
+        length = (other.stamp - one.stamp) / number
+        steps += [
+            (one.at(one.stamp + round((step + 0.5) * length)).twist, length / NANOSECONDS)
+            for step in range(number)
+        ]
+    rng, L, k = np.random.default_rng(1), model.wheel_separation, model.wheel_travel_variance
+    return noisy_runs(rng, steps, np.zeros((3, 3)), count, L, k)
 
 
 def errors(name: str, duration: float, seeds: range) -> np.ndarray:
@@ -56,23 +109,27 @@ def errors(name: str, duration: float, seeds: range) -> np.ndarray:
     return np.array(found)
 
 
-def accuracy(count: int, duration: float) -> Table:
+def accuracy(names: Iterable[str], count: int, duration: float) -> Table:
     """Return the table of the errors."""
     table = Table(title=f'ground_truth about odom after {duration:g} s, {count} seeds')
-    for name in ('drive', 'NEES', 'sigma x (m)', 'published', 'sigma y (m)', 'published'):
+    for name in ('drive', 'NEES', 'sigma x (m)', 'published', 'sigma y (m)', 'published', 'NEES, noisy'):
         table.add_column(name, justify='right')
     workers = os.cpu_count() or 1
     shares = [range(count)[first::workers] for first in range(workers)]
     with ProcessPoolExecutor(workers) as pool:
-        for name in DRIVES:
+        for name in names:
             parts = pool.map(errors, [name] * workers, [duration] * workers, shares)
             found = np.concatenate(list(parts))
             covariance = driven(RobotModel(), name, duration).covariance
-            values = np.einsum('ni,ij,nj->n', found, np.linalg.inv(covariance), found)
+            inverse = np.linalg.inv(covariance)
+            values = np.einsum('ni,ij,nj->n', found, inverse, found)
+            others = noisy(name, duration, count)
+            by_steps = np.einsum('ni,ij,nj->n', others, inverse, others).mean()
             sigma, published = np.sqrt(np.mean(found**2, axis=0)), np.sqrt(np.diag(covariance))
             table.add_row(
                 *(name, f'{values.mean():.2f} ± {values.std() / math.sqrt(count):.2f}'),
                 *(f'{sigma[0]:.5f}', f'{published[0]:.5f}', f'{sigma[1]:.5f}', f'{published[1]:.5f}'),
+                f'{by_steps:.2f}',
             )
     return table
 
@@ -111,9 +168,11 @@ def main() -> None:
     parser.add_argument('--seeds', type=int, default=4000, help='number of seeds (default: 4000)')
     parser.add_argument('--seconds', type=float, default=10.0, help='length of a drive (default: 10.0)')
     parser.add_argument('--rounds', type=int, default=20, help='rounds of timing (default: 20)')
+    parser.add_argument('--limited', action='store_true', help='only robots with limits')
     options = parser.parse_args()
-    console = Console(width=110)
-    console.print(accuracy(options.seeds, options.seconds))
+    console = Console(width=120)
+    names = [*([] if options.limited else DRIVES), *LIMITED]
+    console.print(accuracy(names, options.seeds, options.seconds))
     console.print(cost(options.rounds))
 
 

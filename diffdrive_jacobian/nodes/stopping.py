@@ -1,0 +1,80 @@
+"""What a robot that takes time to stop means for those who stop it, in words.
+
+Source: doc/mathematics.md, "Acceleration, lag and delay".
+"""
+
+from __future__ import annotations
+
+import math
+
+from diffdrive_jacobian.kinematics.saturation import VelocityLimits
+from diffdrive_jacobian.simulation.actuators import Actuators, Wheels
+
+NEGLIGIBLE = 5e-4
+"""Motion that is not described (m, rad)."""
+
+
+def rolls_on(
+    actuators: Actuators | None, twist: tuple[float, float], wheels: Wheels | None = None
+) -> str:
+    """Describe how far a robot rolls after a zero command, to be appended to a sentence.
+
+    Args:
+        actuators: How it follows commands, as far as that is known. None: at once.
+        twist: Its twist `(v, omega)` (m/s, rad/s).
+        wheels: Its wheels; None: the limit of their acceleration is left out.
+
+    Returns:
+        The description. Empty: it stops at once, or nothing is known.
+    """
+    if actuators is None or actuators.immediate or not math.isfinite(sum(twist)):
+        return ''
+    distance, turn = actuators.rolled(twist, wheels)
+    if max(abs(distance), abs(turn)) < NEGLIGIBLE:
+        return ''
+    return f'; the robot rolls on for about {abs(distance):.3f} m and turns by {turn:.3f} rad'
+
+
+def overshoot_warnings(
+    kv: float | None, kp: float | None, limits: VelocityLimits, actuators: Actuators
+) -> list[str]:
+    """Return warnings about gains that ask for more deceleration than a robot has.
+
+    A law whose speed is `gain` times what is left, up to a limit, is too fast to stop where
+
+        speed (reaction + speed / (2 deceleration)) > speed / gain
+
+    Args:
+        kv: Gain on the distance (1/s); None: the law has none.
+        kp: Gain on the heading error (1/s); None: the law has none.
+        limits: The velocity limits.
+        actuators: How the robot follows commands, as far as that is known.
+    """
+    if actuators.immediate:
+        return []
+    v, omega = actuators.acceleration.v, actuators.acceleration.omega
+    found = []
+    for name, gain, speed, deceleration, unit, farthest in (
+        ('kv', kv, limits.max_v, -v.max_deceleration, 'm', math.inf),
+        (
+            *('kp', kp, max(-limits.min_omega, limits.max_omega)),
+            *(min(-omega.max_deceleration, omega.max_deceleration_reverse), 'rad', math.pi),
+        ),
+    ):
+        if gain is None:
+            continue
+        fastest = 2.0 * deceleration * max(1.0 / gain - actuators.reaction, 0.0)
+        if math.isnan(fastest):
+            # No limit of the acceleration, and no time to react.
+            fastest = 0.0
+        begin, speed = fastest / gain, min(speed, gain * farthest)
+        if speed <= fastest or begin >= farthest:
+            continue
+        best = 1.0 / (actuators.reaction + speed / (2.0 * deceleration))
+        what = 'goals further away' if unit == 'm' else 'turns by more'
+        found.append(
+            f'{name} {gain:g} lets the robot drive too fast to stop with its limits of the '
+            f'acceleration, its lag and delay: {what} than {begin:.3g} {unit} may be overshot; choose '
+            f'{name} below {best:.3g}, a lower limit of the velocity, or stop_in_time'
+        )
+    return found

@@ -1,0 +1,299 @@
+"""Speeds that change with time, polynomials and exponential functions of it.
+
+Both v and omega of a body twist are piecewise
+
+    a + b t + c exp(-t / tau)
+
+That is what acceleration limits and a first-order lag of the wheels make of commands. The last piece is
+constant and has no end.
+
+The pose after a time is an integral over v and the heading. It is computed by Gauss-Legendre quadrature
+in steps that turn by at most `MAX_TURN` and last at most `MAX_DECAY` time constants, with fewer nodes in
+short ones. The steps of a piece are equal, and begin with it. So the state at a time depends on the
+pieces alone, not on the times at which states are computed.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Iterator
+from itertools import pairwise
+from math import cos, exp, expm1, sin, sqrt
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from diffdrive_jacobian.numerics.elementary import wrap
+from diffdrive_jacobian.time_units import NANOSECONDS
+
+Course: TypeAlias = tuple[float, float, float]
+"""a, b and c of a speed."""
+Twist: TypeAlias = tuple[float, float]
+"""`(v, omega)` (m/s, rad/s)."""
+MAX_TURN = 1.0
+"""Largest turn of a step of the quadrature (rad)."""
+MAX_DECAY = 2.0
+"""Largest duration of a step of the quadrature, in time constants of the exponential function."""
+
+
+class Quadrature(NamedTuple):
+    """Gauss-Legendre quadrature on [0, 1]."""
+
+    nodes: tuple[tuple[float, float], ...]
+    """Nodes and weights."""
+    partial: tuple[tuple[float, ...], ...]
+    """Weights of the integrals from 0 to each node, of the polynomial through the nodes."""
+
+    @classmethod
+    def of(cls, count: int) -> Quadrature:
+        """Return the quadrature with a number of nodes.
+
+        By the Legendre polynomials P_k: `integral of P_k = (P_k+1 - P_k-1) / (2 k + 1)`.
+        """
+        x, weights = np.polynomial.legendre.leggauss(count)
+        P = np.polynomial.legendre.legvander(x, count).T
+        integrals = np.array([P[1] + 1.0, *(P[k + 1] - P[k - 1] for k in range(1, count))])
+        partial = (integrals.T @ P[:count]) * weights / 4.0
+        nodes = np.stack([(x + 1.0) / 2.0, weights / 2.0], axis=-1)
+        return cls(tuple(map(tuple, nodes.tolist())), tuple(map(tuple, partial.tolist())))
+
+
+_LONG = Quadrature.of(8)
+RULE = _LONG.nodes
+"""Nodes and weights for a step of any size."""
+_QUADRATURES = (0.05, Quadrature.of(3)), (0.25, Quadrature.of(4)), (math.inf, _LONG)
+"""The size of a step, and the quadrature for steps of at most that size."""
+
+
+def speed_at(course: Course, t: float, tau: float) -> float:
+    """Return a speed after the time t."""
+    a, b, c = course
+    return a + b * t + (c * exp(-t / tau) if c else 0.0)
+
+
+def travelled(course: Course, t: float, tau: float) -> float:
+    """Return the integral of a speed over the time t."""
+    a, b, c = course
+    return (a + b * t / 2.0) * t - (c * tau * expm1(-t / tau) if c else 0.0)
+
+
+class Piece(NamedTuple):
+    """A twist over a time in which each of its speeds follows one course."""
+
+    seconds: float
+    """Duration (s); the last piece: infinite."""
+    v: Course
+    omega: Course
+    tau: float = 1.0
+    """Time constant of the exponential function (s)."""
+
+    @property
+    def constant(self) -> bool:
+        """Whether both speeds are constant."""
+        return not (any(self.v[1:]) or any(self.omega[1:]))
+
+    def twist(self, t: float) -> Twist:
+        """Return the twist after the time t."""
+        return speed_at(self.v, t, self.tau), speed_at(self.omega, t, self.tau)
+
+    def path(self, t: float) -> Twist:
+        """Return the distance travelled, forwards less backwards, and the turn, after the time t."""
+        return travelled(self.v, t, self.tau), travelled(self.omega, t, self.tau)
+
+    def part(self, begin: float, end: float) -> Piece:
+        """Return the piece from one time to another."""
+        if begin == 0.0:
+            return self._replace(seconds=end)
+        v, omega = (
+            (a + b * begin, b, c * exp(-begin / self.tau) if c else 0.0) for a, b, c in self[1:3]
+        )
+        return Piece(end - begin, v, omega, self.tau)
+
+    def mapped(self, rows: tuple[Twist, Twist]) -> Piece:
+        """Return the piece with its twist multiplied by a matrix."""
+        v, omega = (
+            (
+                p * self.v[0] + q * self.omega[0],
+                p * self.v[1] + q * self.omega[1],
+                p * self.v[2] + q * self.omega[2],
+            )
+            for p, q in rows
+        )
+        return Piece(self.seconds, v, omega, self.tau)
+
+    def faster(self, v: float, omega: float) -> Piece:
+        """Return the piece with constant speeds added."""
+        (a, b, c), (d, e, f) = self.v, self.omega
+        return self._replace(v=(a + v, b, c), omega=(d + omega, e, f))
+
+    @property
+    def step(self) -> float:
+        """Duration of the steps of the quadrature (s)."""
+        if self.constant:
+            return self.seconds
+        a, b, c = self.omega
+        steps = (abs(a) + abs(b) * self.seconds / 2.0) * self.seconds / MAX_TURN
+        if self.v[2] or c:
+            # The speed lies between that at the beginning and those that it follows. (In a short piece
+            # with a large b the terms of the speed are much larger than their sum.)
+            first = a + b * self.tau
+            fastest = max(abs(a + c), abs(first), abs(first + b * self.seconds))
+            steps = fastest * self.seconds / MAX_TURN
+            steps = max(steps, self.seconds / self.tau / MAX_DECAY)
+        return self.seconds / max(1.0, math.ceil(steps))
+
+    def state(self, t: float) -> tuple[float, float, float, float]:
+        """Return the twist after the time t, and the path and the turn until then."""
+        (a, b, c), (d, e, f), tau = self.v, self.omega, self.tau
+        v, omega, path, turn = a + b * t, d + e * t, (a + b * t / 2.0) * t, (d + e * t / 2.0) * t
+        if c or f:
+            loss = expm1(-t / tau)
+            v, omega = v + c * (1.0 + loss), omega + f * (1.0 + loss)
+            path, turn = path - c * tau * loss, turn - f * tau * loss
+        return v, omega, path, turn
+
+    def quadrature(self, t: float) -> Quadrature:
+        """Return the quadrature that is exact to 1e-14 over the time t, at most a step."""
+        (_, _, c), (d, e, f) = self.v, self.omega
+        # An order n of the derivative of exp(i e t^2 / 2) has up to n!! times sqrt(e)^n.
+        size = (abs(d) + abs(f) + 1.8 * sqrt(abs(e))) * t
+        if c or f:
+            size = max(size, t / self.tau)
+        return next(quadrature for most, quadrature in _QUADRATURES if size <= most)
+
+    def displacement(self, t: float) -> tuple[float, float, float]:
+        """Compute `(dx, dy, dtheta)` in the body frame of the beginning, after at most a step."""
+        x = y = 0.0
+        for node, weight in self.quadrature(t).nodes:
+            v, _, _, turn = self.state(node * t)
+            x += weight * v * cos(turn)
+            y += weight * v * sin(turn)
+        return x * t, y * t, travelled(self.omega, t, self.tau)
+
+
+class Profile:
+    """The speeds from a time on: pieces one after the other. Immutable."""
+
+    __slots__ = ('begins', 'pieces', 'start')
+
+    def __init__(self, start: int, pieces: list[Piece]) -> None:
+        """Take the time of the start (ns), and the pieces, the last one constant and without end."""
+        self.start = start
+        self.pieces = pieces
+        self.begins = [0.0]
+        for piece in pieces[:-1]:
+            self.begins.append(self.begins[-1] + piece.seconds)
+
+    @property
+    def final(self) -> Twist:
+        """The twist in the end."""
+        return self.pieces[-1].twist(0.0)
+
+    @property
+    def settled_at(self) -> int:
+        """The time from which on the twist is constant (ns)."""
+        return self.start + math.ceil(self.begins[-1] * NANOSECONDS)
+
+    def seconds(self, stamp: int) -> float:
+        """Return the time since the start (s) of a time (ns)."""
+        return (stamp - self.start) / NANOSECONDS
+
+    def twist(self, t: float) -> Twist:
+        """Return the twist after a time (s)."""
+        index = bisect_right(self.begins, t) - 1
+        return self.pieces[index].twist(t - self.begins[index])
+
+    def between(self, begin: float, end: float) -> list[Piece]:
+        """Return the pieces from one time to another (s)."""
+        found = []
+        for start, piece in zip(self.begins, self.pieces, strict=True):
+            first, last = max(begin - start, 0.0), min(end - start, piece.seconds)
+            if first < last:
+                found.append(piece.part(first, last))
+        return found
+
+    def steps(self, begin: float, end: float) -> Iterator[tuple[Piece, float]]:
+        """Yield the motion between two times in steps that are short enough for one quadrature.
+
+        Yields:
+            The piece from the beginning of the step on, with the duration of the step, and the time at
+            its end (s).
+        """
+        index = bisect_right(self.begins, begin) - 1
+        while begin < end:
+            start, piece = self.begins[index], self.pieces[index]
+            limit = self.begins[index + 1] if index + 1 < len(self.begins) else math.inf
+            step = piece.step
+            if step < math.inf:
+                number = int((begin - start) / step) + 1
+                # The quotient rounds.
+                number += start + number * step <= begin
+                if start + (number + 0.5) * step < limit:
+                    limit = start + number * step
+            limit = min(limit, end)
+            yield piece.part(begin - start, limit - start), limit
+            index += index + 1 < len(self.begins) and limit == self.begins[index + 1]
+            begin = limit
+
+
+def moved(pose: tuple[float, float, float], piece: Piece) -> tuple[float, float, float]:
+    """Return the pose after a piece, in steps that are short enough for one quadrature."""
+    begin, step = 0.0, piece.step
+    for number in range(1, round(piece.seconds / step) + 1):
+        part = piece.part(begin, number * step)
+        pose = displaced(pose, part.displacement(part.seconds))
+        begin = number * step
+    return pose
+
+
+def displaced(
+    pose: tuple[float, float, float], displacement: tuple[float, float, float]
+) -> tuple[float, float, float]:
+    """Return the pose after a displacement in its body frame.
+
+    Raises:
+        ValueError: It overflows.
+    """
+    (x, y, theta), (dx, dy, turn) = pose, displacement
+    c, s = cos(theta), sin(theta)
+    x, y = x + c * dx - s * dy, y + s * dx + c * dy
+    if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(turn)):
+        raise ValueError('pose, twist and dt must give a finite result, but it overflows')
+    return x, y, wrap(theta + turn)
+
+
+def sign_changes(course: Course, seconds: float, tau: float) -> list[float]:
+    """Return the times within a duration at which a speed changes its sign, in their order."""
+    _, b, c = course
+    bounds = [0.0, seconds]
+    if c and b and c / (b * tau) > 0.0:
+        # At the extremum.
+        extremum = tau * math.log(c / (b * tau))
+        if 0.0 < extremum < seconds:
+            bounds.insert(1, extremum)
+    found = []
+    for low, high in pairwise(bounds):
+        first, last = speed_at(course, low, tau), speed_at(course, high, tau)
+        if first * last >= 0.0:
+            continue
+        if not c:
+            found.append(low - first / b)
+            continue
+        while True:
+            middle = (low + high) / 2.0
+            if not low < middle < high:
+                break
+            if (speed_at(course, middle, tau) > 0.0) == (first > 0.0):
+                low = middle
+            else:
+                high = middle
+        found.append(low)
+    return found
+
+
+def rolled(course: Course, piece: Piece, seconds: float) -> float:
+    """Return the integral of the absolute value of a speed of a piece over a time (s)."""
+    times = [0.0, *sign_changes(course, seconds, piece.tau), seconds]
+    places = [travelled(course, time, piece.tau) for time in times]
+    return sum(abs(end - begin) for begin, end in pairwise(places))
