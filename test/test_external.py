@@ -393,6 +393,13 @@ def test_a_process_that_is_never_quiet_is_named_with_its_thread(lockstep):
         lockstep.publish('busy/odom', odometry())
 
 
+def test_a_process_that_is_stopped_is_named(lockstep):
+    process = lockstep.start(command('echo'), patience=0.5)
+    process.signal(signal.SIGSTOP)
+    with pytest.raises(LockstepError, match=r'/echo not quiet within 0.5 s: thread .* is stopped'):
+        lockstep.publish('echo/odom', odometry())
+
+
 def test_a_thread_that_polls_on_wall_time_is_named():
     with (
         Lockstep() as world,
