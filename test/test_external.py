@@ -618,9 +618,9 @@ def test_nothing_is_left_of_a_world_that_is_killed(tmp_path):
     """As by a time limit of the tests."""
     (tmp_path / 'world.py').write_text(WORLD)
     world = ExternalProcess([sys.executable, str(tmp_path / 'world.py'), *command('echo')])
-    while not (words := world.printed(0).split()):
+    while not (printed := world.printed(0)).endswith('\n'):
         world.check_running()
-    left = set(map(int, words))
+    left = set(map(int, printed.split()))
     assert len(left) >= 2
     os.kill(world.pid, signal.SIGKILL)
     while any(Path(f'/proc/{pid}').exists() for pid in left):

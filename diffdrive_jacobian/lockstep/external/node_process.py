@@ -548,10 +548,15 @@ class NodeProcess:
         """
         if not self._connected:
             return 0
-        if self._services_changed:
-            self._offer_called()
-        self._refuse(self._take())
         begin = time.monotonic()
+        if self._services_changed:
+            known = len(self._relays)
+            self._offer_called()
+            if len(self._relays) > known:
+                # The process may call them at once.
+                self._confirm(Allowance(self._quiet, self._command.timeout))
+                self._wait()
+        self._refuse(self._take())
         send()
         self._wait()
         arrived = self._take()
