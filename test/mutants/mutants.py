@@ -1,7 +1,7 @@
 """Mutation testing: which changes of the program do the tests notice?
 
     pip install coverage
-    python test/mutants/mutants.py [--package NAME] [--write]
+    python test/mutants/mutants.py [--package NAME] [--tests FOLDER ...] [--write]
 
 runs the mutants of `mutants.json`, see `mutation`, and compares the results with those stored there. A
 mutant runs in a fork of this process, which has imported the libraries but nothing of the package. In
@@ -311,7 +311,7 @@ def measure(file: str, directory: Path) -> Measured:
     return Measured(plugin.cpu, plugin.not_passed, lines)
 
 
-def measured_coverage(workers: int) -> Coverage:
+def measured_coverage(workers: int, folders: Iterable[str] = ('test',)) -> Coverage:
     """Measure test files that have changed, or all if the program has; returns what is known of all."""
     folder = CACHE / _digest(
         path
@@ -319,7 +319,8 @@ def measured_coverage(workers: int) -> Coverage:
         if not path.name.startswith(('test_', 'mutants', 'mutation'))
     )
     folder.mkdir(parents=True, exist_ok=True)
-    tests = [path for path in sorted((ROOT / 'test').rglob('test_*.py')) if path.stem not in LEFT_OUT]
+    found = {path for name in folders for path in (ROOT / name).rglob('test_*.py')}
+    tests = [path for path in sorted(found) if path.stem not in LEFT_OUT]
     kept = {str(path.relative_to(ROOT)): folder / f'{path.stem}.{_digest([path])}' for path in tests}
     calls = [(file, partial(measure, file)) for file, path in kept.items() if not path.exists()]
     for number, done in enumerate(forked(calls, workers), 1):
@@ -469,6 +470,9 @@ def main() -> None:
     parser.add_argument(
         '--sample', type=positive, metavar='N', help='N random mutants; with --write they replace those'
     )
+    parser.add_argument(
+        '--tests', nargs='+', default=['test'], metavar='FOLDER', help='only the tests of these folders'
+    )
     parser.add_argument('--seed', type=int, default=1, help='of the random ones (default: 1)')
     parser.add_argument('--workers', type=positive, default=os.cpu_count(), help='number of processes')
     parser.add_argument('--cpu', type=float, default=CPU, help='CPU time of the tests of a mutant (s)')
@@ -496,7 +500,7 @@ def main() -> None:
     os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='OFF', ROS_PYTHON_CHECK_FIELDS='1')
     for name in IMPORTED:
         importlib.import_module(name)
-    coverage = measured_coverage(options.workers)
+    coverage = measured_coverage(options.workers, options.tests)
     outcomes: dict[Mutant, Outcome] = {}
     begin = time.monotonic()
     try:
