@@ -14,6 +14,7 @@ from diffdrive_jacobian.kinematics import inverse_velocity as iv
 from diffdrive_jacobian.kinematics.mobile_manipulator import MobileManipulator
 from diffdrive_jacobian.kinematics.planar_arm import PlanarArm
 from diffdrive_jacobian.simulation import Drift, Robot, RobotModel, odometry_noise
+from diffdrive_jacobian.simulation.exact_moments import gaussian, propagate_moments
 
 POSE, TWIST, GOAL, TURNED = (0.3, -0.2, 1.0), (0.2, 0.5), (1.0, 2.0), (1.0, -0.2, 0.3)
 WHEELS, THETA = {'r': 0.033, 'L': 0.16}, {'theta': 0.5}
@@ -172,6 +173,10 @@ OTHERS = {
     ROBOT.restarted: {'stamp': 5},
     ROBOT.twist_covariance: {'interval': 0.02},
     ROBOT.twist_covariance_tuple: {'interval': 0.02},
+    propagate_moments: {
+        **{'moments': tuple(gaussian(COVARIANCE)), 'pose': POSE, 'twist': TWIST, 'dt': 0.5},
+        **ODOMETRY,
+    },
     closed_loops: LOOP | {'progress': None},
     trajectories: LOOP,
 }
