@@ -31,7 +31,7 @@ PURE = LAYERS[:4]
 WITHOUT_ROS = LAYERS[4:9]
 # Modules beside the layers, which every layer may import, and what they may import themselves.
 COMMON = {
-    **{name: () for name in ('text', 'time_units', 'errors', 'lazy', 'signals')},
+    **dict.fromkeys(('text', 'time_units', 'errors', 'lazy', 'signals'), ()),
     'bounded_yaml': ('errors', 'text'),
 }
 LOUD = re.compile('print|stdout|stderr')
@@ -43,12 +43,20 @@ def place(path) -> str:
     return first if rest else path.stem
 
 
+def statements(node):
+    """Yield the statements in a node of a syntax tree, anywhere in it."""
+    for field in ('body', 'orelse', 'handlers', 'finalbody', 'cases'):
+        for each in getattr(node, field, ()):
+            yield each
+            yield from statements(each)
+
+
 def imports() -> dict[Path, set[str]]:
     """Collect what each file imports, anywhere in it: `a.b`, and `a.b` and `a` of `from a import b`."""
     found = defaultdict(set)
     for path in FILES:
         package = '.'.join((PACKAGE, *path.parent.relative_to(ROOT).parts))
-        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        for node in statements(ast.parse(path.read_text(encoding='utf-8'))):
             if isinstance(node, ast.Import):
                 found[path].update(alias.name for alias in node.names)
             elif isinstance(node, ast.ImportFrom):
