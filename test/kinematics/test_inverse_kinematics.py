@@ -259,13 +259,6 @@ def test_newton_ends_on_what_it_cannot_reach(where):
     assert np.all(result.error <= ROUNDING * np.linalg.norm(target - task.forward(q0), axis=1))
 
 
-def test_steps_run_out():
-    result = Task(THREE).solve([1.0, 0.5], [0.1, 0.2, 0.3], method='transpose', max_iterations=3)
-    assert not result.converged
-    assert result.iterations == 3
-    assert result.error > TOLERANCE
-
-
 # --- Batches
 
 
@@ -377,16 +370,6 @@ def test_what_is_not_finite_ends_its_own_target_only(which, bad, method):
     whole = task.solve(target, q0, **options)
     for field, other in zip(result, whole, strict=True):
         assert np.array_equal(field[result.converged], other[result.converged])
-
-
-def test_of_nothing_no_difference_is_asked():
-    def nothing(q):
-        return np.full_like(q, np.nan)
-
-    result = solve(nothing, TWO.jacobian, [1.0, 1.0], [0.0, 1.0], difference=pytest.fail)
-    assert not result.converged
-    assert np.isnan(result.error)
-    assert result.q.tolist() == [0.0, 1.0]
 
 
 @pytest.mark.parametrize('method', METHODS)

@@ -71,16 +71,6 @@ def test_the_tip_is_the_sum_of_complex_numbers_and_a_chain_of_rigid_motions(n):
 
 
 @links
-def test_the_jacobian_turns_the_tip_about_each_joint(n):
-    arm, q, _ = an_arm(n)
-    positions = arm.joint_positions(q)
-    levers = positions[..., -1:, :] - positions[..., :-1, :]
-    J = arm.jacobian(q, heading=True)
-    close(J, np.stack([-levers[..., 1], levers[..., 0], np.ones_like(q)], axis=-2))
-    assert np.array_equal(J[..., :2, :], arm.jacobian(q))
-
-
-@links
 def test_torques_do_the_work_of_the_wrench(n):
     arm, q, q_dot = an_arm(n)
     for size, heading in [(2, False), (3, True)]:
@@ -252,20 +242,6 @@ def test_one_step_is_many_and_the_base_drives_as_if_alone(n):
     v, omega = dd.wheel_to_body(q_dot[..., 0], q_dot[..., 1], R, L)
     same_pose(there, se2.integrate(q[..., :3], np.stack([v, omega], axis=-1), 1.0))
     close(there[..., 3:], q[..., 3:] + q_dot[..., 2:])
-
-
-@pytest.mark.parametrize('heading', [False, True])
-def test_it_is_redundant_and_null_space_motion_leaves_the_tip(heading):
-    robot, q, wish = a_robot(3)
-    J = robot.jacobian(q, heading)
-    x_dot = np.random.default_rng(7).normal(size=J.shape[:-1])
-    assert np.all(np.linalg.matrix_rank(J) == J.shape[-2])
-    close(times(J, iv.redundant(J, x_dot, wish)), x_dot, 1e-9)
-    still, dt = iv.redundant(J, np.zeros(J.shape[-2]), wish), 1e-4
-    assert np.all(norm(still) > 1e-3)
-    change = robot.forward_kinematics(robot.integrate(q, still, dt)) - robot.forward_kinematics(q)
-    change = np.append(change[..., :2], se2.wrap_angle(change[..., 2:]) * heading, axis=-1)
-    assert np.all(norm(change) <= 2.0 * norm(dt * still) ** 2)
 
 
 # --- The wheel as a contact

@@ -103,14 +103,6 @@ def test_near_the_epoch_nothing_is_lost(seed):
     assert one.pose[0] == 0.2 * 1e-9
 
 
-def test_a_constant_command_is_the_same_command_issued_often():
-    twist, rng = (0.2, -1.3), np.random.default_rng(20)
-    once = often = start(HELD).commanded(twist, 0)
-    for instant in np.unique(rng.integers(1, 3 * SECOND, 100)).tolist():
-        often = often.commanded(twist, instant)
-    close(often.at(3 * SECOND), once.at(3 * SECOND))
-
-
 def test_between_events_the_state_is_one_exact_arc_with_its_covariance():
     robot = start(HELD).commanded((0.15, 1.1), 7)
     there = robot.at(7 + 2 * SECOND)
