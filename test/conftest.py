@@ -7,7 +7,6 @@ import gc
 import os
 import signal
 import sys
-import time
 
 # Before rclpy is loaded: nobody outside a test's context hears it, messages check their fields'
 # types, and nothing is written into the home directory.
@@ -17,8 +16,9 @@ os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 os.environ.setdefault('ROS_LOG_DIR', os.path.join(os.environ.get('TMPDIR', '/tmp'), 'ros_test_log'))
 
-import forked
 import pytest
+from fork_server import forked
+from support.harness import Harness
 
 pytest_plugins = ['pytester']
 
@@ -38,8 +38,6 @@ LONGEST_FIRST = (
 """Files with tests that take seconds. They start first, so that none is left for the end."""
 CHUNK = 4
 """Most tests that a worker of pytest-xdist gets at once."""
-PATIENCE = 20.0
-"""How long a condition may take to come true before the test fails (s)."""
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -77,77 +75,6 @@ def pytest_collection():
 def pytest_collection_modifyitems(items):
     places = {name: place for place, name in enumerate(LONGEST_FIRST)}
     items.sort(key=lambda item: places.get(item.path.stem, len(places)))
-
-
-class Harness:
-    """A context with its nodes, an executor that serves them, and a plain node to talk to them."""
-
-    def __init__(self, context, executor):
-        from rclpy.node import Node
-
-        self.context = context
-        self.executor = executor
-        self.nodes = []
-        self.peer = self.add(Node, node_name='peer')
-
-    def add(self, node_class, *, parameters=None, **kwargs):
-        """Make a node with parameter overrides and serve it."""
-        from rclpy.parameter import Parameter
-
-        overrides = [Parameter(name, value=value) for name, value in (parameters or {}).items()]
-        node = node_class(context=self.context, parameter_overrides=overrides, **kwargs)
-        self.nodes.append(node)
-        self.executor.add_node(node)
-        return node
-
-    def listen(self, message_type, topic, *, latched=False):
-        """Collect the messages of a topic; returns the list that grows."""
-        from rclpy.qos import DurabilityPolicy, QoSProfile
-
-        received = []
-        profile = QoSProfile(depth=1000)
-        if latched:
-            profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
-        self.peer.create_subscription(message_type, topic, received.append, profile)
-        return received
-
-    def talk(self, message_type, topic):
-        """Make a publisher that already has a reader."""
-        publisher = self.peer.create_publisher(message_type, topic, 100)
-        self.until(lambda: publisher.get_subscription_count() > 0, f'somebody reads {topic}')
-        return publisher
-
-    def until(self, condition, what='a condition', patience=PATIENCE):
-        """Serve the nodes until a condition holds, and fail if it never does."""
-        deadline = time.monotonic() + patience
-        while not condition():
-            assert time.monotonic() < deadline, f'not within {patience} s: {what}'
-            self.executor.spin_once(timeout_sec=0.01)
-
-    def until_said(self, capfd, *words):
-        """Serve the nodes until all words stand in the log; returns the log so far."""
-        said = ''
-
-        def told():
-            nonlocal said
-            said += capfd.readouterr().err
-            return all(word in said for word in words)
-
-        self.until(told, f'the log says {words}')
-        return said
-
-    def call(self, service_type, name):
-        """Call a service without arguments; returns the response."""
-        client = self.peer.create_client(service_type, name)
-        self.until(client.service_is_ready, f'service {name}')
-        future = client.call_async(service_type.Request())
-        self.until(future.done, f'answer of {name}')
-        return future.result()
-
-    def close(self):
-        self.executor.shutdown()
-        for node in self.nodes:
-            node.destroy_node()
 
 
 @pytest.fixture(params=['events', 'single'])
@@ -194,7 +121,7 @@ def no_display(monkeypatch):
 @pytest.fixture
 def add(lockstep):
     """Put one of our nodes into the world; see `lockstep_nodes.make`."""
-    from lockstep_nodes import make
+    from support.lockstep_nodes import make
 
     return lambda node_class, namespace='', **parameters: lockstep.add(
         make(node_class, namespace, **parameters)
@@ -213,7 +140,7 @@ def pytest_terminal_summary(terminalreporter):
 @pytest.fixture
 def add_complete(lockstep):
     """Put one of our nodes into the world; see `lockstep_nodes.make_complete`."""
-    from lockstep_nodes import make_complete
+    from support.lockstep_nodes import make_complete
 
     return lambda node_class, namespace='', **parameters: lockstep.add(
         make_complete(node_class, namespace, **parameters)
@@ -223,7 +150,7 @@ def add_complete(lockstep):
 @pytest.fixture
 def team(lockstep):
     """The topics of a robot with bridge and quick controller, and the nodes."""
-    from lockstep_nodes import QUICK, Topics, add_team
+    from support.lockstep_nodes import QUICK, Topics, add_team
 
     topics = Topics(lockstep)
     topics.robot, topics.bridge, topics.controller = add_team(lockstep, **QUICK)

@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from moments_reference import DRIVES, noisy_runs
+from support.moments_reference import DRIVES, noisy_runs
 
 from diffdrive_jacobian.simulation import Drift, Robot, RobotModel
 from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from moments_reference import DRIVES, noisy_runs, reported_path
+from support.moments_reference import DRIVES, noisy_runs, reported_path
 
 from diffdrive_jacobian.simulation import Robot, RobotModel
 from diffdrive_jacobian.simulation.exact_moments import (

@@ -1,1 +1,1 @@
-"""Faults that a simulation cannot inject, in real processes. `test/promises.py` runs them and counts."""
+"""Faults that a simulation cannot inject, in real processes. `promises.py` runs them and counts."""

@@ -17,9 +17,9 @@ from typing import Any
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry
-from processes import World
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
+from support.processes import World
 
 from process_faults.fuzzed_parameters import finite
 from process_faults.outcome import Outcome, unexpected

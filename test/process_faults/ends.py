@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
 
-import processes
-from processes import Child, World
+from support import processes
+from support.processes import Child, World
 
 from process_faults.outcome import Outcome, spread, unexpected
 from process_faults.worlds import quiet_world

@@ -22,10 +22,10 @@ from io import StringIO
 from pathlib import Path
 from unittest import mock
 
-import processes
 from nav_msgs.msg import Odometry
-from processes import Child, World
 from rclpy.serialization import serialize_message
+from support import processes
+from support.processes import Child, World
 
 from diffdrive_jacobian.bags.bag_reader import messages, open_bag
 from diffdrive_jacobian.signals import Signals

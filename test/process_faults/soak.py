@@ -16,13 +16,13 @@ from pathlib import Path
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import Goals, Odometry
-from processes import Child, World
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
+from support.processes import Child, World
 
 from diffdrive_jacobian.parameters.declaration import default_of, specifications
 from diffdrive_jacobian.ros.rclpy_internals import RCLError

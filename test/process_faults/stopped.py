@@ -17,9 +17,9 @@ from typing import Any
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry
-from processes import Child, World
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
+from support.processes import Child, World
 
 from process_faults.outcome import Outcome, spread, unexpected
 from process_faults.worlds import quiet_world

@@ -9,9 +9,9 @@ from io import StringIO
 from pathlib import Path
 from unittest import mock
 
-import processes
-from conftest import Harness
-from processes import Child, World, open_world
+from support import processes
+from support.harness import Harness
+from support.processes import Child, World, open_world
 
 LIFE = 900.0
 """How long a process may live (s)."""

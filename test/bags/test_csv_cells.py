@@ -1,0 +1,72 @@
+"""Cells of CSV files are numbers or empty: no text of a bag can become a formula of a spreadsheet."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from pathlib import Path
+
+import pytest
+from geometry_msgs.msg import PoseStamped, TwistStamped
+from support.bags import SECOND, write_bag
+from support.ros_messages import goal, joint_command, odometry
+
+import diffdrive_jacobian
+from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.plots.run_table import write_csv
+from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.tools.sweep_gains import main as sweep_gains
+
+NUMBER = re.compile(r'(-?\d+(\.\d+)?(e-?\d+)?)?')
+HEADER = re.compile(r'[a-z][a-z0-9_]*')
+FORMULAS = ('=cmd|" /C calc"!A0', '+1+1', '-2+3', '@SUM(A1)', '\t=1', '"\n=1', '=1,=2')
+
+
+def assert_no_formulas(text):
+    header, *rows = csv.reader(io.StringIO(text))
+    assert rows
+    assert all(HEADER.fullmatch(cell) for cell in header)
+    assert all(NUMBER.fullmatch(cell) for row in rows for cell in row)
+
+
+@pytest.mark.parametrize('text', FORMULAS)
+def test_names_of_joints_and_frames_are_not_in_the_table_of_a_run(tmp_path, text):
+    names = [text, text + '2']
+    sent = []
+    for index in range(3):
+        at = 1.0 + index / 10
+        message = odometry(index / 20, 0.0, -0.1)
+        message.header.frame_id, message.child_frame_id = text, text
+        wheels = joint_command(1.0, -1.0, round(at * SECOND))
+        wheels.name, wheels.header.frame_id = names, text
+        sent += [(at, '/odom', message), (at, '/joint_states', wheels)]
+        sent.append((at, '/cmd_vel_out', TwistStamped()))
+        sent[-1][-1].header.frame_id = text
+    target: PoseStamped = goal(0.3, 0.1)
+    target.header.frame_id = text
+    sent.append((1.2, '/goal_pose', target))
+    robot = {'left_wheel_name': names[0], 'right_wheel_name': names[1], 'x': text}
+    bag = write_bag(tmp_path / 'bag', sent, parameters={'/virtual_robot': robot})
+    run = read_run(bag)
+    assert len(run.wheels) == 3
+    write_csv(run, tmp_path / 'run.csv')
+    assert_no_formulas((tmp_path / 'run.csv').read_text())
+
+
+def test_the_table_of_a_sweep(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert sweep_gains(['--grid', '3', '--starts', '2', '--csv', 'a.csv'], Signals()) == 0
+    assert_no_formulas((tmp_path / 'a.csv').read_text())
+
+
+def test_no_other_module_writes_csv():
+    """A new one needs a test here."""
+    package = Path(diffdrive_jacobian.__file__).parent
+    found = {
+        path.relative_to(package).as_posix()
+        for path in package.rglob('*.py')
+        if re.search(r'^\s*(import csv|from csv)\b|savetxt', path.read_text(), re.MULTILINE)
+    }
+    # control/path_source.py reads.
+    assert found == {'control/path_source.py', 'plots/run_table.py', 'simulation/gain_sweep.py'}

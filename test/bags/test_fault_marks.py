@@ -1,0 +1,100 @@
+"""Faults of a recorded lockstep world: read from the bag, and marked in the figure."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import Twist, Vector3
+from std_msgs.msg import String
+from support.bags import SECOND, write_bag
+from support.runs import sample
+
+from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.time_series import commanded, measured
+from diffdrive_jacobian.bags.timeline import timeline
+from diffdrive_jacobian.faults import Push, TimeJump
+from diffdrive_jacobian.plots.fault_marks import NAMED, fault_spans
+from diffdrive_jacobian.plots.run_figure import figure
+from diffdrive_jacobian.testing.recorded_run import RecordedRun
+
+
+def event(at, fault, what):
+    return at, '/fault_events', String(data=json.dumps({'time': at, 'fault': fault, 'what': what}))
+
+
+def run_of(tmp_path, *extra):
+    """Read a run of four seconds that begins at 10 s."""
+    return read_run(write_bag(tmp_path / 'run', sample(extra)))
+
+
+def labels(drawing):
+    return [text.get_text() for legend in drawing.legends for text in legend.get_texts()]
+
+
+def test_faults_are_bands_over_time(tmp_path):
+    loss, kill = "Loss('odom', start=1.0, duration=0.5)", "Kill('robot', start=2.0)"
+    run = run_of(
+        tmp_path,
+        event(11.0, loss, 'begins'),
+        event(11.2, loss, 'messages 1 to 9 of /odom to /controller lost'),
+        event(11.5, loss, 'ends: 25 of 25 messages of /odom to /controller'),
+        event(12.0, kill, 'begins'),
+        event(12.0, kill, '/robot is killed'),
+    )
+    assert run.fault_events[0] == (11 * SECOND, loss, 'begins')
+    assert '5 events of faults' in repr(run)
+    spans = fault_spans(timeline(run))
+    assert [span.fault for span in spans] == [loss, kill]
+    assert spans[0][1:] == pytest.approx((1.0, 1.5))
+    # To the end of the run.
+    assert spans[1][1:] == pytest.approx((2.0, 3.98))
+    drawing = figure([run])
+    assert labels(drawing) == [loss, kill]
+    plane, *panels = drawing.axes
+    assert not plane.patches
+    for panel in panels[:-1]:
+        assert [patch.get_x() for patch in panel.patches] == pytest.approx([1.0, 2.0])
+    # Several runs are compared without them.
+    assert labels(figure([run, run])) == []
+
+
+def test_many_faults_are_counted(tmp_path):
+    events = [event(10.1 + 0.1 * number, f'Stale({number})', 'begins') for number in range(NAMED + 3)]
+    drawing = figure([run_of(tmp_path, *events)])
+    assert len(labels(drawing)) == NAMED
+    assert labels(drawing)[-1] == 'and 4 more faults'
+
+
+@pytest.mark.parametrize('data', ['', 'x', '3', '{"fault": 1, "what": "begins"}', '[' * 100_000])
+def test_other_messages_on_the_topic_are_noted(tmp_path, data):
+    run = run_of(tmp_path, (11.0, '/fault_events', String(data=data)))
+    assert run.fault_events == ()
+    assert 'hold invalid' in run.notes[0]
+    assert labels(figure([run])) == []
+
+
+def test_lines_are_broken_where_time_goes_back_and_a_push_is_a_line(lockstep, robot_at, tmp_path):
+    robot_at(cmd_vel_timeout=0.0)
+    recorded = RecordedRun(lockstep, tmp_path)
+    push, jump = Push(0.1, start=0.2), TimeJump(-0.3, start=0.5)
+    lockstep.inject(push, jump)
+    for _ in range(8):
+        lockstep.publish('cmd_vel', Twist(linear=Vector3(x=0.1)))
+        lockstep.run_for(0.1)
+    run = read_run(recorded.finish())
+    one = timeline(run)
+    # Recorded in the order in which it happened.
+    assert len(one.breaks) == 1
+    (back,) = one.breaks
+    assert one.time[back] < one.time[back - 1] - 0.25
+    assert (np.diff(run.odometry.received) > 0).all()
+    for lines in (measured(one, 'v'), measured(one, 'left'), commanded(one, 'v')):
+        gaps = np.flatnonzero(np.isnan(lines[:, 0]))
+        assert len(gaps)
+        assert not (np.diff(lines[:, 0]) < 0.0).any(), 'a line leads back in time'
+    spans = {span.fault: span for span in fault_spans(one)}
+    # The axis begins with the first odometry.
+    assert spans[repr(push)][1:] == pytest.approx((0.18, 0.18))
+    assert spans[repr(jump)].end > spans[repr(jump)].begin

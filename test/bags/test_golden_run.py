@@ -1,0 +1,337 @@
+"""Golden runs of tests, and the comparison of messages."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import pytest
+from geometry_msgs.msg import Point32, PoseStamped, Twist
+from nav_msgs.msg import Odometry
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from support.inner_sessions import draw_quickly, run_inner
+from unique_identifier_msgs.msg import UUID
+
+from diffdrive_jacobian.bags import read_run
+from diffdrive_jacobian.bags.bag_reader import open_bag
+from diffdrive_jacobian.bags.bag_writer import build_bag
+from diffdrive_jacobian.bags.journal import Channel, Message
+from diffdrive_jacobian.bags.message_definitions import definition
+from diffdrive_jacobian.testing.golden_run import Comparison, GoldenRun, GoldenRunError
+
+# --- Messages
+
+
+def differences(run, golden, tolerance=1e-9, comparison=None):
+    """Compare lists of (time, message) of one type."""
+    kind = type((run or golden)[0][1])
+    one, other = (
+        [(time, serialize_message(message)) for time, message in side] for side in (run, golden)
+    )
+    deserialize = partial(deserialize_message, message_type=kind)
+    return (comparison or Comparison(tolerance)).of_topic('/t', one, other, deserialize)
+
+
+def first(message, golden, tolerance=1e-9):
+    """Return how a message differs from a golden one, at 1.5 s."""
+    found = differences([(1_500_000_000, message)], [(1_500_000_000, golden)], tolerance)
+    return None if found is None else found.first.removeprefix('message 1 of /t, at 1.5 s: ')
+
+
+def twist(v):
+    """Return a Twist."""
+    message = Twist()
+    message.linear.x = v
+    return message
+
+
+def test_the_first_field_that_differs_is_named():
+    moved = Odometry()
+    moved.pose.pose.position.x, moved.pose.covariance[7] = 1.0, 2.0
+    assert first(moved, Odometry()) == (
+        'pose.pose.position.x is 1.0, golden 0.0: differs by 1, allowed 1e-09'
+    )
+    golden = Odometry()
+    golden.pose.pose.position.x = 1.0
+    assert first(moved, golden) == ('pose.covariance[7] is 2.0, golden 0.0: differs by 2, allowed 1e-09')
+    late = PoseStamped()
+    late.header.stamp.nanosec = 1
+    assert first(late, PoseStamped()) == 'header.stamp.nanosec is 1, golden 0'
+    assert first(String(data='a\n'), String(data='b')) == "data is 'a\\n', golden 'b'"
+    joints = JointState(name=['left', 'right'], velocity=[1.0])
+    assert first(joints, JointState(name=['left'], velocity=[1.0])) == 'len(name) is 2, golden 1'
+    assert first(joints, JointState(name=['left', 'r'])) == "name[1] is 'right', golden 'r'"
+
+
+@pytest.mark.parametrize(
+    ('value', 'golden', 'same'),
+    [
+        (0.0, 9e-10, True),
+        (0.0, 2e-9, False),
+        (1e6, 1e6 + 9e-4, True),
+        (1e6, 1e6 + 2e-3, False),
+        (0.0, -0.0, True),
+        (math.nan, math.nan, True),
+        (math.nan, 0.0, False),
+        (0.0, math.nan, False),
+        (math.inf, math.inf, True),
+        (math.inf, -math.inf, False),
+        (math.inf, 1e300, False),
+        (1e300, math.inf, False),
+    ],
+)
+def test_floats_are_equal_within_the_tolerance(value, golden, same):
+    assert (first(twist(value), twist(golden)) is None) == same
+
+
+def test_floats_of_tolerance_zero_are_equal_to_the_last_bit():
+    assert first(twist(1.0), twist(1.0), tolerance=0.0) is None
+    assert first(twist(math.nextafter(1.0, 2.0)), twist(1.0), tolerance=0.0) == (
+        'linear.x is 1.0000000000000002, golden 1.0: differs by 2.22e-16, allowed 0'
+    )
+    assert first(Point32(x=0.5), Point32(x=0.25)).startswith('x is 0.5, golden 0.25')
+
+
+def test_missing_and_additional_messages_and_times_are_differences():
+    one, two, three = ((number * 1_000_000_000, twist(float(number))) for number in (1, 2, 3))
+    assert differences([one, two], [one, two]) is None
+    missing = differences([one], [one, two])
+    assert (missing.first, missing.time) == ('message 2 of /t, at 2 s, is missing', two[0])
+    assert (missing.different, missing.compared) == (1, 2)
+    additional = differences([one, two, three], [])
+    assert additional.first == 'message 1 of /t, at 1 s, is additional'
+    assert (additional.different, additional.compared) == (3, 3)
+    late = differences([one, (two[0] + 1, two[1])], [one, two])
+    assert late.first == 'message 2 of /t, was published at 2.000000001 s, golden at 2 s'
+    # From one that is missing on, each is compared with another.
+    assert differences([one, three], [one, two, three]).different == 2
+
+
+def test_random_identifiers_are_compared_by_what_they_identify():
+    a, b, c = (UUID(uuid=[number] * 16) for number in (1, 2, 3))
+    comparison = Comparison(0.0)
+    same = partial(differences, comparison=comparison)
+    assert same([(1, a), (2, b), (3, a)], [(1, b), (2, c), (3, b)]) is None
+    # Also on another topic.
+    assert same([(1, a)], [(1, b)]) is None
+    assert 'identifies something else' in same([(1, a)], [(1, c)]).first
+    assert 'identifies something else' in same([(1, c)], [(1, b)]).first
+
+
+# --- Bags
+
+
+class Recorded:
+    """A recorded run with a bag of /cmd_vel and /other, instead of one of a test."""
+
+    def __init__(self, bag, *speeds, other=0.0, topic='/cmd_vel'):
+        messages = [(0, 20_000_000 * number, twist(v)) for number, v in enumerate(speeds)]
+        messages.append((1, 0, twist(other)))
+        type_name = 'geometry_msgs/msg/Twist'
+        described = definition(type_name)
+        channels = [
+            Channel(
+                id=number,
+                topic=name,
+                type_name=type_name,
+                definition=described.text,
+                type_hash=described.type_hash,
+            )
+            for number, name in enumerate((topic, '/other'))
+        ]
+        records = [Message(number, time, serialize_message(one)) for number, time, one in messages]
+        self.bag = bag
+        build_bag(channels, records, bag, 'mcap', replace=True)
+
+    def finish(self):
+        return self.bag
+
+
+@pytest.fixture
+def golden(tmp_path):
+    """Return a function that makes the golden run of a recorded one; its bag is at `golden/run`."""
+
+    def golden(*speeds, update=False, **kwargs):
+        recorded = Recorded(tmp_path / 'run', *speeds, **kwargs)
+        return GoldenRun(recorded, tmp_path / 'golden' / 'run', 'test_a.py::test_b[x]', update)
+
+    return golden
+
+
+def stamps(path):
+    return {file.name: file.stat().st_mtime_ns for file in path.iterdir()}
+
+
+def test_a_run_is_compared_with_the_golden_one_by_tolerance_and_topics(golden):
+    written = golden(0.0, 1.0, 2.0, update=True)
+    written.check()
+    assert written.written
+    same = golden(0.0, 1.0, 2.0)
+    same.check(tolerance=0.0)
+    assert same.checked
+    assert not same.written
+    near = golden(0.0, 1.0, 2.0 + 1e-6)
+    near.check(tolerance=1e-5)
+    with pytest.raises(GoldenRunError) as caught:
+        near.check()
+    assert str(caught.value).splitlines() == [
+        'the run differs from the golden run, first in message 3 of /cmd_vel, at 0.04 s: linear.x is '
+        '2.000001, golden 2.0: differs by 1e-06, allowed 1e-09',
+        'messages that differ: /cmd_vel 1 of 3',
+        f'golden run: {near.path}',
+        "to make this run the golden one: pytest --update-golden-runs 'test_a.py::test_b[x]'",
+    ]
+    # The first in time, not by name.
+    other = golden(0.0, 1.0, 3.0, 4.0, other=1.0)
+    words = r'first in message 1 of /other, .*\nmessages that differ: /other 1 of 1, /cmd_vel 2 of 4\n'
+    with pytest.raises(GoldenRunError, match=words):
+        other.check()
+    other.check(without=['/other', '/cmd_vel'])
+    with pytest.raises(GoldenRunError, match='first in message 1 of /cmd_vel, at 0 s, is missing'):
+        golden(0.0, 1.0, 2.0, topic='/z').check()
+
+
+def test_the_arguments_of_check_are_checked(golden):
+    run = golden(0.0)
+    for tolerance in (-1.0, math.nan, math.inf):
+        with pytest.raises(
+            ValueError, match=f'tolerance must be finite and at least 0, got {tolerance}'
+        ):
+            run.check(tolerance=tolerance)
+    for without in ('/odom', ['odom'], ['/a', 'b']):
+        with pytest.raises(ValueError, match="without must be names of topics such as '/odom', got"):
+            run.check(without=without)
+
+
+def test_a_golden_run_is_replaced_only_if_the_run_differs(golden):
+    path = golden(0.0).path
+    golden(0.0, 1.0, update=True).check(without=['/other'])
+    with open_bag(path) as reader:
+        assert [one.topic for one in reader.connections] == ['/cmd_vel']
+    before = stamps(path)
+    again = golden(0.0, 1.0 + 1e-10, update=True)
+    again.check(without=['/other'])
+    assert not again.written
+    assert stamps(path) == before
+    different = golden(0.0, 2.0, update=True)
+    different.check()
+    assert different.written
+    golden(0.0, 2.0).check()
+
+
+def test_a_golden_run_that_cannot_be_read_is_reported_and_can_be_replaced(golden):
+    run = golden(0.0, update=True)
+    run.check()
+    (data,) = run.path.glob('*.mcap')
+    data.write_bytes(data.read_bytes()[:2000])
+    words = 'the golden run cannot be compared: .* is damaged: .*\nto replace it: pytest --update'
+    with pytest.raises(GoldenRunError, match=words):
+        golden(0.0).check()
+    golden(0.0, update=True).check()
+    golden(0.0).check()
+    (run.path / 'notes.txt').touch()
+    with pytest.raises(OSError, match='exists already and is not a bag'):
+        golden(1.0, update=True).check()
+
+
+# --- Tests with a golden run
+
+
+GOAL = """
+    import os
+    from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+    from geometry_msgs.msg import PoseStamped, TransformStamped
+    from rclpy.node import Node
+
+    class TestGoal:
+        @pytest.mark.parametrize('side', ['left/up'])
+        def test_drives(self, lockstep, robot_at, golden_run, side):
+            robot_at(theta=0.5, linear__x__max_velocity=float(os.environ['SPEED']))
+            lockstep.add(GoToGoal())
+            if 'TRANSFORMS' in os.environ:
+                node = lockstep.add(Node('transforms'))
+                tf = node.create_publisher(TransformStamped, '/tf', 100)
+                node.create_timer(0.05, lambda: tf.publish(TransformStamped()))
+            goal = PoseStamped()
+            goal.pose.position.x = 1.0
+            lockstep.publish('goal_pose', goal)
+            lockstep.run_for(0.5)
+            if 'TOLERANCE' in os.environ:
+                golden_run.check(tolerance=float(os.environ['TOLERANCE']))
+            assert 'FAIL' not in os.environ
+"""
+
+
+@pytest.fixture
+def drive(pytester, monkeypatch):
+    """Run a test that drives to a goal; gives the result."""
+    draw_quickly(monkeypatch)
+
+    def drive(*options, SPEED='0.2', **environment):
+        for file in pytester.path.glob('test_*.py'):
+            file.unlink()
+        for name, value in {**environment, 'SPEED': SPEED}.items():
+            monkeypatch.setenv(name, value)
+        result = run_inner(pytester, GOAL, *options)
+        for name in environment:
+            monkeypatch.delenv(name)
+        return result
+
+    return drive
+
+
+def test_transforms_are_not_compared(drive):
+    """They are published only where tf2_ros is installed."""
+    drive('--update-golden-runs').assert_outcomes(passed=1)
+    drive(TRANSFORMS='1').assert_outcomes(passed=1)
+
+
+def test_the_golden_run_of_a_test(drive, pytester):
+    result = drive()
+    result.assert_outcomes(failed=1)
+    text = result.stdout.str()
+    path = next(
+        line for line in text.splitlines() if line.startswith('there is no golden run ')
+    ).split()[-1]
+    assert path.startswith(f'{pytester.path}/golden/test_0.TestGoal.test_drives-left_up-')
+    command = "pytest --update-golden-runs 'test_0.py::TestGoal::test_drives[left/up]'"
+    assert f'to make this run the golden one: {command}' in text
+    assert '- recorded run -' in text
+    assert 'Traceback' not in text
+    assert 'During handling' not in text
+    # Not by a test that fails.
+    drive('--update-golden-runs', FAIL='1').assert_outcomes(failed=1)
+    assert not (pytester.path / 'golden').exists()
+    result = drive('--update-golden-runs')
+    result.assert_outcomes(passed=1)
+    result.stdout.fnmatch_lines(['*golden runs*', f'written: {path}'])
+    # It is a bag like others, without what says nothing about the run.
+    with open_bag(pytester.path / path) as reader:
+        topics = {one.topic for one in reader.connections}
+    assert topics == {
+        *('/cmd_vel', '/cmd_vel_out', '/goal_pose', '/goal_status', '/joint_states', '/odom'),
+        '/start_pose',
+    }
+    assert len(read_run(path).odometry) == 26
+    assert sum(file.stat().st_size for file in (pytester.path / path).iterdir()) < 100_000
+    # Whatever the random identifier of the goal.
+    drive(TOLERANCE='0.0').assert_outcomes(passed=1)
+    result = drive(SPEED='0.1999')
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(
+        [
+            'the run differs from the golden run, first in message 1 of /cmd_vel_out, at 1.02 s: '
+            'twist.linear.x is 0.1999, golden 0.2: differs by 0.0001, allowed 1e-09',
+            'messages that differ: /cmd_vel_out 25 of 25, *',
+            f'golden run: {path}',
+            'to make this run the golden one: pytest --update-golden-runs *',
+        ]
+    )
+    # The trace of a check by hand ends in the test.
+    result = drive(SPEED='0.1999', TOLERANCE='1e-6')
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(
+        ['>*golden_run.check(*', 'E *: the run differs from *, allowed 1e-06', 'test_0.py:*Error']
+    )

@@ -1,0 +1,561 @@
+"""Verification: a run driven again moves as it did, and what was altered is found, with its place."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+from support.lockstep_nodes import make_complete as make
+from support.recorded import recorded
+from support.ros_messages import goal, goals, twist, twist_stamped
+
+from diffdrive_jacobian.bags import BagError, read_run
+from diffdrive_jacobian.bags.run import COLUMNS, Run, Series
+from diffdrive_jacobian.bags.verification import (
+    COVARIANCE_TOLERANCE,
+    largest_covariance_difference,
+    start_covariances,
+    verify,
+)
+from diffdrive_jacobian.faults import ActuatorLag, DeadWheel, SaturatedWheel
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.simulation.robot import Robot
+from diffdrive_jacobian.simulation.robot_model import RobotModel
+
+EXACT = 1e-9
+FOREIGN = Path(__file__).parents[1] / 'bags' / 'turtlebot3_fake_sqlite'
+
+
+def held(run, tolerance=EXACT, **kwargs):
+    """Verify, hold the run against a tolerance, and give what was found."""
+    verification = verify(run, **kwargs)
+    assert verification.holds(tolerance, tolerance), (
+        verification.distances.max(),
+        verification.headings.max(),
+    )
+    return verification
+
+
+def rows(series, keep):
+    return replace(
+        series, received=series.received[keep], stamps=series.stamps[keep], values=series.values[keep]
+    )
+
+
+DRIVES: dict[frozenset, Run] = {}
+"""Runs that several tests verify, by the parameters of the robot."""
+LIMITS = {'linear__x__max_velocity': 0.1, 'angular__z__max_velocity': 0.5, 'max_wheel_velocity': 3.0}
+
+
+@pytest.fixture
+def drive(request, tmp_path):
+    """Record a drive to two waypoints, once for each robot."""
+
+    def drive(**parameters):
+        key = frozenset(parameters.items())
+        if key in DRIVES:
+            return DRIVES[key]
+        lockstep = request.getfixturevalue('lockstep')
+        lockstep.add(make(VirtualRobot, **parameters))
+        if parameters.get('command_interface') == 'wheels':
+            lockstep.add(make(WheelBridge))
+        lockstep.add(make(GoToGoal))
+        with recorded(lockstep, tmp_path / 'run') as made:
+            lockstep.publish('goals', goals(goal(0.5, 0.2), goal(-0.3, 0.4)))
+            lockstep.run_for(300.0 / parameters.get('publish_rate', 50.0))
+        DRIVES[key] = _frozen(made.run)
+        return DRIVES[key]
+
+    return drive
+
+
+def _frozen(run):
+    """Make the arrays of a run read-only, because tests share it."""
+    for field in fields(run):
+        value = getattr(run, field.name)
+        is_series = isinstance(value, Series)
+        for array in (value.received, value.stamps, value.values) if is_series else (value,):
+            if isinstance(array, np.ndarray):
+                array.setflags(write=False)
+    return run
+
+
+@pytest.mark.parametrize(
+    'parameters',
+    [
+        {},
+        {'command_interface': 'wheels'},
+        LIMITS,
+        {'publish_rate': 333.0, 'x': 4.0, 'y': -1.0, 'theta': 2.0},
+    ],
+    ids=['twist', 'wheels', 'limits', 'placed'],
+)
+def test_a_run_is_driven_again_exactly(drive, parameters):
+    run = drive(**parameters)
+    verification = held(run)
+    assert verification.source == 'cmd_vel_out'
+    assert len(verification.seconds) == len(run.odometry) > 250
+    assert np.ptp(run.odometry.values[:, 0]) > 0.2
+
+
+def test_messages_that_are_there_twice_do_not_turn_back_time(drive):
+    run = drive()
+    twice = np.repeat(np.arange(len(run.odometry)), 2)
+    run = replace(
+        run, odometry=rows(run.odometry, twice), odometry_covariances=run.odometry_covariances[twice]
+    )
+    assert len(held(run).seconds) == len(twice)
+
+
+@pytest.mark.parametrize(
+    'parameters',
+    [{}, {'command_interface': 'wheels'}, LIMITS],
+    ids=['twist', 'wheels', 'limits'],
+)
+def test_without_cmd_vel_out_the_commands_are_taken_by_their_recording(drive, parameters):
+    run = drive(**parameters)
+    run = replace(run, cmd_vel_out=rows(run.cmd_vel_out, slice(0, 0)))
+    verification = held(run)
+    assert verification.source == ('joint_command' if 'command_interface' in parameters else 'cmd_vel')
+    assert verification.start == 'odometry'
+
+
+def test_placements_resets_timeouts_and_parameters_are_driven_again(lockstep, robot_at, tmp_path):
+    robot = robot_at(cmd_vel_timeout=0.3)
+    with recorded(lockstep, tmp_path / 'run') as made:
+        made.look()
+        lockstep.publish('cmd_vel', twist(0.5, 1.0))
+        lockstep.run_for(1.0)
+        placed = PoseWithCovarianceStamped()
+        placed.pose.pose = goal(3.0, 3.0, -2.0).pose
+        lockstep.publish('cmd_vel', twist(-0.5, 2.0))
+        lockstep.run_for(0.1)
+        lockstep.publish('initialpose', placed)
+        lockstep.run_for(0.5)
+        lockstep.publish('cmd_vel', twist(1.0, 0.1))
+        robot.set_parameters([Parameter('linear.x.max_velocity', value=0.2)])
+        lockstep.run_for(0.2)
+        lockstep.call(Trigger, 'reset_odometry')
+        lockstep.run_for(0.5)
+    run = made.run
+    assert len(run.start_pose) == 3
+    assert run.parameter_events[-1][2] == {'linear.x.max_velocity': 0.2}
+    held(run)
+
+
+def test_a_robot_that_takes_time_is_driven_again_with_its_parameters(lockstep, robot_at, tmp_path):
+    robot_at(
+        linear__x__max_acceleration=0.5,
+        linear__x__max_deceleration=-0.8,
+        angular__z__max_acceleration=2.0,
+        wheel_lag=0.1,
+        command_delay=0.05,
+        max_wheel_acceleration=20.0,
+    )
+    with recorded(lockstep, tmp_path / 'run') as made:
+        made.look()
+        for v, omega in ((0.5, 1.0), (-0.3, 1.0), (0.4, -2.0), (0.0, 0.0), (0.3, 0.3)):
+            lockstep.publish('cmd_vel', twist(v, omega))
+            lockstep.run_for(0.43)
+        lockstep.run_for(2.0)
+    run = made.run
+    verification = held(run, 1e-12)
+    assert (verification.source, verification.start) == ('cmd_vel_out', 'start_pose')
+    assert verification.covariance_difference <= COVARIANCE_TOLERANCE
+    # Not standing still.
+    assert np.ptp(run.odometry.values[:, 0]) > 0.1
+    # The timeout stops it by deceleration.
+    stop = run.cmd_vel_out.stamps[-1]
+    stopping = run.odometry.values[run.odometry.stamps > stop, 3]
+    assert run.cmd_vel_out.values[-1].tolist() == [0.0, 0.0]
+    assert stopping[0] > 0.15
+    assert (np.diff(stopping[5:]) <= 0.0).all()
+    assert stopping[-1] == pytest.approx(0.0, abs=1e-6)
+    without = verify(replace(run, parameters={}))
+    assert without.distances.max() > 0.01
+    assert 'cannot be reproduced without them' in without.notes[-1]
+    late = replace(run, start_pose=rows(run.start_pose, slice(0, 0)))
+    assert any('what it was commanded before is missing' in note for note in verify(late).notes)
+
+
+def test_changes_of_the_dynamics_are_driven_again(lockstep, robot_at, tmp_path):
+    robot = robot_at(linear__x__max_acceleration=0.4, command_delay=0.13)
+
+    def change(**values):
+        names = ((name.replace('__', '.'), value) for name, value in values.items())
+        robot.set_parameters([Parameter(name, value=value) for name, value in names])
+
+    with recorded(lockstep, tmp_path / 'run') as made:
+        made.look()
+        for v, changes in (
+            (0.3, {'wheel_lag': 0.1}),
+            (-0.2, {'linear__x__max_acceleration': 0.9, 'linear__x__max_deceleration': -0.3}),
+            (0.5, {'command_delay': 0.31, 'cmd_vel_timeout': 0.2}),
+            (0.4, {'command_delay': 0.0, 'wheel_lag': 0.0}),
+            (-0.3, {'linear__x__max_acceleration': math.nan}),
+            (0.3, {'max_wheel_acceleration': 9.0, 'wheel_radius': 0.04}),
+            (0.9, {'linear__x__max_acceleration': 2.0, 'command_delay': 0.2}),
+        ):
+            lockstep.publish('cmd_vel', twist(v, 0.7))
+            lockstep.run_for(0.07)
+            change(**changes)
+            lockstep.run_for(0.0313)
+            # At the time of a command.
+            lockstep.publish('cmd_vel', twist(-v, 0.5))
+            change(angular__z__max_acceleration=2.0 + v)
+            lockstep.publish('cmd_vel', twist(v, -0.5))
+            lockstep.run_for(0.4)
+    run = made.run
+    assert len(run.parameter_stamps) == len(run.parameter_events) >= 12
+    held(run, 1e-12)
+    assert verify(replace(run, parameter_events=(), parameter_stamps=())).distances.max() > 0.01
+
+
+@pytest.mark.parametrize('limits', [{}, {'linear__x__max_acceleration': 0.5, 'wheel_lag': 0.05}])
+def test_faults_of_the_motors_are_driven_again(lockstep, robot_at, tmp_path, limits):
+    robot_at(**limits)
+    lockstep.inject(
+        ActuatorLag(0.2, start=0.3, duration=0.9),
+        DeadWheel('left', start=0.5, duration=1.0),
+        SaturatedWheel('right', 3.5, start=0.2, duration=1.5),
+        ActuatorLag(0.1, start=1.0),
+    )
+    with recorded(lockstep, tmp_path / 'run') as made:
+        for number in range(9):
+            lockstep.publish('cmd_vel', twist(0.3, (-1) ** number))
+            lockstep.run_for(0.25)
+    run = made.run
+    held(run, 1e-12)
+    of_another = tuple((at, f"{fault[:-1]}, robot='/b')", what) for at, fault, what in run.fault_events)
+    assert verify(replace(run, fault_events=of_another)).distances.max() > 0.01
+    without = verify(replace(run, fault_events=()))
+    assert without.distances.max() > 0.01
+    assert 'record /fault_events' in without.notes[-1]
+
+
+def test_time_that_goes_back_is_followed(lockstep, robot_at, tmp_path):
+    robot_at()
+    with recorded(lockstep, tmp_path / 'run') as made:
+        lockstep.publish('cmd_vel', twist(0.5, 1.0))
+        lockstep.run_for(0.4)
+    run = made.run
+    shifted = replace(run.odometry, stamps=run.odometry.stamps - 10**9)
+    start = rows(run.start_pose, slice(-1, None))
+    begun = replace(
+        start,
+        stamps=shifted.stamps[:1],
+        values=shifted.values[:1, :3],
+        received=run.odometry.received[-1:],
+    )
+    received = begun.received + 1
+    moving = run.odometry.values[:1, 3:]
+
+    def again(twists):
+        commands = replace(run.cmd_vel_out, stamps=shifted.stamps[:1], values=twists, received=received)
+        return replace(
+            run,
+            odometry=_joined(run.odometry, replace(shifted, received=shifted.received + 10**9)),
+            start_pose=_joined(run.start_pose, begun),
+            cmd_vel_out=_joined(run.cmd_vel_out, commands),
+        )
+
+    assert np.any(np.diff(again(moving).odometry.stamps) < 0)
+    assert len(held(again(moving)).seconds) == 2 * len(run.odometry)
+    stood = verify(again(0.0 * moving))
+    assert stood.distances[: len(run.odometry)].max() < EXACT
+    assert stood.distances[-1] > 0.1
+
+
+def _joined(first, second):
+    return replace(
+        first,
+        **{
+            name: np.concatenate([getattr(first, name), getattr(second, name)])
+            for name in ('received', 'stamps', 'values')
+        },
+    )
+
+
+@pytest.mark.lockstep(start=100.0)
+def test_late_stamped_commands_are_explained(lockstep, robot_at, tmp_path):
+    robot_at(enable_stamped_cmd_vel=True)
+    with recorded(lockstep, tmp_path / 'run') as made:
+        for index in range(20):
+            lockstep.run_for(0.05)
+            late = lockstep.now - 30_000_000
+            lockstep.publish('cmd_vel', twist_stamped(0.5, (-1) ** index, late))
+    assert len(made.run.cmd_vel_out) == 20
+    held(made.run)
+
+
+def test_a_recording_that_begins_late_is_held_from_its_first_odometry(lockstep, robot_at, tmp_path):
+    robot_at()
+    lockstep.publish('cmd_vel', twist(0.3, -0.7))
+    lockstep.run_for(0.2)
+    with recorded(lockstep, tmp_path / 'run') as made:
+        lockstep.run_for(0.2)
+        lockstep.publish('cmd_vel', twist(0.1, 0.9))
+        lockstep.run_for(1.0)
+    verification = held(made.run)
+    assert verification.start == 'odometry'
+
+
+@pytest.mark.parametrize('slip', [False, True])
+def test_a_robot_that_stood_until_the_recording_is_held_from_its_start(
+    lockstep, robot_at, tmp_path, slip
+):
+    """As where a process creates its nodes long before it spins them."""
+    robot_at(x=0.3, theta=0.7, simulate_slip=slip)
+    lockstep.run_for(0.5)
+    with recorded(lockstep, tmp_path / 'run') as made:
+        lockstep.run_for(0.1)
+        lockstep.publish('cmd_vel', twist(0.1, 0.9))
+        lockstep.run_for(1.0)
+    verification = held(made.run)
+    assert verification.start == 'start_pose'
+    assert verification.covariance_difference <= COVARIANCE_TOLERANCE
+    assert (verification.truth is not None) == slip
+    driven = replace(made.run, odometry=rows(made.run.odometry, slice(20, None)))
+    driven = replace(driven, odometry_covariances=made.run.odometry_covariances[20:])
+    assert held(driven).start == 'odometry'
+
+
+def test_after_a_reset_of_the_odometry_alone_the_truth_has_no_known_start(lockstep, robot_at, tmp_path):
+    robot_at(simulate_slip=True, cmd_vel_timeout=0.1)
+    lockstep.publish('cmd_vel', twist(0.3, -0.7))
+    lockstep.run_for(0.5)
+    lockstep.call(Trigger, 'reset_odometry')
+    lockstep.run_for(0.5)
+    with recorded(lockstep, tmp_path / 'run') as made:
+        lockstep.run_for(0.1)
+        lockstep.publish('cmd_vel', twist(0.1, 0.9))
+        lockstep.run_for(0.5)
+        lockstep.publish('initialpose', PoseWithCovarianceStamped())
+        lockstep.run_for(0.1)
+    verification = held(made.run)
+    assert (verification.start, verification.truth) == ('odometry', None)
+    assert len(made.run.start_pose) == 3
+    assert len(verification.seconds) == len(made.run.odometry)
+
+
+def test_what_was_altered_is_found_with_its_place(drive):
+    run = drive()
+    odometry = run.odometry
+    commands = run.cmd_vel_out
+    seconds = (commands.stamps - odometry.stamps[0]) / 1e9
+    gap = verify(replace(run, cmd_vel_out=rows(commands, (seconds < 1.0) | (seconds > 1.5))))
+    assert not gap.holds(EXACT, EXACT)
+    first = gap.seconds[np.flatnonzero(gap.distances > EXACT)[0]]
+    assert 1.0 <= first <= 1.1
+    scaled = odometry.values * [1.01, 1.01, 1.0, 1.0, 1.0]
+    assert not verify(replace(run, odometry=replace(odometry, values=scaled))).holds(EXACT, EXACT)
+    for column, differences in ((0, 'distances'), (1, 'distances'), (2, 'headings')):
+        altered = odometry.values.copy()
+        altered[123, column] += 1e-3
+        found = verify(replace(run, odometry=replace(odometry, values=altered)))
+        assert not found.holds(EXACT, EXACT)
+        assert found.seconds[getattr(found, differences).argmax()] == pytest.approx(
+            (odometry.stamps[123] - odometry.stamps[0]) / 1e9
+        )
+        assert getattr(found, differences).max() == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize('missed', [1, 10])
+def test_a_recorder_that_missed_the_first_commands_does_not_blame_the_robot(drive, missed):
+    run = drive()
+    late = replace(run, cmd_vel_out=rows(run.cmd_vel_out, slice(missed, None)))
+    found = held(late)
+    assert any('moved before the first command that was recorded' in note for note in found.notes)
+    assert found.start == 'odometry'
+    assert len(found.distances) >= len(run.odometry) - missed - 100
+    assert not any('before the first command' in note for note in held(run).notes)
+
+
+def test_half_a_second_without_commands_is_found_by_recording_time_too(drive):
+    run = drive()
+    seconds = (run.cmd_vel.received - run.odometry.stamps[0]) / 1e9
+    gap = rows(run.cmd_vel, (seconds < 0.2) | (seconds > 0.7))
+    run = replace(run, cmd_vel_out=rows(run.cmd_vel_out, slice(0, 0)), cmd_vel=gap)
+    assert not verify(run).holds(0.02, 0.02)
+
+
+def test_a_bag_of_ros2_bag_record_is_held_against_our_robot():
+    run = read_run(FOREIGN)
+    verification = held(run, 0.02)
+    # That robot integrates by midpoints at 100 Hz; its commands' true instants are not known.
+    assert 1e-4 < verification.distances.max() < 2e-3
+    slower = verify(run, {'linear.x.max_velocity': 0.05})
+    assert not slower.holds(0.02, 0.02)
+
+
+def test_runs_that_cannot_be_verified_say_why(drive):
+    run = drive()
+    nothing = slice(0, 0)
+    with pytest.raises(BagError, match='no odometry'):
+        verify(replace(run, odometry=rows(run.odometry, nothing)))
+    stopped = replace(run.odometry, received=0 * run.odometry.received)
+    with pytest.raises(BagError, match='clock of the recorder stood still'):
+        verify(replace(run, odometry=stopped))
+    shuffled = replace(
+        run.odometry, stamps=run.odometry.stamps - 10**9 * (np.arange(len(run.odometry)) % 2)
+    )
+    with pytest.raises(BagError, match='record without use_sim_time'):
+        verify(replace(run, odometry=shuffled))
+    silent = replace(run, cmd_vel_out=rows(run.cmd_vel_out, nothing), cmd_vel=rows(run.cmd_vel, nothing))
+    with pytest.raises(BagError, match='has no commands: record cmd_vel_out, or cmd_vel'):
+        verify(silent)
+
+
+def test_types_of_the_commands_are_both_read(lockstep, robot_at, tmp_path):
+    for index, (stamped, kind) in enumerate([(False, Twist), (True, TwistStamped)]):
+        robot_at(namespace=f'robot{index}', enable_stamped_cmd_vel=stamped)
+        topics = tuple(
+            f'robot{index}/{name}' for name in ('cmd_vel', 'odom', 'cmd_vel_out', 'start_pose')
+        )
+        made_at = tmp_path / f'run{index}'
+        message = twist_stamped(0.2, 0.3, lockstep.now) if stamped else twist(0.2, 0.3)
+        publisher = lockstep.node.create_publisher(kind, f'robot{index}/cmd_vel', 10)
+        with recorded(lockstep, made_at, topics=topics) as made:
+            publisher.publish(message)
+            lockstep.run_for(0.3)
+        assert made.run.cmd_vel.values.tolist() == [[0.2, 0.3]]
+        held(made.run)
+
+
+def series(name, received, stamps, values):
+    return Series(
+        received=np.asarray(received, dtype=np.int64),
+        stamps=np.asarray(stamps, dtype=np.int64),
+        values=np.asarray(values, dtype=np.float64).reshape(len(stamps), len(COLUMNS[name])),
+        columns=COLUMNS[name],
+    )
+
+
+def run_of(**given):
+    empty = {name: series(name, [], [], []) for name in COLUMNS}
+    return Run(path=Path('run'), **(empty | given))
+
+
+def test_the_time_is_linear_where_all_commands_were_recorded_late(monkeypatch):
+    computed = []
+    at = Robot.at
+    monkeypatch.setattr(Robot, 'at', lambda self, stamp: computed.append(stamp) or at(self, stamp))
+    calls = []
+    for n in (200, 400):
+        stamps = 10**9 + 1000 * np.arange(n)
+        computed.clear()
+        verify(
+            run_of(
+                odometry=series('odometry', stamps, stamps, np.zeros((n, 5))),
+                cmd_vel_out=series('cmd_vel_out', stamps + 10**9, stamps, np.full((n, 2), 0.1)),
+            )
+        )
+        calls.append(len(computed))
+    assert calls[1] < 2.1 * calls[0]
+
+
+@pytest.mark.parametrize('ahead', [10**18, -(10**18)], ids=['recorder', 'robot'])
+def test_recording_times_of_another_clock_than_the_odometry_are_refused(ahead):
+    stamps = 2 * 10**18 + 10**8 * np.arange(100)
+    run = run_of(
+        odometry=series('odometry', stamps + ahead, stamps, np.zeros((100, 5))),
+        cmd_vel=series('cmd_vel', stamps + ahead, stamps + ahead, np.full((100, 2), 0.5)),
+    )
+    with pytest.raises(BagError, match='another clock than the stamps of the odometry'):
+        verify(run)
+
+
+def test_applied_commands_of_another_clock_than_the_odometry_are_refused():
+    stamps = 2 * 10**18 + 10**8 * np.arange(100)
+    for ahead in (10**18, -(10**18)):
+        run = run_of(
+            odometry=series('odometry', stamps, stamps, np.zeros((100, 5))),
+            cmd_vel_out=series('cmd_vel_out', stamps[50:], stamps[50:] + ahead, np.full((50, 2), 0.5)),
+        )
+        with pytest.raises(BagError, match='no odometry after the first command on cmd_vel_out'):
+            verify(run)
+
+
+@pytest.mark.parametrize('topic', ['cmd_vel', 'cmd_vel_out'])
+def test_odometry_must_follow_a_command(topic):
+    stamps = 10**9 + 10**8 * np.arange(100)
+    late = stamps[-1:] + 1
+    run = run_of(
+        odometry=series('odometry', stamps, stamps, np.zeros((100, 5))),
+        **{topic: series(topic, late, late, [[0.5, 0.3]])},
+    )
+    with pytest.raises(BagError, match=f'no odometry after the first command on {topic}'):
+        verify(run)
+
+
+def test_odometry_that_was_not_compared_is_counted():
+    stamps = 10**9 + 10**8 * np.arange(100)
+    run = run_of(
+        odometry=series('odometry', stamps, stamps, np.zeros((100, 5))),
+        cmd_vel=series('cmd_vel', stamps[40:], stamps[40:], np.zeros((60, 2))),
+    )
+    verification = verify(run)
+    assert len(verification.seconds) == 61
+    assert verification.notes == (
+        '39 of 100 odometry messages precede the start of the simulated robot and were not compared',
+    )
+
+
+# --- The covariance
+
+
+def test_the_covariances_are_those_of_the_node_to_the_last_bit(lockstep, robot_at, tmp_path):
+    robot_at(cmd_vel_timeout=0.3)
+    with recorded(lockstep, tmp_path / 'run') as made:
+        made.look()
+        lockstep.publish('cmd_vel', twist(0.2, 1.0))
+        lockstep.run_for(1.0)
+        placed = PoseWithCovarianceStamped()
+        placed.pose.covariance[0] = placed.pose.covariance[7] = placed.pose.covariance[35] = 0.04
+        lockstep.publish('initialpose', placed)
+        for turn in range(40):
+            lockstep.publish('cmd_vel', twist(-0.2, 0.1 * turn))
+            lockstep.run_for(0.1)
+    run = made.run
+    verification = held(run)
+    assert verification.covariance_difference == 0.0
+    # The heading of the start is exactly zero, so that no digit is lost in the quaternion.
+    assert run.odometry_covariances[-1, 5] > 0.04
+
+    forged = run.odometry_covariances.copy()
+    forged[100, 3] *= 1.0 + 1e-6
+    verification = verify(replace(run, odometry_covariances=forged))
+    assert verification.covariance_difference > COVARIANCE_TOLERANCE
+    assert not verification.holds(EXACT, EXACT)
+
+
+@pytest.mark.parametrize('missing', ['parameters', 'start_pose'])
+def test_without_the_robot_or_its_start_the_covariances_are_not_compared(drive, missing):
+    run = drive()
+    without = {} if missing == 'parameters' else rows(run.start_pose, slice(0, 0))
+    verification = held(replace(run, **{missing: without}))
+    assert verification.covariance_difference is None
+
+
+def test_covariances_are_compared_in_units_of_their_standard_deviations():
+    robot = Robot(model=RobotModel(), stamp=0, pose=np.zeros(3), covariance=np.zeros((3, 3)))
+    now = robot.commanded((0.2, 0.1), 0).at(1_000_000_000)
+    recorded = np.array([now.moments[:6]])
+    for factor, exact in ((1.0 + 1e-11, True), (1.0 + 1e-8, False)):
+        difference = largest_covariance_difference([now], factor * recorded)
+        assert (difference <= COVARIANCE_TOLERANCE) == exact
+
+
+def test_an_invalid_covariance_of_a_start_is_zero():
+    entries = np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 1.0], [1.0, 5.0, 0.0, 1.0, 0.0, 1.0]])
+    found = start_covariances(SimpleNamespace(start_covariances=entries, start_pose=[0, 1]))
+    np.testing.assert_array_equal(found, [np.eye(3).ravel(), np.zeros(9)])

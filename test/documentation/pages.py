@@ -1,0 +1,506 @@
+"""The pages of the documentation: their code blocks, how these are run, and what is generated in them.
+
+    python test/documentation/pages.py parameters  write the parameter tables of doc/nodes.md
+    python test/documentation/pages.py bodies [PAGE ...]  write the bodies of functions into pages
+    python test/documentation/pages.py outputs [PAGE ...]  run pages and write their outputs
+    python test/documentation/pages.py public  write doc/public.md
+    python test/documentation/pages.py pictures  draw the pictures of plot_jacobian that pages show
+
+A page is run from top to bottom in one empty directory. A `python` block is a program and a `bash` block
+a script. Programs of this package, `pytest` and `python` run in forks, see `forked`. `python3` is a new
+interpreter.
+A block of any language whose first line is `# NAME.EXTENSION` is a file. HTML comments before
+a block say what differs:
+
+    <!-- test: skip, REASON -->          is not run; only the options of our tools in it are checked
+    <!-- test: instead COMMAND -->       this command is run instead
+    <!-- test: exit N -->                ends with this exit code
+    <!-- test: processes -->             every line is a process; the last one ends by itself
+    <!-- test: beside COMMAND; ... -->   runs while these commands run
+    <!-- test: edit FILE, WORDS -->      replaces the one line of the file that has these words
+    <!-- output -->                      is all that the block before printed; `...` stands for lines
+    <!-- output: part -->                its lines are in what the block before printed, in this order
+    <!-- output: part, exact -->         the same, with equal numbers (also without `part`)
+
+Numbers in other outputs may differ. Before a `py` block, which is not run:
+
+    <!-- body: PACKAGE.MODULE.FUNCTION -->   a function of the package, without its docstring
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import io
+import itertools
+import os
+import pkgutil
+import re
+import signal
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import textwrap
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass, fields
+from pathlib import Path
+from types import ModuleType
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from fork_server import forked
+from support.domains import domain_id
+
+import diffdrive_jacobian
+from diffdrive_jacobian.parameters.declaration import NodeParameters, specifications
+from diffdrive_jacobian.parameters.nodes import (
+    GoToGoalParameters,
+    VirtualRobotParameters,
+    WheelBridgeParameters,
+)
+from diffdrive_jacobian.tools.entry_points import NODES, tools
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = {
+    str(path.relative_to(ROOT)): path for path in (ROOT / 'README.md', *sorted(ROOT.glob('doc/*.md')))
+}
+PARAMETERS: dict[str, type[NodeParameters]] = {
+    'virtual_robot': VirtualRobotParameters,
+    'go_to_goal': GoToGoalParameters,
+    'wheel_bridge': WheelBridgeParameters,
+}
+PATIENCE = 240.0
+"""How long a block may run, or a process beside it may take to print something (s)."""
+TYPING = 2.0
+"""Time in which a person goes to the next terminal (s). Processes that have just started find each other
+one after the other: a recorder that hears the odometry already may miss the first command."""
+BLOCK = re.compile(
+    r'(?P<notes>(?:^<!-- (?:test|output)[^\n]*-->\n+)*)^```(?P<language>\w*)\n(?P<code>.*?)^```$',
+    re.MULTILINE | re.DOTALL,
+)
+FILE_NAME = re.compile(r'# ([\w./-]+\.\w+)\n')
+ELLIPSIS = '...'
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Block:
+    """One block of a page, and what the comments before it say."""
+
+    language: str
+    code: str
+    notes: dict[str, str]
+    line: int
+    start: int
+    """Offset of the code in the text of the page."""
+
+    @property
+    def file(self) -> str | None:
+        """The name of the file that the block is; None if it is none."""
+        found = FILE_NAME.match(self.code)
+        return found.group(1) if found else None
+
+
+def blocks(text: str) -> list[Block]:
+    """Return the blocks of a page from top to bottom."""
+    found = []
+    for match in BLOCK.finditer(text):
+        notes = {}
+        for words in re.findall(r'<!-- (?:test: )?(.*?) -->', match['notes']):
+            word, rest = re.fullmatch(r'(\w+)[:,]? ?(.*)', words).groups()
+            notes[word] = rest
+        found.append(
+            Block(
+                language=match['language'],
+                code=match['code'],
+                notes=notes,
+                line=text.count('\n', 0, match.start('code')),
+                start=match.start('code'),
+            )
+        )
+    return found
+
+
+class Session:
+    """A page that is run in a directory."""
+
+    def __init__(self, directory: Path, commands: Path) -> None:
+        """Run in a ROS domain that other sessions are unlikely to have.
+
+        Args:
+            directory: An empty directory.
+            commands: Where to make the commands of this package.
+        """
+        self._directory = directory
+        (directory / 'config').symlink_to(ROOT / 'config')
+        scripts = Path(sysconfig.get_path('scripts'))
+        ours = [scripts / name for name in ('pytest', *NODES, *tools())]
+        self._commands = forked.make_commands(commands, ['python', *ours])
+        self._environment = {
+            **os.environ,
+            'PATH': os.pathsep.join([str(commands), str(scripts), os.environ['PATH']]),
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+            'ROS_DOMAIN_ID': str(domain_id()),
+            'PYTHONUNBUFFERED': '1',
+            # They take longer to import than most tests of the pages run.
+            'PYTEST_ADDOPTS': '-p no:hypothesispytest -p no:xdist -p no:launch_testing',
+        }
+
+    def run(self, block: Block) -> str:
+        """Run a block; return what it printed.
+
+        Raises:
+            AssertionError: It ended with another exit code than it should.
+        """
+        if block.file is not None:
+            path = self._directory / block.file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(block.code)
+            return ''
+        if 'edit' in block.notes:
+            self._edit(*block.notes['edit'].split(', ', 1), block.code)
+            return ''
+        beside = [one.strip() for one in block.notes.get('beside', '').split(';') if one.strip()]
+        command = ['bash', '-euo', 'pipefail', '-c', block.notes.get('instead', block.code)]
+        if block.language == 'python':
+            command = ['python', '-c', block.code]
+        elif 'processes' in block.notes:
+            *beside, last = [line for line in block.code.splitlines() if not line.startswith('#')]
+            command = ['bash', '-c', f'exec {last}']
+        with ExitStack() as stack:
+            for line in beside:
+                stack.enter_context(Background(line, self._directory, self._environment))
+            if 'processes' in block.notes:
+                time.sleep(TYPING)
+            output, code = self._completed(command, block)
+        expected = int(block.notes.get('exit', 0))
+        assert code == expected, (
+            f'line {block.line}: exit code {code}, not {expected}:\n{block.code}\n{output}'
+        )
+        return output
+
+    def _completed(self, command: list[str], block: Block) -> tuple[str, int]:
+        """Run a command to its end; return what it printed and its exit code."""
+        process = subprocess.Popen(
+            command,
+            cwd=self._directory,
+            env=self._environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+        try:
+            output, _ = process.communicate(timeout=PATIENCE)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            output, _ = process.communicate()
+            raise AssertionError(
+                f'line {block.line}: not within {PATIENCE} s:\n{block.code}\n{output}'
+            ) from None
+        return output, process.returncode
+
+    def _edit(self, name: str, words: str, replacement: str) -> None:
+        path = self._directory / name
+        lines = path.read_text().splitlines(keepends=True)
+        (index,) = [number for number, line in enumerate(lines) if words in line]
+        lines[index] = replacement
+        path.write_text(''.join(lines))
+
+
+class Background:
+    """A command that runs beside a block, and has to exit with 0 when it is interrupted."""
+
+    def __init__(self, command: str, directory: Path, environment: dict[str, str]) -> None:
+        """Start it, and wait until it has printed something."""
+        self._command = command
+        self._output = tempfile.TemporaryFile(mode='w+')  # noqa: SIM115
+        self._process = subprocess.Popen(
+            ['bash', '-c', f'exec {command}'],
+            cwd=directory,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=self._output,
+            stderr=subprocess.STDOUT,
+        )
+        deadline = time.monotonic() + PATIENCE
+        while os.fstat(self._output.fileno()).st_size == 0:
+            if self._process.poll() is not None or time.monotonic() > deadline:
+                self._process.kill()
+                raise AssertionError(f'{command} printed nothing: exit code {self._process.wait()}')
+            time.sleep(0.01)
+
+    def __enter__(self) -> Background:
+        """Return it."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Interrupt it and check how it ends."""
+        self._process.send_signal(signal.SIGINT)
+        try:
+            code = self._process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            code = self._process.wait()
+        self._output.seek(0)
+        text = self._output.read()
+        self._output.close()
+        if kind is not None:
+            print(f'{self._command}\n{text}')
+        else:
+            assert code == 0, f'{self._command}: exit code {code}\n{text}'
+
+
+def is_run(block: Block) -> bool:
+    """Return whether a block is run, written or used to edit a file."""
+    if 'skip' in block.notes or 'output' in block.notes:
+        return False
+    return block.language in ('python', 'bash') or block.file is not None
+
+
+def masked(line: str) -> str:
+    """Return a line without what may differ from run to run: numbers and the width of spaces."""
+    return spaced(re.sub(r'-?\d+(\.\d+)?(e[-+]?\d+)?', '#', line))
+
+
+def spaced(line: str) -> str:
+    """Return a line with single spaces."""
+    return ' '.join(line.split())
+
+
+def check_output(quoted: Block, printed: str) -> None:
+    """Compare a quoted output with the real one.
+
+    Raises:
+        AssertionError: They differ in more than numbers, or at all if the quotation is exact.
+    """
+    compared = spaced if 'exact' in quoted.notes['output'] else masked
+    real = [compared(line) for line in printed.strip().splitlines()]
+    lines = [compared(line) for line in quoted.code.strip().splitlines()]
+    if 'part' in quoted.notes['output']:
+        rest = iter(real)
+        for line in lines:
+            assert line in rest, (
+                f'line {quoted.line}: not printed, or not in this order: {line}\n{printed}'
+            )
+        return
+    if ELLIPSIS in lines:
+        cut = lines.index(ELLIPSIS)
+        tail = len(lines) - cut - 1
+        real = [*real[:cut], ELLIPSIS, *real[len(real) - tail :]]
+    assert lines == real, f'line {quoted.line}: printed was\n{printed}'
+
+
+def refreshed(quoted: Block, printed: str) -> str:
+    """Return the code of a quoted output as it should be, cut as it was.
+
+    A part stays as it is; if it is out of date, that is reported.
+    """
+    lines, real = quoted.code.splitlines(), printed.strip().splitlines()
+    if 'part' in quoted.notes['output']:
+        try:
+            check_output(quoted, printed)
+        except AssertionError as error:
+            print(f'edit by hand: {error}')
+        return quoted.code
+    if ELLIPSIS in lines:
+        cut = lines.index(ELLIPSIS)
+        tail = len(lines) - cut - 1
+        real = [*real[:cut], ELLIPSIS, *real[len(real) - tail :]]
+    return '\n'.join(real) + '\n'
+
+
+def run_page(text: str, directory: Path) -> list[tuple[Block, str]]:
+    """Run the blocks of a page; return the quoted outputs with what was printed."""
+    printed, outputs = '', []
+    with tempfile.TemporaryDirectory() as folder:
+        session = Session(directory, Path(folder) / 'commands')
+        for block in blocks(text):
+            if 'output' in block.notes:
+                outputs.append((block, printed))
+            elif is_run(block):
+                printed = session.run(block)
+    return outputs
+
+
+# --- Parameter tables
+
+
+def parameter_table(parameters: type[NodeParameters]) -> str:
+    """Return the table of the parameters of a node."""
+    values = {field.name: field.default for field in fields(parameters)}
+    rows = ['| parameter | default | allowed | |', '|---|---|---|---|']
+    for name, (field, specification) in specifications(parameters).items():
+        allowed = specification.allowed.removeprefix('in ').replace("'", '`')
+        rows.append(
+            f'| `{name}` | {_written(values[field])} | {allowed} | {specification.description} |'
+        )
+    return '\n'.join(rows)
+
+
+def _written(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return '.nan' if value != value else str(value)
+
+
+def with_parameter_tables(text: str) -> str:
+    """Return a page with its parameter tables as they should be."""
+    for name, parameters in PARAMETERS.items():
+        begin, end = f'<!-- parameters of {name} -->\n', '<!-- end of parameters -->'
+        before, _, rest = text.partition(begin)
+        if rest:
+            table = f'\n{parameter_table(parameters)}\n\n'
+            text = before + begin + table + end + rest.partition(end)[2]
+    return text
+
+
+# --- Bodies of functions
+
+BODY = re.compile(r'(<!-- body: ([\w.]+) -->\n+```py\n)(.*?)(^```$)', re.MULTILINE | re.DOTALL)
+
+
+def body(name: str) -> str:
+    """Return the source of a function or method, without decorators and docstring.
+
+    Args:
+        name: Its full name, `PACKAGE.MODULE.FUNCTION` or `PACKAGE.MODULE.CLASS.METHOD`.
+    """
+    source = textwrap.dedent(inspect.getsource(pkgutil.resolve_name(name)))
+    (function,) = ast.parse(source).body
+    assert isinstance(function, ast.FunctionDef), f'{name} is no function'
+    lines = source.splitlines(keepends=True)
+    first = function.body[0]
+    if ast.get_docstring(function) is not None:
+        del lines[first.lineno - 1 : first.end_lineno]
+    return ''.join(lines[function.lineno - 1 :])
+
+
+def with_bodies(text: str) -> str:
+    """Return a page with its bodies of functions as they should be."""
+    return BODY.sub(lambda match: match[1] + body(match[2]) + match[4], text)
+
+
+# --- Public names
+
+
+def public_names(package: ModuleType = diffdrive_jacobian, prefix: str = '') -> dict[str, object]:
+    """Return the public objects by their path in this package, those in public modules included."""
+    found = {}
+    for name in package.__all__:
+        if not hasattr(package, name):
+            importlib.import_module(f'{package.__name__}.{name}')
+        value = found[f'{prefix}{name}'] = getattr(package, name)
+        if inspect.ismodule(value):
+            found |= public_names(value, f'{prefix}{name}.')
+    return found
+
+
+def public_page() -> str:
+    """Return the page that lists the public names."""
+    lines = [
+        '# Public names',
+        '',
+        'What a program may import, with the first sentence of its docstring. Paths begin with',
+        '`diffdrive_jacobian`: under kinematics, `planar_arm.PlanarArm` is',
+        '`from diffdrive_jacobian.kinematics.planar_arm import PlanarArm`. Each object has one public',
+        'path, as on this page. Packages and modules list these names in `__all__`. Everything else is',
+        'internal and may change without notice. All errors derive from `errors.DiffdriveError`.',
+        '',
+        'Written by `python test/documentation/pages.py public`.',
+    ]
+    for path, value in public_names().items():
+        package, _, name = path.partition('.')
+        if not name:
+            lines += ['', f'## {package}', '', _sentence(value), '', '| name | |', '|---|---|']
+        else:
+            lines.append(f'| `{name}` | {_sentence(value, path)} |')
+    return '\n'.join([*lines, ''])
+
+
+def _sentence(value: object, path: str = '') -> str:
+    """Return the first sentence of the docstring of a public object, at this path in the package."""
+    documented = inspect.ismodule(value) or inspect.isclass(value) or inspect.isroutine(value)
+    text = (inspect.getdoc(value) if documented else _constant_docstring(value, path)) or ''
+    text = ' '.join(text.partition('\n\n')[0].split())
+    found = re.match(r'.*?\.(?= [A-Z]|$)', text)
+    return (found[0] if found else text).replace('|', '\\|')
+
+
+def _constant_docstring(value: object, path: str) -> str:
+    """Return the string below the assignment of a constant."""
+    if description := getattr(value, 'description', ''):
+        return str(description)
+    package, name = path.split('.')[0], path.split('.')[-1]
+    for key, module in list(sys.modules.items()):
+        if key.startswith(f'{diffdrive_jacobian.__name__}.{package}') and name in vars(module):
+            for statement, below in itertools.pairwise(ast.parse(inspect.getsource(module)).body):
+                target = statement.targets[0] if isinstance(statement, ast.Assign) else None
+                if (
+                    isinstance(target, ast.Name)
+                    and target.id == name
+                    and vars(module)[name] is value
+                    and isinstance(below, ast.Expr)
+                    and isinstance(below.value, ast.Constant)
+                ):
+                    return str(below.value.value)
+    raise ValueError(f'the public constant {path} has no docstring')
+
+
+# --- Pictures
+
+
+def write_pictures() -> None:
+    """Draw the pictures of `plot_jacobian` that pages show, with a palette, a third of the size."""
+    from PIL import Image
+
+    from diffdrive_jacobian import plots
+    from diffdrive_jacobian.plots.rendering import render, styled
+
+    shown = {
+        Path(link)
+        for path in PAGES.values()
+        for link in re.findall(r'!\[.*?\]\((.*?)\)', path.read_text())
+    }
+    for name in plots.PICTURES:
+        if (file := Path('../resource/pictures') / f'{name}.png') in shown:
+            with styled():
+                content = render(getattr(plots, name)(), 'png')
+            picture = Image.open(io.BytesIO(content)).convert('RGB').quantize(dither=Image.Dither.NONE)
+            picture.save(ROOT / 'doc' / file, optimize=True)
+
+
+def main(what: str, names: list[str]) -> None:
+    """Write what is generated into the pages."""
+    for name in names or PAGES:
+        path = PAGES[name]
+        text = path.read_text()
+        new = text
+        if what == 'parameters':
+            new = with_parameter_tables(text)
+        elif what == 'bodies':
+            new = with_bodies(text)
+        else:
+            with tempfile.TemporaryDirectory() as directory:
+                for block, printed in reversed(run_page(text, Path(directory))):
+                    end = block.start + len(block.code)
+                    new = new[: block.start] + refreshed(block, printed) + new[end:]
+        if new != text:
+            path.write_text(new)
+            print(f'{name}: written')
+
+
+if __name__ == '__main__':
+    if sys.argv[1:] == ['public']:
+        PAGES.get('doc/public.md', ROOT / 'doc' / 'public.md').write_text(public_page())
+        sys.exit()
+    if sys.argv[1:] == ['pictures']:
+        write_pictures()
+        sys.exit()
+    written = sys.argv[1:2] in (['parameters'], ['bodies'], ['outputs'])
+    if not written or not {*sys.argv[2:]} <= {*PAGES}:
+        sys.exit(__doc__)
+    main(sys.argv[1], sys.argv[2:])

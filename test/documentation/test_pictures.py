@@ -1,0 +1,170 @@
+"""The pictures of the documents and their command: they are drawn whole, and mistakes are reported."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.text import Text
+
+from diffdrive_jacobian import plots
+from diffdrive_jacobian.plots import legs_figure, rendering
+from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.tools.plot_jacobian import main
+
+LARGEST = 100_000
+"""Size of a picture (bytes)."""
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """An empty directory, the current one."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(*arguments):
+    """Run the tool in this process; return its exit code."""
+    try:
+        return main(arguments, Signals())
+    except SystemExit as end:
+        return end.code
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('name', plots.PICTURES)
+def test_the_labels_of_a_picture_are_whole_and_apart(name):
+    with rendering.styled():
+        drawn = getattr(plots, name)()
+        content = rendering.render(drawn, 'png')
+    assert len(content) < LARGEST
+    texts = {one for one in drawn.findobj(Text) if one.get_visible() and one.get_text().strip()}
+    boxes = {one: one.get_window_extent() for one in texts.difference(hidden(drawn))}
+    assert boxes
+    for text, box in boxes.items():
+        assert drawn.bbox.x0 <= box.x0 < box.x1 <= drawn.bbox.x1, text
+        assert drawn.bbox.y0 <= box.y0 < box.y1 <= drawn.bbox.y1, text
+    for (one, box), (other, second) in itertools.combinations(boxes.items(), 2):
+        # Boxes of letters that lean have room in their corners.
+        assert not box.padded(-1.0).overlaps(second.padded(-1.0)), (one, other)
+
+
+def hidden(drawn):
+    """Return the texts of axes that are off, and of ticks outside, which are not drawn."""
+    for axes in drawn.axes:
+        for at, axis in enumerate((axes.xaxis, axes.yaxis)):
+            low, high = sorted(axis.get_view_interval())
+            for text in axis.findobj(Text):
+                inside = text is axis.label or low <= text.get_position()[at] <= high
+                if not (axes.axison and inside):
+                    yield text
+
+
+@pytest.mark.parametrize('name', plots.PICTURES)
+def test_a_picture_does_not_depend_on_the_style_of_the_user(name):
+    import matplotlib
+
+    with matplotlib.rc_context({'text.usetex': True, 'font.size': 40.0, 'lines.linewidth': 20.0}):
+        strange = getattr(plots, name)()
+    with rendering.styled():
+        assert rendering.render(strange, 'png') == rendering.render(getattr(plots, name)(), 'png')
+
+
+def test_the_ellipses_are_a_line_at_the_axle_and_a_circle_at_half_the_wheel_separation():
+    from matplotlib.patches import Polygon
+
+    (axes,) = plots.velocity_ellipses(r=0.05, L=0.4).axes
+    shapes = [one for one in axes.patches if isinstance(one, Polygon) and len(one.get_xy()) > 100]
+    boxes = [one.get_extents().transformed(axes.transData.inverted()) for one in shapes[1:]]
+    np.testing.assert_allclose([box.x0 + box.width / 2 for box in boxes], [0, 0.1, 0.2, 0.4], atol=1e-9)
+    ratios = [box.height / box.width for box in boxes]  # 2 d / L
+    np.testing.assert_allclose(ratios, [0.0, 0.5, 1.0, 2.0], atol=1e-3)
+
+
+def test_the_axle_centre_is_half_way_between_the_wheel_centres_and_faces_forward():
+    (axes,) = plots.figure_2(L=0.3).axes
+    points = [one.get_xydata()[0] for one in axes.lines if one.get_marker() == 'o']
+    C_1, C_2, C = points
+    np.testing.assert_allclose((C_1 + C_2) / 2.0, C)
+    assert np.linalg.norm(C_1 - C_2) == pytest.approx(0.3)
+    arrows = [one for one in axes.texts if one.arrow_patch is not None]
+    from_C = [np.subtract(one.xy, one.xyann) for one in arrows if np.allclose(one.xyann, C)]
+    assert len(from_C) == 4  # the heading, v_C, e_f, e_l
+    along = [vector @ (C_1 - C_2) / np.linalg.norm(vector) / 0.3 for vector in from_C]
+    np.testing.assert_allclose(along, [0.0, 0.0, 0.0, -1.0], atol=1e-12)
+
+
+def test_the_columns_of_the_wheel_cancel_at_the_ground_and_the_feet_stand_on_it():
+    (axes,) = plots.wheel(r=0.5).axes
+    arrows = [one for one in axes.texts if one.arrow_patch is not None]
+    at_ground = [np.subtract(one.xy, one.xyann) for one in arrows if np.allclose(one.xyann, [1.0, 0.0])]
+    assert len(at_ground) == 2
+    np.testing.assert_allclose(np.sum(at_ground, axis=0), 0.0, atol=1e-12)
+    (axes,) = plots.legs().axes
+    drawn = [one.get_xydata() for one in axes.lines if len(one.get_xydata()) == 3]
+    np.testing.assert_allclose([leg[-1] for leg in drawn], legs_figure.FEET)
+    lengths = np.linalg.norm(np.diff(drawn, axis=1), axis=-1)
+    np.testing.assert_allclose(lengths, np.broadcast_to(legs_figure.LEG.lengths, (2, 2)))
+
+
+def test_every_picture_is_public_and_in_the_documentation(folder, capsys):
+    assert {*plots.PICTURES, 'PICTURES', 'run_figure', 'run_table', 'sweep_figure'} == {*plots.__all__}
+    table = (ROOT / 'doc' / 'documents.md').read_text().split('| name | shows |', 1)[1].split('\n\n')[0]
+    assert dict(re.findall(r'^\| `(\w+)` \| (.*) \|$', table, re.MULTILINE)) == plots.PICTURES
+    assert run('--help') == 0
+    helped = capsys.readouterr().out
+    assert all(f'  {name}' in helped and what in helped for name, what in plots.PICTURES.items())
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'file', 'begin'),
+    [
+        ((), 'geometry.png', b'\x89PNG'),
+        (('-o', 'a.svg'), 'a.svg', b'<?xml'),
+        (('--output', 'a.pdf'), 'a.pdf', b'%PDF'),
+    ],
+)
+def test_the_command_writes_a_picture_once(folder, capsys, arguments, file, begin):
+    assert run('geometry', *arguments) == 0
+    assert capsys.readouterr() == (f'{file}\n', '')
+    assert [one.name for one in folder.iterdir()] == [file]
+    assert (folder / file).read_bytes().startswith(begin)
+    (folder / file).write_bytes(b'precious')
+    assert run('geometry', *arguments) == 2
+    assert f'{file} exists already; it is not overwritten' in capsys.readouterr().err
+    assert (folder / file).read_bytes() == b'precious'
+    assert run('geometry', *arguments, '--force') == 0
+    assert (folder / file).read_bytes().startswith(begin)
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'code', 'message'),
+    [
+        (('geomtry',), 2, "argument NAME: must be one of geometry, .*got 'geomtry'"),
+        ((), 2, 'the following arguments are required: NAME'),
+        (('geometry', '-o', 'a.jpg'), 2, "the picture must end in .png, .svg, .pdf, got 'a.jpg'"),
+        (('geometry', '--ros-args'), 2, 'plot_jacobian takes no ROS arguments'),
+        (('geometry', '-o', 'none/a.png'), 1, 'none/a.png cannot be written: No such file or directory'),
+    ],
+)
+def test_mistakes_are_reported(folder, capsys, arguments, code, message):
+    assert run(*arguments) == code
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert re.match(f'plot_jacobian: error: .*{message}', last), last
+    assert not list(folder.iterdir())
+
+
+def test_without_matplotlib_the_remedy_is_reported(folder, capsys, monkeypatch):
+    for name in [name for name in sys.modules if name.partition('.')[0] == 'matplotlib']:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, 'matplotlib', None)
+    assert run('geometry') == 2
+    assert (
+        "matplotlib is not installed: pip install 'diffdrive_jacobian[plot]'" in capsys.readouterr().err
+    )
+    assert not list(folder.iterdir())

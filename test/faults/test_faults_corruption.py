@@ -1,0 +1,367 @@
+"""Corrupt: one wrong field in messages of any type."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+import random
+import sys
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped, Twist
+from nav_msgs.msg import Odometry, Path
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, ParameterValue
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import BatteryState, Image, JointState, LaserScan
+from std_msgs.msg import Bool, Byte, Empty, Int8, Int64, String, UInt8
+from support.lockstep_nodes import QUICK, Topics, add_team, arrives
+from support.ros_messages import goal, odometry, time_of
+
+from diffdrive_jacobian.faults.corruption import CHANGES, Corrupt
+
+SECOND = 1_000_000_000
+
+
+def through(message, *args, seed=0, **kwargs):
+    """Return what a receiver reads of a message, and whether its bytes are those of the sender."""
+    data = bytes(serialize_message(message))
+    corrupt = Corrupt('topic', *args, **kwargs).begin(random.Random(seed), type(message))
+    ((delay, received),) = corrupt(0, data)
+    assert delay == 0
+    return deserialize_message(received, type(message)), received is data
+
+
+def corrupted(message, *args, **kwargs):
+    return through(message, *args, **kwargs)[0]
+
+
+def drive(x=1.5):
+    """Return odometry with a stamp and without a zero."""
+    message = odometry(x, -2.0, 0.5)
+    message.header.stamp.sec, message.header.stamp.nanosec = 12, 250_000_000
+    message.pose.covariance = np.arange(1.0, 37.0)
+    return message
+
+
+def refused(message_type, *args, **kwargs):
+    with pytest.raises(ValueError, match=r'^Corrupt: ') as caught:
+        Corrupt('topic', *args, **kwargs).begin(random.Random(0), message_type)
+    return str(caught.value)
+
+
+# --- Values
+
+
+@pytest.mark.parametrize(
+    ('change', 'amount', 'expected'),
+    [
+        ('nan', 0.0, math.nan),
+        ('inf', 0.0, math.inf),
+        ('-inf', 0.0, -math.inf),
+        ('negate', 0.0, 2.0),
+        ('offset', 0.25, -1.75),
+        ('offset', -3, -5.0),
+        ('scale', -10.0, 20.0),
+        ('scale', 1.7e308, -math.inf),
+        ('set', 7, 7.0),
+        ('subnormal', 0.0, -5e-324),
+    ],
+)
+def test_one_float_is_changed_and_nothing_else(change, amount, expected):
+    sent = drive()
+    received = corrupted(sent, 'pose.pose.position.y', change, amount)
+    np.testing.assert_equal(received.pose.pose.position.y, expected)
+    received.pose.pose.position.y = sent.pose.pose.position.y
+    assert received == sent
+
+
+def test_a_float_of_single_precision_gets_its_own_subnormal_and_overflows_at_its_own_limit():
+    sent = BatteryState(voltage=12.0, temperature=-1.0)
+    tiny = corrupted(sent, 'temperature', 'subnormal').temperature
+    assert tiny == -(2.0**-149)
+    assert abs(tiny) < float(np.finfo(np.float32).smallest_normal)
+    assert corrupted(sent, 'voltage', 'scale', 1e300).voltage == math.inf
+    assert corrupted(sent, 'voltage', 'set', 0.1).voltage == float(np.float32(0.1))
+
+
+def test_a_double_subnormal_is_below_the_least_normal_number():
+    value = corrupted(drive(), 'pose.pose.position.x', 'subnormal').pose.pose.position.x
+    assert 0.0 < value < sys.float_info.min
+
+
+@pytest.mark.parametrize(
+    ('message', 'change', 'amount', 'expected'),
+    [
+        (Int8(data=100), 'offset', 50, 127),
+        (Int8(data=-128), 'negate', 0.0, 127),
+        (Int8(data=100), 'negate', 0.0, -100),
+        (Int8(data=5), 'scale', 0.5, 2),
+        (Int64(data=2), 'scale', 1e300, 2**63 - 1),
+        (Int64(data=0), 'set', 2**63 - 1, 2**63 - 1),
+        (UInt8(data=5), 'offset', -9.0, 0),
+        (UInt8(data=5), 'scale', -1.0, 0),
+        (Bool(data=True), 'negate', 0.0, False),
+        (Bool(data=False), 'set', True, True),
+        (String(data='odom'), 'set', 'map', 'map'),
+    ],
+)
+def test_other_types_stay_within_their_range(message, change, amount, expected):
+    received = corrupted(message, 'data', change, amount)
+    assert received.data == expected
+    assert type(received.data) is type(expected)
+
+
+def test_a_wrong_frame():
+    sent = drive()
+    received = corrupted(sent, 'header.frame_id', 'set', 'a frame that is longer')
+    assert received.header.frame_id == 'a frame that is longer'
+    received.header.frame_id = sent.header.frame_id
+    assert received == sent
+
+
+@pytest.mark.parametrize(
+    ('change', 'amount', 'expected'),
+    [
+        ('offset', -2.5, (9, 750_000_000)),
+        ('offset', 0.75, (13, 0)),
+        ('offset', -20.0, (-8, 250_000_000)),
+        ('offset', 1e300, (2**31 - 1, SECOND - 1)),
+        ('offset', -1e300, (-(2**31), 0)),
+        ('set', 0.0, (0, 0)),
+        ('set', -0.5, (-1, 500_000_000)),
+    ],
+)
+def test_a_stamp_is_shifted_in_seconds_within_what_it_can_represent(change, amount, expected):
+    stamp = corrupted(drive(), 'header.stamp', change, amount).header.stamp
+    assert (stamp.sec, stamp.nanosec) == expected
+
+
+@pytest.mark.parametrize(
+    ('part', 'amount', 'expected'),
+    [('sec', -3, (-3, 250_000_000)), ('nanosec', 2**32 - 1, (12, 2**32 - 1))],
+)
+def test_stamps_that_make_no_sense_are_possible(part, amount, expected):
+    stamp = corrupted(drive(), f'header.stamp.{part}', 'set', amount).header.stamp
+    assert (stamp.sec, stamp.nanosec) == expected
+
+
+# --- Paths
+
+
+def test_elements_and_whole_arrays_of_both_kinds():
+    sent = JointState(name=['left', 'right'], velocity=[1.0, 2.0])
+    assert list(corrupted(sent, 'velocity[1]', 'negate').velocity) == [1.0, -2.0]
+    assert list(corrupted(sent, 'velocity', 'scale', 3.0).velocity) == [3.0, 6.0]
+    assert corrupted(sent, 'name[0]', 'set', 'wheel').name == ['wheel', 'right']
+    covariance = corrupted(drive(), 'pose.covariance[35]', 'nan').pose.covariance
+    assert math.isnan(covariance[35])
+    assert list(covariance[:35]) == list(range(1, 36))
+    assert np.isnan(corrupted(drive(), 'pose.covariance', 'nan').pose.covariance).all()
+    scan = LaserScan(ranges=[1.0, 2.0])
+    assert list(corrupted(scan, 'ranges', 'inf').ranges) == [math.inf, math.inf]
+    assert list(corrupted(Image(data=b'\1\2'), 'data', 'offset', 254).data) == [255, 255]
+
+
+def test_elements_that_are_messages_also_in_bounded_sequences():
+    sent = Path(poses=[PoseStamped(), PoseStamped()])
+    received = corrupted(sent, 'poses[1].pose.position.x', 'set', 4.0)
+    assert [one.pose.position.x for one in received.poses] == [0.0, 4.0]
+    assert corrupted(sent, 'poses[0].header.stamp', 'set', 2.0).poses[0].header.stamp.sec == 2
+    bounded = ParameterDescriptor(floating_point_range=[FloatingPointRange(to_value=1.0)])
+    received = corrupted(bounded, 'floating_point_range[0].to_value', 'nan')
+    assert math.isnan(received.floating_point_range[0].to_value)
+    flags = ParameterValue(bool_array_value=[True, False])
+    assert corrupted(flags, 'bool_array_value', 'negate').bool_array_value == [False, True]
+
+
+@pytest.mark.parametrize(
+    ('message', 'path'),
+    [
+        (JointState(velocity=[1.0]), 'velocity[1]'),
+        (JointState(), 'velocity'),
+        (Path(), 'poses[0].pose.position.x'),
+    ],
+)
+def test_a_message_without_the_element_arrives_as_it_was(message, path):
+    received, same = through(message, path, 'nan')
+    assert same
+    assert received == message
+
+
+def test_a_change_that_changes_nothing_leaves_the_bytes_alone():
+    """A receiver that compares bytes does not see another message."""
+    assert through(drive(), 'pose.pose.position.x', 'scale', 1.0)[1]
+    assert through(drive(), 'header.stamp', 'offset', 0.0)[1]
+    assert not through(drive(0.0), 'pose.pose.position.x', 'negate')[1]
+
+
+def test_bytes_that_are_no_message_are_left_to_the_receiver():
+    corrupt = Corrupt('odom', 'pose.pose.position.x', 'nan').begin(random.Random(0), Odometry)
+    assert list(corrupt(0, b'\0\1\0\0abc')) == [(0, b'\0\1\0\0abc')]
+
+
+# --- Probability
+
+
+def test_the_share_of_changed_messages_and_which_ones_follow_from_the_seed():
+    data = bytes(serialize_message(Twist()))
+
+    def changed(seed):
+        fault = Corrupt('cmd_vel', 'linear.x', 'nan', probability=0.3)
+        corrupt = fault.begin(random.Random(seed), Twist)
+        return [next(iter(corrupt(0, data)))[1] is not data for _ in range(1000)]
+
+    first = changed(1)
+    # 5 standard deviations of a binomial distribution.
+    assert abs(sum(first) - 300) < 5 * math.sqrt(1000 * 0.3 * 0.7)
+    assert changed(1) == first != changed(2)
+
+
+# --- What is refused
+
+
+@pytest.mark.parametrize(
+    ('path', 'told'),
+    [
+        ('pose.x', "geometry_msgs/PoseWithCovariance has no 'x'; its fields: pose, covariance"),
+        ('speed', "nav_msgs/Odometry has no 'speed'; its fields: header, child_frame_id, pose, twist"),
+        ('header.stamp.sec.x', "int32 has no 'x'; its fields: none"),
+        ('pose.covariance[36]', "'covariance' has 36 elements"),
+        ('pose[0].pose', "'pose' has a single value"),
+        ('pose.covariance.x', "double[36] has no 'x'; its fields: elements [0], [1], ..."),
+        ('pose..pose', "has no ''"),
+        ('pose.covariance[-1]', "has no 'covariance[-1]'"),
+        ('pose.__class__', "has no '__class__'"),
+    ],
+)
+def test_a_field_that_does_not_exist_names_those_that_do(path, told):
+    message = refused(Odometry, path, 'nan')
+    assert message.startswith(f"Corrupt: field '{path}' does not exist: ")
+    assert told in message
+
+
+@pytest.mark.parametrize(
+    ('message_type', 'path', 'change', 'told'),
+    [
+        (
+            Int8,
+            'data',
+            ('nan',),
+            "it must be 'negate', 'offset', 'scale' or 'set', with integers from -128",
+        ),
+        (
+            UInt8,
+            'data',
+            ('negate',),
+            "it must be 'offset', 'scale' or 'set', with integers from 0 to 255",
+        ),
+        (UInt8, 'data', ('set', 256), 'integers from 0 to 255'),
+        (Int8, 'data', ('offset', 0.5), 'integers from -128 to 127'),
+        (Int8, 'data', ('set', True), 'integers from -128 to 127'),
+        (String, 'data', ('nan',), "it must be 'set' with a str"),
+        (String, 'data', ('set', 1.0), "it must be 'set' with a str"),
+        (Bool, 'data', ('offset', 1.0), "it must be 'negate', or 'set' with a bool"),
+        (Odometry, 'header.stamp', ('nan',), "'offset' or 'set', with a number of seconds"),
+        (Odometry, 'header.stamp', ('scale', 2.0), "'offset' or 'set', with a number of seconds"),
+        (Odometry, 'pose.pose.position.x', ('set', 'map'), 'with a number as amount'),
+        (Odometry, 'pose.pose', ('nan',), 'name one of its fields that is a number'),
+        (Path, 'poses', ('nan',), 'name one of its fields that is a number'),
+        (Byte, 'data', ('set', 1), 'name one of its fields that is a number'),
+    ],
+)
+def test_a_change_that_the_type_does_not_allow_is_refused_with_those_that_it_does(
+    message_type, path, change, told
+):
+    message = refused(message_type, path, *change)
+    assert f"is not possible for field '{path}'" in message
+    assert told in message
+
+
+def test_a_type_without_fields():
+    assert "has no 'data'" in refused(Empty, 'data', 'nan')
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'told'),
+    [
+        ({'change': 'broken'}, "change must be one of 'nan', 'inf'"),
+        (
+            {'change': 'offset', 'amount': math.nan},
+            "amount of 'offset' must be a finite number, got nan",
+        ),
+        ({'change': 'scale', 'amount': 'x'}, "amount of 'scale' must be a finite number, got 'x'"),
+        ({'change': 'offset', 'amount': True}, 'must be a finite number, got True'),
+        ({'change': 'set', 'amount': math.inf}, "a bool or a str (for others there are 'nan', 'inf'"),
+        ({'change': 'set', 'amount': None}, 'a bool or a str'),
+        ({'change': 'nan', 'amount': 2.0}, "amount must not be given with change 'nan', got 2.0"),
+        ({'change': 'nan', 'probability': 1.5}, 'probability must be in [0, 1], got 1.5'),
+        ({'change': 'nan', 'field': ''}, 'field must be a string'),
+        ({'change': 'nan', 'topic': 3}, 'topic must be a string'),
+        ({'change': 'nan', 'start': -1.0}, 'start must be'),
+    ],
+)
+def test_invalid_values_are_refused_at_once(arguments, told):
+    with pytest.raises(ValueError, match=r'^Corrupt: ') as caught:
+        Corrupt(**{'topic': 'odom', 'field': 'pose', **arguments})
+    assert told in str(caught.value)
+
+
+@pytest.mark.parametrize('change', CHANGES)
+def test_a_corruption_is_a_value_and_its_repr_makes_it_again(change):
+    amount = {'offset': np.float64(0.5), 'scale': 2, 'set': 'map'}.get(change, 0.0)
+    fault = Corrupt('odom', 'header.frame_id', change, amount, probability=0.5, start=2.0, node='robot')
+    assert eval(repr(fault)) == fault == pickle.loads(pickle.dumps(fault)) == copy.deepcopy(fault)
+    assert fault != Corrupt('odom', 'header.frame_id', change, amount)
+
+
+# --- In a world
+
+
+def test_a_receiver_gets_the_wrong_value_and_the_others_the_right_one(lockstep, robot_at):
+    robot_at()
+    fine = lockstep.listen(Odometry, 'odom')
+    wrong = []
+    node = lockstep.add(Node('receiver'))
+    node.create_subscription(Odometry, 'odom', wrong.append, 10)
+    lockstep.inject(
+        Corrupt('odom', 'pose.pose.position.x', 'set', 7.0, start=0.1, duration=0.1, node='receiver'),
+        Corrupt('odom', 'header.frame_id', 'set', 'map', start=0.15),
+    )
+    lockstep.run_for(0.3)
+    assert {one.pose.pose.position.x for one in fine} == {0.0}
+    received = {(one.pose.pose.position.x, one.header.frame_id) for one in wrong}
+    assert received == {(0.0, 'odom'), (7.0, 'odom'), (7.0, 'map'), (0.0, 'map')}
+    times = [time_of(one) - SECOND for one in wrong if one.pose.pose.position.x]
+    assert (min(times), max(times)) == (100_000_000, 180_000_000)
+    events = [event.what for event in lockstep.fault_events]
+    assert any('changed' in event and '/odom to /receiver' in event for event in events)
+    assert "Corrupt('odom', 'header.frame_id', 'set', amount='map', start=0.15)" in lockstep.report()
+
+
+def test_our_controller_drops_odometry_that_is_not_finite_and_goes_on_afterwards(lockstep):
+    x = 'pose.pose.position.x'
+    lockstep.inject(
+        *(Corrupt('odom', x, change, start=0.2, duration=0.2) for change in ('nan', 'negate'))
+    )
+    topics = Topics(lockstep)
+    add_team(lockstep, **QUICK)
+    lockstep.publish('goal_pose', goal(0.3, 0.1))
+    lockstep.run_for(0.2)
+    before = len(topics.commands)
+    lockstep.run_for(0.18)
+    assert len(topics.commands) == before
+    arrives(lockstep, topics)
+    numbers = [(one.linear.x, one.angular.z) for one in topics.commands]
+    assert np.isfinite(numbers).all()
+
+
+def test_a_field_that_does_not_exist_is_reported_when_the_type_is_known(lockstep, robot_at):
+    lockstep.inject(Corrupt('cmd_vel', 'twist.linear.x', 'nan'))
+    with pytest.raises(
+        ValueError, match="geometry_msgs/Twist has no 'twist'; its fields: linear, angular"
+    ):
+        robot_at()
+    lockstep.close()

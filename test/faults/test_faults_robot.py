@@ -1,0 +1,582 @@
+"""Faults of the robot: what its motors, wheels and encoders do, and where it truly is."""
+
+from __future__ import annotations
+
+import math
+import pickle
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+from support.lockstep_nodes import Topics, change, make
+from support.ros_messages import instants, pose_of, twist, twist_stamped, twists
+
+from diffdrive_jacobian.control import VelocityLimits
+from diffdrive_jacobian.faults.nodes import Kill
+from diffdrive_jacobian.faults.robot import (
+    ActuatorLag,
+    DeadWheel,
+    EncoderSteps,
+    Push,
+    SaturatedWheel,
+    Slip,
+    WrongGeometry,
+)
+from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
+from diffdrive_jacobian.kinematics.se2 import compose, integrate, inverse, wrap_angle
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.simulation import Robot, RobotModel
+from diffdrive_jacobian.simulation.actuators import SETTLING, Actuators
+from diffdrive_jacobian.simulation.encoders import Encoders
+from diffdrive_jacobian.simulation.slip import Drift
+from diffdrive_jacobian.testing import LockstepError
+
+SECOND = 1_000_000_000
+R, L = 0.033, 0.16
+START = (0.3, -0.2, 2.9)
+
+
+def at_rest(**model):
+    return Robot(model=RobotModel(wheel_radius=R, wheel_separation=L, **model), stamp=0, pose=START)
+
+
+def lagging(tau, **model):
+    return at_rest(actuators=Actuators(lag=tau), **model)
+
+
+def reached(tau, seconds):
+    """Return the angle of a wheel that approaches 1 rad/s from rest, after a time."""
+    return seconds - tau * (1.0 - math.exp(-seconds / tau))
+
+
+def close(pose, expected, tolerance=1e-12):
+    difference = np.asarray(pose) - np.asarray(expected)
+    assert np.abs(difference[:2]).max() < tolerance
+    assert abs(wrap_angle(difference[2])) < tolerance
+
+
+# --- Motors, as values
+
+
+@pytest.mark.parametrize(('wheel', 'side'), [('left', 1.0), ('right', -1.0)])
+def test_a_dead_motor_turns_the_robot_about_its_wheel(wheel, side):
+    """The other wheel keeps its speed v / r: omega is v / L, about the point y = L / 2 or -L / 2."""
+    v, seconds = 0.2, 1.7
+    robot = at_rest(actuators=Actuators(**{f'max_{wheel}_speed': 0.0})).commanded((v, 0.0), 0)
+    assert robot.twist == pytest.approx((v / 2.0, side * v / L))
+    turn = side * v / L * seconds
+    centre = compose(START, (0.0, side * L / 2.0, 0.0))
+    expected = compose(compose(centre, (0.0, 0.0, turn)), (0.0, -side * L / 2.0, 0.0))
+    end = robot.at(round(seconds * SECOND))
+    close(end.pose, expected)
+    angles = dict(zip(('right', 'left'), end.wheel_angles, strict=True))
+    assert angles.pop(wheel) == 0.0
+    assert next(iter(angles.values())) == pytest.approx(v / R * seconds, rel=1e-12)
+
+
+def test_a_weak_motor_limits_its_own_wheel_after_the_limits_of_the_robot():
+    limits = VelocityLimits(max_v=0.3)
+    robot = at_rest(limits=limits, actuators=Actuators(max_right_speed=2.0)).commanded((5.0, 0.0), 0)
+    assert robot.wheel_speeds == pytest.approx((2.0, 0.3 / R))
+    back = robot.commanded((-5.0, 0.0), SECOND)
+    assert back.wheel_speeds == pytest.approx((-2.0, -5.0 / R))
+    slow = robot.commanded((0.03, 0.1), SECOND)
+    # To the bit: what the motors can do is not touched.
+    assert slow.twist == (0.03, 0.1)
+
+
+@pytest.mark.parametrize('tau', [1e-3, 0.05, 0.3, 2.0])
+def test_a_lagging_wheel_is_exact_at_any_time(tau):
+    robot = lagging(tau).commanded((0.2, 1.0), 0)
+    goals = body_to_wheel(0.2, 1.0, R, L)
+    for stamp in range(7, 3 * SECOND, SECOND // 13):
+        seconds, later = stamp / SECOND, robot.at(stamp)
+        for angle, speed, goal in zip(later.wheel_angles, later.wheel_speeds, goals, strict=True):
+            assert angle == pytest.approx(goal * reached(tau, seconds), rel=1e-9, abs=1e-13)
+            assert speed == pytest.approx(-goal * math.expm1(-seconds / tau), rel=1e-9)
+
+
+def test_a_lagging_robot_reaches_the_command_and_is_then_an_ordinary_one():
+    robot = lagging(0.1).commanded((0.2, 1.0), 0)
+    assert robot.settles_at == round(SETTLING * 0.1 * SECOND)
+    assert robot.at(robot.settles_at - 1).twist == pytest.approx((0.2, 1.0), rel=1e-15)
+    assert robot.at(robot.settles_at).twist == robot.target == (0.2, 1.0)
+    assert robot.at(robot.stamp + 5 * SECOND).twist == (0.2, 1.0)
+
+
+def test_the_motion_of_a_lagging_robot_does_not_depend_on_when_it_is_looked_at():
+    def drive(looks):
+        robot, time = lagging(0.2, command_timeout=SECOND // 2), 0
+        for v, omega, seconds in ((0.2, 0.0, 0.11), (0.1, -1.0, 0.234567), (-0.2, 0.5, 0.9)):
+            robot = robot.commanded((v, omega), time)
+            end = time + round(seconds * SECOND)
+            for look in looks:
+                robot.at(time + round(look * (end - time)))
+            time = end
+        return robot.at(time)
+
+    one, other = drive([]), drive([0.1, 0.5, 0.77])
+    assert one.pose_tuple == other.pose_tuple
+    assert (one.wheel_angles, one.twist) == (other.wheel_angles, other.twist)
+    assert one.covariance_tuple == other.covariance_tuple
+
+
+def test_a_lagging_robot_rolls_on_after_its_timeout_and_after_the_command_to_stop():
+    tau, v = 0.1, 0.2
+    moving = lagging(tau, command_timeout=SECOND // 2).commanded((v, 0.0), 0)
+    assert moving.expiry == SECOND // 2
+    expired, stopped = moving, moving.commanded((0.0, 0.0), SECOND // 2)
+    for robot in (expired, stopped):
+        end = robot.at(10 * SECOND)
+        assert end.twist == (0.0, 0.0)
+        assert end.expiry is None
+        travelled = math.dist(end.pose_tuple[:2], START[:2])
+        # All in all it gets as far as without the lag.
+        assert travelled == pytest.approx(v * 0.5, rel=1e-12)
+        at_timeout = math.dist(robot.at(SECOND // 2).pose_tuple[:2], START[:2])
+        assert at_timeout == pytest.approx(v * reached(tau, 0.5), rel=1e-9)
+
+
+def test_a_command_replaces_the_one_that_is_still_approached():
+    tau, time = 0.3, 130_000_000
+    first = lagging(tau).commanded((0.2, 0.0), 0)
+    speed = 0.2 / R * (1.0 - math.exp(-0.13 / tau))
+    second = first.commanded((-0.1, 0.0), time)
+    goal, seconds = -0.1 / R, 0.4
+    angle = goal * seconds + (speed - goal) * tau * (1.0 - math.exp(-seconds / tau))
+    turned = second.at(time + round(seconds * SECOND)).wheel_angles[0] - second.wheel_angles[0]
+    assert turned == pytest.approx(angle, rel=1e-9)
+
+
+def test_a_motor_that_dies_while_it_lags_runs_out():
+    tau = 0.1
+    moving = lagging(tau).commanded((0.2, 0.0), 0).at(5 * SECOND)
+    dead = replace(moving.model, actuators=Actuators(lag=tau, max_right_speed=0.0))
+    robot = moving.remodelled(dead, 5 * SECOND)
+    turned = robot.at(5 * SECOND + SECOND // 10).wheel_angles[0] - robot.wheel_angles[0]
+    assert turned == pytest.approx(0.2 / R * tau * (1.0 - math.exp(-0.1 / tau)), rel=1e-4)
+    end = robot.at(15 * SECOND)
+    assert end.settles_at == end.stamp
+    assert end.wheel_speeds == pytest.approx((0.0, 0.2 / R))
+
+
+def test_without_effect_actuators_change_no_bit():
+    plain, same = at_rest(), at_rest(actuators=Actuators())
+    for stamp, command in ((0, (0.2, 0.3)), (SECOND, (0.0, -1.0)), (2 * SECOND, (0.0, 0.0))):
+        plain, same = plain.commanded(command, stamp), same.commanded(command, stamp)
+        later = stamp + SECOND // 3
+        assert plain.at(later).pose_tuple == same.at(later).pose_tuple
+        assert plain.at(later).covariance_tuple == same.at(later).covariance_tuple
+
+
+def test_actuators_refuse_what_is_no_speed_and_no_time():
+    for name in ('max_left_speed', 'max_right_speed', 'lag'):
+        for value in (-1.0, math.nan, 'x'):
+            with pytest.raises(ValueError, match=name):
+                Actuators(**{name: value})
+    with pytest.raises(ValueError, match='actuators'):
+        RobotModel(actuators=3.0)
+
+
+def test_time_does_not_go_back_for_a_lagging_robot():
+    robot = lagging(0.1).commanded((0.2, 0.0), SECOND)
+    with pytest.raises(ValueError, match='cannot go back'):
+        robot.at(SECOND - 1)
+
+
+# --- Encoders, as values
+
+
+def test_odometry_of_coarse_encoders_stays_within_their_increment_of_the_truth():
+    rng = np.random.default_rng(4)
+    per_revolution = 20
+    increment = math.tau / per_revolution
+    robot, time, distance = at_rest(), 0, 0.0
+    robot = robot.commanded((0.3, 1.0), 0).at(SECOND // 7)
+    encoders, first = Encoders.at(robot, per_revolution), robot
+    time = robot.stamp
+    worst = 0.0
+    for v, omega in rng.normal(0.0, [0.3, 2.0], (200, 2)):
+        robot = robot.commanded((v, omega), time)
+        for _ in range(3):
+            time += SECOND // 50
+            robot = robot.at(time)
+            encoders = encoders.read(robot)
+            distance += abs(v) / 50.0
+            seen = encoders.reported(robot)
+            turned = np.subtract(robot.wheel_angles, first.wheel_angles)
+            counted = np.subtract(seen.wheel_angles, encoders_start(first, increment))
+            assert np.abs(counted - turned).max() < increment
+            heading = abs(float(wrap_angle(seen.pose[2] - robot.pose[2])))
+            assert heading < 2.0 * R * increment / L
+            apart = math.dist(seen.pose[:2], robot.pose[:2])
+            worst = max(worst, apart)
+            assert apart < 2.0 * R * increment + 2.0 * R * increment / L * distance
+    # The bound is not idle.
+    assert worst > R * increment / 2.0
+
+
+def encoders_start(robot, increment):
+    return [math.floor(angle / increment) * increment for angle in robot.wheel_angles]
+
+
+def test_fine_encoders_give_the_exact_odometry():
+    robot = at_rest().commanded((0.2, 0.7), 0)
+    encoders = Encoders.at(robot, 10**9)
+    for tick in range(1, 51):
+        encoders = encoders.read(robot.at(tick * SECOND // 50))
+    end = robot.at(SECOND)
+    close(encoders.pose, end.pose, 1e-8)
+    assert encoders.reported(end).twist == pytest.approx((0.2, 0.7), abs=1e-6)
+
+
+def test_a_slow_wheel_is_seen_as_bursts_of_whole_increments():
+    robot = at_rest().commanded((R * 1.0, 0.0), 0)
+    encoders = Encoders.at(robot, 10)
+    speeds = []
+    for tick in range(1, 51):
+        encoders = encoders.read(robot.at(tick * SECOND // 50))
+        speeds.append(encoders.speeds[0])
+    # 1 rad in 1 s: one increment of 0.628 rad, seen in one period of 0.02 s.
+    assert sorted(set(speeds)) == pytest.approx([0.0, math.tau / 10 * 50])
+    assert speeds.count(0.0) == 49
+    # Four increments in the next 3 s.
+    assert encoders.read(robot.at(4 * SECOND)).speeds == pytest.approx((math.tau / 10 * 5 / 3.0,) * 2)
+    assert encoders.read(robot.at(4 * SECOND).restarted(SECOND)).speeds == (0.0, 0.0)
+
+
+# --- Pushes, as values
+
+
+@pytest.mark.parametrize('noticed', [False, True])
+def test_a_push_is_a_motion_in_the_body_frame(noticed):
+    robot = replace_pose(at_rest(drift=Drift(left_wheel_radius_multiplier=1.2)))
+    robot = robot.commanded((0.2, 0.4), 0)
+    before = robot.at(SECOND)
+    after = robot.pushed((0.1, -0.05, 0.7), SECOND, noticed=noticed)
+    close(compose(inverse(before.true_pose), after.true_pose), (0.1, -0.05, 0.7))
+    expected = compose(before.pose, (0.1, -0.05, 0.7)) if noticed else before.pose
+    close(after.pose, expected)
+    assert (after.twist, after.wheel_angles) == (before.twist, before.wheel_angles)
+    assert after.covariance_tuple == before.covariance_tuple
+    # Who reads the start_pose of a push can compute all that follows from it.
+    anew = before.placed(after.pose, after.covariance, SECOND)
+    assert (after.moments == anew.moments) == noticed
+    # It drives on from there.
+    close(
+        after.at(2 * SECOND).true_pose,
+        compose(after.true_pose, compose(inverse(before.true_pose), before.at(2 * SECOND).true_pose)),
+    )
+
+
+def replace_pose(robot):
+    return robot.placed(START, np.diag([1e-4, 2e-4, 3e-4]), 0)
+
+
+def test_a_push_that_the_odometry_does_not_notice_needs_a_truth():
+    with pytest.raises(ValueError, match='model must have a drift'):
+        at_rest().pushed((0.1, 0.0, 0.0), 0)
+    close(at_rest().pushed((0.1, 0.0, 0.0), 0, noticed=True).pose, compose(START, (0.1, 0.0, 0.0)))
+
+
+# --- In a world
+
+
+def drive(world, v=0.2, omega=0.0, topic='cmd_vel'):
+    world.publish(topic, twist(v, omega))
+
+
+def measured(topics):
+    """Return the last twist of the odometry."""
+    return twists([topics.odom[-1].twist])[0]
+
+
+def test_a_motor_dies_under_a_command_that_is_held_and_lives_again(lockstep, robot_at):
+    robot = robot_at(cmd_vel_timeout=0.0)
+    topics = Topics(lockstep)
+    lockstep.inject(DeadWheel('left', start=1.0, duration=0.5))
+    drive(lockstep)
+    lockstep.run_for(2.0)
+    expected_twists = [(0.2, 0.0), (0.1, 0.2 / L), (0.2, 0.0)]
+    np.testing.assert_allclose(twists(topics.applied), expected_twists, atol=1e-12)
+    assert instants(topics.applied) == [SECOND, 2 * SECOND, 5 * SECOND // 2]
+    turned = 0.2 / L * 0.5
+    expected = compose(
+        integrate(integrate((0.0, 0.0, 0.0), (0.2, 0.0), 1.0), (0.1, 0.2 / L), 0.5),
+        (0.1, 0.0, 0.0),
+    )
+    close(pose_of(topics.odom[-1]), expected, 1e-9)
+    close(robot.truth, expected, 1e-9)
+    assert expected[2] == pytest.approx(turned)
+    left, right = topics.states[-1].position
+    assert left == pytest.approx(0.2 / R * 1.5)
+    assert right == pytest.approx(0.2 / R * 2.0)
+    assert [event.what for event in lockstep.fault_events] == ['begins', 'ends']
+
+
+def test_a_weak_motor_bends_the_path(lockstep, robot_at):
+    robot_at()
+    topics = Topics(lockstep)
+    lockstep.inject(SaturatedWheel('right', 3.0))
+    drive(lockstep)
+    lockstep.run_for(0.1)
+    v, omega = measured(topics)
+    assert body_to_wheel(v, omega, R, L) == pytest.approx((3.0, 0.2 / R))
+
+
+def test_a_lagging_robot_is_seen_in_its_odometry_and_commands(lockstep, robot_at):
+    tau = 0.1
+    robot_at(publish_rate=50.0)
+    topics = Topics(lockstep)
+    lockstep.inject(ActuatorLag(tau))
+    drive(lockstep)
+    began = lockstep.now
+    lockstep.run_for(0.4)
+    travelled = 0.2 * reached(tau, (lockstep.now - began) / SECOND)
+    assert topics.odom[-1].pose.pose.position.x == pytest.approx(travelled, rel=1e-9)
+    # Its timeout of 0.5 s is one of the commands, not of the steps.
+    lockstep.run_for(0.1)
+    assert topics.odom[-1].pose.pose.position.x == pytest.approx(0.2 * reached(tau, 0.5), rel=1e-9)
+    lockstep.run_for(3.0)
+    assert topics.odom[-1].pose.pose.position.x == pytest.approx(0.2 * 0.5, abs=1e-4)
+    assert measured(topics) == pytest.approx((0.0, 0.0), abs=1e-9)
+    # cmd_vel_out has the targets.
+    assert [one.twist.linear.x for one in topics.applied][-2:] == [0.2, 0.0]
+    assert np.diff(instants(topics.applied))[-1] == SECOND // 2
+
+
+def test_a_stamped_command_is_obeyed_while_the_robot_lags(lockstep, robot_at):
+    robot_at(enable_stamped_cmd_vel=True)
+    topics = Topics(lockstep, command=TwistStamped)
+    lockstep.inject(ActuatorLag(0.3))
+    for v in (0.2, -0.2):
+        lockstep.publish('cmd_vel', twist_stamped(v, 0.0, max(SECOND, lockstep.now - 30_000_000)))
+        lockstep.run_for(0.1)
+    assert [one.twist.linear.x for one in topics.applied][-2:] == [0.2, -0.2]
+    seen = [one.twist.twist.linear.x for one in topics.odom]
+    assert max(seen) < 0.1
+    assert seen[-1] < max(seen)
+
+
+def test_coarse_encoders_in_a_world(lockstep, robot_at):
+    robot = robot_at()
+    topics = Topics(lockstep)
+    truths = lockstep.listen(Odometry, 'ground_truth')
+    lockstep.inject(EncoderSteps(16, start=0.2, duration=1.0))
+    increment = math.tau / 16
+    for _ in range(7):
+        drive(lockstep, 0.2, 1.0)
+        lockstep.run_for(0.2)
+        close(robot.pose, pose_of(topics.odom[-1]))
+        apart = math.dist(robot.pose[:2], robot.truth[:2])
+        assert apart < 2.0 * R * increment * (1.0 + 0.3 / L)
+    exact = integrate((0.0, 0.0, 0.0), (0.2, 1.0), 1.4)
+    close(robot.truth, exact, 1e-9)
+    close(pose_of(truths[-1]), exact, 1e-9)
+    np.testing.assert_allclose(twists(one.twist for one in truths), [(0.2, 1.0)] * len(truths))
+    # During the fault the angles are whole increments, and the twist is what was counted.
+    during = slice(*np.searchsorted(instants(topics.states), [13 * SECOND // 10, 21 * SECOND // 10]))
+    counted = topics.states[during]
+    angles = np.array([one.position for one in counted]) / increment
+    assert np.abs(angles - np.round(angles)).max() < 1e-9
+    assert len(set(angles[:, 0])) > 3
+    velocities = np.array([one.velocity for one in counted])[1:]
+    np.testing.assert_allclose(velocities, np.diff(angles, axis=0) * increment * 50.0, atol=1e-9)
+    # Afterwards the odometry goes on from where it was.
+    jumps = np.diff([pose_of(one)[:2] for one in topics.odom], axis=0)
+    assert np.hypot(*jumps.T).max() < R * increment + 0.2 / 50.0
+    assert len(topics.starts) == 1
+    assert math.dist(pose_of(topics.odom[-1])[:2], exact[:2]) > 1e-4
+
+
+def test_coarse_odometry_can_be_reset(lockstep, robot_at):
+    robot = robot_at(x=0.5)
+    topics = Topics(lockstep)
+    lockstep.inject(EncoderSteps(16))
+    drive(lockstep)
+    lockstep.run_for(0.3)
+    lockstep.call(Trigger, 'reset_odometry')
+    lockstep.run_for(0.002)
+    assert pose_of(topics.odom[-1])[0] > 0.52
+    drive(lockstep, 0.0)
+    lockstep.run_for(0.1)
+    close(pose_of(topics.odom[-1]), (0.5, 0.0, 0.0))
+    close(robot.truth, (0.5604, 0.0, 0.0), 1e-9)
+
+
+@pytest.mark.parametrize('noticed', [False, True])
+def test_a_push_moves_the_robot_and_its_odometry_only_if_it_is_noticed(lockstep, robot_at, noticed):
+    robot = robot_at(x=1.0, theta=math.pi / 2.0)
+    topics = Topics(lockstep)
+    truths = lockstep.listen(Odometry, 'ground_truth')
+    starts = lockstep.listen(PoseWithCovarianceStamped, 'start_pose')
+    lockstep.inject(Push(0.1, 0.2, 0.3, start=0.5, noticed=noticed))
+    lockstep.run_for(0.4)
+    close(robot.truth, (1.0, 0.0, math.pi / 2.0))
+    lockstep.run_for(0.2)
+    assert [(event.time_ns, event.what) for event in lockstep.fault_events] == [
+        (500_000_000, 'begins'),
+        (500_000_000, 'ends'),
+    ]
+    moved = (0.8, 0.1, math.pi / 2.0 + 0.3)
+    close(robot.truth, moved)
+    close(pose_of(topics.odom[-1]), moved if noticed else (1.0, 0.0, math.pi / 2.0))
+    assert len(starts) == noticed
+    if noticed:
+        close(pose_of(starts[-1]), moved)
+        assert not truths
+        return
+    close(pose_of(truths[-1]), moved)
+    # A reset is one of the odometry alone.
+    lockstep.call(Trigger, 'reset_odometry')
+    drive(lockstep)
+    lockstep.run_for(0.1)
+    close(robot.truth, compose(moved, (0.02, 0.0, 0.0)), 1e-9)
+    close(pose_of(topics.odom[-1]), (1.0, 0.02, math.pi / 2.0), 1e-9)
+
+
+def test_slip_and_wrong_geometry_for_a_time_are_seen_by_the_truth_alone(lockstep, robot_at):
+    robot = robot_at(cmd_vel_timeout=0.0)
+    topics = Topics(lockstep)
+    lockstep.inject(WrongGeometry(left_wheel_radius_multiplier=0.5, start=0.5, duration=0.5))
+    drive(lockstep)
+    lockstep.run_for(0.4)
+    close(robot.truth, (0.08, 0.0, 0.0), 1e-9)
+    lockstep.run_for(1.0)
+    # Half a second with 0.2 m/s at the right and 0.1 m/s at the left wheel.
+    expected = integrate(integrate((0.1, 0.0, 0.0), (0.15, 0.1 / L), 0.5), (0.2, 0.0), 0.4)
+    close(robot.truth, expected, 1e-9)
+    close(pose_of(topics.odom[-1]), (0.28, 0.0, 0.0), 1e-9)
+
+
+def test_the_slip_follows_from_the_seed_of_the_injection(lockstep, robot_at):
+    names = ('/a', '/b', '/c')
+    robots = [robot_at(namespace=name) for name in names]
+    for name, seed in zip(names, (1, 1, 2), strict=True):
+        lockstep.inject(Slip(robot=f'{name}/virtual_robot', duration=0.3), seed=seed)
+        drive(lockstep, topic=f'{name}/cmd_vel')
+    lockstep.run_for(0.3)
+    first = [robot.truth for robot in robots]
+    assert all(np.abs(one - (0.06, 0.0, 0.0)).max() > 1e-6 for one in first)
+    assert len({tuple(one) for one in first}) == 3
+    lockstep.run_for(0.1)
+    for robot, before in zip(robots, first, strict=True):
+        close(robot.truth, compose(before, (0.02, 0.0, 0.0)), 1e-9)
+
+
+def test_faults_add_up_and_parameters_still_change(lockstep, robot_at):
+    robot = robot_at(cmd_vel_timeout=0.0)
+    topics = Topics(lockstep)
+    lockstep.inject(
+        SaturatedWheel('left', 2.0, start=0.1, duration=0.9),
+        SaturatedWheel('left', 2.5, start=0.5),
+        DeadWheel('right', start=0.7),
+    )
+    drive(lockstep)
+    change(robot, linear__x__max_velocity=0.1)
+    seen = []
+    for _ in range(4):
+        lockstep.run_for(0.3)
+        seen.append(body_to_wheel(*measured(topics), R, L))
+    full = 0.1 / R
+    assert np.array(seen) == pytest.approx(
+        np.array([(full, 2.0), (full, 2.0), (0.0, 2.0), (0.0, 2.5)]), abs=1e-9
+    )
+
+
+def test_lags_count_once_and_multipliers_multiply(lockstep, robot_at):
+    robot = robot_at(true_wheel_separation_multiplier=3.0)
+    topics = Topics(lockstep)
+    half = WrongGeometry(wheel_separation_multiplier=0.5)
+    lockstep.inject(ActuatorLag(0.3), ActuatorLag(0.1), half, half)
+    drive(lockstep, 0.0, 1.0)
+    lockstep.run_for(0.2)
+    turned = pose_of(topics.odom[-1])[2]
+    assert turned == pytest.approx(reached(0.3, 0.2))
+    assert robot.truth[2] == pytest.approx(turned / (3.0 * 0.5 * 0.5))
+
+
+def test_a_fault_applies_to_a_robot_that_is_added_later_and_again(lockstep):
+    lockstep.inject(DeadWheel('left'), Push(0.5))
+    topics = Topics(lockstep)
+    for expected in (0.5, 0.0):
+        robot = lockstep.add(make(VirtualRobot))
+        close(robot.truth, (expected, 0.0, 0.0))
+        drive(lockstep)
+        lockstep.run_for(0.1)
+        assert measured(topics) == pytest.approx((0.1, 0.2 / L))
+        lockstep.remove(robot)
+    lockstep.check_faults()
+
+
+def test_a_robot_that_is_killed_comes_back_with_its_fault(lockstep):
+    lockstep.create(lambda: make(VirtualRobot, cmd_vel_timeout=0.0))
+    topics = Topics(lockstep)
+    lockstep.inject(
+        DeadWheel('left', duration=1.0), Kill('virtual_robot', start=0.2, duration=0.2), Push(0.3)
+    )
+    lockstep.run_for(0.5)
+    drive(lockstep)
+    lockstep.run_for(0.1)
+    assert measured(topics) == pytest.approx((0.1, 0.2 / L))
+    lockstep.run_for(0.5)
+    assert measured(topics) == pytest.approx((0.2, 0.0))
+    # It has lost its pose.
+    robot = lockstep.find('virtual_robot')
+    turned = 0.2 / L * 0.5
+    centre = compose((0.0, L / 2.0, 0.0), (0.0, 0.0, turned))
+    close(robot.truth, compose(centre, (0.02, -L / 2.0, 0.0)), 1e-9)
+
+
+def test_a_fault_without_a_robot_is_reported_and_one_of_another_node_refused(lockstep):
+    lockstep.inject(DeadWheel('left', robot='robot'))
+    lockstep.run_for(0.1)
+    with pytest.raises(LockstepError, match=r'DeadWheel.*no node /robot was seen'):
+        lockstep.check_faults()
+    with pytest.raises(LockstepError, match='needs a VirtualRobot, but node /robot is a Node'):
+        lockstep.add(Node('robot'))
+
+
+@pytest.mark.parametrize(
+    ('make_fault', 'told'),
+    [
+        (lambda: DeadWheel('front'), "wheel must be one of 'left', 'right', got 'front'"),
+        (lambda: SaturatedWheel('left', 0.0), 'max_velocity must be positive and finite, got 0.0'),
+        (lambda: ActuatorLag(-1.0), 'seconds must be positive and finite, got -1.0'),
+        (lambda: EncoderSteps(0), 'per_revolution must be an integer from 1 to 1000000000, got 0'),
+        (lambda: EncoderSteps(1.5), 'per_revolution must be an integer from 1 to 1000000000, got 1.5'),
+        (lambda: EncoderSteps(10**10), 'from 1 to 1000000000, got 10000000000'),
+        (lambda: Push(math.nan), 'dx must be finite, got nan'),
+        (lambda: Push(noticed=1), 'noticed must be True or False, got 1'),
+        (
+            lambda: WrongGeometry(wheel_separation_multiplier=0.0),
+            'must be in [0.01, 100], got 0.0',
+        ),
+        (lambda: Slip(robot=''), 'robot must be a string that is not empty'),
+    ],
+)
+def test_invalid_values_are_refused_at_once(make_fault, told):
+    with pytest.raises(ValueError, match=re.escape(told)):
+        make_fault()
+
+
+@pytest.mark.parametrize(
+    'fault',
+    [
+        DeadWheel('left', start=1.0),
+        SaturatedWheel('right', 2.0, robot='/one/virtual_robot'),
+        ActuatorLag(0.1, duration=2.0),
+        EncoderSteps(16),
+        Slip(),
+        WrongGeometry(left_wheel_radius_multiplier=0.5),
+        Push(0.1, dtheta=-0.5, noticed=True),
+    ],
+)
+def test_a_fault_is_a_value_and_its_repr_makes_it_again(fault):
+    assert eval(repr(fault)) == fault == pickle.loads(pickle.dumps(fault))
+    assert replace(fault, start=9.0) != fault

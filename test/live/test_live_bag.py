@@ -1,0 +1,213 @@
+"""A bag on the live page."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.lockstep_nodes import QUICK, make_complete
+from support.ros_messages import twist
+
+from diffdrive_jacobian.bags import read_run
+from diffdrive_jacobian.bags.bag_reader import BagError
+from diffdrive_jacobian.drives import drive
+from diffdrive_jacobian.live.bag_player import BagPlayer
+from diffdrive_jacobian.live.commands import CancelGoal, Pause, Seek, SetSpeed, Step
+from diffdrive_jacobian.live.recorded_runs import read_robots
+from diffdrive_jacobian.live.session import Session
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.recording.recorder import Recorder
+from diffdrive_jacobian.recording.recording import Recording
+from diffdrive_jacobian.recording.selection import Selection
+from diffdrive_jacobian.tools.entry_points import ROS_MODULES
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    """A drive over two goals."""
+    path = tmp_path_factory.mktemp('live') / 'tour'
+    recording = Recording(path, 'mcap', lossless=True)
+    drive([[0.4, 0.0], [0.4, 0.4]], lockstep=True, parameters=QUICK, recording=recording)
+    recording.finish()
+    return path
+
+
+class Player:
+    """A player with a page."""
+
+    def __init__(self, bag, robots):
+        self.session = Session()
+        self.page = self.session.enter()
+        self.player = BagPlayer(self.session, bag, robots)
+        self.player.advance(0.0)
+
+    def send(self, *commands):
+        for command in commands:
+            self.session.put(self.page, command)
+            self.player._obey(self.session.take_commands()[0][1])
+        self.player.advance(0.0)
+
+    @property
+    def robot(self):
+        return self.session.latest()[1].robots[0]
+
+    @property
+    def world(self):
+        return self.session.latest()[1].world
+
+
+@pytest.fixture(scope='module')
+def robots(bag):
+    return read_robots(bag)
+
+
+@pytest.fixture
+def player(bag, robots):
+    return Player(bag, robots)
+
+
+def test_the_robot_is_where_it_was(bag, player):
+    run = read_run(bag)
+    odometry = run.odometry
+    times = (odometry.stamps - odometry.stamps[0]) * 1e-9
+    for index in (0, 10, 20, len(odometry) - 1):
+        player.send(Seek(float(times[index]) + 1e-6))
+        assert player.robot['pose'] == pytest.approx(odometry.values[index, :3].tolist(), abs=1e-5)
+        assert player.robot['twist'] == pytest.approx(odometry.values[index, 3:].tolist(), abs=1e-4)
+    assert player.robot['region']['a'] > 0.0
+
+
+def test_goals_and_the_chain_are_as_recorded(player):
+    player.send(Seek(0.2))
+    robot = player.robot
+    assert robot['goal']['goals'] == [
+        pytest.approx([0.4, 0.0, math.pi / 2], abs=1e-5),
+        [0.4, 0.4, 0.0],
+    ]
+    assert (robot['goal']['index'], robot['goal']['state']) == (0, 'executing')
+    assert robot['law']['gains']['Kp'] == QUICK['kp']
+    assert robot['commanded']
+    chain = robot['chain']
+    assert np.array(chain['forward']) @ chain['wheels'] == pytest.approx(chain['twist'], rel=1e-4)
+    player.send(Seek(player.world['duration']))
+    assert player.robot['goal']['index'] == 1
+    assert player.robot['goal']['state'] == 'succeeded'
+
+
+def test_time_plays_pauses_steps_and_jumps(player):
+    assert player.world['time'] == 0.0
+    player.player.advance(0.1)
+    assert player.world['time'] == pytest.approx(0.1)
+    player.send(SetSpeed(2.0))
+    player.player.advance(0.1)
+    assert player.world['time'] == pytest.approx(0.3)
+    player.send(Pause(paused=True))
+    player.player.advance(5.0)
+    assert player.world['time'] == pytest.approx(0.3)
+    player.send(Step())
+    assert player.world['time'] == pytest.approx(0.32, abs=1e-3)
+    player.send(Seek(1e6), Pause(paused=False))
+    assert player.world['time'] == 0.0
+    player.player.advance(1e6)
+    assert player.world['paused']
+    assert player.world['time'] == player.world['duration']
+    version = player.session.latest()[0]
+    player.player.advance(1.0)
+    assert player.session.latest()[0] == version
+
+
+def test_what_was_recorded_cannot_be_steered(player):
+    player.send(CancelGoal('/'))
+    assert 'this is a recording' in player.session.notices_after(0)[0]['text']
+
+
+def test_curves_and_parameters_of_the_whole_bag(player):
+    fixed = player.session.latest()[1].fixed
+    strips = fixed['strips']['/']
+    assert len({len(curve) for curve in strips.values()}) == 1
+    assert strips['distance'][0] == pytest.approx(0.4, abs=0.05)
+    assert max(value for value in strips['left'] if value is not None) > 1.0
+    keys = {row['key']: row['value'] for row in fixed['settings']['/']}
+    assert keys['controller/kp'] == QUICK['kp']
+    assert fixed['bag'] == 'tour'
+    trail = player.session.latest()[1].trails['/']
+    player.send(Seek(player.world['duration']))
+    assert player.robot['travelled'] == len(trail.points)
+
+
+def test_gains_of_another_package_are_shown_as_recorded(bag, robots):
+    (robot,) = robots
+    values = {**robot.run.of_node('go_to_goal'), 'controller': 'mine', 'k1': 2.5, 'Odd.name': 1.0}
+    run = replace(robot.run, parameters={'/go_to_goal': {**values, 'k2': math.nan}})
+    player = Player(bag, [replace(robot, run=run)])
+    rows = player.session.latest()[1].fixed['settings']['/']
+    keys = {row['key']: row['value'] for row in rows}
+    assert keys['controller/k1'] == 2.5
+    assert not keys.keys() & {'controller/kp', 'controller/yaw_goal_tolerance', 'controller/k2'}
+
+
+def test_the_page_follows_changes_of_the_controller(bag, robots):
+    (robot,) = robots
+    received = int(robot.run.odometry.received[20])
+    change = (received, '/go_to_goal', {'use_goal_heading': True})
+    player = Player(bag, [replace(robot, run=replace(robot.run, parameter_events=(change,)))])
+    for index, expected in ((19, False), (20, True), (19, False)):
+        player.send(Seek(float(robot.time[index]) + 1e-6))
+        assert player.robot['use_heading'] is expected
+
+
+def test_several_robots(lockstep, tmp_path):
+    recording = Recording(tmp_path / 'two', 'mcap', lossless=True)
+    for name, y in (('/one', 0.0), ('/two', 1.0)):
+        lockstep.add(make_complete(VirtualRobot, name, y=y))
+    lockstep.add(Recorder(Selection(everything=True), recording)).discover()
+    lockstep.settle()
+    lockstep.publish('/one/cmd_vel', twist(0.5, 0.0))
+    lockstep.run_for(0.4)
+    recording.finish()
+    player = Player(tmp_path / 'two', read_robots(tmp_path / 'two'))
+    player.send(Seek(0.4))
+    one, two = player.session.latest()[1].robots
+    assert (one['name'], two['name']) == ('/one', '/two')
+    assert one['pose'][0] > 0.1
+    assert two['pose'] == [0.0, 1.0, 0.0]
+
+
+def test_what_is_no_run(tmp_path):
+    with pytest.raises(BagError):
+        read_robots(tmp_path / 'none')
+
+
+def test_a_bag_is_watched_without_ros():
+    """In an interpreter of its own."""
+    program = 'import sys, diffdrive_jacobian.live.serving, diffdrive_jacobian.tools.watch_run\n'
+    program += 'print(*{name.split(".")[0] for name in sys.modules})'
+    run = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True)
+    assert not set(run.stdout.split()) & {*ROS_MODULES, 'rpyutils', 'matplotlib'}
+
+
+def test_the_ground_truth_of_a_bag(tmp_path):
+    recording = Recording(tmp_path / 'slip', 'mcap', lossless=True)
+    slip = ('simulate_slip:=true', 'wheel_travel_variance:=2e-3')
+    arguments = ['--ros-args', *(word for one in slip for word in ('-p', f'virtual_robot:{one}'))]
+    drive([[0.4, 0.0]], lockstep=True, parameters=QUICK, recording=recording, ros_arguments=arguments)
+    recording.finish()
+    player = Player(tmp_path / 'slip', read_robots(tmp_path / 'slip'))
+    run = read_run(tmp_path / 'slip')
+    trail = player.session.latest()[1].true_trails['/']
+    assert len(trail.points) == len(run.ground_truth)
+    for index in (10, len(run.odometry) - 1):
+        player.send(Seek((run.odometry.stamps[index] - run.odometry.stamps[0]) * 1e-9 + 1e-6))
+        latest = np.searchsorted(run.ground_truth.stamps, run.odometry.stamps[index], side='right') - 1
+        truth = run.ground_truth.values[latest, :3]
+        assert player.robot['truth'] == pytest.approx(truth.tolist(), abs=1e-5)
+        assert player.robot['truly_travelled'] == latest + 1
+
+
+def test_a_bag_without_ground_truth(player):
+    assert player.robot['truth'] is None
+    assert player.session.latest()[1].true_trails['/'].points == []

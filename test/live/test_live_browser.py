@@ -1,0 +1,295 @@
+"""The live page in a real browser: chromium, headless. Skipped loudly where there is none."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import signal
+import threading
+import time
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+from chromium import Browser, find_chromium, until
+from support import processes
+from support.processes import open_world
+
+QUICK = ('--ros-args', '-p', 'go_to_goal:kp:=8.0', '-p', 'go_to_goal:kv:=4.0')
+
+if find_chromium() is None and not os.environ.get('CHROMIUM_REQUIRED'):
+    pytest.skip('chromium is not installed: the live page was not tested', allow_module_level=True)
+
+
+@pytest.fixture(scope='module')
+def live(tmp_path_factory):
+    """A browser with the page of `drive_to --live --lockstep`."""
+    directory = tmp_path_factory.mktemp('browser')
+    with open_world(directory) as world, pytest.MonkeyPatch.context() as patch:
+        # All tests use it.
+        patch.setattr(processes, 'LIMIT', 150.0)
+        child = world.start('drive_to', '--live', '--lockstep', '--no-record', '--no-browser', *QUICK)
+        browser = Browser(1280, 800)
+        try:
+            child.until_says(r'page: http://\S+\n')
+            browser.size(1280, 800)
+            url = re.search(r'page: (\S+)', child.stdout)[1]
+            browser.open(url)
+            browser.until('document.getElementById("state").innerText === "no goal"')
+            browser.until('document.querySelector("#sliders input") !== null')
+            yield Live(browser, child, url)
+        finally:
+            browser.close()
+
+
+class Live:
+    """The page as its user sees it."""
+
+    def __init__(self, browser, child, url):
+        self.browser, self.child, self.url = browser, child, url
+
+    def state(self, name):
+        self.browser.until(f'document.getElementById("state").innerText === {json.dumps(name)}')
+
+    def place(self, dx, dy):
+        """Return a place on the screen, so far from the middle of the map (px)."""
+        x, y = self.browser.center('#map')
+        return [x + dx, y + dy]
+
+    def pose(self):
+        """Return x, y and theta as the page shows them."""
+        text = self.browser.text('#chain > .small').replace('\u2212', '-')
+        return [float(number) for number in re.findall(r'-?\d+\.\d{3}', text)[:3]]
+
+    def settled(self):
+        """Wait until the map follows a robot that stands."""
+        until(lambda: self.pose() == self.pose(), 'the robot stands')
+
+
+def test_a_click_sends_a_goal_and_the_robot_arrives(live):
+    # 280 px are a metre, and the robot is in the middle.
+    live.browser.click(live.place(140, -70))
+    live.state('driving')
+    live.state('arrived')
+    x, y, _ = live.pose()
+    assert math.dist((x, y), (0.5, 0.25)) < 0.03
+    assert live.browser.errors == []
+    own = re.search(r'http://([^/]+)/', live.url)[1]
+    assert all(re.match(rf'(http|ws)://{own}/', url) for url in live.browser.requests)
+
+
+@pytest.mark.parametrize(
+    ('typed', 'heading'),
+    [
+        (' ', None),
+        ('1,5', 1.5),
+        ('-90°', -math.pi / 2),
+        ('180 deg', math.pi),
+        ('1 rad', 1.0),
+        ('90', 'refused'),
+        ('pi/2', 'refused'),
+        ('400°', 'refused'),
+        ('north', 'refused'),
+    ],
+)
+def test_a_heading_is_taken_as_typed_or_refused(live, typed, heading):
+    """Nothing that is typed is taken for no heading."""
+    browser = live.browser
+    browser.evaluate(
+        f'document.getElementById("goto-theta").value = {json.dumps(typed)};'
+        'document.getElementById("notices").replaceChildren();'
+        'window.sent = []; window.before ??= WebSocket.prototype.send;'
+        'WebSocket.prototype.send = (text) => window.sent.push(JSON.parse(text))'
+    )
+    browser.evaluate('document.getElementById("goto").requestSubmit()')
+    sent = browser.evaluate('window.sent')
+    notice = browser.text('#notices')
+    browser.evaluate(
+        'WebSocket.prototype.send = window.before; document.getElementById("goto-theta").value = "";'
+        'document.getElementById("notices").replaceChildren()'
+    )
+    if heading == 'refused':
+        assert sent == []
+        assert f'in radians, from \u22122\u03c0 to 2\u03c0, or in degrees as 90°, got {typed}' in notice
+    else:
+        (command,) = sent
+        assert command['theta'] == (None if heading is None else pytest.approx(heading))
+        assert notice == ''
+
+
+def test_a_slider_changes_the_gain_and_a_refused_value_goes_back(live):
+    browser, kp = live.browser, '[data-key="controller/kp"] input'
+    slider = browser.center(f'{kp}[type=range]')
+    browser.click([slider[0] + 10, slider[1]])
+    browser.until(f'document.querySelector({json.dumps(kp)}).value !== "8"')
+    value = browser.evaluate(f'document.querySelector({json.dumps(kp + "[type=text]")}).value')
+    field = f'document.querySelector({json.dumps(kp + "[type=text]")})'
+    browser.evaluate(f'({field}.value = "-3", {field}.dispatchEvent(new Event("change")))')
+    browser.until('document.getElementById("notices").innerText.includes("kp refused")')
+    browser.until(f'{field}.value === {json.dumps(value)}')
+
+
+def test_a_key_drives_and_letting_go_stops(live):
+    browser = live.browser
+    live.settled()
+    x, y, theta = live.pose()
+    browser.key('Down', 'ArrowUp')
+    live.state('by hand')
+    until(lambda: math.dist(live.pose()[:2], (x, y)) > 0.05, 'the robot moves')
+    browser.key('Up', 'ArrowUp')
+    browser.until('document.getElementById("state").innerText !== "by hand"')
+    live.settled()
+    moved = live.pose()
+    assert moved[2] == pytest.approx(theta, abs=0.01)
+    along = (moved[0] - x) * math.cos(theta) + (moved[1] - y) * math.sin(theta)
+    assert along == pytest.approx(math.dist(moved[:2], (x, y)), abs=2e-3)
+
+
+@pytest.mark.parametrize('event', ['blur', 'hidden'])
+def test_a_page_without_attention_stops_the_robot(live, event):
+    browser = live.browser
+    browser.key('Down', 'KeyW')
+    live.state('by hand')
+    if event == 'blur':
+        browser.evaluate('window.dispatchEvent(new Event("blur"))')
+    else:
+        browser.evaluate(
+            'Object.defineProperty(document, "hidden", {value: true, configurable: true});'
+            'document.dispatchEvent(new Event("visibilitychange")); delete document.hidden'
+        )
+    # The key is still held.
+    browser.until('document.getElementById("state").innerText !== "by hand"')
+    browser.key('Up', 'KeyW')
+
+
+def test_the_robot_is_placed_by_dragging_it(live):
+    live.browser.click('#reset')
+    until(lambda: live.pose() == [0.0, 0.0, 0.0], 'the robot is at the origin')
+    live.browser.until('document.getElementById("follow").getAttribute("aria-pressed") === "true"')
+    browser = live.browser
+    # The map follows gently.
+    box = browser.evaluate('[map.clientWidth, map.clientHeight]')
+    middle = ' '.join(str(math.floor(side / 2 + 0.5)) for side in box)
+    browser.until(f'map.dataset.robot === {json.dumps(middle)}')
+    browser.drag(live.place(0, 0), live.place(-140, 0))
+    until(lambda: live.pose()[0] == pytest.approx(-0.5, abs=0.05), 'it is placed')
+
+
+def test_pause_step_and_waypoints(live):
+    browser = live.browser
+    browser.click('#play')
+    browser.until('document.getElementById("play").getAttribute("aria-label") === "Continue"')
+    before = browser.text('#clock')
+    browser.click('#step')
+    browser.until(f'document.getElementById("clock").innerText !== {json.dumps(before)}')
+    # Goals are taken while time stands.
+    browser.click(live.place(200, 40))
+    browser.click(live.place(200, 140), shift=True)
+    live.state('accepted')
+    browser.until('document.getElementById("summary").innerText.startsWith("waypoint 1 of 2")')
+    # Time that does not pass makes no robot silent, which the page would say after a second.
+    time.sleep(1.5)
+    live.state('accepted')
+    browser.key('Down', 'Escape')
+    browser.key('Up', 'Escape')
+    live.state('canceled')
+    browser.click('#play')
+    browser.until('document.getElementById("play").getAttribute("aria-label") === "Pause"')
+
+
+def test_other_widths_and_colours(live):
+    browser = live.browser
+    ground = 'getComputedStyle(document.body).backgroundColor'
+    light = browser.evaluate(ground)
+    browser.scheme('dark')
+    browser.until(f'{ground} !== {json.dumps(light)}')
+    browser.size(390, 844, mobile=True)
+    browser.until('document.documentElement.scrollWidth <= 390')
+    assert browser.evaluate('document.getElementById("map").clientWidth') > 300
+    browser.size(1280, 800)
+    browser.scheme('light')
+
+
+def test_nothing_is_clipped_on_usual_screens(live):
+    browser = live.browser
+    for width, height in ((1600, 900), (1440, 900), (1400, 900), (1366, 768), (1000, 700), (420, 800)):
+        browser.size(width, height)
+        clipped = """[...document.querySelectorAll('.strip p, #goto, #actions, #hint')].filter(
+            (node) => node.scrollWidth > node.clientWidth).length"""
+        assert browser.evaluate(clipped) == 0, width
+        assert browser.evaluate("document.getElementById('goto').offsetHeight") < 40
+        # A notice covers no legend.
+        browser.evaluate('document.getElementById("goto-x").value = "x"')
+        browser.evaluate('document.getElementById("goto").requestSubmit()')
+        covered = """(([a, b]) => a.left < b.right && b.left < a.right
+            && a.top < b.bottom && b.top < a.bottom)(['.notice', '#legend'].map(
+            (one) => document.querySelector(one).getBoundingClientRect()))"""
+        assert not browser.evaluate(covered), width
+        browser.evaluate('document.getElementById("goto-x").value = "1"')
+        if width >= 1280:
+            # Neither column scrolls.
+            scrolled = """['controls', 'mathematics'].filter((id) => {
+                const node = document.getElementById(id);
+                return node.scrollHeight > node.clientHeight; })"""
+            assert browser.evaluate(scrolled) == [], width
+    browser.size(1280, 800)
+
+
+@contextmanager
+def other_site():
+    """Serve an empty page of another origin, in this browser."""
+
+    class Empty(BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(b'<title>another site</title>')
+
+        def log_message(self, *_):
+            pass
+
+    with ThreadingHTTPServer(('127.0.0.1', 0), Empty) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f'http://127.0.0.1:{server.server_port}/'
+        server.shutdown()
+        thread.join()
+
+
+def test_a_page_of_another_site_cannot_use_the_page(live):
+    """Even if it knew the address: neither connect nor read, load or frame."""
+    browser, url = live.browser, live.url
+    ways = {
+        'connect': f'const s = new WebSocket("{url.replace("http", "ws")}socket");'
+        's.onopen = () => done("open"); s.onerror = () => done("refused");',
+        'read': f'fetch("{url}").then(() => done("open"), () => done("refused"));',
+        'script': f'const s = document.createElement("script"); s.src = "{url}main.js";'
+        's.onload = () => done("open"); s.onerror = () => done("refused"); document.head.append(s);',
+        'frame': f'const f = document.createElement("iframe"); f.src = "{url}";'
+        'f.onload = () => done(f.contentDocument === null ? "refused" : "open");'
+        'document.documentElement.append(f);',
+    }
+    with other_site() as site:
+        browser.open(site)
+        browser.until('document.title === "another site"')
+        for way, script in ways.items():
+            assert browser.evaluate(f'new Promise((done) => {{ {script} }})') == 'refused', way
+    browser.open(url)
+    browser.until('document.getElementById("connection").innerText === "connected"')
+    browser.until('document.querySelector("#sliders input") !== null')
+
+
+def test_the_page_says_when_the_connection_is_lost(live):
+    """Last: the program ends. What was driven by hand has stopped before."""
+    browser = live.browser
+    browser.key('Down', 'KeyW')
+    live.state('by hand')
+    live.child.signal(signal.SIGINT)
+    assert live.child.exit() == 0
+    browser.until('document.getElementById("connection").innerText.includes("lost")')
+    assert browser.evaluate('document.querySelectorAll("#pad .held").length') == 0
+    browser.key('Up', 'KeyW')
+    browser.click(live.place(100, 100))
+    browser.until('document.getElementById("notices").innerText.includes("there is no connection")')

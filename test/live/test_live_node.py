@@ -1,0 +1,465 @@
+"""The node behind the live page, in lockstep with robot, wheel bridge and controller."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.node import Node
+from support.lockstep_nodes import QUICK, make_complete
+
+from diffdrive_jacobian.control.controller import KP, KV
+from diffdrive_jacobian.live import hand, settings
+from diffdrive_jacobian.live import node as live_node
+from diffdrive_jacobian.live.commands import (
+    CancelGoal,
+    ClearPath,
+    DriveByHand,
+    Pause,
+    Place,
+    Release,
+    Reset,
+    SendGoal,
+    SetParameter,
+)
+from diffdrive_jacobian.live.node import LivePage
+from diffdrive_jacobian.live.session import Session
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+
+
+class Live:
+    """An open page, and the node behind it."""
+
+    def __init__(self, world):
+        self.world = world
+        self.session = Session()
+        self.page = self.session.enter()
+        self.node = world.add(LivePage(self.session, world.node.context, polled=False))
+        self.notices = []
+
+    def send(self, *commands, page=None):
+        for command in commands:
+            assert self.session.put(page or self.page, command)
+
+    def pass_time(self, seconds=0.02):
+        end = self.world.elapsed + seconds
+        while self.world.elapsed < end:
+            self.node.work()
+            self.world.step(0.02)
+        self.node.work()
+        self.world.settle()
+        self.node.work()
+
+    def until(self, condition, timeout=20.0):
+        end = self.world.elapsed + timeout
+        while not condition():
+            assert self.world.elapsed < end, (self.texts, self.robot())
+            self.pass_time()
+
+    def robot(self, name='/'):
+        """Return what the page shows of a robot."""
+        _, snapshot = self.session.latest()
+        return next((one for one in snapshot.robots if one['name'] == name), None)
+
+    @property
+    def texts(self):
+        return [notice['text'] for notice in self.session.notices_after(0)]
+
+    def settings(self, name='/'):
+        _, snapshot = self.session.latest()
+        return {row['key']: row for row in snapshot.fixed['settings'][name]}
+
+    def state(self, name='/'):
+        return self.robot(name)['goal']['state']
+
+
+@pytest.fixture
+def live(lockstep, monkeypatch):
+    monkeypatch.setattr(live_node, 'PERIOD', 0.0)
+    monkeypatch.setattr(live_node, 'DISCOVERY_PERIOD', 0.0)
+    # By the clock on the wall, which has nothing to do with simulated time.
+    monkeypatch.setattr(hand, 'DEAD_MAN', math.inf)
+    return Live(lockstep)
+
+
+@pytest.fixture
+def driven(live):
+    """A robot with controller and wheel bridge, known to the page."""
+    for node in (VirtualRobot, WheelBridge, GoToGoal):
+        parameters = {'command_interface': 'wheels'} if node is VirtualRobot else {}
+        live.world.add(make_complete(node, **parameters, **(QUICK if node is GoToGoal else {})))
+    live.until(lambda: live.robot() and len(live.settings()) > 8)
+    return live
+
+
+def goal(x, y, theta=None, *, robot='/', append=False):
+    return SendGoal(robot, x, y, theta, append=append)
+
+
+def test_a_goal_is_driven_to_and_every_number_of_the_chain_is_there(driven):
+    driven.send(goal(0.4, 0.3))
+    driven.until(lambda: driven.state() == 'executing' and driven.robot()['commanded'])
+    robot = driven.robot()
+    assert robot['goal']['goals'][0][:2] == [0.4, 0.3]
+    assert robot['distance'] == pytest.approx(0.5, abs=0.02)
+    assert robot['law']['name'] == 'go_to_goal'
+    assert robot['law']['gains']['Kp'] == QUICK['kp']
+    assert robot['tolerance'] == 0.02
+    chain = robot['chain']
+    assert chain['measured']
+    assert np.array(chain['inverse']) @ chain['command'] == pytest.approx(chain['wanted'], rel=1e-4)
+    assert np.array(chain['forward']) @ chain['wheels'] == pytest.approx(chain['twist'], rel=1e-4)
+    world = np.array(chain['unicycle']) @ chain['twist']
+    assert world == pytest.approx(np.array(chain['world']), rel=1e-4, abs=1e-6)
+    driven.until(lambda: driven.state() == 'succeeded')
+    x, y, _ = driven.robot()['pose']
+    assert math.dist((x, y), (0.4, 0.3)) <= 0.02
+    assert driven.robot()['region']['a'] > driven.robot()['region']['b'] > 0.0
+    _, snapshot = driven.session.latest()
+    assert len(snapshot.trails['/'].points) > 10
+
+
+def test_waypoints_are_appended_and_a_goal_is_canceled(driven):
+    driven.send(goal(0.3, 0.0))
+    driven.until(lambda: driven.state() == 'executing')
+    driven.send(goal(0.3, 0.3, append=True), goal(5.0, 5.0, 1.0, append=True))
+    driven.until(lambda: len(driven.robot()['goal']['goals']) > 1)
+    driven.until(lambda: driven.robot()['goal']['index'] == len(driven.robot()['goal']['goals']) - 1)
+    assert driven.robot()['goal']['goals'][-1] == [5.0, 5.0, 1.0]
+    driven.send(CancelGoal('/'))
+    driven.until(lambda: driven.state() == 'canceled')
+    driven.pass_time(0.1)
+    assert driven.robot()['twist'] == [0.0, 0.0]
+    driven.send(CancelGoal('/'))
+    driven.until(lambda: any('no goal is active' in text for text in driven.texts))
+
+
+def test_the_ends_of_goals_are_reported_with_the_place_of_the_robot(driven):
+    ends = []
+    driven.node.robots['/'].on_end = ends.append
+    driven.send(goal(0.2, 0.0), goal(0.3, 0.1, append=True))
+    driven.until(lambda: driven.state() == 'succeeded')
+    driven.send(goal(5.0, 5.0))
+    driven.until(lambda: driven.state() == 'executing')
+    driven.send(CancelGoal('/'))
+    driven.until(lambda: driven.state() == 'canceled')
+    assert [(end.robot, end.state.name) for end in ends] == [('/', 'SUCCEEDED'), ('/', 'CANCELED')]
+    np.testing.assert_array_equal([end.goal[:2] for end in ends], [[0.3, 0.1], [5.0, 5.0]])
+    for end in ends:
+        assert end.distance == pytest.approx(math.dist(end.pose[:2], end.goal[:2]))
+    assert ends[0].distance <= 0.021
+
+
+def test_a_waypoint_is_appended_to_a_goal_that_was_sent_just_now(driven):
+    driven.send(goal(0.3, 0.0), goal(0.3, 0.3, append=True), goal(0.0, 0.3, append=True))
+    driven.until(lambda: driven.state() == 'executing')
+    places = [one[:2] for one in driven.robot()['goal']['goals']]
+    assert places == [[0.3, 0.0], [0.3, 0.3], [0.0, 0.3]]
+    driven.until(lambda: driven.state() == 'succeeded')
+    driven.send(goal(0.5, 0.5, append=True))
+    driven.until(lambda: driven.state() == 'executing')
+    assert len(driven.robot()['goal']['goals']) == 1
+
+
+def test_without_a_heading_the_goal_is_approached_straight(driven):
+    driven.send(goal(0.3, 0.3))
+    driven.until(lambda: driven.robot()['goal']['goals'])
+    assert driven.robot()['goal']['goals'][0][2] == pytest.approx(math.pi / 4, abs=1e-5)
+
+
+def test_driving_by_hand_cancels_the_goal_first_and_stops_with_the_page(driven):
+    commands = driven.world.listen(Twist, 'cmd_vel')
+    driven.send(goal(5.0, 0.0))
+    driven.until(lambda: driven.state() == 'executing')
+    driven.send(DriveByHand('/', 0.25, 0.5))
+    driven.until(lambda: driven.robot()['by_hand'] and driven.robot()['commanded'], timeout=2.0)
+    driven.until(lambda: commands[-1].linear.x == 0.25, timeout=2.0)
+    assert driven.state() == 'canceled'
+    assert 'driving by hand: the goal is canceled' in driven.texts
+    # No command of the controller comes between.
+    by_hand = [(one.linear.x, one.angular.z) for one in commands]
+    first = by_hand.index((0.25, 0.5))
+    assert by_hand[first - 1] == (0.0, 0.0)
+    assert set(by_hand[first:]) == {(0.25, 0.5)}
+    driven.session.leave(driven.page)
+    driven.pass_time(0.1)
+    assert (commands[-1].linear.x, commands[-1].angular.z) == (0.0, 0.0)
+    stopped = len(commands)
+    driven.pass_time(0.5)
+    assert len(commands) == stopped
+
+
+def test_driving_by_hand_sends_25_commands_per_second_however_often_the_page_is_asked(driven):
+    commands = driven.world.listen(Twist, 'cmd_vel')
+    driven.send(DriveByHand('/', 0.25, 0.5))
+    begin = driven.world.elapsed
+    while driven.world.elapsed < begin + 1.0:
+        for _ in range(5):
+            driven.node.work()
+        driven.world.step(0.01)
+    assert 20 <= len(commands) <= 26
+
+
+def test_a_goal_is_refused_while_the_robot_is_driven_by_hand(driven):
+    driven.send(DriveByHand('/', 0.2, 0.0), goal(1.0, 0.0))
+    driven.pass_time(0.1)
+    assert any('release the keys' in text for text in driven.texts)
+    assert not driven.robot()['goal']['active']
+    other = driven.session.enter()
+    driven.send(DriveByHand('/', -0.9, 0.0), page=other)
+    driven.pass_time(0.1)
+    assert 'another page drives this robot by hand' in driven.texts
+    assert driven.robot()['twist'][0] == pytest.approx(0.2)
+    driven.send(Release('/'), page=other)
+    driven.pass_time(0.1)
+    assert driven.robot()['by_hand']
+    driven.send(Release('/'))
+    driven.pass_time(0.1)
+    assert driven.robot()['twist'] == [0.0, 0.0]
+
+
+def test_the_robot_is_placed_and_reset(driven):
+    driven.send(Place('/', 1.0, -2.0, 0.5))
+    driven.until(lambda: driven.robot()['pose'] == pytest.approx([1.0, -2.0, 0.5]))
+    driven.send(ClearPath('/'))
+    driven.pass_time(0.1)
+    assert driven.session.latest()[1].trails['/'].points == [(1.0, -2.0)]
+    driven.send(Reset('/'))
+    driven.until(lambda: driven.robot()['pose'] == [0.0, 0.0, 0.0])
+
+
+def test_parameters_are_set_and_refusals_are_shown(driven):
+    driven.send(
+        SetParameter('/', 'controller/kp', 5.0),
+        SetParameter('/', 'controller/controller', 'pose'),
+        SetParameter('/', 'robot/max_wheel_velocity', 9.0),
+        SetParameter('/', 'controller/linear.x.max_velocity', 0.1),
+        SetParameter('/', 'controller/linear.x.max_velocity', None),
+    )
+    driven.until(lambda: driven.settings()['controller/controller']['value'] == 'pose')
+    driven.pass_time(0.1)
+    rows = driven.settings()
+    assert rows['controller/kp']['value'] == 5.0
+    assert rows['robot/max_wheel_velocity']['value'] == 9.0
+    assert rows['controller/linear.x.max_velocity']['value'] is None
+    assert driven.robot()['use_heading']
+    assert driven.texts == []
+    driven.send(
+        SetParameter('/', 'controller/kp', -1.0),
+        SetParameter('/', 'controller/controller', 'none'),
+        SetParameter('/', 'controller/use_sim_time', False),
+    )
+    driven.until(lambda: len(driven.texts) == 3)
+    assert any(text.startswith('kp refused') for text in driven.texts)
+    assert any(text.startswith('controller refused') for text in driven.texts)
+    assert any('there is no setting' in text for text in driven.texts)
+    assert driven.settings()['controller/kp']['value'] == 5.0
+
+
+class Driver(Node):
+    """The driver of a robot, with descriptors of its own."""
+
+    def __init__(self):
+        super().__init__('driver')
+        self.odometry = self.create_publisher(Odometry, 'odom', 10)
+        self.create_timer(0.02, lambda: self.odometry.publish(Odometry()))
+        self.declare('max_wheel_velocity', 20.0, (2.0, 120.0))
+        self.declare('wheel_travel_variance', 0.001, None)
+
+    def declare(self, name, value, served):
+        ranges = [FloatingPointRange(from_value=served[0], to_value=served[1])] if served else []
+        self.declare_parameter(name, value, ParameterDescriptor(floating_point_range=ranges))
+
+
+def test_the_sliders_have_the_ranges_that_a_driver_serves(live):
+    driver = live.world.add(Driver())
+
+    def slider(name):
+        row = live.settings()[f'robot/{name}']
+        return row['low'], row['high']
+
+    live.until(lambda: live.robot() and len(live.settings()) == 2)
+    live.until(lambda: slider('max_wheel_velocity') == (2.0, 120.0))
+    # It serves no range: the usual one.
+    assert slider('wheel_travel_variance') == (0.0, 0.002)
+    driver.declare('unrelated', 1.0, (0.0, 1.0))
+    live.send(SetParameter('/', 'robot/max_wheel_velocity', 130.0))
+    live.until(lambda: live.texts)
+    assert 'max_wheel_velocity refused: ' in live.texts[0]
+    live.pass_time(0.1)
+    assert live.settings()['robot/max_wheel_velocity']['value'] == 20.0
+    assert len(live.settings()) == 2
+
+
+def test_the_nodes_of_this_package_have_all_sliders_with_the_usual_ranges(driven):
+    driven.pass_time(0.1)
+    (robot,) = driven.node.robots.values()
+    # What they serve are all valid values, which are too many for a slider.
+    assert robot.links['controller'].ranges['kp'] == (0.0, KP.bounds[1])
+    ranges = {key: (row['low'], row['high']) for key, row in driven.settings().items()}
+    usual = {one.key: (one.low, one.high) for one in settings.offered((KP, KV))}
+    assert ranges == usual
+
+
+def test_changes_of_others_are_followed(driven):
+    controller = next(node for node in driven.world.nodes if isinstance(node, GoToGoal))
+    from rclpy.parameter import Parameter
+
+    controller.set_parameters([Parameter('kv', value=1.25)])
+    driven.until(lambda: driven.settings()['controller/kv']['value'] == 1.25, timeout=2.0)
+
+
+def test_robots_in_namespaces(live):
+    for name in ('/one', '/two'):
+        live.world.add(make_complete(VirtualRobot, name))
+        live.world.add(make_complete(GoToGoal, name, **QUICK))
+    live.until(lambda: live.robot('/one') and live.robot('/two'))
+    live.pass_time(0.1)
+    live.send(goal(0.3, 0.0, robot='/two'))
+    live.until(lambda: live.state('/two') == 'succeeded')
+    assert live.robot('/one')['pose'] == [0.0, 0.0, 0.0]
+    live.send(goal(0.3, 0.0, robot='/three'))
+    live.pass_time(0.04)
+    assert 'there is no such robot' in live.texts
+
+
+def test_a_robot_without_a_controller(live):
+    live.world.add(make_complete(VirtualRobot))
+    live.until(lambda: live.robot())
+    live.send(goal(1.0, 0.0), CancelGoal('/'), SetParameter('/', 'controller/kp', 1.0))
+    live.send(Pause(paused=True))
+    live.pass_time(0.1)
+    assert len(live.texts) == 4
+    assert 'nobody is subscribed to /goal_pose: is go_to_goal running?' in live.texts
+    assert any('there is no service /cancel_goal' in text for text in live.texts)
+    assert 'there is no controller to set kp of' in live.texts
+    assert any('time is real here' in text for text in live.texts)
+
+
+def test_a_robot_that_takes_stamped_commands(live):
+    live.world.add(make_complete(VirtualRobot, enable_stamped_cmd_vel=True))
+    live.until(lambda: live.robot())
+    live.send(DriveByHand('/', 0.3, 0.0))
+    live.until(lambda: live.robot()['twist'][0] == pytest.approx(0.3), timeout=2.0)
+
+
+def test_the_end_of_driving_by_hand_says_how_far_a_slow_robot_rolls(live):
+    live.world.add(make_complete(VirtualRobot, **{'linear.x.max_acceleration': 0.1}))
+    live.until(lambda: live.robot() and 'robot/linear.x.max_acceleration' in live.settings())
+    live.send(SetParameter('/', 'robot/linear.x.max_acceleration', 0.2))
+    live.until(lambda: live.settings()['robot/linear.x.max_acceleration']['value'] == 0.2)
+    live.send(DriveByHand('/', 0.2, 0.0))
+    live.until(lambda: live.robot()['twist'][0] == pytest.approx(0.2), timeout=2.0)
+    live.send(Release('/'))
+    live.until(lambda: any('rolls on for about 0.100 m' in text for text in live.texts), timeout=2.0)
+
+
+def test_without_a_page_nothing_is_computed(live):
+    live.world.add(make_complete(VirtualRobot))
+    live.session.leave(live.page)
+    live.pass_time(0.2)
+    assert live.node.robots
+    assert live.session.latest()[0] == 0
+
+
+def test_robots_that_are_silent_and_gone(live, monkeypatch):
+    robot = live.world.add(make_complete(VirtualRobot))
+    live.until(lambda: live.robot())
+    live.world.remove(robot)
+    monkeypatch.setattr(live_node, 'LOST', 0.0)
+    live.until(lambda: live.robot() is None)
+
+
+def test_a_node_that_changes_its_name_leaves_nothing_behind(driven):
+    robot = driven.node.robots['/']
+    before = len(list(driven.node.clients))
+    for number in range(5):
+        robot.use_nodes({'robot': f'/robot_{number}', 'controller': f'/controller_{number}'})
+        refused = []
+        robot.links['robot'].set('x', 1.0, refused.append)
+    assert len(list(driven.node.clients)) <= before + 2 * 3
+    robot.use_nodes({'robot': '/virtual_robot'})
+    assert refused == ['/robot_4 is gone']
+    robot.destroy()
+    assert not list(driven.node.clients)
+
+
+def test_a_robot_too_many_is_named(live, monkeypatch):
+    monkeypatch.setattr(live_node, 'MAX_ROBOTS', 1)
+    first = live.world.add(make_complete(VirtualRobot, '/one'))
+    live.until(lambda: live.robot('/one'))
+    live.world.add(make_complete(VirtualRobot, '/two'))
+
+    def notes():
+        return live.session.latest()[1].fixed['notes']
+
+    live.until(notes)
+    assert notes() == ['at most 1 robots are shown; 1 more publish odometry: /two']
+    live.world.remove(first)
+    monkeypatch.setattr(live_node, 'LOST', 0.0)
+    live.until(lambda: live.robot('/two') and not notes())
+
+
+def test_a_robot_that_slips_is_shown_where_it_truly_is(live):
+    slip = {'simulate_slip': True, 'wheel_travel_variance': 2e-3}
+    robot = live.world.add(make_complete(VirtualRobot, command_interface='wheels', **slip))
+    for node in (WheelBridge, GoToGoal):
+        live.world.add(make_complete(node, **(QUICK if node is GoToGoal else {})))
+    live.until(lambda: live.robot() and len(live.settings()) > 8)
+    ends = []
+    live.node.robots['/'].on_end = ends.append
+    live.send(goal(1.0, 0.5))
+    live.until(lambda: live.state() == 'executing')
+    live.pass_time(0.2)
+    shown = live.robot()
+    assert shown['true_distance'] == pytest.approx(math.dist(shown['truth'][:2], (1.0, 0.5)), abs=1e-4)
+    assert shown['true_distance'] != shown['distance']
+    live.until(lambda: live.state() == 'succeeded')
+    live.pass_time(0.2)
+    assert live.robot()['truth'] == pytest.approx(robot.truth.tolist(), abs=1e-4)
+    (end,) = ends
+    assert end.distance <= 0.021 < end.true_distance
+    trail = live.session.latest()[1].true_trails['/']
+    assert len(trail.points) > 10
+    assert trail.points[-1] == pytest.approx(robot.truth[:2].tolist(), abs=0.011)
+    live.send(ClearPath('/'))
+    live.pass_time(0.02)
+    assert len(live.session.latest()[1].true_trails['/'].points) <= 1
+
+
+def test_the_error_of_the_heading_is_shown_where_it_counts(driven):
+    driven.send(goal(0.3, 0.0, 2.0))
+    driven.until(lambda: driven.state() == 'executing')
+    assert driven.robot()['goal_heading_error'] is None
+    driven.send(SetParameter('/', 'controller/use_goal_heading', value=True))
+    driven.until(lambda: driven.robot()['use_heading'])
+    shown = driven.robot()
+    assert shown['goal_heading_error'] == pytest.approx(2.0 - shown['pose'][2], abs=1e-4)
+    assert driven.robot()['truth'] is None
+
+
+def test_a_heading_that_does_not_count_is_told(driven):
+    driven.send(goal(0.3, 0.0), goal(0.3, 0.1, 2.0))
+    driven.pass_time(0.1)
+    (text,) = driven.texts
+    assert text.startswith('go_to_goal ignores the heading of the goal')
+    driven.send(SetParameter('/', 'controller/use_goal_heading', value=True))
+    driven.until(lambda: driven.robot()['use_heading'])
+    driven.send(goal(0.3, 0.2, 2.0))
+    driven.pass_time(0.1)
+    assert driven.texts == [text]
+
+
+def test_the_distance_from_a_goal_is_shown_after_the_arrival(driven):
+    driven.send(goal(0.3, 0.0))
+    driven.until(lambda: driven.state() == 'succeeded')
+    shown = driven.robot()
+    x, y, _ = shown['pose']
+    assert shown['distance'] == pytest.approx(math.hypot(0.3 - x, y), abs=1e-5)
+    assert shown['bearing_error'] is None

@@ -1,0 +1,462 @@
+"""The parts of the live page that need neither ROS nor a browser."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from diffdrive_jacobian.control import KP, KV, OFFSET, Arrival, circle_path
+from diffdrive_jacobian.kinematics import diff_drive
+from diffdrive_jacobian.live import files, settings
+from diffdrive_jacobian.live.commands import Pause, SetSpeed, Step
+from diffdrive_jacobian.live.goal_progress import GoalProgress
+from diffdrive_jacobian.live.hand import CANCEL_PATIENCE, DEAD_MAN, Act, HandDriving
+from diffdrive_jacobian.live.pacing import Pacing
+from diffdrive_jacobian.live.quantities import chain, errors, region, rounded
+from diffdrive_jacobian.live.robot_state import MAX_POINTS, SPACING, RobotState, Trail
+from diffdrive_jacobian.live.session import MAX_COMMANDS, MAX_NOTICES, Session, Snapshot
+from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.parameters.declaration import specifications
+from diffdrive_jacobian.parameters.nodes import GoToGoalParameters, VirtualRobotParameters
+
+# --- Driving by hand
+
+
+def is_open(page):
+    return True
+
+
+def test_driving_ends_when_the_page_is_silent():
+    hand = HandDriving()
+    assert hand.command(1, (0.2, 0.0), now=10.0)
+    assert hand.update(10.0, 10.0, is_open, goal_active=False) is Act.PUBLISH
+    assert hand.update(10.01, 10.01, is_open, goal_active=False) is Act.NOTHING
+    assert (
+        hand.update(10.0 + 0.9 * DEAD_MAN, 10.0 + 0.9 * DEAD_MAN, is_open, goal_active=False)
+        is Act.PUBLISH
+    )
+    assert (
+        hand.update(10.0 + 1.1 * DEAD_MAN, 10.0 + 1.1 * DEAD_MAN, is_open, goal_active=False) is Act.STOP
+    )
+    assert hand.page is None
+    assert hand.update(11.0, 11.0, is_open, goal_active=False) is Act.NOTHING
+
+
+def test_commands_are_spaced_by_the_clock_of_the_robot():
+    """However often it is asked: it may be asked because of the last command."""
+    hand = HandDriving()
+    hand.command(1, (0.2, 0.0), now=10.0)
+    times = (5.0, 5.0, 5.03, 5.041, 5.05, 1.0, 1.03, 1.05)
+    acts = [hand.update(10.0, robot_time, is_open, goal_active=False) for robot_time in times]
+    assert [time for time, act in zip(times, acts, strict=True) if act is Act.PUBLISH] == [
+        *(5.0, 5.041),
+        # It was set back.
+        *(1.0, 1.05),
+    ]
+
+
+def test_driving_ends_at_once_with_the_page_or_its_release():
+    for end in ('closed', 'released'):
+        hand = HandDriving()
+        hand.command(1, (0.2, 0.0), now=10.0)
+        hand.update(10.0, 10.0, is_open, goal_active=False)
+        if end == 'released':
+            hand.release(2)
+            assert hand.update(10.05, 10.05, is_open, goal_active=False) is Act.PUBLISH
+            hand.release(1)
+        gone = end == 'closed'
+        assert hand.update(10.06, 10.06, lambda page, gone=gone: not gone, goal_active=False) is Act.STOP
+
+
+def test_one_page_drives_at_a_time():
+    hand = HandDriving()
+    assert hand.command(1, (0.2, 0.0), now=10.0)
+    assert not hand.command(2, (0.9, 0.0), now=10.1)
+    assert hand.twist == (0.2, 0.0)
+    hand.release(1)
+    hand.update(10.2, 10.2, is_open, goal_active=False)
+    assert hand.command(2, (0.9, 0.0), now=10.3)
+
+
+def test_an_active_goal_is_canceled_before_anything_is_driven():
+    hand = HandDriving()
+    hand.command(1, (0.2, 0.0), now=10.0)
+    assert hand.update(10.0, 10.0, is_open, goal_active=True) is Act.CANCEL_GOAL
+    hand.command(1, (0.2, 0.0), now=10.1)
+    assert hand.update(10.1, 10.1, is_open, goal_active=True) is Act.NOTHING
+    assert hand.update(10.2, 10.2, is_open, goal_active=False) is Act.PUBLISH
+
+
+def test_nothing_is_driven_if_the_goal_is_not_canceled():
+    hand = HandDriving()
+    acts = []
+    for step in range(40):
+        now = 10.0 + 0.1 * step
+        if hand.page is not None or not step:
+            hand.command(1, (0.2, 0.0), now=now)
+        acts.append(hand.update(now, now, is_open, goal_active=True))
+    assert acts[0] is Act.CANCEL_GOAL
+    assert acts.index(Act.GIVE_UP) == pytest.approx(CANCEL_PATIENCE / 0.1, abs=1.1)
+    assert Act.PUBLISH not in acts
+    assert Act.STOP not in acts
+
+
+# --- Pace
+
+
+def test_time_passes_at_the_speed_that_was_chosen():
+    pacing = Pacing(speed=2.0)
+    assert pacing.may_advance(5.0, now=100.0)
+    assert not pacing.may_advance(5.02, now=100.005)
+    assert pacing.may_advance(5.02, now=100.01)
+    pacing.obey(SetSpeed(0.5))
+    assert pacing.may_advance(5.02, now=100.01)
+    assert not pacing.may_advance(5.04, now=100.03)
+    assert pacing.may_advance(5.04, now=100.051)
+
+
+def test_a_machine_that_was_busy_does_not_race_afterwards():
+    pacing = Pacing()
+    assert pacing.may_advance(0.0, now=0.0)
+    assert pacing.may_advance(0.02, now=9.0)
+    assert not pacing.may_advance(0.04, now=9.01)
+
+
+def test_pause_and_steps():
+    pacing = Pacing()
+    pacing.obey(Pause(paused=True))
+    assert not pacing.may_advance(1.0, now=0.0)
+    pacing.obey(Step())
+    pacing.obey(Step())
+    assert [pacing.may_advance(1.0, now=float(k)) for k in range(3)] == [True, True, False]
+    assert pacing.shown()['paused']
+    pacing.obey(Pause(paused=False))
+    assert pacing.may_advance(1.0, now=5.0)
+
+
+def test_the_wait_ends_when_the_program_does():
+    pacing = Pacing(paused=True)
+    assert pacing.pace(0.0, lambda: True)
+
+
+# --- Goals
+
+
+def test_goals_and_their_state():
+    goal = GoalProgress()
+    goal.sent(np.array([[1.0, 0.0, 0.0], [1.0, 1.0, 0.0]]), (1, 0))
+    assert not goal.active
+    goal.reported(GoalState.EXECUTING, (1, 0))
+    np.testing.assert_array_equal(goal.current, [1.0, 0.0, 0.0])
+    goal.moved(np.array([0.99, 0.0, 0.0]), Arrival())
+    assert goal.shown()['index'] == 1
+    assert len(goal.remaining()) == 1
+    goal.reported(GoalState.SUCCEEDED, (1, 0))
+    assert goal.current is None
+    assert goal.shown()['state'] == 'succeeded'
+
+
+def test_a_status_that_overtakes_its_goal():
+    goal = GoalProgress()
+    goal.reported(GoalState.EXECUTING, (2, 0))
+    assert goal.active
+    assert goal.current is None
+    goal.sent(np.array([[1.0, 0.0, 0.0]]), (2, 0))
+    np.testing.assert_array_equal(goal.current, [1.0, 0.0, 0.0])
+
+
+def test_a_goal_that_is_replaced_and_one_that_is_refused():
+    goal = GoalProgress()
+    first, second = np.array([[1.0, 0.0, 0.0]]), np.array([[2.0, 0.0, 0.0]])
+    goal.sent(first, (1, 0))
+    goal.reported(GoalState.EXECUTING, (1, 0))
+    goal.sent(second, (2, 0))
+    goal.reported(GoalState.CANCELED, (1, 0))
+    goal.reported(GoalState.ACCEPTED, (2, 0))
+    assert goal.active
+    np.testing.assert_array_equal(goal.goals, second)
+    goal.sent(np.array([[9.0, 0.0, 0.0]]), (3, 0))
+    goal.reported(GoalState.ABORTED, (3, 0))
+    goal.reported(GoalState.EXECUTING, (2, 0))
+    np.testing.assert_array_equal(goal.goals, second)
+
+
+def test_the_end_of_each_goal_is_reported_once():
+    goal = GoalProgress()
+    goal.sent(np.array([[1.0, 0.0, 0.0]]), (1, 0))
+
+    def ends(state, stamp):
+        changed = goal.reported(state, stamp)
+        return changed is not None and changed.fate.is_end
+
+    assert not ends(GoalState.EXECUTING, (1, 0))
+    assert ends(GoalState.SUCCEEDED, (1, 0))
+    assert not ends(GoalState.SUCCEEDED, (1, 0))
+    goal.sent(np.array([[2.0, 0.0, 0.0]]), (2, 0))
+    assert ends(GoalState.ABORTED, (2, 0))
+    goal.sent(np.array([[3.0, 0.0, 0.0]]), (3, 0))
+    assert not ends(GoalState.ACCEPTED, (3, 0))
+    goal.sent(np.array([[4.0, 0.0, 0.0]]), (4, 0))
+    assert not ends(GoalState.CANCELED, (3, 0))
+    assert ends(GoalState.CANCELED, (4, 0))
+
+
+# --- Numbers
+
+
+def test_the_chain_is_that_of_document_a():
+    numbers = chain(0.0, (0.5, 2.35619449), None, (0.033, 0.16))
+    assert numbers['wanted'] == pytest.approx([20.864, 9.440], abs=1e-3)
+    assert numbers['world'] == pytest.approx([0.5, 0.0, 2.35619], abs=1e-5)
+    assert np.array(numbers['forward']) @ np.array(numbers['inverse']) == pytest.approx(
+        np.eye(2), abs=1e-5
+    )
+    theta, wheels = 0.7, (3.0, -1.0)
+    numbers = chain(theta, (0.5, 0.0), wheels, (0.05, 0.3))
+    expected = diff_drive.wheel_to_world_jacobian(theta, 0.05, 0.3) @ np.array(wheels)
+    assert numbers['world'] == pytest.approx(expected.tolist(), rel=1e-5)
+    assert numbers['measured']
+
+
+def test_the_chain_has_the_radius_of_each_wheel():
+    wheels, multipliers = (3.0, -1.0), (1.1, 0.9)
+    numbers = chain(0.0, (0.5, 0.0), wheels, (0.05, 0.3), multipliers)
+    right, left = 3.0 * 0.05 * 1.1, -1.0 * 0.05 * 0.9
+    expected = [(right + left) / 2.0, (right - left) / 0.3]
+    assert numbers['twist'] == pytest.approx(expected, rel=1e-5)
+    assert numbers['wanted'] == pytest.approx([0.5 / 0.05 / 1.1, 0.5 / 0.05 / 0.9], rel=1e-5)
+
+
+def test_the_region_contains_95_percent():
+    rng = np.random.default_rng(1)
+    angle, deviations = 0.6, np.array([0.3, 0.05])
+    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    covariance = np.zeros((3, 3))
+    covariance[:2, :2] = rotation @ np.diag(deviations**2) @ rotation.T
+    covariance[2, 2] = 0.04
+    found = region(covariance)
+    assert abs(math.sin(found['angle'] - angle)) < 1e-5
+    assert found['heading'] == pytest.approx(1.96 * 0.2)
+    axes = (rng.normal(size=(20000, 2)) * deviations) / [found['a'], found['b']]
+    assert np.mean(np.sum(axes**2, axis=1) <= 1.0) == pytest.approx(0.95, abs=0.01)
+    assert region(np.zeros((3, 3))) is None
+    assert region(np.full((3, 3), math.nan)) is None
+
+
+def test_distance_and_heading_error():
+    assert errors(np.array([0.0, 0.0, 0.5]), np.array([0.0, 2.0, 0.0]), 0.0) == pytest.approx(
+        (2.0, math.pi / 2 - 0.5)
+    )
+    assert errors(np.array([0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), 0.4)[0] == pytest.approx(0.6)
+
+
+def test_numbers_of_the_page_are_short_and_finite():
+    assert rounded([1.23456789, math.nan, (np.float64(2.0), 3)]) == [1.23457, None, [2.0, 3]]
+
+
+# --- Bounds
+
+
+def test_a_path_is_bounded_and_interrupted_by_jumps():
+    trail = Trail()
+    for step in range(3 * MAX_POINTS):
+        trail = trail.extended(1.1 * SPACING * step, 0.0)
+    assert len(trail.points) <= MAX_POINTS
+    last = 3.3 * SPACING * (MAX_POINTS - 1)
+    assert trail.points[0] == (0.0, 0.0)
+    assert trail.points[-1][0] == pytest.approx(last, abs=0.1)
+    trail = trail.extended(0.0, 0.0)
+    assert trail.points[-2:] == [None, (0.0, 0.0)]
+    assert len(trail.extended(0.0, SPACING / 2).points) == len(trail.points)
+
+
+@pytest.mark.parametrize('piece', [1, 2, 3, 20])
+def test_a_path_of_many_jumps_goes_on(piece):
+    """The longest that odometry can jump about; what is shown ends where the robot is."""
+    trail, renewed = Trail(), 0
+    for step in range(12 * MAX_POINTS):
+        x = 1.1 * SPACING * step + 5.0 * (step // piece)
+        before, trail = trail, trail.extended(x, 0.0)
+        renewed += trail is not before
+        assert len(trail.points) <= MAX_POINTS
+        assert trail.points[-1][0] == pytest.approx(x, abs=0.5)
+    # A new path is sent to the page as a whole.
+    assert renewed < 60
+
+
+def test_a_page_receives_only_what_is_new():
+    session = Session()
+    trail = Trail().extended(0.0, 0.0)
+    session.store(Snapshot(robots=[{'name': '/'}], trails={'/': trail}, fixed={'bag': 'x'}))
+    page = session.enter()
+    first = page.frame(session)
+    assert first['fixed'] == {'bag': 'x'}
+    assert first['paths'] == {'/': {'new': True, 'points': [(0.0, 0.0)]}}
+    assert page.frame(session) is None
+    trail.extended(1.0, 0.0, jump=2.0)
+    session.store(Snapshot(trails={'/': trail}, fixed={'bag': 'x'}))
+    session.notify('something')
+    second = page.frame(session)
+    assert 'fixed' not in second
+    assert second['paths'] == {'/': {'new': False, 'points': [(1.0, 0.0)]}}
+    assert [notice['text'] for notice in second['notices']] == ['something']
+    assert 'notices' not in (session.enter().frame(session))
+
+
+def test_commands_and_notices_are_bounded():
+    session = Session()
+    page = session.enter()
+    taken = [session.put(page, Step()) for _ in range(MAX_COMMANDS + 5)]
+    assert taken.count(False) == 5
+    assert len(session.take_commands()) == MAX_COMMANDS
+    assert session.take_commands() == []
+    for _ in range(3 * MAX_NOTICES):
+        session.notify('again')
+    assert len(session.notices_after(0)) == MAX_NOTICES
+    session.leave(page)
+    assert not session.watched
+
+
+# --- Settings
+
+
+def test_every_setting_is_a_parameter_of_its_node():
+    nodes = {'controller': GoToGoalParameters, 'robot': VirtualRobotParameters}
+    for setting in settings.offered((KP, KV, OFFSET)):
+        assert setting.name in specifications(nodes[setting.role]), setting.name
+
+
+def test_settings_that_are_shown_and_taken():
+    values = {'controller': {'kp': 3.0, 'controller': 'mine', 'linear.x.max_velocity': math.nan}}
+    rows = {row['key']: row for row in settings.shown(values, (KP, KV))}
+    assert set(rows) == {
+        'controller/kp',
+        'controller/controller',
+        'controller/linear.x.max_velocity',
+    }
+    assert rows['controller/controller']['choices'][-1] == 'mine'
+    assert rows['controller/linear.x.max_velocity']['value'] is None
+    assert settings.find('controller/kp', (KP,)).checked(2.0) == 2.0
+    assert math.isnan(settings.find('robot/max_wheel_velocity', ()).checked(None))
+    for key, value in (('controller/kp', None), ('controller/kp', 'a'), ('controller/controller', 1.0)):
+        with pytest.raises(settings.SettingError):
+            settings.find(key, (KP,)).checked(value)
+    with pytest.raises(settings.SettingError, match='there is no setting'):
+        settings.find('controller/use_sim_time', (KP,))
+
+
+# --- Files of the page
+
+
+def test_the_page_loads_nothing_from_elsewhere():
+    found = files.page_files()
+    assert {'index.html', 'main.js', 'theme.css', 'icon.svg'} <= set(found)
+    for name, (_, content) in found.items():
+        text = content.decode().replace('http://www.w3.org/2000/svg', '')
+        assert not re.search(r'https?:|//\w+\.\w|@import|url\(', text), name
+
+
+def test_modules_and_elements_that_are_used_exist():
+    texts = {name: content.decode() for name, (_, content) in files.page_files().items()}
+    ids = set(re.findall(r'id="([\w-]+)"', texts['index.html']))
+    for name, text in texts.items():
+        for used in re.findall(r"byId\('([\w-]+)'\)", text):
+            assert used in ids, (name, used)
+        for module in re.findall(r"from '\./(\w+\.js)'", text):
+            assert module in texts, (name, module)
+        if name.endswith('.js') and name != 'main.js':
+            assert any(f"'./{name}'" in other for other in texts.values()), name
+        assert text.count('\n') < 300, name
+    # The content security policy forbids inline scripts and styles.
+    assert not re.search(r'<script>|style=|onclick=', texts['index.html'])
+
+
+def test_every_control_has_a_name():
+    html = files.page_files()['index.html'][1].decode()
+    for tag in re.findall(r'<(?:button|canvas|select|input)[^>]*>[^<]*', html):
+        text = tag.split('>', 1)[1].strip()
+        labelled = 'aria-label' in tag or any(letter.isalpha() for letter in text)
+        within_label = re.search(rf'<label>[^\n]*{re.escape(tag)}', html)
+        assert labelled or within_label, tag
+
+
+def test_the_front_end_is_installed():
+    setup = (Path(__file__).parents[2] / 'setup.py').read_text()
+    assert "f'{PACKAGE}.live': ['page/*']" in setup
+
+
+def test_installed_controllers_are_looked_for_once(monkeypatch):
+    """It takes many milliseconds, and the page is served 30 times a second."""
+    looked = []
+    monkeypatch.setattr(settings, 'controller_names', lambda: looked.append(1) or ['a'])
+    settings._controllers.cache_clear()
+    for _ in range(5):
+        settings.shown({'controller': {'controller': 'a'}}, ())
+    settings._controllers.cache_clear()
+    assert len(looked) == 1
+
+
+def test_parameters_of_any_node_may_be_anything():
+    state = RobotState('/')
+    state.moved(1.0, np.array([1.0, 2.0, 0.5]), (0.3, 0.1), None)
+    state.goal.sent(np.array([[2.0, 2.0, 0.0]]), (1, 0))
+    state.goal.reported(GoalState.EXECUTING, (1, 0))
+    usual = state.shown(age=0.0, by_hand=False)
+    for value in (math.nan, math.inf, -1.0, 0.0, 1e-300, 1e300, 'x', None, True, [1.0]):
+        state.robot_values = dict.fromkeys(
+            ('wheel_radius', 'wheel_separation', 'left_wheel_name'), value
+        )
+        names = ('kp', 'kv', 'offset', 'xy_goal_tolerance', 'use_goal_heading')
+        for controller in ('go_to_goal', 'pose', 'offset_point', value):
+            state.controller_values = {**dict.fromkeys(names, value), 'controller': controller}
+            shown = state.shown(age=0.0, by_hand=False)
+            json.dumps(shown, allow_nan=False)
+            assert shown['geometry'] == usual['geometry']
+
+
+def test_a_planned_path_is_shown_with_its_errors():
+    state = RobotState('/')
+    state.goal.sent(circle_path(1.0), (1, 0))
+    state.goal.reported(GoalState.EXECUTING, (1, 0))
+    state.controller_values = {'controller': 'go_to_goal', 'path_controller': 'kanayama'}
+    for x in (0.0, 0.1):
+        state.moved(x, np.array([x, -0.05, 0.2]), (1.0, 0.0), None)
+    shown = json.loads(json.dumps(state.shown(age=0.0, by_hand=False), allow_nan=False))
+    assert (shown['law']['name'], shown['bearing_error']) == ('kanayama', None)
+    away = math.hypot(0.1, 1.05) - 1.0
+    assert shown['across'] == pytest.approx(-away, abs=1e-4)
+    passed = math.atan2(0.1, 1.05)
+    assert shown['path_heading_error'] == pytest.approx(0.2 - passed, abs=1e-4)
+    assert shown['distance'] == pytest.approx(2.0 * math.pi - passed, abs=2e-3)
+    places = np.array(shown['goal']['path'])
+    np.testing.assert_allclose(np.hypot(places[:, 0], places[:, 1] - 1.0), 1.0, atol=1e-3)
+    assert len(shown['goal']['goals']) == 1
+    state.goal.sent(np.array([[2.0, 2.0, 0.0]]), (2, 0))
+    state.goal.reported(GoalState.EXECUTING, (2, 0))
+    shown = state.shown(age=0.0, by_hand=False)
+    assert (shown['across'], shown['goal'].get('path')) == (None, None)
+    assert shown['law']['name'] == 'go_to_goal'
+
+
+def test_the_path_is_interrupted_where_a_robot_is_placed():
+    state = RobotState('/')
+    for x in (0.0, 0.02, 0.04):
+        state.moved(x, np.array([x, 0.0, 0.0]), (1.0, 0.0), None)
+    state.interrupt()
+    # One message more is from before.
+    for time, x in ((0.06, 0.06), (0.08, 0.2), (0.1, 0.22)):
+        state.moved(time, np.array([x, 0.0, 0.0]), (1.0, 0.0), None)
+    assert state.trail.points == [
+        (0.0, 0.0),
+        (0.02, 0.0),
+        (0.04, 0.0),
+        (0.06, 0.0),
+        None,
+        (0.2, 0.0),
+        (0.22, 0.0),
+    ]

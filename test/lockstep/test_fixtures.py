@@ -1,0 +1,544 @@
+"""The plugin of pytest as a user of the package has it: without any line in a conftest.py."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+import warnings
+
+import pytest
+from fork_server import forked
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+from support.inner_sessions import OPTIONS, SETTING, draw_quickly, run_inner
+
+from diffdrive_jacobian.bags import read_run
+from diffdrive_jacobian.bags.verification import verify
+from diffdrive_jacobian.faults import EncoderSteps
+from diffdrive_jacobian.testing.fixtures import MAX_LENGTH, artifact_name, name_beside_the_file
+
+PLUGIN = 'diffdrive_jacobian.testing.fixtures'
+
+
+@pytest.fixture
+def run(pytester):
+    """Run tests in this process; gives the result."""
+    return lambda tests, *options, **files: run_inner(pytester, tests, *options, **files)
+
+
+# --- The plugin
+
+
+UNRELATED = """
+import json, os, sys
+
+class Blocker:
+    wanted = []
+
+    def find_spec(self, name, *_):
+        if name.partition('.')[0] in ('rclpy', 'numpy', 'matplotlib', 'rosbags'):
+            self.wanted.append(name)
+            raise ModuleNotFoundError(f'No module named {name!r}', name=name)
+
+sys.meta_path.insert(0, Blocker())
+
+def pytest_collection_finish():
+    with open('found.json', 'w') as file:
+        json.dump({'wanted': Blocker.wanted, 'modules': [*sys.modules], 'env': dict(os.environ)}, file)
+"""
+
+
+def test_the_plugin_does_nothing_in_projects_without_ros(pytester):
+    """In a process of its own, in which neither ROS nor NumPy can be imported."""
+    pytester.makepyfile(
+        blocker=UNRELATED,
+        test_unrelated='def test_passes(): pass',
+        test_robot='def test_needs_ros(lockstep): pass',
+    )
+    command = [sys.executable, '-m', 'pytest', '-p', 'blocker', '-p', 'no:hypothesispytest', '-q']
+    command += ['-p', 'no:launch_testing']
+    before = {**os.environ, 'PYTHONPATH': os.pathsep.join(['.', os.environ.get('PYTHONPATH', '')])}
+    ended = subprocess.run(command, cwd=pytester.path, env=before, capture_output=True, text=True)
+    assert '1 passed, 1 error' in ended.stdout, ended.stdout + ended.stderr
+    assert (
+        "the fixture lockstep needs ROS 2, which cannot be imported: No module named 'rclpy'"
+        in ended.stdout
+    )
+    found = json.loads((pytester.path / 'found.json').read_text())
+    assert PLUGIN in found['modules']
+    assert found['wanted'] == []
+    ours = {name for name in found['modules'] if name.startswith('diffdrive_jacobian')}
+    parents = {'diffdrive_jacobian', 'diffdrive_jacobian.lazy', 'diffdrive_jacobian.testing'}
+    assert ours == {*parents, PLUGIN, 'diffdrive_jacobian.testing.fixtures'}
+    changed = {name for name, value in found['env'].items() if before.get(name) != value}
+    assert all(name.startswith('PYTEST_') for name in changed)
+    assert before.keys() <= found['env'].keys()
+
+
+def test_the_plugin_may_be_named_as_before(run, pytester):
+    """In a conftest.py, and on the command line: it is loaded once."""
+    pytester.makeconftest(f"pytest_plugins = ['{PLUGIN}']")
+    tests = """
+    def test_has_the_fixtures(lockstep, request):
+        assert request.config.pluginmanager.has_plugin('diffdrive_jacobian.testing.fixtures')
+    """
+    run(tests).assert_outcomes(passed=1)
+    run(tests, '-p', PLUGIN).assert_outcomes(passed=1)
+
+
+def test_the_plugin_can_be_left_out(run):
+    result = run('def test_has_none(lockstep): pass', '-p', f'no:{PLUGIN}')
+    result.assert_outcomes(errors=1)
+    result.stdout.fnmatch_lines(["*fixture 'lockstep' not found"])
+
+
+CHECKED = """
+    import os
+    from conftest import AT_START
+
+    def test_checks():
+        assert AT_START == os.environ.get('ROS_PYTHON_CHECK_FIELDS') == {expected}
+"""
+
+
+@pytest.mark.parametrize(('ini', 'expected'), [('lockstep_check_fields = true', '1'), ('', None)])
+def test_fields_are_checked_from_the_beginning_if_the_option_is_set(
+    run, pytester, monkeypatch, ini, expected
+):
+    monkeypatch.delenv('ROS_PYTHON_CHECK_FIELDS')
+    pytester.makeini(f'[pytest]\n{ini}')
+    pytester.makeconftest("import os\nAT_START = os.environ.get('ROS_PYTHON_CHECK_FIELDS')")
+    run(CHECKED.format(expected=repr(expected))).assert_outcomes(passed=1)
+    assert 'ROS_PYTHON_CHECK_FIELDS' not in os.environ
+
+
+def test_a_message_type_that_was_imported_before_its_fields_are_checked_is_reported(
+    run, pytester, monkeypatch
+):
+    monkeypatch.setattr('geometry_msgs.msg._twist.ros_python_check_fields', '')
+    # As launch_testing does: the category is left out.
+    monkeypatch.setattr(warnings, 'formatwarning', lambda message, *_, **__: f'{message}\n')
+    pytester.makeini('[pytest]\nlockstep_check_fields = true')
+    result = run('def test_passes(): pass', '-W', 'default')
+    result.assert_outcomes(passed=1, warnings=1)
+    result.stdout.fnmatch_lines(
+        [
+            '*lockstep_check_fields has no effect on message types that were '
+            'imported before, of geometry_msgs: set ROS_PYTHON_CHECK_FIELDS=1 *'
+        ]
+    )
+
+
+# --- Worlds
+
+
+WORLDS = """
+    from diffdrive_jacobian import faults
+
+    def test_two_robots(lockstep, robot_at):
+        robot_at(1.0, -2.0, 0.5, namespace='one', linear__x__max_velocity=0.2)
+        robot_at(namespace='two')
+        one, two = (lockstep.listen(Odometry, f'/{name}/odom') for name in ('one', 'two'))
+        twist = Twist()
+        twist.linear.x = 1.0
+        lockstep.publish('/one/cmd_vel', twist)
+        lockstep.run_for(0.5)
+        assert one[-2].twist.twist.linear.x == 0.2
+        x, y = one[-1].pose.pose.position.x, one[-1].pose.pose.position.y
+        assert (x - 1.0) ** 2 + (y + 2.0) ** 2 == pytest.approx(0.1 ** 2)
+        assert two[-1].pose.pose.position.x == 0.0
+
+    def test_a_robot_that_is_killed_is_made_again_where_it_was_put(lockstep, robot_at):
+        robot = robot_at(1.0)
+        lockstep.inject(faults.Kill('virtual_robot', start=1.0, duration=1.0))
+        lockstep.run_for(3.0)
+        again = lockstep.find('virtual_robot')
+        assert again is not robot
+        assert again.pose.tolist() == [1.0, 0.0, 0.0]
+
+    @pytest.mark.parametrize('turn', range(3))
+    def test_begins_anew(lockstep, robot_at, turn):
+        assert lockstep.elapsed == 0.0
+        robot_at()
+        lockstep.run_for(1.0)
+
+    @pytest.mark.lockstep(start=7.0, patience=1.0, args=['--ros-args', '-r', '__ns:=/a'])
+    def test_is_made_as_marked(lockstep, robot_at):
+        assert lockstep.now == 7_000_000_000
+        assert robot_at().get_namespace() == '/a'
+
+    def test_marks_do_not_last(lockstep):
+        assert lockstep.now == 1_000_000_000
+
+    @pytest.mark.lockstep(3)
+    def test_has_a_mark_without_a_name(lockstep):
+        pass
+
+    def test_asks_for_an_unknown_parameter(robot_at):
+        robot_at(colour='red')
+"""
+
+
+def test_each_test_has_a_world_and_robots_of_its_own(run):
+    result = run(WORLDS)
+    result.assert_outcomes(passed=7, failed=1, errors=1)
+    result.stdout.fnmatch_lines(
+        [
+            '*TypeError: the marker lockstep takes keyword arguments only, as Lockstep does, got (3,)',
+            "*TypeError: virtual_robot has no parameter 'colour'; it has *",
+        ]
+    )
+
+
+def test_a_robot_has_its_pose_by_odometry_and_its_true_one(lockstep, robot_at):
+    robot = robot_at(1.0, 2.0, 0.5, simulate_slip=True, slip_seed=3)
+    assert robot.pose.tolist() == robot.truth.tolist() == [1.0, 2.0, 0.5]
+    odom = lockstep.listen(Odometry, 'odom')
+    command = Twist()
+    command.linear.x = 1.0
+    lockstep.publish('cmd_vel', command)
+    lockstep.run_for(0.4)
+    position = odom[-1].pose.pose.position
+    assert robot.pose[:2].tolist() == [position.x, position.y]
+    assert robot.pose == pytest.approx([1.0 + 0.4 * math.cos(0.5), 2.0 + 0.4 * math.sin(0.5), 0.5])
+    assert math.dist(robot.pose[:2], robot.truth[:2]) > 1e-4
+    # Between two messages, too.
+    lockstep.run_for(0.01)
+    assert math.dist(robot.pose[:2], (1.0, 2.0)) == pytest.approx(0.41)
+    # They are copies.
+    robot.pose[:] = robot.truth[:] = 0.0
+    assert math.dist(robot.pose[:2], (1.0, 2.0)) == pytest.approx(0.41)
+
+
+def test_the_pose_of_a_robot_is_that_of_its_encoders(lockstep, robot_at):
+    robot = robot_at()
+    lockstep.inject(EncoderSteps(per_revolution=10))
+    odom = lockstep.listen(Odometry, 'odom')
+    command = Twist()
+    command.linear.x = 0.123
+    lockstep.publish('cmd_vel', command)
+    lockstep.run_for(0.4)
+    assert robot.pose[0] == odom[-1].pose.pose.position.x != robot.truth[0]
+    assert abs(robot.pose[0] - robot.truth[0]) < 0.03
+    # Read, and not changed by that.
+    assert robot.pose.tolist() == robot.pose.tolist()
+
+
+@pytest.mark.parametrize('capture', ['fd', 'sys', 'no'])
+def test_runs_whatever_pytest_captures(run, capture):
+    run(
+        """
+    def test_drives(lockstep, robot_at, capsys):
+        robot_at()
+        lockstep.run_for(0.1)
+    """,
+        f'--capture={capture}',
+    ).assert_outcomes(passed=1)
+
+
+def test_parallel_worlds_do_not_hear_each_other(pytester):
+    """Two processes at once, on one domain, with one topic, and with the plugin in a conftest.py."""
+    tests = """
+    import os, pathlib, time
+
+    def test_hears_only_itself(lockstep, robot_at):
+        robot_at()
+        odom = lockstep.listen(Odometry, 'odom')
+        twist = Twist()
+        twist.linear.x = float(os.environ['SPEED'])
+        me, other = (pathlib.Path(os.environ[name]) for name in ('ME', 'OTHER'))
+        me.touch()
+        met, begun = 0, time.monotonic()
+        while met < 50 and time.monotonic() - begun < 30.0:
+            lockstep.publish('cmd_vel', twist)
+            lockstep.run_for(0.1)
+            met += other.exists()
+        assert met == 50
+        assert odom[-1].pose.pose.position.x == pytest.approx(lockstep.elapsed * twist.linear.x)
+        assert len(odom) == round(50 * lockstep.elapsed)
+    """
+    pytester.makeconftest(f"pytest_plugins = ['{PLUGIN}']")
+    pytester.makepyfile(SETTING + tests)
+    session = 'import sys, pytest; sys.exit(pytest.main(sys.argv[1:]))'
+    processes = []
+    for me, other, speed in (('a', 'b', '1.0'), ('b', 'a', '-1.0')):
+        environment = {**os.environ, 'SPEED': speed, 'ME': me, 'OTHER': other}
+        environment.pop('ROS_AUTOMATIC_DISCOVERY_RANGE')
+        processes.append(forked.Popen(session, ['-q', *OPTIONS], cwd=pytester.path, env=environment))
+    assert [process.wait(timeout=60) for process in processes] == [0, 0]
+
+
+# --- Reports
+
+
+FAILURES = """
+    def test_fails(lockstep, robot_at):
+        robot_at()
+        lockstep.publish('cmd_vel', Twist())
+        assert False
+
+    def test_waits_in_vain(lockstep, robot_at):
+        robot_at()
+        lockstep.run_until(lambda: False, timeout=1.0, what='the end of the world')
+
+    def test_passes(lockstep, robot_at):
+        robot_at()
+
+    def test_raises(lockstep):
+        def on_tick():
+            raise KeyError('no such wheel')
+        lockstep.node.create_timer(0.1, on_tick)
+        lockstep.run_for(1.0)
+
+    @pytest.fixture
+    def driving(lockstep, robot_at, recorded_run):
+        robot_at(namespace='driving')
+        lockstep.publish('/driving/cmd_vel', Twist())
+        assert False
+
+    def test_is_not_set_up(driving):
+        pass
+"""
+
+
+def test_a_failure_reports_the_last_messages_once(run, monkeypatch):
+    draw_quickly(monkeypatch)
+    result = run(FAILURES)
+    result.assert_outcomes(failed=3, passed=1, errors=1)
+    text = result.stdout.str()
+    assert text.count('  /cmd_vel: 1 from /lockstep, last at 1 s: Twist()') == 1
+    assert text.count('  /driving/cmd_vel: 1 from /lockstep, last at 1 s: Twist()') == 1
+    assert 'not within 1 s of simulated time: the end of the world' in text
+    assert text.count('- lockstep -') == 3
+    assert text.count('- recorded run -') == 1
+    result.stdout.fnmatch_lines(["*raise KeyError('no such wheel')", "E * KeyError: 'no such wheel'"])
+
+
+REQUIRED = """
+    from dataclasses import dataclass
+    from diffdrive_jacobian import properties
+    from diffdrive_jacobian.testing import PropertyViolation
+
+    @dataclass(frozen=True, repr=False)
+    class Ends(properties.Property):
+        def watch(self, world):
+            watch = properties.Watch(world)
+            watch.finish = lambda: 'it never ends'
+            return watch
+
+    def test_ends(lockstep, robot_at, recorded_run):
+        robot_at()
+        lockstep.require(Ends())
+        lockstep.run_for(0.1)
+
+    def test_is_finished_by_hand(lockstep):
+        lockstep.require(Ends())
+        with pytest.raises(PropertyViolation, match='it never ends'):
+            lockstep.finish()
+
+    def test_is_closed_by_hand(lockstep):
+        lockstep.require(Ends())
+        lockstep.close()
+
+    def test_fails(lockstep):
+        lockstep.require(Ends())
+        assert 1 == 2
+"""
+
+
+def test_required_properties_are_checked_when_a_test_has_passed(run, monkeypatch):
+    draw_quickly(monkeypatch)
+    # Without the summary, which repeats whole messages where the variable CI is set.
+    result = run(REQUIRED, '-rN')
+    result.assert_outcomes(failed=2, passed=2)
+    text = result.stdout.str()
+    assert text.count('Ends() is violated at 0.1 s: it never ends\nlast messages, at 1.1 s of the ') == 1
+    # Once, as part of the violation; and of the other test.
+    assert text.count('- lockstep -') == 1
+    assert text.count('- recorded run -') == 1
+    assert 'During handling' not in text
+    assert 'E       assert 1 == 2' in text
+
+
+def test_no_hook_raises(run):
+    result = run("""
+    import pytest
+
+    def broken():
+        raise KeyError('of a bug')
+
+    def timed_out():
+        pytest.fail('Timeout')
+
+    def test_fails(lockstep, recorded_run, monkeypatch):
+        monkeypatch.setattr(lockstep, 'report', broken)
+        monkeypatch.setattr(recorded_run, 'keep', broken)
+        assert False
+
+    def test_fails_while_a_plugin_stops_it(lockstep, recorded_run, monkeypatch):
+        monkeypatch.setattr(recorded_run, 'keep', timed_out)
+        assert False
+
+    def test_of_the_same_session(lockstep):
+        pass
+    """)
+    result.assert_outcomes(failed=2, passed=1)
+    text = result.stdout.str()
+    assert text.count("not available: KeyError: 'of a bug'") == 2
+    assert 'INTERNALERROR' not in text
+
+
+# --- Recordings
+
+
+RECORDED = """
+    from support.inner_sessions import draw_quickly
+
+    @pytest.mark.parametrize('speed', [0.5])
+    def test_fails(lockstep, robot_at, recorded_run, speed):
+        robot_at()
+        twist = Twist()
+        twist.linear.x = speed
+        lockstep.publish('cmd_vel', twist)
+        lockstep.run_for(1.0)
+        assert False
+
+    def test_passes(lockstep, robot_at, recorded_run):
+        robot_at()
+        lockstep.run_for(1.0)
+
+    def test_kept_by_hand(lockstep, robot_at, recorded_run, monkeypatch):
+        draw_quickly(monkeypatch)
+        robot_at()
+        lockstep.run_for(1.0)
+        first = recorded_run.keep()
+        lockstep.run_for(1.0)
+        assert recorded_run.keep() == first
+        assert False, first
+
+    def test_finished_by_hand(lockstep, robot_at, recorded_run):
+        robot_at()
+        assert recorded_run.finish() == recorded_run.bag
+        assert recorded_run.bag.is_dir()
+"""
+
+
+def test_run_of_a_failed_test_is_kept_and_of_others_is_not(run, pytester):
+    result = run(RECORDED, '--basetemp=kept')
+    result.assert_outcomes(failed=2, passed=2)
+    folders = sorted(path.name for path in (pytester.path / 'kept').iterdir() if 'test_' in path.name)
+    assert folders == ['test_0.test_fails-0.5', 'test_0.test_kept_by_hand']
+    failed, by_hand = (pytester.path / 'kept' / name / 'run' for name in folders)
+    run_of_it = read_run(failed)
+    assert len(run_of_it.odometry) >= 50
+    assert verify(run_of_it).holds(1e-9, 1e-9)
+    # Kept once, and not after that.
+    assert len(read_run(by_hand).odometry) == 51
+    text = result.stdout.str()
+    assert failed.with_suffix('.png').read_bytes().startswith(b'\x89PNG')
+    for bag in (failed, by_hand):
+        assert f'\n{bag}\n{bag}.png\n' in text
+        assert sorted(path.name for path in bag.parent.iterdir()) == ['run', 'run.png']
+
+
+FAILS_OR_PASSES = """
+    import os
+
+    def test_drives(lockstep, robot_at, recorded_run):
+        robot_at()
+        lockstep.run_for(0.1)
+        assert 'FAIL' not in os.environ
+"""
+
+
+def test_recordings_go_to_the_directory_of_the_option_and_replace_those_of_before(pytester, monkeypatch):
+    draw_quickly(monkeypatch)
+    pytester.makeini('[pytest]\nlockstep_artifacts = artifacts')
+    pytester.makepyfile(SETTING + FAILS_OR_PASSES)
+    (inner,) = pytester.path.glob('test_*.py')
+    place = pytester.path / 'artifacts' / f'{inner.stem}.test_drives'
+    monkeypatch.setenv('FAIL', '1')
+    for _ in range(2):
+        pytester.runpytest_inprocess(*OPTIONS).assert_outcomes(failed=1)
+        assert sorted(path.name for path in place.iterdir()) == ['run', 'run.png']
+        # As a test leaves it that was killed.
+        (place / 'run.journal.mcap').touch()
+    monkeypatch.delenv('FAIL')
+    pytester.runpytest_inprocess(*OPTIONS).assert_outcomes(passed=1)
+    assert not place.exists()
+    monkeypatch.setenv('FAIL', '1')
+    pytester.runpytest_inprocess(*OPTIONS, '--lockstep-artifacts=others').assert_outcomes(failed=1)
+    assert (pytester.path / 'others' / place.name / 'run' / 'metadata.yaml').exists()
+    # Never anything that is not ours.
+    (place / 'run').mkdir(parents=True)
+    (place / 'run' / 'notes.txt').touch()
+    result = pytester.runpytest_inprocess(*OPTIONS)
+    result.assert_outcomes(errors=1)
+    result.stdout.fnmatch_lines(['*FileExistsError: *run exists already and is not a bag*'])
+    assert (place / 'run' / 'notes.txt').exists()
+
+
+def test_a_session_in_this_process_loads_no_c_extension_again(pytester):
+    """Those of pybind11 raise ImportError when they are loaded twice."""
+    passes = 'import contourpy\ndef test_passes(): assert contourpy.FillType'
+    for _ in range(2):
+        run_inner(pytester, passes).assert_outcomes(passed=1)
+
+
+def test_artifacts_have_the_names_of_the_tests():
+    name = artifact_name
+    assert name('test_drive.py::test_stops') == 'test_drive.test_stops'
+    assert (
+        name('tests/sim/test_a.py::TestArm::test_b[0.5-left]')
+        == 'tests.sim.test_a.TestArm.test_b-0.5-left'
+    )
+    assert name_beside_the_file('tests/test_a.py::test_b[x/y]').startswith('test_a.test_b-x_y-')
+    assert name_beside_the_file('tests/test_a.py::test_b[y]') == 'test_a.test_b-y'
+    awkward = [
+        *('a.py::t[x/y]', 'a.py::t[x_y]', 'a.py::t[x y]', 'a.py::t[]', 'a.py::t[..]', 'a.py::t[\\x00é]'),
+        *(f'a.py::t[{"x" * 300}]', f'a.py::t[{"x" * 301}]', '../a.py::t', 'a.py::t[x:"<>|*?\r\n]'),
+    ]
+    names = [name(one) for one in awkward]
+    assert len({*names}) == len(names)
+    for one in names:
+        assert len(one) <= MAX_LENGTH
+        assert one == one.strip('.') or one.endswith('..')
+        assert not set(one) - set('abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_.+-')
+
+
+FULL_DISK = """
+    import errno, os
+    from diffdrive_jacobian.bags.journal import JournalWriter
+    from diffdrive_jacobian.recording.recording import RecordingError
+
+    @pytest.fixture
+    def full_disk(lockstep, recorded_run, monkeypatch):
+        def write(*_):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        monkeypatch.setattr(JournalWriter, 'flush', write)
+
+    def test_fails(lockstep, robot_at, recorded_run, full_disk):
+        robot_at()
+        lockstep.run_for(1.0)
+        assert False
+
+    def test_keeps(lockstep, robot_at, recorded_run, full_disk):
+        robot_at()
+        lockstep.run_for(1.0)
+        with pytest.raises(RecordingError, match='No space left on device'):
+            recorded_run.keep()
+        with pytest.raises(RecordingError, match='No space left on device'):
+            recorded_run.keep()
+"""
+
+
+def test_a_recording_on_a_full_disk_is_reported_and_the_session_goes_on(run, monkeypatch):
+    draw_quickly(monkeypatch)
+    result = run(FULL_DISK)
+    result.assert_outcomes(failed=1, passed=1)
+    text = result.stdout.str()
+    assert 'the recording was aborted: No space left on device' in text
+    assert 'INTERNALERROR' not in text

@@ -1,0 +1,315 @@
+"""What messages can make the nodes log, and how much of a message they quote or convert."""
+
+from __future__ import annotations
+
+import re
+import struct
+
+import pytest
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import TwistStamped
+from nav_msgs.msg import Goals
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+from support.lockstep_nodes import ABORTED, ACCEPTED, CANCELED, EXECUTING, Controller, change
+from support.ros_messages import (
+    goal,
+    goals,
+    joint_command,
+    odometry,
+    placement,
+    stamp,
+    twist,
+    twist_stamped,
+)
+
+from diffdrive_jacobian.messages import conversion as messages
+from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS, MessageError
+from diffdrive_jacobian.nodes import go_to_goal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.parameters.declaration import ParameterError
+from diffdrive_jacobian.parameters.nodes import GoToGoalParameters
+from diffdrive_jacobian.ros import node, serialization
+from diffdrive_jacobian.ros.rate_limit import TokenBucket
+
+MEGABYTE = 1_000_000 * 'f'
+FLOOD = 200
+MOST_LINES = 40
+"""More than EVENT_BURST lines, and what EVENT_PERIOD adds on a slow machine."""
+
+
+@pytest.fixture
+def controller(lockstep):
+    return Controller(lockstep)
+
+
+def lines(capfd, text):
+    return [line for line in capfd.readouterr().err.splitlines() if text in line]
+
+
+def test_a_token_bucket_permits_a_burst_and_then_a_rate():
+    limit = TokenBucket(3, 0.5)
+    assert [limit.permits(10.0) for _ in range(5)] == [True, True, True, False, False]
+    assert [limit.permits(10.25), limit.permits(10.5), limit.permits(10.5)] == [False, True, False]
+    assert [limit.permits(99.0) for _ in range(4)] == [True, True, True, False]
+
+
+@pytest.mark.parametrize(
+    ('flood', 'words', 'statuses'),
+    [
+        (lambda number: goal(1, 0, stamp=number), 'goal accepted: ', (ACCEPTED, CANCELED)),
+        (lambda number: goal(9e9, 0, stamp=number), 'goal refused: ', (ABORTED,)),
+        (lambda number: goals(stamp=number), 'goal refused: ', (ABORTED,)),
+    ],
+    ids=['accepted', 'refused', 'refused goals'],
+)
+def test_flood_of_goals_has_a_status_each_and_a_few_log_lines(controller, capfd, flood, words, statuses):
+    for number in range(1, FLOOD):
+        controller.send(flood(number))
+    assert node.EVENT_BURST <= len(lines(capfd, words)) <= MOST_LINES
+    for number in range(1, FLOOD - 1):
+        assert [status for stamp, status in controller.statuses if stamp == number] == list(statuses)
+
+
+def test_each_goal_of_a_person_is_logged(controller, capfd):
+    for number in range(1, node.EVENT_BURST + 1):
+        controller.send(goal(number, 0))
+        controller.sees(odometry(number, 0, 0))
+    written = capfd.readouterr().err
+    assert len(re.findall('goal accepted', written)) == node.EVENT_BURST
+    assert len(re.findall('goal reached', written)) == node.EVENT_BURST
+
+
+def test_cancelled_and_waiting_goals_are_logged_a_few_times(lockstep, controller, capfd):
+    change(controller.node, odom_timeout=0.001)
+    for _ in range(FLOOD):
+        controller.send(goal(1, 0))
+        lockstep.run_for(0.002)
+        assert lockstep.call(Trigger, 'cancel_goal').success
+    written = capfd.readouterr().err
+    for words in ('goal accepted', 'the goal waits for odometry', 'goal canceled'):
+        assert node.EVENT_BURST <= written.count(words) <= MOST_LINES
+
+
+def test_odometry_that_comes_and_goes_is_logged_a_few_times(lockstep, controller, capfd):
+    change(controller.node, odom_timeout=0.001)
+    controller.send(goal(1, 0))
+    for _ in range(FLOOD):
+        controller.sees(odometry(0, 0, 0))
+        lockstep.run_for(0.002)
+    written = capfd.readouterr().err
+    for words in ('no valid odometry', 'odometry is received again'):
+        assert node.EVENT_BURST <= written.count(words) <= MOST_LINES
+
+
+def test_changes_of_parameters_are_warned_about_a_few_times(controller, capfd):
+    for number in range(FLOOD):
+        change(controller.node, kp=0.1 + 0.001 * number, linear__x__max_velocity=0.0)
+    written = capfd.readouterr().err
+    for words in ('is not larger than kv', 'linear.x.max_velocity is 0'):
+        assert node.EVENT_BURST <= written.count(words) <= MOST_LINES
+
+
+def test_placements_and_jumps_of_time_are_logged_a_few_times(lockstep, add, capfd):
+    add(VirtualRobot)
+    for number in range(FLOOD):
+        lockstep.publish('initialpose', placement(number))
+    assert node.EVENT_BURST <= len(lines(capfd, 'pose set to')) <= MOST_LINES
+    lockstep.run_for(1.0)
+    for _ in range(FLOOD):
+        lockstep.jump(-0.001)
+    assert node.EVENT_BURST <= len(lines(capfd, 'time went back')) <= MOST_LINES
+
+
+def test_silence_of_commands_is_logged_a_few_times(lockstep, add, capfd):
+    add(WheelBridge, cmd_vel_timeout=0.001)
+    for _ in range(FLOOD):
+        lockstep.publish('cmd_vel', twist(1, 0))
+        lockstep.run_for(0.002)
+    assert node.EVENT_BURST <= len(lines(capfd, 'the wheels are stopped')) <= MOST_LINES
+
+
+# --- Quoted text
+
+
+@pytest.mark.parametrize('text', [MEGABYTE, 5_000 * '\x1b[31m', 5_000 * '\n', 5_000 * '\u202e'])
+def test_long_frames_are_quoted_in_short(lockstep, controller, capfd, text):
+    lockstep.add(VirtualRobot())
+    controller.sees(odometry(0, 0, 0, frame=text))
+    controller.send(goal(1, 0, frame=text[1:]))
+    controller.send(goals(goal(1, 0, frame=text), goal(1, 0, frame='b'), frame=text[1:]))
+    controller.send(goals(*(goal(1, 0, frame=f'{number}{text}') for number in range(9))))
+    controller.send(goal(1, 0))
+    controller.sees(odometry(0, 0, 0, frame=text))
+    controller.sees(odometry(0, 0, 0, frame='other'))
+    controller.sees(odometry(0, 0, 0, frame=text[1:]))
+    lockstep.publish('initialpose', placement(0, frame=text))
+    written = capfd.readouterr().err
+    for words in (
+        'in the frame of the',
+        'in one frame, got',
+        'it must stay in frame',
+        'its frame must be',
+    ):
+        assert words in written
+    assert max(map(len, written.splitlines())) < 600
+    assert '\x1b' not in written
+    assert '\u202e' not in written
+
+
+def test_long_and_many_joint_names_are_quoted_in_short(lockstep, add, capfd):
+    add(VirtualRobot, command_interface='wheels')
+    names = [MEGABYTE, *(f'joint {number}' for number in range(10_000))]
+    lockstep.publish('joint_command', JointState(name=names, velocity=[0.0] * len(names)))
+    (line,) = lines(capfd, 'command dropped')
+    assert "must name each of ['left_wheel_joint', 'right_wheel_joint'] once" in line
+    assert line.endswith("'joint 2', ... (10001 in all)]")
+    assert len(line) < 500
+
+
+@pytest.mark.parametrize('name', ['odom_frame_id', 'base_frame_id', 'left_wheel_name'])
+def test_long_strings_are_refused_as_parameters(lockstep, add_complete, name):
+    robot = add_complete(VirtualRobot)
+    value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=10 * MEGABYTE)
+    request = SetParameters.Request(parameters=[ParameterMessage(name=name, value=value)])
+    (result,) = lockstep.call(SetParameters, 'virtual_robot/set_parameters', request).results
+    assert not result.successful
+    assert f"'{name}' must be not empty and at most 256 characters, got 'fff" in result.reason
+    assert result.reason.endswith("...' (10000000 characters)")
+    assert len(result.reason) < 300
+    assert change(robot, **{name: 256 * 'n'}).successful
+    assert not change(robot, **{name: 257 * 'n'}).successful
+
+
+def test_choices_that_are_too_long_are_quoted_in_short():
+    with pytest.raises(ParameterError, match=r"got 'fff.*\.\.\.' \(1000000 characters\)") as caught:
+        GoToGoalParameters(controller=MEGABYTE)
+    assert len(str(caught.value)) < 300
+    with pytest.raises(ParameterError) as caught:
+        GoToGoalParameters(kp=MEGABYTE)
+    assert len(str(caught.value)) < 300
+
+
+# --- Long goals
+
+
+def test_goals_with_too_many_poses_are_refused_unread(controller, monkeypatch, capfd):
+    controller.send(goal(1, 0, stamp=1))
+    controller.at(0, 0)
+    message = goals(*[goal(1, 0)] * (MAX_WAYPOINTS + 1), stamp=2)
+    with monkeypatch.context() as patched:
+        patched.setattr(go_to_goal, '_read_goals', None)
+        controller.send(message)
+    words = f'goals must contain at most {MAX_WAYPOINTS} poses, got {MAX_WAYPOINTS + 1}'
+    assert words in capfd.readouterr().err
+    assert controller.statuses[-2:] == [(2, ABORTED), (1, EXECUTING)]
+    message.goals.pop()
+    controller.send(message)
+    assert controller.statuses[-2:] == [(1, CANCELED), (2, ACCEPTED)]
+
+
+@pytest.mark.parametrize('frame', ['', 'a', 'abc', 'abcd', 'äöü', 'a longer frame'])
+@pytest.mark.parametrize('count', [0, 1, 3])
+def test_header_of_goals_is_read_without_the_poses(frame, count):
+    message = goals(*[goal(1, 0, frame='x')] * count, frame=frame)
+    message.header.stamp = stamp(-5_000_000_123)
+    assert serialization.poses_header(serialize_message(message), Goals) == (message.header.stamp, count)
+
+
+def big_endian_goals(count):
+    """Serialize that many poses of zeros, without frames, in an encapsulation that only rclpy reads."""
+    header = struct.pack('>iII', 2, 0, 1) + bytes(4)
+    return b'\0\2\0\0' + header + struct.pack('>I', count) + bytes(72 * count)
+
+
+def test_long_goals_in_another_byte_order_are_not_converted(lockstep, monkeypatch, capfd):
+    assert serialization.poses_header(big_endian_goals(10), Goals) == (Time(sec=2), 10)
+    controller = Controller(lockstep)
+    publisher = lockstep.node.create_publisher(Goals, 'goals', 10)
+    with monkeypatch.context() as patched:
+        patched.setattr(serialization, '_read_header', None)
+        publisher.publish(big_endian_goals(MAX_WAYPOINTS + 1000))
+        lockstep.settle()
+    assert 'goals dropped: a Goals message must have at most 200000 bytes' in capfd.readouterr().err
+    assert controller.statuses == []
+
+
+@pytest.mark.parametrize('length', range(24))
+def test_goals_that_are_cut_off_are_no_goals(length):
+    data = serialize_message(goals(goal(1, 0)))[:length]
+    with pytest.raises(MessageError, match='it is not a Goals message'):
+        serialization.poses_header(data, Goals)
+
+
+@pytest.mark.parametrize(
+    'data',
+    [
+        b'',
+        b'\0\1\0\0',
+        b'\xff' * 64,
+        serialize_message(goals(goal(1, 0), goal(2, 0)))[:-50],
+        serialize_message(goals())[:-4] + b'\x05\0\0\0',
+    ],
+    ids=['empty', 'encapsulation', 'ones', 'cut off', 'poses missing'],
+)
+def test_bytes_that_are_no_goals_are_dropped(lockstep, controller, data):
+    publisher = lockstep.node.create_publisher(Goals, 'goals', 10)
+    lockstep.settle()
+    publisher.publish(data)
+    lockstep.settle()
+    controller.send(goal(1, 0, stamp=3))
+    assert controller.at(0, 0) == (0.5, 0.0)
+    assert controller.statuses[-1] == (3, EXECUTING)
+
+
+# --- Stamps that cannot be
+
+
+@pytest.mark.parametrize('sec', [-1, -5, -(2**31)])
+@pytest.mark.parametrize('nanosec', [0, 999_999_999, 1_000_000_000, 2**32 - 1])
+def test_stamps_before_time_began_are_invalid(sec, nanosec):
+    with pytest.raises(MessageError, match=f'got sec {sec}, nanosec {nanosec}'):
+        messages.from_time(sec, nanosec)
+
+
+@pytest.mark.parametrize(
+    ('node_class', 'parameters', 'topic', 'answers', 'message'),
+    [
+        (
+            VirtualRobot,
+            {'command_interface': 'wheels'},
+            'joint_command',
+            (TwistStamped, 'cmd_vel_out'),
+            joint_command(10.0, 10.0),
+        ),
+        (
+            VirtualRobot,
+            {'enable_stamped_cmd_vel': True},
+            'cmd_vel',
+            (TwistStamped, 'cmd_vel_out'),
+            twist_stamped(1.0, 0.0, 0),
+        ),
+        (
+            WheelBridge,
+            {'enable_stamped_cmd_vel': True},
+            'cmd_vel',
+            (JointState, 'joint_command'),
+            twist_stamped(1.0, 0.0, 0),
+        ),
+    ],
+)
+def test_negative_stamp_is_not_taken_for_none(
+    lockstep, add, capfd, node_class, parameters, topic, answers, message
+):
+    answered = lockstep.listen(*answers)
+    add(node_class, **parameters)
+    # Together they are zero, which would mean that the command has no stamp.
+    message.header.stamp.sec, message.header.stamp.nanosec = -1, 1_000_000_000
+    lockstep.publish(topic, message)
+    assert answered == []
+    assert 'command dropped: its stamp must have sec of at least 0' in capfd.readouterr().err

@@ -1,0 +1,251 @@
+"""Paths that are driven: by drive_to, by send_path, and how their runs are read, tabulated and drawn."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+import signal
+
+import numpy as np
+import pytest
+from nav_msgs.msg import Path as PathMessage
+from support.bags import status
+from support.processes import Drive, open_world
+from support.ros_messages import goal, odometry, path, receive
+from support.runs import STRAIGHT, run_of
+
+from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.bags.timeline import timeline
+from diffdrive_jacobian.control import Path, circle_path, line_path, planned_path
+from diffdrive_jacobian.drives import drive, in_lockstep
+from diffdrive_jacobian.messages.goal_status import GoalState
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.goal_client import GoalClient
+from diffdrive_jacobian.nodes.remote_goal import Result, send_path
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.plots.run_figure import figure
+from diffdrive_jacobian.plots.run_table import write_csv
+from diffdrive_jacobian.recording.record import open_recording
+from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.tools.drive_to import main
+
+TAKES_TIME = {'linear.x.max_acceleration': 0.3, 'wheel_lag': 0.2, 'command_delay': 0.2}
+
+
+@pytest.mark.parametrize('robot', [TAKES_TIME, {'command_delay': 0.5}])
+@pytest.mark.parametrize('planned', [line_path(1.0), circle_path(0.5)])
+def test_a_robot_that_takes_time_stops_at_the_end(planned, robot):
+    known = {**robot, 'stop_in_time': True}
+    outcome = drive(planned, lockstep=True, parameters=known, robot_parameters=robot)
+    assert outcome.arrived
+    assert not outcome.moving
+    assert outcome.distance < 0.021
+    assert drive(planned, lockstep=True, robot_parameters=robot).distance > 0.04
+
+
+def test_a_robot_that_still_moves_is_not_said_to_have_stopped(capsys):
+    arguments = ['0.5', '0', '--lockstep', '--no-record', '--command-delay', '1', '--wheel-lag', '5']
+    assert main(arguments, Signals()) == 0
+    out = capsys.readouterr().out
+    assert 'arrived: the robot still moved at x' in out
+    assert 'the robot rolled out of the tolerance of 0.02 m' in out
+
+
+@pytest.mark.parametrize('law', ['pure_pursuit', 'kanayama', 'offset_point', 'dynamic_feedback'])
+def test_a_path_that_turns_back_is_driven_to_its_end(law):
+    there_and_back = Path(np.array([(0.0, 0.0), (0.5, 0.0), (1.0, 0.0), (0.5, 0.0), (0.0, 0.0)]))
+    outcome = drive(there_and_back, lockstep=True, timeout=60.0, parameters={'path_controller': law})
+    assert outcome.arrived
+    assert outcome.seconds > 9.0
+
+
+def test_drive_to_drives_along_a_circle_without_stopping(tmp_path, capsys):
+    bag = tmp_path / 'circle'
+    arguments = ['--path', 'circle:1.0', '--speed', '0.4', '--lockstep', '-o', str(bag), '--no-plot']
+    assert main(arguments, Signals()) == 0
+    assert 'm from the end of the path, after at most 0.00' in capsys.readouterr().out
+    one = timeline(read_run(bag))
+    ((planned,), series) = one.paths, one.run.odometry.values
+    assert planned.length == pytest.approx(2.0 * math.pi)
+    on_path = one.progress > 1.0
+    assert on_path.sum() > 500
+    speeds = series[on_path & (one.progress < 6.0), 3]
+    assert speeds == pytest.approx(np.full(len(speeds), 0.4))
+    assert abs(one.across[on_path]).max() < 0.01
+    assert abs(one.path_heading_error[on_path]).max() < 0.02
+    assert np.isnan(one.along).all()
+    assert (one.path >= 0).sum() == np.isfinite(one.across).sum() > 700
+    # Until the robot has arrived.
+    assert one.path[-1] == -1
+    assert one.progress[one.path >= 0][-1] == pytest.approx(planned.length, abs=0.021)
+    write_csv(one.run, tmp_path / 'run.csv')
+    with open(tmp_path / 'run.csv') as file:
+        *_, row = (row for row in csv.DictReader(file) if row['path_progress_m'])
+    assert float(row['path_progress_m']) == pytest.approx(planned.length, abs=0.021)
+    assert (row['along_path_m'], row['distance_m']) == ('', '')
+    plane, *panels = figure([one.run]).axes
+    assert [panel.get_ylabel() for panel in panels[:2]] == ['across path [m]', 'heading to path [rad]']
+    assert any(np.allclose(np.ptp(line.get_data(), axis=1), 2.0, atol=1e-3) for line in plane.lines)
+
+
+def test_the_true_distance_of_a_robot_that_drifts_is_reported(capsys):
+    arguments = ['--path', 'line:0.5', '--lockstep', '--no-record', '--ros-args', '-p']
+    assert main([*arguments, 'simulate_slip:=true'], Signals()) == 0
+    assert re.search(r'm from it by odometry, truly 0\.\d+ m from its end', capsys.readouterr().out)
+
+
+def test_a_run_of_a_table_can_be_driven_again(tmp_path):
+    """The CSV of a run is a trajectory, and the new run has errors along it."""
+    path = line_path(1.0).timed(0.25)
+    recording = open_recording('drive', str(tmp_path / 'bag'), 'mcap', lossless=True, replace=False)
+    kanayama = {'path_controller': 'kanayama'}
+    outcome = drive(path, lockstep=True, parameters=kanayama, recording=recording)
+    recording.finish()
+    assert outcome.arrived
+    assert outcome.seconds == pytest.approx(4.0, abs=0.3)
+    run = read_run(tmp_path / 'bag')
+    one = timeline(run)
+    late = one.progress > 0.5
+    assert abs(one.along[late]).max() < 0.02
+    write_csv(run, tmp_path / 'run.csv')
+    again = planned_path(str(tmp_path / 'run.csv'))
+    assert again.length == pytest.approx(1.0, abs=0.03)
+    assert again.duration == pytest.approx(np.ptp(run.odometry.stamps) / 1e9)
+
+
+def test_a_shape_begins_at_the_robot():
+    start = [f'virtual_robot:{name}:={at}' for name, at in zip('xy', (2.0, 1.0), strict=True)]
+    arguments = ['--ros-args', '-p', start[0], '-p', start[1], '-p', 'virtual_robot:theta:=1.5']
+    outcome = drive(line_path(0.5), relative=True, lockstep=True, ros_arguments=arguments)
+    assert outcome.arrived
+    assert outcome.across < 1e-6
+    expected = 2.0 + 0.5 * math.cos(1.5), 1.0 + 0.5 * math.sin(1.5)
+    assert outcome.pose[:2] == pytest.approx(expected, abs=0.021)
+
+
+def test_send_path_follows_a_path_to_its_end():
+    with in_lockstep() as runner:
+        runner.add(lambda: VirtualRobot(context=runner.context))
+        runner.add(lambda: GoToGoal(context=runner.context))
+        result = send_path(circle_path(0.3), runner=runner, relative=True)
+    assert result.arrived
+    assert result.topic == '/path'
+    assert result.across < 0.01
+    assert result.distance < 0.03
+
+
+def test_send_path_cancels_a_path_that_takes_too_long():
+    with in_lockstep() as runner:
+        runner.add(lambda: VirtualRobot(context=runner.context))
+        runner.add(lambda: GoToGoal(context=runner.context))
+        result = send_path(line_path(5.0), runner=runner, timeout=1.0)
+    assert (result.result, result.canceled) == (Result.TIMEOUT, True)
+    assert 4.0 < result.distance < 5.0
+    with pytest.raises(ValueError, match='path must have at most 10000 poses, got 20001'):
+        send_path(Path(np.column_stack([np.arange(20_001.0)] * 2)))
+
+
+def test_a_trajectory_is_sent_with_stamps_where_the_robot_is(ros):
+    def create(context, parameter_overrides):
+        return GoalClient('client', line_path(1.0).timed(0.5), context, relative=True)
+
+    client = ros.add(create, parameters=None)
+    received = ros.listen(PathMessage, 'path')
+    ros.add(GoToGoal)
+    missing = 'no odometry on /odom, where the path is to begin'
+    ros.until(lambda: client.obstacle() == missing, 'odometry is missing')
+    receive(client, '/odom', odometry(1.0, 2.0, math.pi / 2))
+    assert client.obstacle() is None
+    client.send()
+    ros.until(lambda: received, 'the path is received')
+    (message,) = received
+    last = message.poses[-1]
+    assert (last.pose.position.x, last.pose.position.y) == pytest.approx((1.0, 3.0))
+    stamps = [one.header.stamp.sec * 10**9 + one.header.stamp.nanosec for one in message.poses]
+    assert stamps[-1] - stamps[0] == 2 * 10**9
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == divmod(stamps[0], 10**9)
+    assert client.distance == pytest.approx(1.0)
+
+
+def test_a_path_that_is_refused_has_no_errors():
+    with in_lockstep() as runner:
+        runner.add(lambda: VirtualRobot(context=runner.context))
+        runner.add(lambda: GoToGoal(context=runner.context))
+        result = send_path(line_path(5.0), runner=runner, frame='map')
+    assert (result.status, result.across) == (GoalState.ABORTED, None)
+
+
+# --- Timelines
+
+
+def paths_of(run):
+    """Return when which path counts: pairs of a time (s) and a number, -1 for none."""
+    one = timeline(run)
+    changes = [0, *(np.flatnonzero(np.diff(one.path)) + 1)]
+    return [(round(float(one.time[index]), 2), int(one.path[index])) for index in changes]
+
+
+ROUTE = path((0, 0), (5, 0))
+
+
+def test_a_path_counts_until_a_goal_replaces_it(tmp_path):
+    extra = [(11.0, '/path', ROUTE), (12.0, '/goal_pose', goal(5, 0))]
+    run = run_of(tmp_path, extra, **STRAIGHT)
+    assert paths_of(run) == [(0.0, -1), (1.0, 0), (2.0, -1)]
+    assert (timeline(run).goal >= 0).sum() == 100
+
+
+@pytest.mark.parametrize('end', [4, 5, 6])
+def test_a_path_counts_until_it_has_ended(tmp_path, end):
+    extra = [
+        (11.0, '/path', ROUTE),
+        (11.0, '/goal_status', status(2)),
+        (11.99, '/goal_status', status(end)),
+    ]
+    assert paths_of(run_of(tmp_path, extra, **STRAIGHT)) == [(0.0, -1), (1.0, 0), (2.0, -1)]
+
+
+def test_a_path_that_was_refused_or_is_none_never_counts(tmp_path):
+    extra = [
+        (10.0, '/path', ROUTE),
+        (10.01, '/goal_status', status(2)),
+        (11.0, '/path', path((9, 9), stamp=7)),
+        (11.01, '/goal_status', status(6, seconds=7)),
+        (11.02, '/goal_status', status(2)),
+    ]
+    assert paths_of(run_of(tmp_path, extra, **STRAIGHT)) == [(0.0, 0)]
+    (tmp_path / 'bare').mkdir()
+    bare = run_of(tmp_path / 'bare', [(11.0, '/path', path((9, 9)))], **STRAIGHT)
+    assert paths_of(bare) == [(0.0, -1)]
+    assert len(figure([bare]).axes) > 1
+
+
+# --- Processes
+
+
+@pytest.fixture
+def world(tmp_path):
+    with open_world(tmp_path) as opened:
+        yield opened
+
+
+def test_ctrl_c_cancels_a_path(world):
+    drive = Drive(world)
+    sender = world.start('send_path', 'circle:1.0')
+    sender.until_says('m to go')
+    drive.harness.until(drive.drives, 'the robot drives')
+    sender.signal(signal.SIGINT)
+    assert sender.exit(5.0) == 130
+    assert sender.last_line == 'canceled: the robot was stopped'
+    assert 'Traceback' not in sender.stderr
+    drive.until_canceled()
+
+
+def test_send_path_drives_processes_along_a_trajectory(world):
+    Drive(world)
+    sender = world.run('send_path', 'line:0.3', '--speed', '0.3')
+    assert sender.exit() == 0
+    assert sender.last_line.startswith('arrived, 0.0')
+    assert sender.last_line.endswith('m from the path')
+    assert sender.stderr == ''

@@ -1,0 +1,206 @@
+"""The nodes on the two executors that run them in earnest, in real time: what lockstep cannot show."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+from support.lockstep_nodes import SECOND, SUCCEEDED, Topics
+from support.ros_messages import (
+    at_rest,
+    goal,
+    instants,
+    odometry,
+    pose_message,
+    pose_of,
+    twist,
+    twist_stamped,
+    twists,
+)
+
+from diffdrive_jacobian.kinematics import se2
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
+from diffdrive_jacobian.ros import node as ros_node
+
+GAINS = {'kp': 12.0, 'kv': 6.0}
+"""Quick, but such that a message that comes late does not spoil the approach."""
+
+
+def team(ros, namespace='', **gains):
+    """A robot driven by its wheels, its bridge and its controller."""
+    wheels = {'command_interface': 'wheels', 'publish_rate': 100.0}
+    ros.add(VirtualRobot, namespace=namespace, parameters=wheels)
+    ros.add(WheelBridge, namespace=namespace)
+    ros.add(GoToGoal, namespace=namespace, parameters=gains)
+
+
+# --- Both executors
+
+
+def test_golden_case_of_document_a_through_the_topics(ros, executor_kind):
+    topics, wheels = Topics(ros), ros.listen(JointState, 'joint_command')
+    team(ros)
+    ros.talk(PoseStamped, 'goal_pose').publish(goal(1.0, 1.0))
+    ros.until(lambda: topics.commands and wheels, 'the first commands')
+    v, omega = twists(topics.commands)[0]
+    assert (round(v, 3), round(omega, 3)) == (0.500, 2.356)
+    assert [round(speed, 3) for speed in wheels[0].velocity] == [9.440, 20.864]
+
+
+def test_robot_arrives_and_stands(ros, executor_kind):
+    topics = Topics(ros)
+    team(ros, **GAINS)
+    ros.talk(PoseStamped, 'goal_pose').publish(goal(1.0, 1.0))
+    ros.until(lambda: topics.statuses[-1:] == [SUCCEEDED] and at_rest(topics.odom[-1]), 'arrival')
+    assert math.dist(pose_of(topics.odom[-1])[:2], (1.0, 1.0)) <= 0.02
+    # The axle's centre goes as far as the mean wheel rolls, and a little farther than straight.
+    rolled = sum(topics.states[-1].position) / 2.0 * 0.033
+    assert math.sqrt(2.0) - 0.02 < rolled < 1.6
+
+
+def test_robot_drives_to_its_timeout_and_reports(ros, executor_kind):
+    topics = Topics(ros)
+    ros.add(VirtualRobot, parameters={'cmd_vel_timeout': 0.1, 'enable_odom_tf': False})
+    ros.talk(Twist, 'cmd_vel').publish(twist(1.0, 2.0))
+    ros.until(lambda: len(topics.applied) == 2 and at_rest(topics.odom[-1]), 'the stop')
+    begun, stopped = instants(topics.applied)
+    assert stopped - begun == SECOND // 10
+    # However late the timers came, in real time, too: the same bits.
+    assert topics.odom[-1].pose.pose == pose_message(se2.integrate([0, 0, 0], [1, 2], 0.1))
+    assert list(np.diff(instants(topics.odom)) > 0) == [True] * (len(topics.odom) - 1)
+
+
+def test_controller_stops_for_want_of_odometry(ros, executor_kind):
+    commands = ros.listen(Twist, 'cmd_vel')
+    ros.add(GoToGoal, parameters={'odom_timeout': 0.1})
+    odom = ros.talk(Odometry, 'odom')
+    ros.talk(PoseStamped, 'goal_pose').publish(goal(1.0, 0.0))
+    ros.peer.create_timer(0.02, lambda: len(commands) < 3 and odom.publish(odometry(0, 0, 0)))
+    ros.until(lambda: len(commands) == 4, 'the zero')
+    assert twists(commands) == [(0.5, 0.0)] * 3 + [(0.0, 0.0)]
+
+
+def test_bridge_stops_the_wheels_once_commands_cease(ros, executor_kind):
+    out = ros.listen(JointState, 'joint_command')
+    ros.add(WheelBridge, parameters={'cmd_vel_timeout': 0.1})
+    ros.talk(Twist, 'cmd_vel').publish(twist(0.033, 0.0))
+    ros.until(lambda: len(out) == 2, 'the stop')
+    assert [list(one.velocity) for one in out] == [[1.0, 1.0], [0.0, 0.0]]
+    first, last = instants(out)
+    assert last - first >= SECOND // 10
+
+
+def test_rate_that_keeps_changing_starves_nobody(ros, executor_kind):
+    odom = ros.listen(Odometry, 'odom')
+    robot = ros.add(VirtualRobot, parameters={'publish_rate': 20.0})
+    rates = itertools.cycle([21.0, 20.0])
+    changed = []
+    ros.peer.create_timer(
+        0.01,
+        lambda: changed.append(robot.set_parameters([Parameter('publish_rate', value=next(rates))])),
+    )
+    ros.until(lambda: len(odom) >= 10, 'odometry')
+    assert len(changed) > len(odom)
+
+
+# --- One executor
+
+
+def test_publish_rate_changes_neither_pose_nor_covariance(ros):
+    rates = {'slow': 10.0, 'usual': 50.0, 'fast': 1000.0}
+    topics = [Topics(ros, name, command=TwistStamped) for name in rates]
+    stamped = {'enable_stamped_cmd_vel': True, 'cmd_vel_timeout': 30.0}
+    robots = [
+        ros.add(VirtualRobot, namespace=name, parameters={**stamped, 'publish_rate': rate})
+        for name, rate in rates.items()
+    ]
+    talkers = [ros.talk(TwistStamped, f'{name}/cmd_vel') for name in rates]
+    random = np.random.default_rng(1)
+    due = max(robot.now() for robot in robots)
+    for index in range(20):
+        due += int(random.integers(1_000_000, 30_000_000))
+        ros.until(lambda due=due: min(robot.now() for robot in robots) >= due, 'its instant')
+        command = random.uniform(-1.0, 1.0, 2) if index < 19 else (0.0, 0.0)
+        for talker in talkers:
+            talker.publish(twist_stamped(*command, due))
+        # On a busy machine several are due at once, and more than a queue holds.
+        ros.until(
+            lambda count=index + 1: all(len(one.applied) >= count for one in topics), 'the command'
+        )
+    ros.until(
+        lambda: all(
+            one.odom and instants(one.odom)[-1] > due and at_rest(one.odom[-1]) for one in topics
+        ),
+        'all robots are at rest',
+    )
+    first, *others = topics
+    assert math.hypot(*pose_of(first.odom[-1])[:2]) > 0.001
+    for other in others:
+        assert other.applied == first.applied
+        assert other.odom[-1].pose == first.odom[-1].pose
+
+
+def test_two_robots_in_two_namespaces_do_not_disturb_each_other(ros):
+    targets = {'one': (1.0, 0.5), 'two': (-0.5, -1.0)}
+    topics = {name: Topics(ros, name) for name in targets}
+    for name in targets:
+        team(ros, name, **GAINS)
+    for name, target in targets.items():
+        ros.talk(PoseStamped, f'{name}/goal_pose').publish(goal(*target))
+    ros.until(
+        lambda: all(
+            one.statuses[-1:] == [SUCCEEDED] and at_rest(one.odom[-1]) for one in topics.values()
+        ),
+        'both arrive',
+    )
+    for name, target in targets.items():
+        assert pose_of(topics[name].odom[-1])[:2] == pytest.approx(target, abs=0.02)
+
+
+# --- A world without /clock
+
+
+def test_without_a_clock_the_robot_moves_nothing_and_that_is_said(ros, capfd, monkeypatch):
+    monkeypatch.setattr(ros_node, 'WATCH_PERIOD', 0.05)
+    topics = Topics(ros)
+    ros.add(VirtualRobot, parameters={'use_sim_time': True})
+    ros.talk(Twist, 'cmd_vel').publish(twist(1.0, 0.0))
+    ros.until_said(capfd, 'nothing came on /clock for', 'command dropped: simulated time')
+    assert not ros.call(Trigger, 'reset_odometry').success
+    assert topics.odom == topics.applied == topics.starts == []
+
+
+def test_without_a_clock_the_controller_commands_nothing(ros, capfd, monkeypatch):
+    monkeypatch.setattr(ros_node, 'WATCH_PERIOD', 0.05)
+    commands = ros.listen(Twist, 'cmd_vel')
+    ros.add(GoToGoal, parameters={'use_sim_time': True})
+    ros.talk(PoseStamped, 'goal_pose').publish(goal(1.0, 0.0))
+    odom = ros.talk(Odometry, 'odom')
+    ros.peer.create_timer(0.02, lambda: odom.publish(odometry(0, 0, 0)))
+    ros.until_said(capfd, 'goal accepted', 'goal canceled: time stands still')
+    assert set(twists(commands)) <= {(0.0, 0.0)}
+
+
+def test_without_a_clock_the_bridge_stops_the_wheels(ros, capfd, monkeypatch):
+    monkeypatch.setattr(ros_node, 'WATCH_PERIOD', 0.05)
+    out = ros.listen(JointState, 'joint_command')
+    node = ros.add(WheelBridge)
+    commands = ros.talk(Twist, 'cmd_vel')
+    commands.publish(twist(0.2, 0.0))
+    ros.until(lambda: len(out) == 1, 'wheel speeds')
+    # Switched to simulated time while the wheels turn: no timeout would ever strike.
+    assert node.set_parameters([Parameter('use_sim_time', value=True)])[0].successful
+    ros.until(lambda: len(out) == 2, 'the stop')
+    assert list(out[1].velocity) == [0.0, 0.0]
+    commands.publish(twist(0.2, 0.0))
+    ros.until_said(capfd, 'command dropped: simulated time has not started')
+    assert len(out) == 2

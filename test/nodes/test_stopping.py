@@ -1,0 +1,176 @@
+"""The node go_to_goal and robots that take time to stop: advice, a stop in time, arrival at rest."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from std_srvs.srv import Trigger
+from support.lockstep_nodes import CANCELED, SUCCEEDED, Controller, Topics, change, make
+from support.ros_messages import goal, odometry, twist
+
+from diffdrive_jacobian.control import VelocityLimits
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.stopping import overshoot_warnings, rolls_on
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.properties import AccelerationWithin
+from diffdrive_jacobian.simulation import Robot, RobotModel, closed_loops
+from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits
+from diffdrive_jacobian.simulation.actuators import Actuators
+from diffdrive_jacobian.testing import PropertyViolation
+
+SLOW = {'linear.x.max_acceleration': 0.4, 'linear.x.max_deceleration': -0.1}
+ACTUATORS = Actuators(
+    acceleration=AccelerationLimits(
+        v=AxisLimits(max_acceleration=0.4, max_deceleration=-0.1),
+        omega=AxisLimits(max_acceleration=2.0, max_deceleration=-1.0),
+    ),
+    lag=0.1,
+    delay=200_000_000,
+)
+SECOND = 1_000_000_000
+
+
+def at_speed(command, actuators=ACTUATORS):
+    """A robot that has followed a command for long."""
+    robot = Robot(model=RobotModel(actuators=actuators), stamp=0, pose=(0.0, 0.0, 0.0))
+    return robot.commanded(command, 0).at(20 * SECOND).placed((0, 0, 0), np.zeros((3, 3)), 20 * SECOND)
+
+
+@pytest.mark.parametrize('command', [(0.3, 0.0), (0.3, 1.0), (0.05, 0.9), (0.0, -0.2)])
+def test_a_robot_rolls_as_far_as_predicted(command):
+    robot = at_speed(command)
+    stopped = robot.commanded((0.0, 0.0), robot.stamp).at(40 * SECOND)
+    right, left = np.subtract(stopped.wheel_angles, robot.wheel_angles)
+    distance, turn = 0.033 * (right + left) / 2.0, 0.033 * (right - left) / 0.16
+    assert ACTUATORS.rolled(command, robot.model) == pytest.approx((distance, turn), abs=1e-9)
+
+
+@pytest.mark.parametrize('command', [(3.0, 0.0), (2.0, 3.0), (-2.0, 0.5), (0.01, 0.0), (0.0, 2.0)])
+@pytest.mark.parametrize('room', [(0.5, math.inf), (math.inf, 0.3), (0.0, math.inf), (0.5, 0.3)])
+def test_a_stoppable_twist_needs_at_most_the_room(command, room):
+    v, omega = ACTUATORS.stoppable(command, room)
+    assert v * command[1] == pytest.approx(omega * command[0])
+    needed = np.abs(ACTUATORS.rolled((v, omega)))
+    assert (needed <= np.array(room) * (1.0 + 1e-9)).all()
+    # It is the fastest one: all of the command, or all of the room.
+    assert (v, omega) == command or np.isclose(needed, room).any()
+
+
+def test_the_description_is_empty_where_nothing_is_to_be_said():
+    assert rolls_on(ACTUATORS, (0.2, 0.0)) == (
+        '; the robot rolls on for about 0.260 m and turns by 0.000 rad'
+    )
+    assert rolls_on(None, (0.2, 0.0)) == rolls_on(ACTUATORS, (0.0, 0.0)) == ''
+    assert rolls_on(Actuators(), (0.2, 0.0)) == rolls_on(ACTUATORS, (math.nan, 0.0)) == ''
+
+
+@pytest.mark.parametrize('max_v', [0.2, 0.6, 5.0])
+@pytest.mark.parametrize('kv', [0.5, 1.5])
+def test_the_advice_is_given_where_a_robot_overshoots(kv, max_v):
+    """The law `v = kv distance`, straight on, with a limit and from far away."""
+    limits = VelocityLimits(max_v=max_v, max_omega=1.0, min_omega=-1.0)
+    actuators = Actuators(
+        acceleration=AccelerationLimits(v=AxisLimits(max_acceleration=1.0, max_deceleration=-0.2))
+    )
+    advice = overshoot_warnings(kv, None, limits, actuators)
+    found = closed_loops(
+        lambda poses, goals, gain: (gain * (goals[..., 0] - poses[..., 0]), 0.0 * poses[..., 0]),
+        [0.0, 0.0, 0.0], [6.0, 0.0], kv,
+        limits=limits, actuators=actuators, duration=60.0,
+    )  # fmt: skip
+    # Up to the tolerance the robot may be fast without overshooting by more than that.
+    assert bool(advice) == (found.overshoot > 0.02)
+    assert bool(advice) == (kv * max_v > 0.4)
+
+
+def test_the_node_logs_the_advice_and_not_with_a_stop_in_time(lockstep, capfd):
+    node = lockstep.add(make(GoToGoal, **{'linear.x.max_velocity': 1.0}))
+    assert 'too fast to stop' not in capfd.readouterr().err
+    assert change(node, **SLOW).successful
+    assert 'kv 0.5 lets the robot drive too fast to stop' in capfd.readouterr().err
+    assert change(node, stop_in_time=True, kv=0.6).successful
+    assert 'too fast to stop' not in capfd.readouterr().err
+
+
+def overshoot(world, **parameters):
+    """Drive to (3, 0) with a robot that brakes slowly; return by how far it overshoots."""
+    robot = world.add(make(VirtualRobot, **SLOW))
+    world.add(make(GoToGoal, kv=1.0, **SLOW, **parameters))
+    topics = Topics(world)
+    world.run_for(0.1)
+    world.publish('goal_pose', goal(3.0, 0.0))
+    world.run_until(lambda: topics.statuses[-1:] == [SUCCEEDED], 60.0, 'arrival')
+    arrived = robot.pose[0]
+    world.run_until(lambda: not any(robot._robot_now().twist), 60.0, 'rest')
+    return max(one.pose.pose.position.x for one in topics.odom) - 3.0, arrived, robot.pose[0]
+
+
+def test_it_overshoots(lockstep):
+    beyond, arrived, at_rest = overshoot(lockstep)
+    # It passes the goal while it counts as arrived.
+    assert beyond > 0.3
+    assert abs(arrived - 3.0) <= 0.02 < abs(at_rest - 3.0)
+
+
+def test_it_stops_in_time(lockstep):
+    beyond, _, at_rest = overshoot(lockstep, stop_in_time=True)
+    assert beyond < 0.02
+    assert abs(at_rest - 3.0) < 0.025
+
+
+def test_it_arrives_at_rest(lockstep):
+    stopped = {'trans_stopped_velocity': 0.01, 'rot_stopped_velocity': 0.01}
+    _, arrived, at_rest = overshoot(lockstep, stop_in_time=True, **stopped)
+    assert max(abs(arrived - 3.0), abs(at_rest - 3.0)) < 0.021
+    assert 0.0 < abs(at_rest - arrived) <= 0.01**2 / 0.2
+
+
+def test_a_goal_is_reached_when_the_odometry_says_that_the_robot_rests(lockstep):
+    controller = Controller(lockstep, trans_stopped_velocity=0.1)
+
+    def sees(x, v):
+        message = odometry(x, 0.0, 0.0)
+        message.twist.twist.linear.x = v
+        return controller.sees(message)
+
+    controller.send(goal(1.0, 0.0))
+    assert sees(0.0, 0.5) == [(0.5, 0.0)]
+    assert sees(1.0, 0.5) == [(0.0, 0.0)]
+    # It has rolled away.
+    assert sees(0.5, 0.05) == [(0.25, 0.0)]
+    assert sees(1.0, math.nan) == [(0.0, 0.0)]
+    assert controller.node.waypoint == 0
+    assert sees(1.0, 0.1) == [(0.0, 0.0)]
+    assert controller.node.waypoint is None
+
+
+def test_canceling_says_how_far_the_robot_rolls(lockstep, capfd):
+    lockstep.add(make(VirtualRobot, **SLOW))
+    lockstep.add(make(GoToGoal, **SLOW))
+    topics = Topics(lockstep)
+    lockstep.run_for(0.1)
+    lockstep.publish('goal_pose', goal(3.0, 0.0))
+    lockstep.run_for(1.0)
+    response = lockstep.call(Trigger, 'cancel_goal')
+    v = topics.odom[-1].twist.twist.linear.x
+    assert topics.statuses[-1] == CANCELED
+    assert f'rolls on for about {v * v / 0.2:.3f} m' in response.message
+    assert 'rolls on for about' in capfd.readouterr().err
+
+
+def test_acceleration_within_tells_robots_with_and_without_limits(lockstep):
+    """The property on the odometry, whose messages come every 20 ms."""
+    lockstep.require(AccelerationWithin(0.4, 2.0, topic='odom', slack=0.03, stops=False))
+    robot = lockstep.add(
+        make(VirtualRobot, **{'linear.x.max_acceleration': 0.4, 'angular.z.max_acceleration': 2.0})
+    )
+    lockstep.publish('cmd_vel', twist(0.3, 1.0))
+    lockstep.run_for(2.0)
+    lockstep.publish('cmd_vel', twist(-0.3, 1.0))
+    lockstep.run_for(2.0)
+    assert change(robot, **{'linear.x.max_acceleration': 0.5}).successful
+    lockstep.publish('cmd_vel', twist(0.3, 1.0))
+    with pytest.raises(PropertyViolation, match=r'changes of 0\.4 m/s'):
+        lockstep.run_for(2.0)

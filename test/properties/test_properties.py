@@ -1,0 +1,321 @@
+"""Requiring properties of a run, and the limits of speed and acceleration."""
+
+from __future__ import annotations
+
+import pickle
+import re
+
+import pytest
+from documentation.pages import PAGES, blocks
+from nav_msgs.msg import Odometry
+from property_nodes import Sender, twist
+
+from diffdrive_jacobian import properties
+from diffdrive_jacobian.properties import (
+    AccelerationWithin,
+    ArrivesOnceFaultsEnd,
+    KeepsDriving,
+    NeverFasterThan,
+    NoCommandAfterCancel,
+    NoStaleGoals,
+    PoseFinite,
+    ReachesGoal,
+    Settles,
+    StatusProtocol,
+    StaysNear,
+    StaysWithin,
+    StopsAfterLastCommand,
+    StopsAfterLostOdometry,
+    StopsOnShutdown,
+)
+from diffdrive_jacobian.testing import LockstepError, PropertyViolation
+
+
+@pytest.fixture
+def send(lockstep):
+    return Sender(lockstep)
+
+
+# --- Requiring
+
+
+def test_a_violation_names_property_time_value_limit_and_what_was_before(lockstep, send):
+    lockstep.require(NeverFasterThan(0.5, 2.0))
+    send('cmd_vel', twist(0.25))
+    lockstep.run_for(1.0)
+    send('cmd_vel', twist(0.75, -1.0))
+    with pytest.raises(PropertyViolation) as raised:
+        lockstep.run_for(1.0)
+    violation = raised.value
+    assert str(violation).startswith(
+        'NeverFasterThan(0.5, 2.0) is violated at 1 s: /cmd_vel: v 0.75 m/s, omega -1 rad/s; '
+        'allowed: |v| <= 0.5 m/s, |omega| <= 2 rad/s\nbefore that:\n'
+        '  0 s: /cmd_vel: v 0.25 m/s, omega 0 rad/s'
+    )
+    assert 'last messages, at 2 s of the clock, 1 s after the start:' in str(violation)
+    assert (violation.property, violation.seconds) == (NeverFasterThan(0.5, 2.0), 1.0)
+    assert isinstance(violation, LockstepError)
+    again = pickle.loads(pickle.dumps(violation))
+    assert str(again) == str(violation)
+    assert again.property == violation.property
+
+
+def violated(lockstep, words):
+    """Return the text of the violation that a second of simulated time shows."""
+    with pytest.raises(PropertyViolation, match=words) as raised:
+        lockstep.run_for(1.0)
+    return raised.value.text
+
+
+def test_a_violation_is_raised_once_and_the_other_properties_stay(lockstep, send):
+    lockstep.require(NeverFasterThan(0.5, 2.0), NeverFasterThan(1.0, 2.0))
+    send('cmd_vel', twist(0.75))
+    with pytest.raises(PropertyViolation, match=r'^NeverFasterThan\(0.5, 2.0\)'):
+        lockstep.settle()
+    lockstep.run_for(1.0)
+    send('cmd_vel', twist(1.75))
+    with pytest.raises(PropertyViolation, match=r'^NeverFasterThan\(1.0, 2.0\)'):
+        lockstep.run_for(1.0)
+    lockstep.finish()
+
+
+def test_a_violation_is_seen_in_every_way_of_advancing_time(lockstep, send):
+    lockstep.node.create_timer(0.1, lambda: send('cmd_vel', twist(1.0)))
+    advances = (
+        lockstep.step,
+        lambda: lockstep.run_until(lambda: False, 1.0),
+        lambda: lockstep.run_for(0.1),
+        lambda: lockstep.jump(5.0),
+        lambda: lockstep.jump(-2.0) or lockstep.step(),
+    )
+    for advance in advances:
+        lockstep.require(NeverFasterThan(0.5, 2.0))
+        with pytest.raises(PropertyViolation):
+            advance()
+
+
+@pytest.mark.parametrize(
+    ('argument', 'words'),
+    [
+        (NeverFasterThan, r'got the class NeverFasterThan; create one: NeverFasterThan\(...\)'),
+        (0.5, 'require takes properties, got an object of the class float'),
+    ],
+)
+def test_what_is_no_property_cannot_be_required(lockstep, argument, words):
+    with pytest.raises(LockstepError, match=words):
+        lockstep.require(argument)
+
+
+def test_a_topic_that_nobody_could_publish_on_is_an_error_at_the_end(lockstep, send):
+    lockstep.require(NeverFasterThan(0.5, 2.0, topic='cmd_vell'))
+    send('cmd_vel', twist(0.1))
+    lockstep.run_for(0.1)
+    with pytest.raises(
+        LockstepError,
+        match=r"topic='cmd_vell'\) observes /cmd_vell, which no .* topics and services: /cmd_vel$",
+    ) as raised:
+        lockstep.finish()
+    assert not isinstance(raised.value, PropertyViolation)
+
+
+def test_nothing_that_a_node_can_notice_is_changed(lockstep):
+    def graph():
+        count = lockstep.node.count_subscribers
+        return [count(topic) for topic in ('cmd_vel', 'odom', 'goal_pose', 'goal_status')]
+
+    before = graph()
+    lockstep.require(*(one for one, _ in VALUES))
+    assert graph() == before
+    with pytest.raises(LockstepError, match='which no node has offered'):
+        lockstep.finish()
+
+
+VALUES = [
+    (NeverFasterThan(0.5, 2.0), 'NeverFasterThan(0.5, 2.0)'),
+    (
+        NeverFasterThan(0.5, float('inf'), topic='odom', namespace='/one'),
+        "NeverFasterThan(0.5, float('inf'), namespace='/one', topic='odom')",
+    ),
+    (AccelerationWithin(1, 2, slack=0.2), 'AccelerationWithin(1.0, 2.0, slack=0.2)'),
+    (StatusProtocol(goals=['goal_pose']), "StatusProtocol(goals=('goal_pose',))"),
+    (StopsAfterLostOdometry(0.5, node='a'), "StopsAfterLostOdometry(0.5, node='a')"),
+    (StopsAfterLastCommand(0.5), 'StopsAfterLastCommand(0.5)'),
+    (StopsOnShutdown(), 'StopsOnShutdown()'),
+    (NoCommandAfterCancel(), 'NoCommandAfterCancel()'),
+    (NoStaleGoals(), 'NoStaleGoals()'),
+    (ReachesGoal(5, tolerance=0.1), 'ReachesGoal(5.0, tolerance=0.1)'),
+    (Settles(5, 0.1), 'Settles(5.0, 0.1)'),
+    (ArrivesOnceFaultsEnd(5), 'ArrivesOnceFaultsEnd(5.0)'),
+    (KeepsDriving(1), 'KeepsDriving(1.0)'),
+    (StaysWithin([0, 1], y=(-1, 1)), 'StaysWithin((0.0, 1.0), (-1.0, 1.0))'),
+    (StaysNear([[0, 0], [1, 0]], 0.1), 'StaysNear(((0.0, 0.0), (1.0, 0.0)), 0.1)'),
+    (PoseFinite(), 'PoseFinite()'),
+]
+
+
+@pytest.mark.parametrize(('one', 'expression'), VALUES, ids=lambda value: type(value).__name__)
+def test_properties_are_values(one, expression):
+    assert repr(one) == expression
+    assert eval(expression, vars(properties)) == one
+    assert pickle.loads(pickle.dumps(one)) == one
+    hash(one)
+
+
+@pytest.mark.parametrize(
+    ('create', 'words'),
+    [
+        (lambda: NeverFasterThan(-1.0, 2.0), 'v must be zero or positive, got -1.0'),
+        (lambda: NeverFasterThan(1.0, float('nan')), 'omega must be zero or positive, got nan'),
+        (lambda: NeverFasterThan('1', 2.0), "v must be a number, got '1'"),
+        (
+            lambda: NeverFasterThan(1.0, 2.0, topic=''),
+            "topic must be a string that is not empty, got ''",
+        ),
+        (
+            lambda: StatusProtocol(goals='goal_pose'),
+            "goals must be a list or tuple of names, got 'goal_pose'",
+        ),
+        (lambda: StatusProtocol(namespace=1), 'namespace must be a string, got 1'),
+        (
+            lambda: StaysWithin((1, 0), (0, 1)),
+            r'x must be the least and the largest value, got \(1, 0\)',
+        ),
+        (lambda: StaysWithin(1.0, (0, 1)), 'x must be the least and the largest value, got 1.0'),
+        (lambda: StaysNear([1, 2], 0.1), r'path must be a sequence of \(x, y\), got \[1, 2\]'),
+        (lambda: Settles(1.0, 0.0), 'tolerance must be positive, got 0.0'),
+        (lambda: ReachesGoal(float('inf')), 'within must be zero or positive and finite, got inf'),
+    ],
+)
+def test_invalid_fields_are_refused(create, words):
+    with pytest.raises(ValueError, match=words):
+        create()
+
+
+# --- Speed
+
+
+@pytest.mark.parametrize(
+    ('v', 'omega', 'allowed'),
+    [
+        (0.5, 2.0, True),
+        (-0.5, -2.0, True),
+        (0.501, 0.0, False),
+        (-0.501, 0.0, False),
+        (0.0, -2.01, False),
+        (float('nan'), 0.0, False),
+        (0.0, float('inf'), False),
+    ],
+)
+def test_never_faster_than(lockstep, send, v, omega, allowed):
+    lockstep.require(NeverFasterThan(0.5, 2.0))
+    send('cmd_vel', twist(v, omega))
+    if allowed:
+        lockstep.run_for(1.0)
+        lockstep.finish()
+    else:
+        assert '/cmd_vel: v ' in violated(lockstep, 'NeverFasterThan')
+
+
+def test_a_long_property_does_not_hide_what_is_wrong(lockstep):
+    """Its message is short. Its `repr` is complete."""
+    path = [(0.1 * number, 0.0) for number in range(61)]
+    near = StaysNear(path, 0.1, odom='pose')
+    assert eval(repr(near)) == near
+    shown = "StaysNear(((0.0, 0.0), (0.1, 0.0), ... 61 in all), 0.1, odom='pose')"
+    assert str(near) == shown
+    lockstep.require(near)
+    with pytest.raises(LockstepError, match=re.escape(f'{shown} observes /pose, which no node')):
+        lockstep.finish()
+    publisher = lockstep.node.create_publisher(Odometry, 'pose', 10)
+    lockstep.require(near)
+    message = Odometry()
+    message.pose.pose.position.y = 1.0
+    publisher.publish(message)
+    with pytest.raises(PropertyViolation) as caught:
+        lockstep.settle()
+    assert str(caught.value).startswith(f'{shown} is violated at 0 s: /pose: ')
+
+
+def test_the_speed_of_odometry_in_a_namespace_as_messages_and_as_bytes(lockstep, send, robot_at):
+    lockstep.require(NeverFasterThan(0.25, 1.0, topic='odom', namespace='/one'))
+    robot_at(namespace='/one')
+    lockstep.publish('/one/cmd_vel', twist(0.25))
+    lockstep.run_for(0.1)
+    send('/one/odom', Odometry())
+    lockstep.publish('/one/cmd_vel', twist(0.3))
+    assert violated(lockstep, 'NeverFasterThan').startswith('/one/odom: v 0.3 m/s')
+
+
+def accelerate(lockstep, send, *commands, period=0.1):
+    """Send commands at a period, and finish."""
+    for command in commands:
+        send('cmd_vel', twist(*command))
+        lockstep.run_for(period)
+    lockstep.finish()
+
+
+def test_acceleration_within(lockstep, send):
+    lockstep.require(AccelerationWithin(1.0, 2.0))
+    # The limit, a stop, and a sequence that is early by the slack.
+    accelerate(lockstep, send, (0.1, 0.2), (0.2, 0.4), (0.3, 0.2), (0.0, 0.0), (0.1,), (0.2,), (0.1,))
+
+
+@pytest.mark.parametrize(
+    'commands',
+    [
+        [(0.11,)],
+        [(0.0, 0.21)],
+        [(0.05,), (0.1,), (0.31,)],
+        [(0.1,), (0.2,), (-0.1,)],
+        [(0.1,), (float('nan'),)],
+        [(0.0,)] * 20 + [(0.11,)],
+    ],
+)
+def test_acceleration_exceeded(lockstep, send, commands):
+    lockstep.require(AccelerationWithin(1.0, 2.0))
+    with pytest.raises(PropertyViolation, match=r'changes of 1 m/s and 2 rad/s per second|finite'):
+        accelerate(lockstep, send, *commands)
+
+
+def test_acceleration_twice_the_limit_is_found_even_with_much_slack(lockstep, send):
+    lockstep.require(AccelerationWithin(1.0, 2.0, slack=0.5))
+    ramp = [(0.2 * number,) for number in range(1, 12)]
+    with pytest.raises(PropertyViolation):
+        accelerate(lockstep, send, *ramp)
+    assert 0.3 < lockstep.elapsed < 0.6
+
+
+def test_a_stop_is_an_acceleration_where_it_is_not_allowed(lockstep, send):
+    lockstep.require(AccelerationWithin(1.0, 2.0, stops=False))
+    with pytest.raises(PropertyViolation):
+        accelerate(lockstep, send, (0.1,), (0.2,), (0.3,), (0.0,))
+
+
+def test_a_topic_of_another_type_is_an_error(lockstep, robot_at):
+    lockstep.require(NeverFasterThan(0.5, 2.0, topic='joint_states'))
+    with pytest.raises(
+        LockstepError,
+        match=r'from messages of type geometry_msgs/msg/Twist, .* of type sensor_msgs/msg/JointState',
+    ):
+        robot_at()
+
+
+# --- The page
+
+
+def test_the_page_has_a_property_of_one_s_own(lockstep, robot_at):
+    (code,) = (
+        block.code
+        for block in blocks(PAGES['doc/lockstep.md'].read_text())
+        if block.file == 'test_own_property.py'
+    )
+    names = {}
+    exec(code, names)
+    names['test_a_robot_publishes_odometry'](lockstep, robot_at)
+
+
+def test_the_page_lists_every_property():
+    table = PAGES['doc/lockstep.md'].read_text()
+    base = {'Property', 'PropertyViolation', 'Watch', 'end_of_faults'}
+    missing = [name for name in properties.__all__ if name not in base and f'`{name}(' not in table]
+    assert missing == []

@@ -1,0 +1,542 @@
+"""The recorder on the executor of record_run: it takes queued messages and counts missing ones."""
+
+from __future__ import annotations
+
+from unittest import mock
+
+import pytest
+from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.event_handler import UnsupportedEventTypeError
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from support.domains import domain_id
+from support.harness import PATIENCE
+
+from diffdrive_jacobian.bags.journal import Channel, Message
+from diffdrive_jacobian.bags.message_definitions import UnknownTypeError
+from diffdrive_jacobian.recording import reception, recorder
+from diffdrive_jacobian.recording.recorder import Recorder, Selection
+from diffdrive_jacobian.ros.rclpy_internals import ReceivedMessage
+from diffdrive_jacobian.ros.runner import ros_context
+
+BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
+DEPTH = 200
+"""Messages that may wait: fewer than the recorder allows."""
+
+
+class Sink:
+    """Keeps what is recorded."""
+
+    def __init__(self):
+        self.data = []
+        self.stamps = []
+        self.channel = None
+        self.missed = {}
+        self.left_out = {}
+
+    def add(self, record):
+        if isinstance(record, Message):
+            self.data.append(record.data)
+            self.stamps.append(record.stamp)
+        if isinstance(record, Channel):
+            self.channel = record
+
+    def set_missed(self, topic, messages):
+        self.missed[topic] = messages
+
+    def set_left_out(self, topic, why):
+        self.left_out[topic] = why
+
+
+class Setting:
+    """A publisher and a recorder in one context."""
+
+    def __init__(self, harness, **profile):
+        self.harness = harness
+        self.sink = Sink()
+        self.sent = []
+        publishers = QoSProfile(depth=10, **profile)
+        self.publishers = [harness.peer.create_publisher(Twist, 'cmd_vel', publishers) for _ in range(2)]
+        self.recorder = harness.add(
+            Recorder, selection=Selection(topics=('cmd_vel',)), sink=self.sink, with_info=True
+        )
+        self.harness.until(self.matched, 'the recorder is there', PATIENCE)
+
+    def matched(self):
+        self.recorder.discover()
+        return all(one.get_subscription_count() for one in self.publishers)
+
+    def send(self, count, publisher=0):
+        for _ in range(count):
+            message = Twist()
+            message.linear.x = float(len(self.sent))
+            self.sent.append(serialize_message(message))
+            self.publishers[publisher].publish(self.sent[-1])
+
+    def until_recorded(self, count):
+        self.harness.until(lambda: len(self.sink.data) >= count, f'{count} are recorded')
+
+    def until_drained(self):
+        self.recorder.end()
+        self.harness.until(self.recorder.drained, 'all is collected')
+
+
+@pytest.fixture
+def executor_kind():
+    return 'single'
+
+
+@pytest.fixture(autouse=True)
+def limits(monkeypatch):
+    monkeypatch.setattr(recorder, 'DEPTH', DEPTH)
+    # Bursts lose nothing in one process.
+    monkeypatch.setattr(recorder, 'HEARTBEAT', 0.0)
+
+
+@pytest.fixture(params=list(ReliabilityPolicy)[1:3], ids=str)
+def setting(ros, executor_kind, request):
+    return Setting(ros, reliability=request.param)
+
+
+@pytest.mark.parametrize('second_is_silent', [False, True])
+def test_what_was_overwritten_while_it_waited_is_counted(setting, second_is_silent):
+    first_of_each = [0] if second_is_silent else [0, 1]
+    for publisher in first_of_each:
+        setting.send(1, publisher)
+    setting.until_recorded(len(first_of_each))
+    for count in (DEPTH + 700, DEPTH + 55):
+        # Nobody serves the recorder meanwhile.
+        setting.send(count - 20)
+        setting.send(20, publisher=first_of_each[-1])
+        before = len(setting.sink.data)
+        setting.until_recorded(before + DEPTH)
+    setting.until_drained()
+    assert len(setting.sink.data) == len(first_of_each) + 2 * DEPTH
+    assert setting.sink.missed == {'/cmd_vel': 755}
+
+
+def test_the_only_message_of_a_publisher_may_have_been_overwritten(setting):
+    setting.send(1, publisher=1)
+    setting.send(DEPTH)
+    setting.until_recorded(DEPTH)
+    setting.until_drained()
+    assert setting.sink.data == setting.sent[1:]
+    assert setting.sink.missed == {}
+    assert setting.sink.left_out == {'possibly part of /cmd_vel': f'its queue of {DEPTH} was full'}
+
+
+def test_what_was_overwritten_at_the_end_is_counted(setting):
+    setting.send(1)
+    setting.until_recorded(1)
+    setting.send(5)
+    setting.recorder.end()
+    setting.send(DEPTH)
+    setting.harness.until(setting.recorder.drained, 'all is collected')
+    assert setting.sink.data == setting.sent[:1]
+    assert setting.sink.missed == {'/cmd_vel': 5}
+
+
+def test_bursts_are_recorded_in_order(setting):
+    for count in (DEPTH - 1, 20, DEPTH - 1):
+        setting.send(count)
+        setting.until_recorded(len(setting.sent))
+    setting.until_drained()
+    assert setting.sink.data == setting.sent
+    assert setting.sink.missed == {}
+    assert setting.sink.left_out == {}
+
+
+def test_what_waits_at_the_end_is_collected_and_what_comes_later_is_not(setting):
+    setting.send(DEPTH - 60)
+    setting.recorder.end()
+    setting.send(50)
+    setting.harness.until(setting.recorder.drained, 'all is collected')
+    assert setting.sink.data == setting.sent[: DEPTH - 60]
+    assert setting.sink.missed == {}
+
+
+def test_the_recording_ends_although_messages_are_still_published(setting):
+    setting.recorder.end()
+
+    def drained():
+        setting.send(1)
+        return setting.recorder.drained()
+
+    setting.harness.until(drained, 'all is collected')
+    assert setting.sink.data == []
+
+
+class Doubt:
+    """A recording that has ended after a burst, of which a heartbeat may bring more for a long time."""
+
+    def __init__(self, ros, monkeypatch, reliability=ReliabilityPolicy.RELIABLE):
+        monkeypatch.setattr(recorder, 'HEARTBEAT', 1e6)
+        monkeypatch.setattr(recorder, 'BURST_VOLUME', 10 * recorder.OVERHEAD)
+        self.setting = Setting(ros, reliability=reliability)
+        self.send(11)
+
+    def send(self, count):
+        for publisher in (0, 1):
+            self.setting.send(count, publisher)
+        self.setting.until_recorded(2 * count)
+
+    def end(self):
+        self.setting.recorder.end()
+        # So that nothing is expected, were it not for the burst.
+        monotonic = recorder.time.monotonic
+        self.setting.recorder._last_added = monotonic() - 2 * recorder.IN_TRANSIT
+
+
+def test_after_a_burst_late_messages_are_waited_for(ros, executor_kind, monkeypatch):
+    doubt = Doubt(ros, monkeypatch)
+    doubt.end()
+    assert not doubt.setting.recorder.drained()
+    assert doubt.setting.recorder.awaited == ['/cmd_vel']
+    monkeypatch.setattr(recorder, 'HEARTBEAT', 0.0)
+    assert doubt.setting.recorder.drained()
+    assert doubt.setting.sink.left_out == {}
+
+
+def test_without_a_burst_nothing_is_waited_for(ros, executor_kind, monkeypatch):
+    monkeypatch.setattr(recorder, 'HEARTBEAT', 1e6)
+    setting = Setting(ros)
+    setting.send(20)
+    setting.until_recorded(20)
+    setting.until_drained()
+    assert setting.sink.left_out == {}
+
+
+def test_a_best_effort_publisher_is_not_waited_for(ros, executor_kind, monkeypatch):
+    doubt = Doubt(ros, monkeypatch, ReliabilityPolicy.BEST_EFFORT)
+    doubt.end()
+    assert doubt.setting.recorder.drained()
+
+
+def test_a_reliable_publisher_confirms_by_its_next_message(ros, executor_kind, monkeypatch):
+    doubt = Doubt(ros, monkeypatch)
+    setting = doubt.setting
+    setting.recorder.end()
+    setting.send(1, publisher=0)
+    setting.harness.until(lambda: setting.recorder._receptions['/cmd_vel'].confirmed, 'one confirms')
+    assert not setting.recorder.drained()
+    setting.send(1, publisher=1)
+    setting.harness.until(setting.recorder.drained, 'both have confirmed')
+    assert setting.recorder.awaited == []
+    assert setting.sink.left_out == {}
+
+
+def test_a_publisher_that_ended_is_not_waited_for(ros, executor_kind, monkeypatch):
+    setting = Doubt(ros, monkeypatch).setting
+    for publisher in setting.publishers:
+        ros.peer.destroy_publisher(publisher)
+    setting.until_drained()
+    assert setting.sink.left_out == {}
+
+
+def test_a_wait_that_is_cut_short_or_too_long_makes_the_recording_incomplete(
+    ros, executor_kind, monkeypatch
+):
+    doubt = Doubt(ros, monkeypatch)
+    doubt.end()
+    doubt.setting.recorder.give_up('no time')
+    assert doubt.setting.sink.left_out == {'possibly the end of /cmd_vel': 'no time'}
+    monkeypatch.setattr(recorder, 'DRAIN_PATIENCE', -1.0)
+    doubt.end()
+    assert doubt.setting.recorder.drained()
+    assert 'still arriving' in doubt.setting.sink.left_out['possibly the end of /cmd_vel']
+
+
+def test_a_large_last_message_cannot_be_confirmed_by_waiting(ros, executor_kind, monkeypatch):
+    monkeypatch.setattr(recorder, 'LARGE', 10)
+    doubt = Doubt(ros, monkeypatch)
+    doubt.end()
+    monkeypatch.setattr(recorder, 'HEARTBEAT', 0.0)
+    assert doubt.setting.recorder.drained()
+    assert 'cannot be confirmed' in doubt.setting.sink.left_out['possibly the end of /cmd_vel']
+
+
+def test_what_was_repaired_at_the_end_may_have_been_too_much_again(ros, executor_kind, monkeypatch):
+    doubt = Doubt(ros, monkeypatch)
+    node = doubt.setting.recorder
+    monkeypatch.setattr(recorder, 'BURST_VOLUME', 1e9)
+    node._last_burst -= 5e5
+    before = node._last_burst
+    doubt.setting.send(1)
+    doubt.end()
+    assert not node.drained()
+    assert node._last_burst > before + 4e5
+
+
+def test_a_recorder_that_was_held_at_the_end_still_waits(ros, executor_kind, monkeypatch):
+    doubt = Doubt(ros, monkeypatch, ReliabilityPolicy.BEST_EFFORT)
+    doubt.end()
+    doubt.setting.recorder._called -= 2 * recorder.HELD
+    assert not doubt.setting.recorder.drained()
+
+
+class Subscriptions:
+    """The subscriptions of a reception, whose messages a test chooses."""
+
+    def __init__(self, monkeypatch, lost):
+        self.recorded = []
+        self.queues = {}
+        monkeypatch.setattr(reception, 'lost_messages', lambda subscription: lost[subscription])
+        self.reception = reception.CountingReception(
+            mock.Mock(create_subscription=lambda *_, **options: options),
+            Twist,
+            '/cmd_vel',
+            DEPTH,
+            mock.Mock(),
+            lambda message: self.recorded.append(message.number),
+            lambda message: False,
+        )
+        monkeypatch.setattr(self.reception, '_subscribe', lambda reliability, durability: reliability)
+        self.reception.match([QoSProfile(depth=1, reliability=one) for one in lost])
+        for (reliability, _), queue in self.reception._queues.items():
+            self.queues[reliability] = queue
+
+    def receive(self, reliability, *numbers):
+        for number in numbers:
+            self.queues[reliability]._receive(ReceivedMessage(b'', b'R', number, 0, 0))
+
+
+def test_a_reliable_publisher_beside_a_best_effort_one_is_recorded_in_order_and_without_loss(
+    monkeypatch,
+):
+    subscriptions = Subscriptions(monkeypatch, {BEST_EFFORT: 3, RELIABLE: 0})
+    subscriptions.receive(BEST_EFFORT, 1, 2)
+    subscriptions.receive(RELIABLE, 2, 3)
+    subscriptions.receive(BEST_EFFORT, 3, 7)
+    subscriptions.receive(RELIABLE, 4, 5, 6, 7)
+    assert subscriptions.recorded == [1, 2, 3, 4, 5, 6, 7]
+    assert subscriptions.reception.missed == 0
+
+
+@pytest.mark.parametrize('reliability', list(ReliabilityPolicy)[1:3], ids=str)
+def test_losses_that_the_middleware_reports_are_counted(monkeypatch, reliability):
+    assert Subscriptions(monkeypatch, {reliability: 3}).reception.missed == 3
+
+
+def test_what_a_latched_topic_overwrote_before_is_not_missed(ros, executor_kind):
+    latched = QoSProfile(depth=3, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    publisher = ros.peer.create_publisher(Twist, 'cmd_vel', latched)
+    for _ in range(10):
+        publisher.publish(Twist())
+    sink = Sink()
+    made = ros.add(Recorder, selection=Selection(topics=('cmd_vel',)), sink=sink, with_info=True)
+
+    def recorded():
+        made.discover()
+        return len(sink.data) == 3
+
+    ros.until(recorded, 'the last ones are recorded')
+    made.end()
+    ros.until(made.drained, 'all is collected')
+    assert sink.missed == {}
+
+
+@pytest.mark.parametrize('name', ['/foo bar', '/foo//bar', '/1', '/\x1b[2J', '/' + 'a' * 300])
+def test_an_invalid_topic_name_of_a_dds_application_is_reported_once(ros, name, monkeypatch, capfd):
+    # No ROS node can publish such a topic.
+    publisher = ros.peer.create_publisher(Twist, 'cmd_vel', 10)
+    recorder = ros.add(Recorder, selection=Selection(everything=True), sink=(sink := Sink()))
+    find = recorder.get_topic_names_and_types
+    monkeypatch.setattr(
+        recorder,
+        'get_topic_names_and_types',
+        lambda: [(name, ['geometry_msgs/msg/Twist']), *find()],
+    )
+
+    def recorded():
+        recorder.discover()
+        publisher.publish(Twist())
+        return sink.data
+
+    ros.until(recorded, 'the other topic is recorded')
+    recorder.discover()
+    reports = capfd.readouterr().err
+    assert reports.count('is not recorded') == 1
+    assert '\x1b[2J' not in reports
+    assert list(sink.left_out) == [name]
+
+
+def test_a_topic_whose_type_is_not_installed_makes_the_recording_incomplete(ros, monkeypatch):
+    publisher = ros.peer.create_publisher(Twist, 'cmd_vel', 10)
+
+    def message_class(name):
+        raise UnknownTypeError('no Twist')
+
+    monkeypatch.setattr(recorder, 'message_class', message_class)
+    made = ros.add(Recorder, selection=Selection(topics=('cmd_vel',)), sink=(sink := Sink()))
+
+    def left_out():
+        made.discover()
+        return sink.left_out
+
+    ros.until(left_out, 'it is left out')
+    assert sink.left_out == {'/cmd_vel': 'no Twist'}
+    assert publisher.get_subscription_count() == 0
+
+
+@pytest.mark.parametrize('with_info', [True, False])
+@pytest.mark.parametrize(
+    ('first', 'second'),
+    [
+        ({'durability': DurabilityPolicy.VOLATILE}, {'reliability': ReliabilityPolicy.BEST_EFFORT}),
+        ({'durability': DurabilityPolicy.TRANSIENT_LOCAL}, {'durability': DurabilityPolicy.VOLATILE}),
+        (
+            {'durability': DurabilityPolicy.TRANSIENT_LOCAL},
+            {'reliability': ReliabilityPolicy.BEST_EFFORT},
+        ),
+    ],
+    ids=['best effort', 'volatile', 'best effort and volatile'],
+)
+def test_a_later_publisher_with_weaker_qos_is_recorded(ros, executor_kind, first, second, with_info):
+    strict = ros.peer.create_publisher(Twist, 'cmd_vel', QoSProfile(depth=10, **first))
+    sink = Sink()
+    recorder = ros.add(
+        Recorder, selection=Selection(topics=('cmd_vel',)), sink=sink, with_info=with_info
+    )
+
+    def matched(publisher):
+        recorder.discover()
+        return publisher.get_subscription_count()
+
+    ros.until(lambda: matched(strict), 'the first is matched')
+    strict.publish(Twist())
+    ros.until(lambda: len(sink.data) == 1, 'its message is recorded')
+    weak = ros.peer.create_publisher(Twist, 'cmd_vel', QoSProfile(depth=10, **second))
+    # This message waits in the old subscription.
+    strict.publish(Twist())
+    ros.until(lambda: matched(weak) and matched(strict), 'both are matched')
+    weak.publish(Twist())
+    strict.publish(Twist())
+    ros.until(lambda: len(sink.data) == 4, 'all four are recorded')
+    recorder.discover()
+    assert sink.missed == {}
+    assert len(sink.channel.qos) == 2
+
+
+LATCHED = QoSProfile(depth=3, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+@pytest.mark.parametrize('latched_first', [False, True])
+@pytest.mark.parametrize('reliability', list(ReliabilityPolicy)[1:3], ids=str)
+def test_a_latched_message_is_recorded_once_beside_another_publisher(
+    ros, executor_kind, latched_first, reliability
+):
+    sink = Sink()
+    recorder = ros.add(Recorder, selection=Selection(topics=('cmd_vel',)), sink=sink, with_info=True)
+    profiles = {'plain': QoSProfile(depth=10, reliability=reliability), 'latched': LATCHED}
+    made = {}
+
+    def recorded(count):
+        recorder.discover()
+        return len(sink.data) == count
+
+    def publish(name, value):
+        message = Twist()
+        message.linear.x = value
+        made[name].publish(message)
+
+    for name in sorted(profiles, reverse=not latched_first):
+        made[name] = ros.peer.create_publisher(Twist, 'cmd_vel', profiles[name])
+        if name == 'latched':
+            # Nobody who is not latched receives the first ones, at least if it is the first publisher.
+            for value in range(5):
+                publish(name, float(value))
+        ros.until(
+            lambda one=made[name]: (recorder.discover(), one.get_subscription_count())[1], 'matched'
+        )
+    expected = 5 if not latched_first else 3
+    ros.until(lambda: recorded(expected), 'the latched ones are recorded')
+    ros.until(lambda: made['latched'].get_subscription_count() == 2, 'both receive')
+    for value in (10.0, 11.0):
+        publish('latched', value)
+        publish('plain', -value)
+    ros.until(lambda: recorded(expected + 4), 'all are recorded')
+    recorder.end()
+    ros.until(recorder.drained, 'all is collected')
+    assert len(sink.data) == len(set(sink.data)) == expected + 4
+    assert (sink.missed, sink.left_out) == ({}, {})
+
+
+def test_other_topics_are_not_recorded(ros, executor_kind):
+    other = ros.peer.create_publisher(Twist, 'another_twist', 10)
+    setting = Setting(ros)
+    assert setting.recorder.topics == ['/cmd_vel']
+    assert other.get_subscription_count() == 0
+
+
+def test_a_middleware_without_events_is_recorded_from(ros, executor_kind, monkeypatch):
+    create = Recorder.create_subscription
+
+    def without_events(*arguments, event_callbacks, **options):
+        if event_callbacks.message_lost is not None:
+            raise UnsupportedEventTypeError('no events')
+        return create(*arguments, event_callbacks=event_callbacks, **options)
+
+    monkeypatch.setattr(Recorder, 'create_subscription', without_events)
+    setting = Setting(ros)
+    setting.send(3)
+    setting.until_recorded(3)
+    assert setting.sink.data == setting.sent
+
+
+@pytest.mark.parametrize('simulated', [False, True])
+def test_the_time_of_a_message_is_that_of_its_receipt_or_of_the_simulated_clock(
+    ros, executor_kind, simulated
+):
+    sink = Sink()
+    recorder = ros.add(
+        Recorder,
+        parameters={'use_sim_time': simulated},
+        selection=Selection(topics=('cmd_vel',)),
+        sink=sink,
+        with_info=True,
+        now=lambda: 5,
+    )
+    publisher = ros.peer.create_publisher(Twist, 'cmd_vel', 10)
+
+    def matched():
+        recorder.discover()
+        return publisher.get_subscription_count()
+
+    ros.until(matched, 'the recorder is there')
+    publisher.publish(Twist())
+    ros.until(lambda: sink.data, 'a message is recorded')
+    assert (sink.stamps == [5]) == simulated
+
+
+@pytest.fixture
+def local_discovery(monkeypatch):
+    """Contexts that are created after this discover each other, as processes do."""
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(domain_id()))
+
+
+def test_publishers_of_another_type_are_reported(local_discovery, ros, executor_kind):
+    sink = Sink()
+    recorder = ros.add(Recorder, selection=Selection(topics=('cmd_vel', 'x')), sink=sink)
+
+    def until(condition, what):
+        ros.until(lambda: (recorder.discover(), condition())[1], what, PATIENCE)
+
+    # In one context a topic can have one type only.
+    with ros_context(['one']) as one, ros_context(['other']) as other:
+        twists, stamped = Node('one', context=one), Node('other', context=other)
+        first = twists.create_publisher(Twist, 'cmd_vel', 10)
+        until(first.get_subscription_count, 'the first is matched')
+        twists.destroy_publisher(first)
+        stamped.create_publisher(TwistStamped, 'cmd_vel', 10)
+        until(lambda: sink.left_out, 'the other type is reported')
+        twists.create_publisher(Twist, 'x', 10)
+        stamped.create_publisher(TwistStamped, 'x', 10)
+        until(lambda: len(sink.left_out) == 2, 'the topic with two types is reported')
+        for node in (twists, stamped):
+            node.destroy_node()
+    assert sink.left_out['/cmd_vel of geometry_msgs/msg/TwistStamped'] == (
+        '/cmd_vel is recorded as geometry_msgs/msg/Twist'
+    )
+    assert any(topic.startswith('/x') for topic in sink.left_out)

@@ -1,0 +1,159 @@
+"""The profiles that entry points give to Fast DDS, and what a user can choose instead."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from fork_server import forked
+from rclpy.node import Node
+from support.domains import domain_id
+
+from diffdrive_jacobian.ros import fastdds_profiles
+from diffdrive_jacobian.ros.fastdds_profiles import (
+    SWITCH,
+    TRANSPORTS,
+    VARIABLE,
+    announce_frequently,
+    fast_heartbeats,
+    withdraw,
+)
+from diffdrive_jacobian.ros.runner import ros_context, running
+
+CHOICES = {
+    'another file': {VARIABLE: '/own.xml'},
+    'another file by its new name': {'FASTDDS_DEFAULT_PROFILES_FILE': '/own.xml'},
+    'no files': {'SKIP_DEFAULT_XML_FILE': '1'},
+    'shared memory only': {TRANSPORTS: 'SHM'},
+    'transports with options': {TRANSPORTS: 'LARGE_DATA?max_msg_size=1MB'},
+    'a discovery server': {'ROS_DISCOVERY_SERVER': '127.0.0.1:11811'},
+    'another middleware': {'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'},
+}
+# The shared memory through which a node receives.
+RECEIVING = """
+import contextlib, os, sys
+from diffdrive_jacobian.ros.fastdds_profiles import announce_frequently
+
+announce_frequently()
+import rclpy
+from rclpy.node import Node
+
+rclpy.init()
+node = Node('receiver')
+for number in os.listdir('/proc/self/fd'):
+    with contextlib.suppress(FileNotFoundError):
+        print(os.path.basename(os.readlink(f'/proc/self/fd/{number}')))
+"""
+# The entry point runs in an empty folder; what it would give to Fast DDS is printed.
+PRINTING = f"""
+import os, sys, types
+
+module = types.ModuleType('run_node')
+module.run_node = lambda *arguments: print(os.path.basename(os.environ.get({VARIABLE!r}, 'none')))
+sys.modules['diffdrive_jacobian.tools.run_node'] = module
+from diffdrive_jacobian.tools.entry_points import virtual_robot
+virtual_robot()
+"""
+
+
+@pytest.fixture(autouse=True)
+def environment(monkeypatch, tmp_path):
+    """An environment without choices of the user, in an empty folder."""
+    for name in (*fastdds_profiles._CHOICES, SWITCH, TRANSPORTS, 'RMW_IMPLEMENTATION'):
+        # Set first, so that it is restored in any case.
+        monkeypatch.setenv(name, '')
+        monkeypatch.delenv(name)
+    monkeypatch.chdir(tmp_path)
+
+
+def profile():
+    """The text of the file that Fast DDS will read."""
+    return Path(os.environ[VARIABLE]).read_text(encoding='utf-8')
+
+
+def test_participants_are_announced_frequently():
+    assert announce_frequently()
+    assert re.search(r'<leaseAnnouncement><sec>0</sec><nanosec>150000000</nanosec>', profile())
+    assert 'heartbeatPeriod' not in profile()
+
+
+@pytest.mark.parametrize('transports', ['DEFAULT', 'UDPv4', 'UDPv4?max_msg_size=1MB'])
+def test_transports_with_udp_are_no_other_choice(transports, monkeypatch):
+    monkeypatch.setenv(TRANSPORTS, transports)
+    assert announce_frequently()
+
+
+@pytest.mark.parametrize(('switch', 'expected'), [('1', False), ('0', True)])
+def test_messages_are_received_through_udp(switch, expected, monkeypatch):
+    """A sender then needs no check of shared memory, which often takes 0.33 s."""
+    monkeypatch.setenv(SWITCH, switch)
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(domain_id()))
+    ended = forked.run(RECEIVING, timeout=60)
+    assert ended.returncode == 0
+    assert bool(re.search(r'^fastrtps_port\d+_el$', ended.stdout, re.MULTILINE)) == expected
+
+
+@pytest.mark.parametrize('announced', [False, True])
+def test_heartbeats_are_added_to_announcements(announced):
+    if announced:
+        announce_frequently()
+    with fast_heartbeats():
+        assert re.search(r'<heartbeatPeriod><sec>0</sec><nanosec>100000000</nanosec>', profile())
+        assert ('leaseAnnouncement' in profile()) == announced
+    assert VARIABLE not in os.environ
+
+
+@pytest.mark.parametrize('choice', CHOICES.values(), ids=CHOICES)
+def test_a_choice_of_the_user_is_left_as_it_is(choice, monkeypatch):
+    for name, value in choice.items():
+        monkeypatch.setenv(name, value)
+    before = dict(os.environ)
+    assert not announce_frequently()
+    with fast_heartbeats():
+        assert dict(os.environ) == before
+    withdraw()
+    assert dict(os.environ) == before
+
+
+@pytest.mark.parametrize('name', ['DEFAULT_FASTRTPS_PROFILES.xml', 'DEFAULT_FASTDDS_PROFILES.xml'])
+def test_profiles_in_the_working_directory_are_left_as_they_are(name, tmp_path):
+    (tmp_path / name).touch()
+    assert not announce_frequently()
+    assert VARIABLE not in os.environ
+
+
+def test_fast_dds_by_its_name_is_no_other_middleware(monkeypatch):
+    monkeypatch.setenv('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp')
+    assert announce_frequently()
+
+
+def test_a_variable_switches_it_off(monkeypatch):
+    monkeypatch.setenv(SWITCH, '0')
+    assert not announce_frequently()
+    monkeypatch.setenv(SWITCH, '1')
+    assert announce_frequently()
+
+
+def test_the_variable_is_gone_when_the_first_node_exists():
+    announce_frequently()
+    with ros_context(['test']) as context, running(context, isolated=True) as runner:
+        assert VARIABLE in os.environ
+        runner.add(lambda: Node('first', context=context))
+        assert VARIABLE not in os.environ
+
+
+@pytest.mark.parametrize(('switch', 'expected'), [('', 'announcements.xml'), ('0', 'none')])
+def test_entry_points_announce_themselves(switch, expected):
+    ended = subprocess.run(
+        [sys.executable, '-c', PRINTING],
+        env={**os.environ, SWITCH: switch},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert ended.stdout == f'{expected}\n'

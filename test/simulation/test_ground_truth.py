@@ -1,0 +1,346 @@
+"""The node virtual_robot with wheels that slip or are not as nominal, and its topic ground_truth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from nav_msgs.msg import Odometry
+from std_srvs.srv import Trigger
+from support.lockstep_nodes import QUICK, SECOND, Topics, arrives, change, make, make_complete
+from support.recorded import recorded
+from support.ros_messages import goal, instants, placement, pose_of, twist, twist_stamped
+
+from diffdrive_jacobian.bags.verification import COVARIANCE_TOLERANCE, verify
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.parameters.declaration import ParameterError, from_ros
+from diffdrive_jacobian.parameters.nodes import VirtualRobotParameters
+from diffdrive_jacobian.plots.run_figure import COLOR, figure
+from diffdrive_jacobian.simulation import Drift, Robot, RobotModel
+from diffdrive_jacobian.testing import Lockstep
+from diffdrive_jacobian.tools.verify_run import report
+
+MULTIPLIERS = {
+    'true_left_wheel_radius_multiplier': 0.99,
+    'true_right_wheel_radius_multiplier': 1.02,
+    'true_wheel_separation_multiplier': 1.05,
+}
+SLIPPING = {'simulate_slip': True, 'slip_seed': 7, 'wheel_travel_variance': 1e-4}
+
+
+# --- What is published
+
+
+def test_a_perfect_robot_has_no_ground_truth_and_is_where_its_odometry_says(lockstep, robot_at):
+    topics, truths = Topics(lockstep), lockstep.listen(Odometry, 'ground_truth')
+    robot = robot_at(1.0, 2.0, 0.5, slip_seed=4)
+    assert robot.truth.tolist() == [1.0, 2.0, 0.5]
+    lockstep.publish('cmd_vel', twist(0.2, 0.5))
+    lockstep.run_for(0.4)
+    assert not truths
+    assert robot.truth == pytest.approx(pose_of(topics.odom[-1]), abs=1e-15)
+    assert 'ground_truth' not in dict(robot.get_topic_names_and_types())
+
+
+@pytest.mark.parametrize('parameters', [SLIPPING, MULTIPLIERS, SLIPPING | MULTIPLIERS], ids=str)
+def test_ground_truth_is_that_of_the_library_and_odometry_that_of_a_perfect_robot(
+    lockstep, robot_at, parameters
+):
+    topics, truths = Topics(lockstep), lockstep.listen(Odometry, 'ground_truth')
+    robot = robot_at(1.0, 2.0, 0.5, **parameters)
+    lockstep.publish('cmd_vel', twist(0.2, 0.5))
+    lockstep.run_for(0.4)
+    assert instants(truths) == instants(topics.odom)
+    drift = Drift(
+        seed=7 if 'slip_seed' in parameters else None,
+        **{name.removeprefix('true_'): value for name, value in parameters.items() if 'true_' in name},
+    )
+    model = RobotModel(drift=drift, wheel_travel_variance=parameters.get('wheel_travel_variance', 1e-5))
+    start = Robot(model=model, stamp=instants(truths)[0], pose=[1.0, 2.0, 0.5])
+    start = start.commanded((0.2, 0.5), start.stamp)
+    for message, odometry in zip(truths[1:], topics.odom[1:], strict=True):
+        (stamp,) = instants([message])
+        expected = start.at(stamp)
+        np.testing.assert_allclose(pose_of(message), expected.true_pose, rtol=1e-15)
+        np.testing.assert_allclose(pose_of(odometry), expected.pose, rtol=1e-15)
+        velocity = message.twist.twist
+        assert (velocity.linear.x, velocity.angular.z) == expected.true_twist
+        assert odometry.twist.twist == twist(0.2, 0.5)
+    assert robot.truth.tolist() == expected.true_pose.tolist()
+    assert np.linalg.norm(robot.truth - expected.pose) > 1e-4
+    assert not np.any(message.pose.covariance)
+    assert not np.any(message.twist.covariance)
+    assert (message.header.frame_id, message.child_frame_id) == ('map', 'base_link')
+
+
+ASSUMED = {name.removeprefix('true_'): value for name, value in MULTIPLIERS.items()}
+
+
+def test_a_robot_that_assumes_its_true_dimensions_is_where_its_odometry_says(lockstep, robot_at):
+    topics, truths = Topics(lockstep), lockstep.listen(Odometry, 'ground_truth')
+    robot = robot_at(1.0, 2.0, 0.5, **MULTIPLIERS, **ASSUMED)
+    lockstep.publish('cmd_vel', twist(0.2, 0.5))
+    lockstep.run_for(0.4)
+    assert len(truths) == len(topics.odom)
+    assert robot.truth == pytest.approx(pose_of(topics.odom[-1]), abs=1e-14)
+    # Its wheels turn for its true dimensions, not for the nominal ones.
+    right, left = (0.2 + 0.5 * 0.16 * 1.05 / 2.0) / 1.02, (0.2 - 0.5 * 0.16 * 1.05 / 2.0) / 0.99
+    assert list(topics.states[-1].velocity) == pytest.approx([left / 0.033, right / 0.033])
+
+
+def test_wrongly_assumed_dimensions_are_the_inverse_of_wrong_true_ones(lockstep, robot_at):
+    robot = robot_at(**ASSUMED)
+    lockstep.publish('cmd_vel', twist(0.2, 0.5))
+    lockstep.run_for(0.4)
+    drift = Drift(
+        right_wheel_radius_multiplier=1.0 / 1.02,
+        left_wheel_radius_multiplier=1.0 / 0.99,
+        wheel_separation_multiplier=1.0 / 1.05,
+    )
+    model = RobotModel(wheel_separation=0.16 * 1.05, drift=drift)
+    start = Robot(model=model, stamp=0, pose=[0.0, 0.0, 0.0]).commanded((0.2, 0.5), 0)
+    assert robot.truth == pytest.approx(start.at(2 * SECOND // 5).true_pose, abs=1e-14)
+
+
+def test_assumed_dimensions_can_change_during_a_drive(lockstep, robot_at):
+    """From then on the truth agrees with the odometry, up to where the robot is by then."""
+    topics, truths = Topics(lockstep), lockstep.listen(Odometry, 'ground_truth')
+    robot = robot_at(**MULTIPLIERS)
+    lockstep.publish('cmd_vel', twist(0.2, 0.5))
+    lockstep.run_for(0.2)
+    assert change(robot, **ASSUMED).successful
+    lockstep.run_for(0.2)
+
+    def turned(messages):
+        poses = {stamp: pose_of(one) for stamp, one in zip(instants(messages), messages, strict=True)}
+        return [pose[2] for stamp, pose in sorted(poses.items())][-8:]
+
+    assert np.diff(turned(truths)) == pytest.approx(np.diff(turned(topics.odom)), abs=1e-12)
+
+
+def test_ground_truth_has_a_frame_of_its_own_that_can_change(lockstep, robot_at, capfd):
+    truths = lockstep.listen(Odometry, 'ground_truth')
+    robot = robot_at(ground_truth_frame_id='world', base_frame_id='body', **SLIPPING)
+    lockstep.run_for(0.02)
+    assert (truths[-1].header.frame_id, truths[-1].child_frame_id) == ('world', 'body')
+    assert 'publishing /odom, /ground_truth' in capfd.readouterr().err
+    assert change(robot, ground_truth_frame_id='earth').successful
+    lockstep.run_for(0.02)
+    assert truths[-1].header.frame_id == 'earth'
+
+
+def drive(rate, **parameters):
+    """Drive by stamped commands that arrive late; give the odometry and the truth by their stamps."""
+    with Lockstep() as world:
+        truths, odometry = (world.listen(Odometry, topic) for topic in ('ground_truth', 'odom'))
+        parameters = SLIPPING | MULTIPLIERS | parameters
+        world.add(make(VirtualRobot, publish_rate=rate, enable_stamped_cmd_vel=True, **parameters))
+        for index in range(12):
+            delay = 3_456_789
+            world.run_for(0.05 - delay * 1e-9)
+            stamp = world.now
+            world.run_for(delay * 1e-9)
+            command = ((0.3, 0.0), (0.3, 2.0), (0.0, -3.0), (0.0, 0.0))[index % 4]
+            world.publish('cmd_vel', twist_stamped(*command, stamp))
+        world.run_for(0.9)
+        return tuple(dict(zip(instants(one), one, strict=True)) for one in (odometry, truths))
+
+
+def test_the_same_stamped_commands_give_the_same_truth_at_each_publish_rate():
+    """Bit for bit, except for messages that were sent before a late command came."""
+    odometry, truth = drive(10.0)
+    last = SECOND + round(0.6 * SECOND)
+    for rate in (50.0, 250.0):
+        other_odometry, other = drive(rate)
+        common = [stamp for stamp in sorted(truth.keys() & other.keys()) if stamp >= last]
+        assert len(common) >= 9
+        for stamp in common:
+            assert other[stamp].pose == truth[stamp].pose
+            assert other[stamp].twist == truth[stamp].twist
+            assert other_odometry[stamp].pose == odometry[stamp].pose
+    _, of_other_seed = drive(10.0, slip_seed=8)
+    assert of_other_seed[common[-1]].pose != truth[common[-1]].pose
+
+
+# --- Drives
+
+
+def driven_to_a_goal(**parameters):
+    """Drive to a goal in a world of its own; give the poses of the odometry and the truth at the end."""
+    with Lockstep() as world:
+        topics = Topics(world)
+        robot = world.add(make(VirtualRobot, **parameters))
+        world.add(make(GoToGoal, **QUICK))
+        world.publish('goal_pose', goal(1.0, 0.5))
+        arrives(world, topics)
+        return [one.pose.pose for one in topics.odom], pose_of(topics.odom[-1]), robot.truth
+
+
+def test_a_goal_driven_on_drifting_odometry_ends_where_the_truth_says():
+    poses, odometry, truth = driven_to_a_goal(**SLIPPING, true_right_wheel_radius_multiplier=1.02)
+    assert math.dist(odometry[:2], (1.0, 0.5)) < 0.02
+    assert math.dist(truth[:2], (1.0, 0.5)) > 0.03
+    # Neither the odometry nor the controller knows of it.
+    of_perfect, odometry, truth = driven_to_a_goal()
+    assert of_perfect == poses
+    np.testing.assert_allclose(truth, odometry, atol=1e-15)
+
+
+def test_initialpose_places_the_robot_and_reset_odometry_its_odometry_alone(lockstep, robot_at):
+    topics, truths = Topics(lockstep), lockstep.listen(Odometry, 'ground_truth')
+    robot = robot_at(1.0, 0.0, 0.0, **SLIPPING)
+    lockstep.publish('cmd_vel', twist(0.5, 0.0))
+    lockstep.run_for(0.2)
+    lockstep.publish('initialpose', placement(3.0, 4.0, 1.0))
+    lockstep.run_for(0.02)
+    assert math.dist(pose_of(truths[-1])[:2], (3.0, 4.0)) < 0.03
+    before = robot.truth
+    assert lockstep.call(Trigger, 'reset_odometry').success
+    assert robot.truth.tolist() == before.tolist()
+    lockstep.run_for(0.02)
+    assert math.dist(pose_of(topics.odom[-1])[:2], (1.0, 0.0)) < 0.03
+    assert math.dist(pose_of(truths[-1])[:2], (3.0, 4.0)) < 0.05
+
+
+# --- Parameters
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'reason'),
+    [
+        ({'slip_seed': 1.5}, "parameter 'slip_seed' must be an integer, got 1.5"),
+        ({'slip_seed': 'one'}, "parameter 'slip_seed' must be an integer, got 'one'"),
+        ({'slip_seed': True}, "parameter 'slip_seed' must be an integer, got True"),
+        ({'slip_seed': -1}, "parameter 'slip_seed' must be in [0, 9223372036854775807], got -1"),
+        ({'simulate_slip': 1}, "parameter 'simulate_slip' must be a bool (true or false), got 1"),
+        *(
+            ({name: value}, f"parameter '{name}' must be in [0.1, 10], got {value}")
+            for name in MULTIPLIERS
+            for value in (0.0, -1.0, 0.099, math.nan)
+        ),
+        (
+            {'simulate_slip': True, 'ground_truth_frame_id': 'odom'},
+            "parameters 'ground_truth_frame_id' and 'odom_frame_id' must differ, both are 'odom'",
+        ),
+        (
+            {**MULTIPLIERS, 'base_frame_id': 'map'},
+            "parameters 'ground_truth_frame_id' and 'base_frame_id' must differ, both are 'map'",
+        ),
+    ],
+    ids=str,
+)
+def test_invalid_parameters_are_refused_with_the_reason(parameters, reason):
+    with pytest.raises(ParameterError) as error:
+        from_ros(VirtualRobotParameters, parameters)
+    assert str(error.value) == reason
+
+
+def test_the_largest_seed_and_a_frame_map_of_a_perfect_robot_are_valid(lockstep, robot_at):
+    robot_at(odom_frame_id='map', slip_seed=2**63 - 1)
+
+
+def test_slip_cannot_change_while_the_robot_drives(lockstep, robot_at):
+    robot = robot_at(**SLIPPING)
+    lockstep.publish('cmd_vel', twist(0.2, 0.5))
+    lockstep.run_for(0.1)
+    reference = robot.truth
+    for name, value in {'simulate_slip': False, 'slip_seed': 3, **MULTIPLIERS}.items():
+        result = change(robot, wheel_separation=0.2, **{name: value})
+        assert not result.successful
+        assert 'read-only' in result.reason
+    assert robot.truth.tolist() == reference.tolist()
+    assert robot.parameters.wheel_separation == 0.16
+
+
+# --- Bags
+
+
+@pytest.fixture(scope='module')
+def run(tmp_path_factory):
+    """Record a drive with a placement, a reset and a timeout."""
+    robot = {'cmd_vel_timeout': 0.3, **SLIPPING, **MULTIPLIERS}
+    with Lockstep() as world, recorded(world, tmp_path_factory.mktemp('bags') / 'run') as made:
+        world.add(make_complete(VirtualRobot, **robot))
+        made.look()
+        for index in range(20):
+            world.publish('cmd_vel', twist(0.3, (-1) ** index * 1.3))
+            world.run_for(0.0723)
+            if index == 8:
+                world.publish('initialpose', placement(2.0, 1.0, variances=(1e-4, 1e-4, 1e-3)))
+            if index == 14:
+                assert world.call(Trigger, 'reset_odometry').success
+        world.run_for(0.6)
+    return made.run
+
+
+def test_a_run_has_the_ground_truth_and_is_verified_with_it_bit_for_bit(run):
+    assert len(run.ground_truth) == len(run.odometry) > 90
+    assert run.ground_truth.columns == ('x', 'y', 'theta', 'v', 'omega')
+    assert np.max(np.abs(run.ground_truth.values[:, :2] - run.odometry.values[:, :2])) > 1e-3
+    verification = verify(run)
+    assert verification.holds(1e-9, 1e-9)
+    assert len(verification.truth.distances) == len(run.ground_truth)
+    assert verification.truth.distances.max() == 0.0
+    assert verification.truth.headings.max() < 1e-15
+    assert verification.covariance_difference <= COVARIANCE_TOLERANCE
+    assert 'ground truth: maximum error 0 m' in report(verification, 1e-9, 1e-9)
+
+
+def test_a_changed_ground_truth_is_found(run):
+    values = run.ground_truth.values.copy()
+    values[50, 0] += 1e-6
+    changed = replace(run, ground_truth=replace(run.ground_truth, values=values))
+    verification = verify(changed)
+    assert not verification.holds(1e-9, 1e-9)
+    assert verification.distances.max() == 0.0
+    assert 'NOT as recorded' in report(verification, 1e-9, 1e-9)
+
+
+def test_another_seed_is_found(run):
+    (name,) = run.parameters
+    other = {name: run.parameters[name] | {'slip_seed': 8}}
+    assert verify(replace(run, parameters=other)).truth.distances.max() > 1e-3
+
+
+def test_without_parameters_the_odometry_alone_is_verified(run):
+    verification = verify(replace(run, parameters={}))
+    assert verification.truth is None
+    assert verification.holds(1e-9, 1e-9)
+    assert any(note.startswith('ground_truth was not compared') for note in verification.notes)
+
+
+def test_a_run_whose_assumed_dimensions_changed_is_verified_by_its_odometry_alone(run):
+    (name,) = run.parameters
+    changed = (run.odometry.received[50], name, {'left_wheel_radius_multiplier': 1.1})
+    verification = verify(replace(run, parameter_events=(changed,)))
+    assert verification.truth is None
+    assert verification.holds(1e-9, 1e-9)
+
+
+def truths_in(drawn):
+    """The paths of the truth in a figure."""
+    return [one for one in drawn.axes[0].lines if one.get_color() == COLOR and len(one.get_xydata()) > 1]
+
+
+def test_the_figure_shows_truth_and_odometry(run):
+    drawn = figure([run])
+    (truth,) = truths_in(drawn)
+    shown = truth.get_xydata()
+    # Broken where the robot was placed.
+    assert np.count_nonzero(np.isnan(shown[:, 0])) == 1
+    assert shown[~np.isnan(shown[:, 0])].tolist() == run.ground_truth.values[:, :2].tolist()
+    labels = [text.get_text() for text in drawn.axes[-1].get_legend().get_texts()]
+    assert 'ground truth and its end' in labels
+    bare = replace(run, ground_truth=replace(run.ground_truth, **empty(run.ground_truth)))
+    assert not truths_in(figure([bare]))
+
+
+def empty(series):
+    return {
+        'received': series.received[:0],
+        'stamps': series.stamps[:0],
+        'values': series.values[:0],
+    }

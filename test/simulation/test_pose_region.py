@@ -1,0 +1,200 @@
+"""The region that holds the robot: its level, its coverage, its limits, and how plot_run draws it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.moments_reference import DRIVES, noisy_runs, reported_path
+
+from diffdrive_jacobian.bags.run import COLUMNS, Run, Series
+from diffdrive_jacobian.bags.timeline import timeline
+from diffdrive_jacobian.kinematics import se2
+from diffdrive_jacobian.plots.run_figure import figure
+from diffdrive_jacobian.plots.uncertainty import ELLIPSE_LABEL, REGION_LABEL, uncertainties
+from diffdrive_jacobian.simulation import Robot, RobotModel
+from diffdrive_jacobian.simulation.exact_moments import gaussian, propagate_moments
+from diffdrive_jacobian.simulation.pose_region import (
+    ELLIPSE_LEVEL,
+    Region,
+    _chord,
+    log_about,
+    region_distance,
+    region_of,
+    sampled_errors,
+)
+
+L, K = 0.16, 1e-5
+NONE = np.zeros((3, 3))
+SECOND = 10**9
+
+
+def region_after(drive):
+    poses, noise = reported_path(drive, L, K)
+    *_, errors = sampled_errors(poses, noise, NONE)
+    return region_of(poses[-1], errors), errors
+
+
+@pytest.mark.parametrize('duration', [10.0, 60.0])
+@pytest.mark.parametrize('drive_for', DRIVES.values(), ids=DRIVES)
+def test_the_region_holds_95_percent_of_four_thousand_other_runs(drive_for, duration):
+    region, _ = region_after(drive_for(duration))
+    errors = noisy_runs(np.random.default_rng(5), drive_for(duration), NONE, 4000, L, K)
+    within = region_distance(region, region.pose[:2] + errors[:, :2]) <= region.level
+    assert 0.94 <= within.mean() <= 0.96
+
+
+def test_drawn_runs_have_the_exact_second_moment():
+    drive = DRIVES['stop and go'](60.0)
+    _, errors = region_after(drive)
+    moments, pose = gaussian(NONE), np.zeros(3)
+    for twist, duration in drive:
+        moments = propagate_moments(moments, pose, twist, duration, L, K)
+        pose = se2.integrate(pose, twist, duration)
+    second = errors.T @ errors / len(errors)
+    deviations = np.sqrt(np.diag(moments.second_moment))
+    # The standard error of an entry is sqrt(2 / 4000) of the deviations' product.
+    assert np.all(np.abs(second - moments.second_moment) < 0.1 * np.outer(deviations, deviations))
+
+
+@pytest.mark.parametrize('largest', [0.0, 1e-9, 0.01, 0.5, 0.51, 7.0])
+def test_the_ratio_of_chord_and_arc_is_that_of_sinc(largest):
+    turns = np.linspace(-largest, largest, 101)
+    np.testing.assert_allclose(_chord(turns), np.sinc(turns / math.tau), rtol=0.0, atol=5e-11)
+
+
+def test_exponential_coordinates_are_those_of_log():
+    rng = np.random.default_rng(1)
+    pose, errors = np.array([3.0, -2.0, 2.5]), rng.normal(0.0, [1.0, 1.0, 0.7], (50, 3))
+    expected = se2.log(se2.compose(se2.inverse(pose), pose + errors))
+    np.testing.assert_allclose(log_about(pose, errors), expected, atol=1e-12)
+
+
+def test_a_small_region_is_the_ellipse():
+    covariance = np.array([[4e-8, 1e-8, 1e-9], [1e-8, 2e-8, 3e-9], [1e-9, 3e-9, 1e-8]])
+    region = Region(np.array([1.0, 2.0, 0.6]), covariance, ELLIPSE_LEVEL)
+    turn = np.array([[math.cos(0.6), -math.sin(0.6)], [math.sin(0.6), math.cos(0.6)]])
+    errors = np.random.default_rng(2).normal(0.0, 3e-4, (500, 2))
+    expected = np.einsum('ni,ij,nj->n', errors @ turn, np.linalg.inv(covariance[:2, :2]), errors @ turn)
+    distance = region_distance(region, region.pose[:2] + errors)
+    near = expected < 10.0
+    np.testing.assert_allclose(distance[near], expected[near], rtol=1e-2)
+
+
+def test_a_distance_is_the_least_over_all_headings():
+    """A region with an unsure heading, by brute force."""
+    covariance = np.array([[0.01, 0.0, 0.0], [0.0, 0.3, 0.2], [0.0, 0.2, 0.25]])
+    region = Region(np.array([1.0, 2.0, 0.6]), covariance, ELLIPSE_LEVEL)
+    inverted = np.linalg.inv(covariance)
+    for position in np.random.default_rng(3).normal([1.0, 2.0], 0.4, (20, 2)):
+        turned = np.linspace(-2.0, 2.0, 40_001)
+        errors = np.column_stack([np.tile(position - region.pose[:2], (len(turned), 1)), turned])
+        xi = log_about(region.pose, errors)
+        least = np.einsum('ni,ij,nj->n', xi, inverted, xi).min()
+        assert region_distance(region, position) == pytest.approx(least, rel=0.01, abs=1e-3)
+
+
+def test_without_any_uncertainty_only_the_pose_is_inside():
+    errors = np.zeros((10, 3))
+    region = region_of(np.array([1.0, 2.0, 0.3]), errors)
+    distance = region_distance(region, [[1.0, 2.0], [1.0, 2.1]])
+    assert distance.tolist() == [0.0, math.inf]
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        ((np.zeros((3, 3)), np.zeros((3, 3)), NONE), 'poses and noise must have shapes'),
+        ((np.zeros((3, 3)), -np.ones((2, 3)), NONE), 'noise must have variances'),
+        ((np.zeros((3, 3)), np.zeros((2, 3)), -np.eye(3)), 'covariance must be symmetric'),
+        ((np.full((3, 3), np.nan), np.zeros((2, 3)), NONE), 'poses must be finite'),
+    ],
+)
+def test_a_wrong_argument_is_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        list(sampled_errors(*arguments))
+
+
+# --- In the figure
+
+
+def driven(drive, rate=50, covariance=NONE):
+    """A run as read from a bag of a virtual robot."""
+    robot, stamp = Robot(model=RobotModel(), stamp=0, pose=np.zeros(3), covariance=covariance), 0
+    rows, covariances, stamps = [], [], []
+    for twist, duration in drive:
+        robot = robot.commanded(twist, stamp)
+        for _ in range(int(duration * rate)):
+            stamp += SECOND // rate
+            now = robot.at(stamp)
+            rows.append([*now.pose_tuple, *now.twist])
+            of_twist = now.twist_covariance_tuple(1.0 / rate)
+            covariances.append([*now.moments[:6], *of_twist[:2], of_twist[3]])
+            stamps.append(stamp)
+    empty = {
+        name: Series(
+            received=np.empty(0, np.int64),
+            stamps=np.empty(0, np.int64),
+            values=np.empty((0, len(columns))),
+            columns=columns,
+        )
+        for name, columns in COLUMNS.items()
+    }
+    made = np.array(stamps)
+    empty['odometry'] = Series(received=made, stamps=made, values=np.array(rows))
+    return Run(path=Path('run'), odometry_covariances=np.array(covariances), **empty)
+
+
+def test_the_regions_along_a_path_hold_95_percent_of_the_robots():
+    drive = [((0.22, 0.3), 6.0), ((0.0, 0.0), 1.0), ((0.22, -0.1), 20.0)]
+    found = uncertainties(timeline(driven(drive)), places=3)
+    assert len(found) == 3
+    last = found[-1]
+    errors = noisy_runs(np.random.default_rng(6), drive, NONE, 4000, L, K)
+    within = region_distance(last.region, last.region.pose[:2] + errors[:, :2]) <= last.region.level
+    assert 0.94 <= within.mean() <= 0.96
+    assert np.all(last.extent[0] < last.region.pose[:2])
+    assert np.all(last.region.pose[:2] < last.extent[1])
+
+
+def test_the_start_of_a_run_may_be_unsure():
+    covariance = np.diag([0.01, 0.01, 0.04])
+    drive = [((0.22, 0.2), 10.0)]
+    (only,) = uncertainties(timeline(driven(drive, covariance=covariance)), places=1)
+    errors = noisy_runs(np.random.default_rng(6), drive, covariance, 4000, L, K)
+    within = region_distance(only.region, only.region.pose[:2] + errors[:, :2]) <= only.region.level
+    assert 0.94 <= within.mean() <= 0.96
+
+
+def legends(run):
+    drawing = figure([run])
+    return [text.get_text() for axes in drawing.axes for text in _legend_texts(axes)]
+
+
+def _legend_texts(axes):
+    return axes.get_legend().get_texts() if axes.get_legend() else []
+
+
+def test_the_figure_has_the_region_and_the_ellipse():
+    labels = legends(driven([((0.22, 0.0), 20.0)]))
+    assert REGION_LABEL in labels
+    assert ELLIPSE_LABEL in labels
+
+
+@pytest.mark.parametrize('entry', [math.nan, math.inf, -1.0, 0.0])
+def test_covariances_that_are_not_of_wheels_are_not_drawn(entry):
+    run = driven([((0.22, 0.0), 1.0)])
+    for column in range(9):
+        covariances = run.odometry_covariances.copy()
+        covariances[:, column] = entry
+        made = replace(run, odometry_covariances=covariances)
+        if entry == 0.0 and column not in (5, 8):
+            uncertainties(timeline(made))
+            continue
+        assert uncertainties(timeline(made)) == [] or column in (1, 2, 4, 7)
+    constant = np.tile(run.odometry_covariances[-1], (len(run.odometry), 1))
+    assert REGION_LABEL not in legends(replace(run, odometry_covariances=constant))
+    assert REGION_LABEL not in legends(replace(run, odometry_covariances=np.empty((0, 9))))

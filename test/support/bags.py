@@ -1,0 +1,79 @@
+"""Bags of what was sent: built from messages, without nodes."""
+
+from __future__ import annotations
+
+import json
+from itertools import count
+from pathlib import Path
+
+from action_msgs.msg import GoalStatus
+from rcl_interfaces.msg import ParameterEvent
+from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
+from ruamel.yaml import YAML
+
+from diffdrive_jacobian.bags.bag_writer import build_bag
+from diffdrive_jacobian.bags.journal import PARAMETERS, Channel, Message, Text
+from diffdrive_jacobian.bags.message_definitions import definition
+from support.ros_messages import odometry, placement, stamp, twist
+
+SECOND = 1_000_000_000
+REAL = Path(__file__).parents[1] / 'bags' / 'turtlebot3_fake_sqlite'
+"""A bag of another robot, written by another version of rosbag2."""
+
+
+def write_bag(path, sent, *, parameters=None, storage='mcap'):
+    """Write a bag of (seconds, topic, message); parameters are by node."""
+    ids, channels, data = count(), {}, []
+    for seconds, topic, message in sent:
+        name = f'{type(message).__module__.split(".")[0]}/msg/{type(message).__name__}'
+        if (topic, name) not in channels:
+            known = definition(name)
+            channels[topic, name] = Channel(
+                id=next(ids),
+                topic=topic,
+                type_name=name,
+                definition=known.text,
+                type_hash=known.type_hash,
+            )
+        received = round(seconds * SECOND)
+        data.append(Message(channels[topic, name].id, received, serialize_message(message)))
+    texts = [Text(PARAMETERS + node, json.dumps(values)) for node, values in (parameters or {}).items()]
+    build_bag(channels.values(), [*texts, *data], path, storage)
+    return path
+
+
+def count_more(bag, topic, more):
+    """Add to the number of messages of a topic in metadata.yaml."""
+    yaml, path = YAML(typ='safe'), bag / 'metadata.yaml'
+    content = yaml.load(path.read_text())
+    for one in content['rosbag2_bagfile_information']['topics_with_message_count']:
+        if one['topic_metadata']['name'] == topic:
+            one['message_count'] += more
+    with open(path, 'w') as file:
+        yaml.dump(content, file)
+
+
+def odom(x, y, theta, v=0.0, omega=0.0, *, seconds=0.0):
+    message = odometry(x, y, theta)
+    message.header.stamp = stamp(round(seconds * SECOND))
+    message.twist.twist = twist(v, omega)
+    return message
+
+
+def status(value, seconds=0):
+    message = GoalStatus(status=value)
+    message.goal_info.stamp.sec = seconds
+    return message
+
+
+def start(x, y, theta, *, seconds):
+    message = placement(x, y, theta)
+    message.header.stamp = stamp(round(seconds * SECOND))
+    return message
+
+
+def changed(node, name, value):
+    return ParameterEvent(
+        node=node, changed_parameters=[Parameter(name, value=value).to_parameter_msg()]
+    )

@@ -1,0 +1,32 @@
+"""Recorded runs of a robot on an arc or a line, without nodes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from diffdrive_jacobian.bags.run_reader import read_run
+from diffdrive_jacobian.kinematics.se2 import integrate
+from support.bags import SECOND, odom, write_bag
+from support.ros_messages import joint_command
+
+RATE = 50
+STRAIGHT = {'omega': 0.0, 'v': 0.5}
+"""At time t at x = t / 2."""
+
+
+def drive(count=200, v=0.5, omega=0.5, begin=10.0, delay=0.0):
+    """Drive an arc; what the robot says is recorded with a delay (s)."""
+    pose = np.zeros(3)
+    for index in range(count):
+        at = begin + index / RATE
+        yield at + delay, '/odom', odom(*pose, v, omega, seconds=at)
+        yield at + delay, '/joint_states', joint_command(index, -index, round(at * SECOND))
+        pose = integrate(pose, (v, omega), 1 / RATE)
+
+
+def sample(extra=(), **how):
+    return sorted([*drive(**how), *extra], key=lambda one: one[0])
+
+
+def run_of(tmp_path, extra=(), *, parameters=None, **how):
+    return read_run(write_bag(tmp_path / 'run', sample(extra, **how), parameters=parameters))

@@ -1,0 +1,499 @@
+"""Options that several tools have, and combinations of options that would have no effect."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import math
+import os
+from pathlib import Path
+
+import pytest
+
+from diffdrive_jacobian import __version__
+from diffdrive_jacobian.parameters.configurations import configurations
+from diffdrive_jacobian.signals import Signals
+from diffdrive_jacobian.tools import _cli, _messages, _options, entry_points
+
+CONFIGS = Path(__file__).parents[2] / 'config'
+
+
+def run(tool, *arguments):
+    """Run a tool in this process; return its exit code."""
+    module = importlib.import_module(f'diffdrive_jacobian.tools.{tool}')
+    try:
+        return module.main([str(one) for one in arguments], Signals())
+    except SystemExit as end:
+        return end.code
+
+
+def refused(capsys, tool, *arguments):
+    """Give the message with which arguments are refused."""
+    assert run(tool, *arguments) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith(f'{tool}: error: ')
+    return last.removeprefix(f'{tool}: error: ')
+
+
+# --- --version
+
+
+@pytest.mark.parametrize('tool', entry_points.tools())
+def test_every_tool_prints_its_version(capsys, tool):
+    assert run(tool, '--version') == 0
+    assert capsys.readouterr().out == f'{tool} (diffdrive_jacobian) {__version__}\n'
+
+
+@pytest.mark.parametrize('node', entry_points.NODES)
+def test_every_node_prints_its_version(capsys, node):
+    from diffdrive_jacobian.tools.run_node import run_node
+
+    with pytest.raises(SystemExit) as end:
+        run_node(node, ['--version'], Signals())
+    assert end.value.code == 0
+    assert capsys.readouterr().out == f'{node} (diffdrive_jacobian) {__version__}\n'
+
+
+# --- --robot
+
+
+def test_the_configurations_of_the_clone_are_found():
+    # Those of the installation if it is not editable.
+    found = {name: path.read_text() for name, path in configurations().items()}
+    assert found == {path.stem: path.read_text() for path in sorted(CONFIGS.glob('*.yaml'))}
+
+
+def test_the_configurations_of_an_installation_are_found(tmp_path, monkeypatch):
+    from diffdrive_jacobian.parameters import configurations as module
+
+    folder = tmp_path / 'share' / 'diffdrive_jacobian' / 'config'
+    folder.mkdir(parents=True)
+    (folder / 'rover.yaml').write_text('')
+    # As if the package was not in a clone.
+    monkeypatch.setattr(module, '__file__', str(tmp_path / 'lib' / 'a' / 'b' / 'c.py'))
+    monkeypatch.setenv('AMENT_PREFIX_PATH', '/nowhere')
+    assert 'rover' not in configurations()
+    monkeypatch.setenv('AMENT_PREFIX_PATH', os.pathsep.join(['/nowhere', str(tmp_path)]))
+    assert configurations()['rover'] == folder / 'rover.yaml'
+    monkeypatch.delenv('AMENT_PREFIX_PATH')
+    monkeypatch.setattr(module, '__file__', str(tmp_path / 'a' / 'b' / 'c.py'))
+    assert configurations()['rover'] == folder / 'rover.yaml'
+    # As pip and colcon install. The list of the installed files, which is slow to read, is not needed.
+    site = tmp_path / 'lib' / 'python3' / 'site-packages'
+    monkeypatch.setattr(module, '__file__', str(site / 'a' / 'b' / 'c.py'))
+    monkeypatch.setattr(module, '_listed_files', lambda: pytest.fail('it reads the list'))
+    assert configurations() == {'rover': folder / 'rover.yaml'}
+
+
+def test_robot_stands_for_its_parameter_file(capsys):
+    parser = _cli.Parser(prog='x')
+    _options.add_params_file(parser)
+    options = parser.parse_args(['--robot', 'turtlebot3_burger'])
+    assert Path(options.params_file).read_text() == (CONFIGS / 'turtlebot3_burger.yaml').read_text()
+    assert 'create3, turtlebot3_burger' in ' '.join(parser.format_help().split())
+
+
+def test_another_robot_is_refused_with_those_there_are(capsys):
+    assert "must be one of 'create3', 'turtlebot3_burger', got" in refused(
+        capsys, 'drive_to', 1, 1, '--robot', 'r2d2'
+    )
+    file = CONFIGS / 'create3.yaml'
+    both = ('--robot', 'create3', '--params-file', file)
+    assert 'not allowed with argument' in refused(capsys, 'drive_to', 1, 1, *both)
+
+
+# --- Headings
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'expected'),
+    [
+        ([], None),
+        (['--heading', '1.5'], 1.5),
+        (['--heading', '-6.2'], -6.2),
+        (['--heading', '90', '--degrees'], math.pi / 2),
+        (['--degrees', '--heading', ' -360'], -math.tau),
+    ],
+)
+def test_headings_are_in_radians_or_degrees(arguments, expected):
+    parser = _cli.Parser(prog='x')
+    _options.add_heading(parser, 'heading')
+    assert _options.given_heading(parser, parser.parse_args(arguments)) == expected
+
+
+@pytest.mark.parametrize('tool', ['drive_to', 'send_goal'])
+def test_headings_in_the_wrong_unit_are_refused(capsys, tool):
+    assert '--degrees accepts them' in refused(capsys, tool, 1, 1, '--heading', 90)
+    assert 'from -360 to 360 degrees' in refused(capsys, tool, 1, 1, '--heading', 400, '--degrees')
+    assert '--degrees needs --heading' in refused(capsys, tool, 1, 1, '--degrees')
+
+
+# --- Options without effect
+
+
+@pytest.mark.parametrize(
+    ('tool', 'arguments', 'words'),
+    [
+        ('drive_to', '1 1 --no-record -o run', '--output has no effect with --no-record'),
+        ('drive_to', '1 1 --no-record --force', '--force has no effect with --no-record'),
+        ('drive_to', '1 1 --force', '--force has no effect without --output'),
+        ('send_path', 'circle:1 --no-wait --timeout 5', '--timeout has no effect with --no-wait'),
+        ('send_path', 'circle:0', 'size of a shape must be a positive number'),
+        ('send_path', 'missing.csv', 'missing.csv: there is no such file'),
+        ('send_path', 'square:1', 'path must be circle:RADIUS, line:LENGTH, eight:SIZE'),
+        ('drive_to', '--path circle:1 1 1', '--path excludes X Y and --heading'),
+        ('drive_to', '--path circle:1 --heading 1', '--path excludes X Y and --heading'),
+        ('drive_to', '1 1 --speed 0.3', '--speed has no effect without --path'),
+        ('drive_to', '1 1 --path-controller kanayama', '--path-controller has no effect without'),
+        ('drive_to', '--path circle:1 --path-controller mine', 'kanayama'),
+        ('drive_to', '--path poses.txt', 'the name of a .csv or .yaml file'),
+        ('send_goal', '1 1 --no-wait --timeout 5', '--timeout has no effect with --no-wait'),
+        ('record_run', '--force', '--force has no effect without --output'),
+        ('record_run', '--all -e odom', '--regex has no effect with --all'),
+        ('record_run', 'odom --all', 'TOPIC has no effect with --all'),
+        ('replay_run', 'run --timeout 1', '--timeout needs -w'),
+        ('replay_run', 'run --topics /a --namespace b', '--namespace has no effect with --topics'),
+        (
+            'replay_run',
+            'run --loop --wait-for-all-acked 1',
+            '--wait-for-all-acked has no effect with --loop',
+        ),
+        ('replay_run', 'run --start-paused', '--start-paused needs a terminal'),
+        ('sweep_gains', '--force', '--force has no effect without --output or --csv'),
+        ('plot_run', 'run --topic odom=/a --topic odom=/b', '--topic can be given once for each name'),
+        ('plot_run', 'run --namespace a-b', 'must be a namespace'),
+    ],
+)
+def test_options_without_effect_are_refused(capsys, tmp_path, monkeypatch, tool, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    assert words in refused(capsys, tool, *arguments.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ('text', 'expected'), [('robot1', '/robot1'), ('/a/b/', '/a/b'), ('/', '/'), ('', '/')]
+)
+def test_namespaces(text, expected):
+    assert _options.namespace(text) == expected
+
+
+@pytest.mark.parametrize('text', ['a b', '1a', 'a//b', 'a-b'])
+def test_names_that_are_no_namespace(text):
+    with pytest.raises(argparse.ArgumentTypeError):
+        _options.namespace(text)
+
+
+# --- Bags of several robots
+
+
+@pytest.fixture(scope='module')
+def robots(tmp_path_factory):
+    """A bag of two robots with different limits; the second one stands elsewhere."""
+    from geometry_msgs.msg import Twist
+    from support.lockstep_nodes import make_complete
+    from support.recorded import LockstepRecording
+    from support.ros_messages import twist
+
+    from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+    from diffdrive_jacobian.testing import Lockstep
+
+    path = tmp_path_factory.mktemp('bags') / 'two'
+    with Lockstep() as world:
+        world.add(make_complete(VirtualRobot, 'one'))
+        world.add(make_complete(VirtualRobot, 'two', x=5.0, linear__x__max_velocity=0.5))
+        made = LockstepRecording(world, path, everything=True)
+        for robot in ('one', 'two'):
+            world.node.create_publisher(Twist, f'/{robot}/cmd_vel', 10)
+        made.look()
+        for speed in (0.25, 0.5):
+            world.publish('/one/cmd_vel', twist(speed, 0.0))
+            world.publish('/two/cmd_vel', twist(2.0 * speed, 0.0))
+            world.run_for(0.4)
+        world.remove(made.recorder)
+        made.recording.finish()
+    return path
+
+
+def test_a_bag_of_several_robots_is_read_by_namespace(robots):
+    from diffdrive_jacobian.bags import BagError, read_run
+
+    with pytest.raises(BagError, match='choose one of them, or one namespace'):
+        read_run(robots)
+    first, second = (read_run(robots, namespace=name) for name in ('/one', '/two'))
+    assert (first.odometry.values[-1, 0], second.odometry.values[-1, 0]) == pytest.approx(
+        (0.3, 5.36), abs=0.05
+    )
+    assert second.of_node('virtual_robot')['linear.x.max_velocity'] == 0.5
+    assert math.isnan(first.of_node('virtual_robot')['linear.x.max_velocity'])
+    assert list(first.parameters) == ['/one/virtual_robot']
+    with pytest.raises(BagError, match=r'in the namespace /three; it has them in /one, /two'):
+        read_run(robots, namespace='/three')
+
+
+def test_verify_run_verifies_each_of_several_robots(robots, capsys):
+    for name in ('one', '/two'):
+        assert run('verify_run', robots, '--namespace', name) == 0
+        assert 'moves as recorded' in capsys.readouterr().out
+        assert run('replay_run', robots, '--verify', '--namespace', name) == 0
+        capsys.readouterr()
+    assert 'one namespace (--namespace)' in refused(capsys, 'verify_run', robots)
+
+
+def test_parameters_that_a_verification_does_not_use_are_refused(robots, capsys):
+    arguments = (robots, '--namespace', 'one', '--robot', 'create3')
+    assert 'have no effect: the bag has cmd_vel_out' in refused(capsys, 'verify_run', *arguments)
+
+
+def test_plot_run_writes_one_of_several_robots(robots, capsys, monkeypatch):
+    from diffdrive_jacobian.tools import plot_run
+
+    drawn = []
+    monkeypatch.setattr(plot_run, 'draw', lambda runs, path, **_: drawn.append((runs[0], path)))
+    assert run('plot_run', robots, '--namespace', 'two') == 0
+    ((data, path),) = drawn
+    assert (round(data.odometry.values[0, 0]), path.name) == (5, 'two_two.png')
+
+
+def test_playback_chooses_a_namespace(robots):
+    from diffdrive_jacobian.bags.bag_reader import BagError, open_bag
+    from diffdrive_jacobian.recording import NothingToPlayError, Playback
+
+    def topics(**how):
+        with open_bag(robots) as reader:
+            return {one.topic for one in Playback(**how).choose(reader)}
+
+    assert topics() == {'/one/cmd_vel', '/two/cmd_vel'}
+    assert topics(namespace='/two') == {'/two/cmd_vel'}
+    everything = topics(names=None, namespace='/two')
+    assert {'/two/odom', '/two/cmd_vel_out'} <= everything
+    assert all(one.startswith('/two/') for one in everything)
+    assert topics(names=None, namespace='/') == topics(names=None)
+    assert topics(topics=('/one/odom', 'two/odom')) == {'/one/odom', '/two/odom'}
+    with pytest.raises(BagError, match='odom is ambiguous, it can be /one/odom or /two/odom'):
+        topics(topics=('odom',))
+    for missing in ('dom', '/odom', '', 'one'):
+        with pytest.raises(BagError, match=f'has no topic {missing}; it has /clock, '):
+            topics(topics=(missing,))
+    with pytest.raises(NothingToPlayError, match='cmd_vel in the namespace /three'):
+        topics(namespace='/three')
+
+
+# --- --force
+
+
+def test_a_bag_replaces_another_one_only_if_asked(robots, tmp_path):
+    from diffdrive_jacobian.bags.bag_writer import build_bag
+    from diffdrive_jacobian.bags.journal import Text
+
+    target = tmp_path / 'run'
+    build_bag([], [Text('a', 'old')], target, 'mcap')
+    with pytest.raises(FileExistsError, match='exists already'):
+        build_bag([], [Text('a', 'new')], target, 'mcap')
+    before = (target / 'metadata.yaml').read_text()
+
+    def failing():
+        yield Text('a', 'new')
+        raise OSError('the disk is full')
+
+    with pytest.raises(OSError, match='the disk is full'):
+        build_bag([], failing(), target, 'mcap', replace=True)
+    assert (target / 'metadata.yaml').read_text() == before
+    build_bag([], [Text('a', 'new')], target, 'sqlite3', replace=True)
+    assert 'new' in (target / 'metadata.yaml').read_text()
+    assert sorted(one.name for one in target.iterdir()) == ['metadata.yaml', 'run.db3']
+    assert list(tmp_path.iterdir()) == [target]
+
+
+@pytest.mark.parametrize(
+    'content', [(), ('notes.txt',), ('metadata.yaml', 'thesis.tex'), ('other.journal.mcap',)]
+)
+def test_a_directory_that_is_no_bag_is_never_replaced(tmp_path, content):
+    from diffdrive_jacobian.recording.record import open_recording
+
+    target = tmp_path / 'thesis'
+    target.mkdir()
+    for name in content:
+        (target / name).touch()
+    with pytest.raises(OSError, match='is not a bag: it is not replaced'):
+        open_recording('run', str(target), 'mcap', replace=True)
+    assert sorted(one.name for one in target.iterdir()) == sorted(content)
+    (tmp_path / 'link').symlink_to(target)
+    with pytest.raises(OSError, match='is not a bag'):
+        open_recording('run', str(tmp_path / 'link'), 'mcap', replace=True)
+
+
+def test_recover_run_never_replaces_the_bag_to_recover(robots, capsys):
+    arguments = (robots, '-o', robots, '--force')
+    assert 'is the bag to recover: it is not replaced' in refused(capsys, 'recover_run', *arguments)
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Files are written without drawing their picture."""
+    monkeypatch.setattr('diffdrive_jacobian.plots.run_figure.figure', lambda *_: None)
+    monkeypatch.setattr('diffdrive_jacobian.plots.run_figure.render', lambda *_: b'picture')
+
+
+@pytest.mark.usefixtures('undrawn')
+def test_drive_to_replaces_bag_and_picture(tmp_path, monkeypatch, capsys):
+    from diffdrive_jacobian.bags import read_run
+
+    pytest.importorskip('matplotlib')
+    monkeypatch.chdir(tmp_path)
+    arguments = ('--lockstep', '-o', 'run', '--tolerance', '0.05')
+    assert run('drive_to', '0.1', '0', *arguments, '--no-plot') == 0
+    (tmp_path / 'run.png').write_text('old')
+    assert 'run exists already' in refused(capsys, 'drive_to', '0.2', '0', *arguments)
+    assert run('drive_to', '0.2', '0', *arguments, '--force') == 0
+    assert read_run(tmp_path / 'run').goals.values[0, 0] == 0.2
+    assert (tmp_path / 'run.png').read_bytes() == b'picture'
+    assert sorted(one.name for one in tmp_path.iterdir()) == ['run', 'run.png']
+
+
+@pytest.mark.usefixtures('undrawn')
+def test_plot_run_and_sweep_gains_overwrite_files_only(tmp_path, robots, capsys, monkeypatch):
+    pytest.importorskip('matplotlib')
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'a.png').write_text('old')
+    (tmp_path / 'a.csv').write_text('old')
+    (tmp_path / 'b.png').mkdir()
+    plot = ('plot_run', robots, '--namespace', 'one', '-o')
+    sweep = ('sweep_gains', '--grid', 2, '--starts', 1, '--duration', 1, '--csv')
+    for command in ((*plot, 'a.png'), (*sweep, 'a.csv')):
+        assert '--force overwrites files' in refused(capsys, *command)
+        assert run(*command, '--force') == 0
+    assert (tmp_path / 'a.png').read_bytes() == b'picture'
+    assert (tmp_path / 'a.csv').read_text().startswith('kp_per_s')
+    assert run(*plot, 'b.png', '--force') == 2
+
+
+# --- Waiting
+
+
+def test_what_is_waited_for_is_said_after_half_a_second_of_each_wait(monkeypatch, capsys):
+    now = 100.0
+    monkeypatch.setattr(_messages.time, 'monotonic', lambda: now)
+    waiting = _messages.Waiting()
+    said = []
+    for step in range(100):
+        now = 100.0 + 0.1 * step
+        waiting.show('a reader')
+        if capsys.readouterr().out:
+            said.append(step)
+    assert said == pytest.approx([5, 35, 65, 95], abs=1)
+    now += 5.0
+    waiting.show('the end')
+    assert capsys.readouterr().out == ''
+    now += 0.3
+    waiting.show('the end')
+    assert capsys.readouterr().out == ''
+    now += 0.3
+    waiting.show('the end')
+    assert capsys.readouterr().out == 'waiting: the end\n'
+
+
+def test_long_work_is_named_on_a_terminal(monkeypatch, capsys):
+    import io
+    import threading
+
+    class Terminal(io.StringIO):
+        written = threading.Event()
+
+        def isatty(self):
+            return True
+
+        def flush(self):
+            self.written.set()
+
+    terminal = Terminal()
+    monkeypatch.setattr(_messages, 'FIRST', 0.01)
+    with _messages.busy('tool', 'reading'):
+        pass
+    assert capsys.readouterr().err == ''
+    monkeypatch.setattr(_messages.sys, 'stderr', terminal)
+    with _messages.busy('tool', 'reading'):
+        assert terminal.written.wait(10.0)
+    assert terminal.getvalue() == 'tool: reading ...\n'
+
+
+# --- send_goal --heading
+
+
+class Progress:
+    """A progress that keeps what it is told."""
+
+    def __init__(self):
+        self.ignored = []
+        self.reasons = set()
+
+    def heading_ignored(self, controller):
+        self.ignored.append(controller)
+
+    def waiting(self, reason):
+        self.reasons.add(reason)
+
+    def driving(self, distance):
+        pass
+
+    def no_odometry(self, topic, seconds):
+        pass
+
+    def standing(self, seconds):
+        pass
+
+
+@pytest.mark.parametrize(
+    ('follow', 'matters', 'parameters', 'expected'),
+    [
+        (True, True, {}, ['/go_to_goal']),
+        (False, True, {}, ['/go_to_goal']),
+        (True, False, {}, []),
+        (True, True, {'use_goal_heading': True}, []),
+        (True, True, {'controller': 'pose'}, []),
+    ],
+)
+def test_a_controller_that_ignores_the_heading_is_reported(follow, matters, parameters, expected):
+    import numpy as np
+    from rclpy.parameter import Parameter
+
+    from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+    from diffdrive_jacobian.nodes.goal_client import GoalClient
+    from diffdrive_jacobian.nodes.remote_goal import _Session
+    from diffdrive_jacobian.ros.runner import ros_context, running
+
+    overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+    progress, signals = Progress(), Signals()
+    with ros_context(['test']) as context, running(context, isolated=True) as runner:
+        runner.add(lambda: GoToGoal(context=context, parameter_overrides=overrides))
+        goals = np.array([[1.0, 0.0, 1.5]])
+        client = runner.add(lambda: GoalClient('client', goals, context, topic='goal_pose'))
+        session = _Session(client, runner, signals, progress)
+        session.run(10.0, 0.0, follow=follow, heading_matters=matters)
+    assert progress.ignored == expected
+    waited = {'no answer on /goal_status', 'no odometry on /odom'} if follow else set()
+    assert waited <= progress.reasons
+
+
+def test_a_replay_says_which_subscriptions_it_waits_for(robots, capfd):
+    from diffdrive_jacobian.recording import Playback, replay
+
+    class Reasons(Progress):
+        def started(self, seconds):
+            pass
+
+        def playing(self, seconds, *, paused):
+            pass
+
+        def toggled(self):
+            return False
+
+        def ended(self):
+            pass
+
+    progress = Reasons()
+    playback = Playback(namespace='/one', rate=100.0)
+    assert replay(robots, playback, patience=0.1, progress=progress).played
+    assert progress.reasons == {
+        'no subscription to /one/cmd_vel (starting after 0.1 s without it)',
+    }
+    assert 'no node is subscribed to /one/cmd_vel' in capfd.readouterr().err

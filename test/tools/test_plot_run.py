@@ -1,0 +1,846 @@
+"""The tool plot_run: the picture shows the run's numbers, the CSV holds them, mistakes are told."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import shutil
+import signal
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fork_server import forked
+from support.bags import REAL, SECOND, changed, odom, start, status, write_bag
+from support.processes import PROGRAM
+from support.ros_messages import goal, goals, joint_command, twist, twist_stamped
+from support.runs import RATE, STRAIGHT, drive, run_of, sample
+
+from diffdrive_jacobian.bags import time_series as _lines
+from diffdrive_jacobian.bags import timeline as _timeline
+from diffdrive_jacobian.bags.run_reader import BagError, read_run
+from diffdrive_jacobian.bags.time_series import limits, line
+from diffdrive_jacobian.bags.timeline import timeline
+from diffdrive_jacobian.kinematics.se2 import wrap_angle
+from diffdrive_jacobian.plots import output_files
+from diffdrive_jacobian.plots import run_figure as _figure
+from diffdrive_jacobian.plots.rendering import render
+from diffdrive_jacobian.plots.run_figure import LABELS, figure, names
+from diffdrive_jacobian.plots.run_table import COLUMNS, decimal_seconds
+from diffdrive_jacobian.signals import CAUGHT, Signals
+from diffdrive_jacobian.tools.plot_run import main
+
+PARAMETERS = {
+    '/virtual_robot': {
+        'linear.x.max_velocity': 0.22,
+        'linear.x.min_velocity': -0.1,
+        'angular.z.max_velocity': math.nan,
+        'angular.z.min_velocity': math.nan,
+        'max_wheel_velocity': 6.67,
+    },
+    '/go_to_goal': {'xy_goal_tolerance': 0.05, 'angular.z.max_velocity': 1.0},
+    '/wheel_bridge': {'max_wheel_velocity': 9.0},
+}
+"""Nodes that limit each other's speeds."""
+
+
+@pytest.fixture(scope='module')
+def recorded(tmp_path_factory):
+    """A run with a goal, commands and limits. It is not changed."""
+    extra = [
+        (10.5, '/goal_pose', goal(1.0, 0.5)),
+        (10.5, '/cmd_vel', twist(0.5, 0.5)),
+        (12.0, '/cmd_vel', twist(0.25, 1.5)),
+        (12.0, '/joint_command', joint_command(1, 2)),
+    ]
+    path = tmp_path_factory.mktemp('recorded') / 'bag'
+    return write_bag(path, sample(extra), parameters=PARAMETERS)
+
+
+@pytest.fixture
+def bag(recorded, tmp_path):
+    """A copy of it."""
+    return shutil.copytree(recorded, tmp_path / 'bag')
+
+
+@pytest.fixture(scope='module')
+def recorded_plain(tmp_path_factory):
+    """A run with odometry alone, which is drawn faster. It is not changed."""
+    return write_bag(tmp_path_factory.mktemp('plain') / 'bag', odometry_only())
+
+
+@pytest.fixture
+def plain(recorded_plain, tmp_path):
+    """A copy of it."""
+    return shutil.copytree(recorded_plain, tmp_path / 'bag')
+
+
+@pytest.fixture(scope='module')
+def run(recorded):
+    return read_run(recorded)
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Files are written without drawing their picture."""
+    monkeypatch.setattr(_figure, 'figure', lambda *_: None)
+    monkeypatch.setattr(_figure, 'render', lambda *_: b'picture')
+
+
+def odometry_only(**how):
+    return [one for one in sample(**how) if one[1] == '/odom']
+
+
+def plot(*arguments):
+    return main([str(one) for one in arguments], Signals())
+
+
+def refuses(capsys, code, *words):
+    """Hold that it said in one line what is wrong, and nothing else."""
+    out, err = capsys.readouterr()
+    assert out == ''
+    last = err.splitlines()[-1]
+    assert last.startswith('plot_run: error: ')
+    assert all(word in last for word in words), last
+    assert 'Traceback' not in err
+    assert code in (1, 2)
+    return err
+
+
+def by_label(made):
+    return {one.get_ylabel(): one for one in made.axes if one.get_ylabel()}
+
+
+def drawn(axes, color=_figure.COLORS[0]):
+    """Give the points of the lines of a colour, without their holes."""
+    rows = [np.column_stack(one.get_data()) for one in axes.lines if one.get_color() == color]
+    rows = np.vstack([one for one in rows if len(one) > 1])
+    return rows[~np.isnan(rows).any(axis=1)]
+
+
+# --- Files
+
+
+@pytest.mark.parametrize(
+    ('ending', 'magic'),
+    [('png', b'\x89PNG\r\n'), ('svg', b'<?xml'), ('pdf', b'%PDF-'), ('PNG', b'\x89PNG')],
+)
+def test_the_picture_is_of_the_format_of_its_ending(
+    recorded, recorded_plain, tmp_path, capsys, ending, magic
+):
+    picture = tmp_path / f'picture.{ending}'
+    assert plot(recorded if ending in ('svg', 'pdf') else recorded_plain, '-o', picture) == 0
+    assert picture.read_bytes().startswith(magic)
+    assert capsys.readouterr() == (f'{picture}\n', '')
+
+
+def test_the_picture_lies_beside_the_bag(bag, tmp_path, monkeypatch):
+    monkeypatch.chdir(bag)
+    assert plot('.') == 0
+    assert (tmp_path / 'bag.png').stat().st_size > 10_000
+
+
+@pytest.mark.usefixtures('undrawn')
+def test_two_runs_lie_in_one_picture(bag, recorded_plain, tmp_path):
+    other = shutil.copytree(recorded_plain, tmp_path / 'other')
+    assert plot(bag, other) == 0
+    assert (tmp_path / 'bag_and_other.png').exists()
+
+
+@pytest.mark.usefixtures('no_display')
+def test_no_display_is_needed(recorded_plain, tmp_path):
+    assert plot(recorded_plain, '-o', tmp_path / 'a.png') == 0
+
+
+@pytest.mark.parametrize('name', ['_hidden', 'cost $5', '$x^$', 'läuft 走行', 'a' * 200])
+def test_a_bag_may_have_any_name(plain, tmp_path, capsys, name):
+    assert plot(plain.rename(tmp_path / name), '-o', tmp_path / 'a.png') == 0
+    assert capsys.readouterr().err == ''
+
+
+def test_the_users_style_does_not_matter(run):
+    import matplotlib
+
+    with matplotlib.rc_context({'figure.figsize': (1, 1), 'text.usetex': True, 'axes.grid': False}):
+        made = figure([run])
+        assert matplotlib.rcParams['text.usetex'] is True
+    assert made.get_size_inches().tolist() == [11.0, 7.0]
+
+
+# --- What is in the picture
+
+
+def test_the_axes_show_the_run_with_units(run):
+    made = figure([run])
+    plane, axes = made.axes[0], by_label(made)
+    assert plane.get_aspect() == 1.0
+    assert (plane.get_xlabel(), plane.get_ylabel()) == ('x [m]', 'y [m]')
+    of_paths = {LABELS[name] for name in ('across', 'along', 'path_heading_error')}
+    assert set(axes) == {'y [m]', *LABELS.values()} - of_paths
+    assert {one.get_xlabel() for one in axes.values()} == {'x [m]', 'time [s]', ''}
+    assert drawn(plane)[: len(run.odometry)] == pytest.approx(run.odometry.values[:, :2], abs=0.0)
+    time = np.arange(200) / RATE
+    for quantity, column in (('v', 3), ('omega', 4)):
+        values = np.column_stack([time, run.odometry.values[:, column]])
+        assert drawn(axes[LABELS[quantity]]) == pytest.approx(values, abs=1e-9)
+    wheels = drawn(axes[LABELS['right']])
+    assert wheels == pytest.approx(np.column_stack([time, run.wheels.values[:, 0]]), abs=1e-9)
+    x, y, theta = run.odometry.values[25:, :3].T
+    distance = drawn(axes[LABELS['distance']])
+    assert distance[:, 1] == pytest.approx(np.hypot(1.0 - x, 0.5 - y), abs=1e-12)
+    error = wrap_angle(np.arctan2(0.5 - y, 1.0 - x) - theta)
+    reached = np.flatnonzero(np.hypot(1.0 - x, 0.5 - y) <= 0.05)
+    until = reached[0] if len(reached) else len(x)
+    shown = drawn(axes[LABELS['bearing_error']])
+    assert shown[:, 1] == pytest.approx(error[:until], abs=1e-12)
+
+
+def test_everything_drawn_lies_inside_the_picture(run):
+    made = figure([run, replace(run, path=Path('second'))])
+    render(made, 'png')
+    width, height = made.get_size_inches() * made.dpi
+    for axes in made.axes:
+        box = axes.get_tightbbox()
+        assert box.x0 >= 0.0
+        assert box.y0 >= 0.0
+        assert box.x1 <= width
+        assert box.y1 <= height
+
+
+def test_runs_differ_by_colour_and_by_style(run):
+    made = figure([replace(run, path=Path(name)) for name in 'abcde'])
+    plane = made.axes[0]
+    labelled = [one for one in plane.lines if not one.get_label().startswith('_')]
+    assert [one.get_label()[:2] for one in labelled] == ['a:', 'b:', 'c:', 'd:', 'e:']
+    assert len({one.get_color() for one in labelled}) == 5
+    dashes = {str(one._dash_pattern) for one in labelled}
+    assert len(dashes) == 5
+    # One for each run, zero, and two limits for each.
+    assert len(by_label(made)[LABELS['v']].lines) == 5 + 5 + 2 * 5
+
+
+def test_only_a_single_run_shows_its_commands(run):
+
+    def lines(made):
+        axes = by_label(made)[LABELS['v']]
+        return [one for one in axes.lines if one.get_color() == _figure.COMMAND]
+
+    (commanded,) = lines(figure([run]))
+    assert commanded.get_drawstyle() == 'steps-post'
+    values = [[0.5, 0.5], [2.0, 0.25], [199 / RATE, 0.25]]
+    assert np.column_stack(commanded.get_data()) == pytest.approx(np.array(values), abs=1e-9)
+    assert lines(figure([run, replace(run, path=Path('b'))])) == []
+
+
+def test_without_goals_and_wheels_their_axes_are_left_out(recorded_plain):
+    made = figure([read_run(recorded_plain)])
+    assert set(by_label(made)) == {'y [m]', LABELS['v'], LABELS['omega']}
+
+
+@pytest.mark.parametrize('count', [1, 2])
+def test_a_robot_that_stands_is_drawn(tmp_path, count):
+    made = figure([run_of(tmp_path, count=count, v=0.0, omega=0.0)])
+    low, high = made.axes[0].get_xlim()
+    assert 0.4 < high - low < 5.0
+
+
+# --- Limits
+
+
+def test_limits_are_the_narrowest_of_the_nodes(run):
+    found = {name: bounds[:, 0, 1].tolist() for name, bounds in limits(timeline(run)).items()}
+    assert found == {
+        'v': [-0.1, 0.22],
+        'omega': [-1.0, 1.0],
+        'right': [-6.67, 6.67],
+        'left': [-6.67, 6.67],
+    }
+
+
+def test_limits_that_are_not_known_are_not_drawn(tmp_path):
+    run = run_of(tmp_path, parameters={'/virtual_robot': {'max_wheel_velocity': math.nan}})
+    assert all(np.isnan(bounds[..., 1]).all() for bounds in limits(timeline(run)).values())
+    assert len(by_label(figure([run]))[LABELS['v']].lines) == 1 + 1 + 1 + 2
+
+
+def test_a_limit_holds_from_when_it_was_set(tmp_path):
+    change = (11.0, '/parameter_events', changed('/virtual_robot', 'max_wheel_velocity', 3.0))
+    run = run_of(tmp_path, [change], parameters=PARAMETERS)
+    upper = limits(timeline(run))['right'][1]
+    assert upper == pytest.approx(np.array([[0.0, 6.67], [1.0, 3.0], [199 / RATE, 3.0]]), abs=1e-9)
+
+
+# --- What counts for the goal
+
+
+CONTROLLER = {'controller': 'go_to_goal', 'use_goal_heading': False, 'xy_goal_tolerance': 0.05}
+
+
+@pytest.mark.parametrize('node', ['/go_to_goal', '/renamed'])
+def test_parameters_of_the_controller_count_from_when_they_were_set(tmp_path, node):
+    extra = [
+        (10.0, '/goal_pose', goal(5.0, 1.0, 1.0)),
+        (11.0, '/parameter_events', changed(node, 'use_goal_heading', value=True)),
+        (12.0, '/parameter_events', changed(node, 'controller', 'offset_point')),
+        (12.0, '/parameter_events', changed(node, 'offset', 0.3)),
+    ]
+    run = run_of(tmp_path, extra, parameters={node: CONTROLLER}, omega=0.0)
+    one = timeline(run)
+    x = run.odometry.values[:, 0]
+    heading, driven = one.time >= 1.0, np.where(one.time >= 2.0, x + 0.3, x)
+    assert one.goal_heading_error == pytest.approx(np.where(heading, 1.0, np.nan), nan_ok=True)
+    assert one.distance == pytest.approx(np.hypot(5.0 - driven, 1.0))
+
+
+def test_the_tolerance_counts_from_when_it_was_set(tmp_path):
+    extra = [
+        (10.0, '/goals', goals(goal(0.5, 0.0), goal(3.0, 0.0))),
+        (10.5, '/parameter_events', changed('/go_to_goal', 'xy_goal_tolerance', 0.2)),
+    ]
+    run = run_of(tmp_path, extra, parameters={'/go_to_goal': CONTROLLER}, **STRAIGHT)
+    assert goals_of(run) == [(0.0, 0), (0.6, 1)]
+
+
+# --- Which goal counts
+
+
+def goals_of(run):
+    """Give `(time, goal)` whenever the goal changes."""
+    one = timeline(run)
+    changes = [0, *(np.flatnonzero(np.diff(one.goal)) + 1).tolist()]
+    return [(round(float(one.time[index]), 6), int(one.goal[index])) for index in changes]
+
+
+def test_a_goal_counts_from_when_it_came_until_the_next(tmp_path):
+    extra = [(11.0, '/goal_pose', goal(5, 0)), (12.0, '/goal_pose', goal(5, 1))]
+    run = run_of(tmp_path, extra, **STRAIGHT)
+    assert goals_of(run) == [(0.0, -1), (1.0, 0), (2.0, 1)]
+    assert np.isnan(timeline(run).distance[:50]).all()
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'tolerance'),
+    [(None, 0.02), ({'/go_to_goal': {'xy_goal_tolerance': 0.1}}, 0.1)],
+)
+def test_the_next_waypoint_counts_from_within_the_tolerance(tmp_path, parameters, tolerance):
+    way = (10.0, '/goals', goals(goal(0.5, 0), goal(1.0, 0), goal(1.5, 0)))
+    run = run_of(tmp_path, [way], parameters=parameters, **STRAIGHT)
+    times = [round((x - tolerance) / 0.5, 6) for x in (0.5, 1.0, 1.5)]
+    assert goals_of(run) == [(0.0, 0), (times[0], 1), (times[1], 2)]
+    one = timeline(run)
+    reached = np.flatnonzero(np.isnan(one.bearing_error))
+    assert one.time[reached[0]] == pytest.approx(times[2])
+    assert not np.isnan(one.distance).any()
+
+
+def test_a_waypoint_that_was_missed_is_passed_at_the_closest_approach(tmp_path):
+    way = (10.0, '/goals', goals(goal(0.5, 0.3), goal(1.0, 0)))
+    assert goals_of(run_of(tmp_path, [way], **STRAIGHT)) == [(0.0, 0), (1.0, 1)]
+
+
+def test_a_waypoint_that_the_node_did_not_reach_stays(tmp_path):
+    way = (10.0, '/goals', goals(goal(0.5, 0.3), goal(1.0, 0)))
+    run = run_of(tmp_path, [way, (10.0, '/goal_status', status(2))], **STRAIGHT)
+    assert goals_of(run) == [(0.0, 0)]
+
+
+@pytest.mark.parametrize('value', [5, 6])
+def test_a_canceled_goal_counts_no_more(tmp_path, value):
+    extra = [
+        (11.0, '/goal_pose', goal(5, 0)),
+        (11.0, '/goal_status', status(2)),
+        (11.99, '/goal_status', status(value)),
+    ]
+    assert goals_of(run_of(tmp_path, extra, **STRAIGHT)) == [(0.0, -1), (1.0, 0), (2.0, -1)]
+
+
+def test_a_refused_goal_never_counts(tmp_path):
+    extra = [
+        (10.0, '/goal_pose', goal(5, 0)),
+        (10.01, '/goal_status', status(2)),
+        (11.0, '/goal_pose', goal(7, 0)),
+        (11.01, '/goal_status', status(6)),
+        (11.02, '/goal_status', status(2)),
+    ]
+    assert goals_of(run_of(tmp_path, extra, **STRAIGHT)) == [(0.0, 0)]
+
+
+def test_a_goal_that_was_replaced_is_followed_by_the_next(tmp_path):
+    extra = [
+        (10.0, '/goal_pose', goal(5, 0)),
+        (10.0, '/goal_status', status(1)),
+        (11.0, '/goal_pose', goal(7, 0)),
+        (11.0, '/goal_status', status(5)),
+        (11.0, '/goal_status', status(1)),
+    ]
+    assert goals_of(run_of(tmp_path, extra, **STRAIGHT)) == [(0.0, 0), (1.0, 1)]
+
+
+@pytest.mark.parametrize('replaced', [True, False])
+def test_a_goal_that_was_not_recorded_ends_the_one_before(tmp_path, replaced):
+    extra = [
+        (10.0, '/goal_pose', goal(5, 0, stamp=9)),
+        (10.0, '/goal_status', status(1, 9)),
+        (11.0, '/goal_status', status(5 if replaced else 4, 9)),
+        (11.5, '/goal_status', status(1, 11)),
+        (12.0, '/goal_status', status(4, 11)),
+        (13.0, '/goal_pose', goal(7, 0, stamp=13)),
+        (13.0, '/goal_status', status(1, 13)),
+    ]
+    run = run_of(tmp_path, extra, **STRAIGHT)
+    assert goals_of(run) == [(0.0, 0), (1.02 if replaced else 1.5, -1), (3.0, 1)]
+
+
+def test_a_goal_that_is_only_passed_is_driven_to_until_the_end(tmp_path):
+    """It comes near the goal, drives on, and is placed elsewhere before the node reports success."""
+    states = [(10.0, '/goal_status', status(2)), (13.9, '/goal_status', status(4))]
+    for name, extra in (('node', states), ('other', [])):
+        placed = (12.0, '/start_pose', start(1.0, 0, 0, seconds=12.0))
+        sent = sample([(10.0, '/goal_pose', goal(0.5, 0)), placed, *extra], **STRAIGHT)
+        one = timeline(read_run(write_bag(tmp_path / name, sent)))
+        assert one.breaks.tolist() == [100]
+        assert not np.isnan(one.distance).any()
+        assert drawn(by_label(figure([one.run]))[LABELS['distance']])[-1, 0] == one.time[-1]
+
+
+def test_a_goal_is_reached_when_the_node_says_so(tmp_path):
+    """Until then it has a direction, also after it was passed; from then on until a reset a distance."""
+    drives = [*drive(100, v=0.5, omega=0.0), *drive(100, v=-0.25, omega=0.0, begin=12.0)]
+    sent = [(at, topic, one) for at, topic, one in drives if topic == '/odom']
+    for index, (_, _, one) in enumerate(sent[100:]):
+        one.pose.pose.position.x = 1.0 - 0.25 * index / RATE
+    extra = [(10.0, '/goal_pose', goal(0.75, 0)), (10.0, '/goal_status', status(2))]
+    extra += [(13.0, '/goal_status', status(4)), (13.5, '/start_pose', start(0.625, 0, 0, seconds=13.5))]
+    run = read_run(write_bag(tmp_path / 'bag', sorted([*sent, *extra], key=lambda one: one[0])))
+    one = timeline(run)
+    # Within 0.02 m of it again since 12.92 s.
+    assert np.flatnonzero(np.isnan(one.bearing_error))[0] == 146
+    assert np.flatnonzero(np.isnan(one.distance)).tolist() == list(range(175, 200))
+
+
+# --- Time
+
+
+@pytest.mark.parametrize('delay', [0.0, 0.5, 1.7e9])
+def test_what_has_no_stamp_counts_by_the_recorders_clock(tmp_path, delay):
+    extra = [(12.0 + delay, '/cmd_vel', twist(0.1, 0.2)), (11.0 + delay, '/goal_pose', goal(1, 1))]
+    run = run_of(tmp_path, extra, delay=delay)
+    assert _timeline.seconds(run, run.cmd_vel) == pytest.approx([2.0], abs=1e-6)
+    assert timeline(run).time == pytest.approx(np.arange(200) / RATE, abs=1e-9)
+    assert np.flatnonzero(timeline(run).goal == 0)[0] in (50, 51)
+
+
+def test_no_line_leads_to_where_the_odometry_begins_anew(tmp_path):
+    sent = [
+        *drive(100),
+        (12.0, '/start_pose', start(0, 0, 0, seconds=12.0)),
+        *drive(100, begin=12.0),
+        *(
+            (14.0 + index / RATE, '/odom', odom(5, 5, 0, seconds=14.0 + index / RATE))
+            for index in range(9)
+        ),
+        (14.2, '/odom', odom(5, 5, 0, seconds=1.0)),
+    ]
+    run = read_run(write_bag(tmp_path / 'bag', sent))
+    assert timeline(run).breaks.tolist() == [100, 200, 209]
+    (path,) = (one for one in figure([run]).axes[0].lines if not one.get_label().startswith('_'))
+    assert np.flatnonzero(np.isnan(path.get_xdata())).tolist() == [100, 201, 211]
+    assert path.get_label().startswith('bag: ')
+
+
+def test_odometry_of_the_instant_of_a_new_beginning_may_be_from_before(tmp_path):
+    sent = [*drive(50, **STRAIGHT), (11.0, '/odom', odom(0.5, 0, 0, seconds=11.0))]
+    sent += [
+        (11.0, '/start_pose', start(0.52, 0, 0, seconds=11.0)),
+        (11.02, '/odom', odom(0.52, 0, 0, seconds=11.02)),
+    ]
+    assert timeline(read_run(write_bag(tmp_path / 'bag', sent))).breaks.tolist() == [51]
+
+
+def test_many_runs_are_drawn(recorded_plain, tmp_path):
+    run = read_run(recorded_plain)
+    _figure.draw([replace(run, path=Path(f'run_{index}')) for index in range(40)], tmp_path / 'a.png')
+    assert (tmp_path / 'a.png').exists()
+
+
+def test_a_teleport_that_nobody_announced_breaks_the_line(tmp_path):
+    sent = [*drive(50, **STRAIGHT), *drive(50, begin=11.0, **STRAIGHT)]
+    assert timeline(read_run(write_bag(tmp_path / 'bag', sent))).breaks.tolist() == [50]
+
+
+def test_a_gap_in_the_recording_is_no_teleport(tmp_path):
+    sent = [one for one in drive(200, **STRAIGHT) if not 10.5 < one[0] < 12.5]
+    assert timeline(read_run(write_bag(tmp_path / 'bag', sent))).breaks.tolist() == []
+
+
+# --- Long runs
+
+
+def test_a_long_line_keeps_its_extremes_and_its_ends():
+    rng = np.random.default_rng(1)
+    rows = np.column_stack([np.arange(1_000_000.0), rng.normal(size=1_000_000)])
+    rows[777_777, 1], rows[33, 1] = 50.0, -50.0
+    kept = line(rows, np.array([500_000]))
+    assert len(kept) < 4 * _lines.BUCKETS + 4
+    assert {33.0, 777_777.0, 0.0, 999_999.0} <= set(kept[:, 0])
+    assert np.isnan(kept[:, 1]).sum() == 1
+    assert (np.diff(kept[~np.isnan(kept[:, 0]), 0]) > 0).all()
+
+
+def test_a_short_line_stays_as_it_is():
+    rows = np.column_stack([np.arange(1000.0), np.arange(1000.0)])
+    assert line(rows, np.array([], dtype=int)).tolist() == rows.tolist()
+
+
+def test_a_long_line_with_very_many_gaps_is_drawn_without_them():
+    count = 100_000
+    rows = np.column_stack([np.arange(count), np.sin(np.arange(count))])
+    kept = line(rows, np.arange(10, count, 10))
+    assert np.isfinite(kept).all()
+    assert len(kept) < count / 5
+    np.testing.assert_allclose(
+        [kept.min(axis=0), kept.max(axis=0)], [rows.min(axis=0), rows.max(axis=0)]
+    )
+
+
+# --- CSV
+
+
+def read_csv(path):
+    with open(path, newline='', encoding='utf-8') as file:
+        header, *rows = csv.reader(file)
+    return header, np.array([[float(value or 'nan') for value in row] for row in rows])
+
+
+@pytest.mark.usefixtures('undrawn')
+def test_csv_holds_the_numbers_of_the_run(recorded, run, tmp_path):
+    assert plot(recorded, '-o', tmp_path / 'a.png', '--csv', tmp_path / 'a.csv') == 0
+    header, rows = read_csv(tmp_path / 'a.csv')
+    one = timeline(run)
+    assert header == list(COLUMNS)
+    columns = dict(zip(header, rows.T, strict=True))
+    assert rows[:, 0].tolist() == one.time.tolist()
+    rounded = {'rtol': 0.0, 'atol': 5.1e-10}
+    np.testing.assert_allclose(rows[:, 1:6], run.odometry.values, **rounded)
+    np.testing.assert_allclose(columns['distance_m'], one.distance, **rounded)
+    assert np.isnan(columns['goal_heading_error_rad']).all()
+    np.testing.assert_allclose(columns['bearing_error_rad'], one.bearing_error, **rounded)
+    assert columns['omega_right_radps'].tolist() == run.wheels.values[:, 0].tolist()
+    assert columns['omega_left_radps'].tolist() == run.wheels.values[:, 1].tolist()
+    first = np.flatnonzero(one.goal == one.goal.max())
+    goal, *places = np.vstack([run.goals.values[-1:, :2], run.odometry.values[first, :2]]) @ [1.0, 1.0j]
+    way = goal - places[0]
+    beyond = ((np.array(places) - goal) * way.conjugate()).real / abs(way)
+    np.testing.assert_allclose(columns['beyond_goal_m'][first], beyond, **rounded)
+    assert beyond[0] == pytest.approx(-abs(way))
+    assert np.ptp(beyond) > 0.1
+    held = [math.nan] * 25 + [0.5] * 75 + [0.25] * 100
+    np.testing.assert_array_equal(columns['v_command_mps'], held)
+
+
+@pytest.mark.usefixtures('undrawn')
+def test_csv_has_exact_times_and_no_artefacts_of_floats(tmp_path):
+    begin = 1_795_213_077
+    sent = [
+        (begin, '/odom', odom(57.303999999999995, 0.1 + 0.2, -1e-12, seconds=begin)),
+        (begin + 1, '/odom', odom(-999999.123456789, 1e-9, 0.0, seconds=begin)),
+    ]
+    sent[1][2].header.stamp.nanosec = 123_456_789
+    bag = write_bag(tmp_path / 'bag', sent)
+    assert plot(bag, '--csv', tmp_path / 'a.csv') == 0
+    _, first, second = (tmp_path / 'a.csv').read_text().splitlines()
+    empty = ',' * (len(COLUMNS) - 6)
+    assert first == '0,57.304,0.3,0,0,0' + empty
+    assert second == '0.123456789,-999999.123456789,0.000000001,0,0,0' + empty
+
+
+@pytest.mark.parametrize(
+    ('nanoseconds', 'text'),
+    [
+        (0, '0'),
+        (1, '0.000000001'),
+        (-1, '-0.000000001'),
+        (2**63 - 1, '9223372036.854775807'),
+        (5 * SECOND, '5'),
+    ],
+)
+def test_csv_times_are_exact(nanoseconds, text):
+    assert decimal_seconds(nanoseconds) == text
+
+
+@pytest.mark.usefixtures('undrawn')
+def test_csv_prefers_the_commands_that_were_applied(tmp_path):
+    extra = [(10.0, '/cmd_vel', twist(9, 9)), (10.5, '/cmd_vel_out', twist_stamped(1, 2, 10 * SECOND))]
+    bag = write_bag(tmp_path / 'bag', sample(extra))
+    assert plot(bag, '--csv', tmp_path / 'a.csv') == 0
+    _, rows = read_csv(tmp_path / 'a.csv')
+    assert (rows[:, 8:10] == [1.0, 2.0]).all()
+
+
+@pytest.mark.usefixtures('undrawn')
+@pytest.mark.parametrize('there', [True, False])
+def test_several_runs_get_a_file_each(bag, tmp_path, there):
+    (tmp_path / 'x').mkdir()
+    other = write_bag(tmp_path / 'x/bag', sample(v=0.2))
+    if there:
+        (tmp_path / 'numbers').mkdir()
+    assert plot(bag, other, '-o', tmp_path / 'a.png', '--csv', tmp_path / 'numbers') == 0
+    found = sorted((tmp_path / 'numbers').iterdir())
+    assert [one.name for one in found] == [f'{tmp_path.name}_bag.csv', 'x_bag.csv']
+    assert sorted(read_csv(one)[1][0, 4] for one in found) == [0.2, 0.5]
+
+
+def test_names_are_as_long_as_it_takes():
+    assert names([Path('/a/run')]) == ['run']
+    assert names([Path('/a/run'), Path('/b/walk')]) == ['run', 'walk']
+    assert names([Path('/a/x/run'), Path('/b/x/run')]) == ['a/x/run', 'b/x/run']
+
+
+# --- Notes
+
+
+def noted(tmp_path, name, count=1):
+    sent = [
+        *sample(),
+        *((10.0 + index / 100, '/joint_command', joint_command(1e308, 0)) for index in range(count)),
+    ]
+    return write_bag(tmp_path / name, sorted(sent, key=lambda one: one[0]))
+
+
+@pytest.mark.usefixtures('undrawn')
+def test_messages_that_were_skipped_are_reported_in_picture_and_terminal(tmp_path, capsys):
+    bag = noted(tmp_path, 'bag', 3)
+    note = '3 of 3 messages on /joint_command hold invalid or implausible values and were skipped'
+    assert plot(bag) == 0
+    assert capsys.readouterr() == (f'{tmp_path / "bag.png"}\n', f'plot_run: {bag}: {note}\n')
+    assert figure([read_run(bag)]).get_supxlabel() == note
+
+
+def test_notes_of_several_runs_name_them_and_are_not_too_many(tmp_path):
+    run = read_run(noted(tmp_path, 'bag'))
+    runs = [replace(run, path=Path(f'r{index}$')) for index in range(6)]
+    lines = figure(runs).get_supxlabel().splitlines()
+    assert [one[:5] for one in lines[:3]] == [r'r0\$:', r'r1\$:', r'r2\$:']
+    assert lines[3:] == ['and 3 more notes']
+
+
+def test_without_notes_nothing_is_written_below(run):
+    assert figure([run]).get_supxlabel() == ''
+
+
+# --- Mistakes
+
+
+@pytest.mark.parametrize('what', ['nothing', 'an empty folder', 'a file', 'damaged', 'without odometry'])
+def test_what_cannot_be_drawn_is_told(tmp_path, capsys, what):
+    bag = tmp_path / 'bag'
+    if what == 'an empty folder':
+        bag.mkdir()
+    elif what == 'a file':
+        bag.write_text('Dear')
+    elif what == 'damaged':
+        write_bag(bag, sample())
+        (bag / 'metadata.yaml').write_text('x')
+    elif what == 'without odometry':
+        write_bag(bag, [(1.0, '/cmd_vel', twist(0, 0))])
+    assert plot(bag) == 2
+    refuses(capsys, 2, str(bag), {'without odometry': 'no odometry'}.get(what, 'bag'))
+    assert not (tmp_path / 'bag.png').exists()
+
+
+@pytest.mark.parametrize('output', ['a.jpg', 'a', 'a.', 'a.png.gz', ''])
+def test_an_unknown_ending_is_told(bag, capsys, output):
+    assert plot(bag, '-o', output) == 2
+    refuses(capsys, 2, '.png, .svg, .pdf', repr(output))
+
+
+@pytest.mark.parametrize('option', ['-o', '--csv'])
+def test_nothing_is_ever_overwritten(bag, tmp_path, capsys, option):
+    file = tmp_path / ('a.png' if option == '-o' else 'a.csv')
+    file.write_text('precious')
+    assert plot(bag, option, file) == 2
+    refuses(capsys, 2, f'{file} exists already')
+    assert file.read_text() == 'precious'
+    assert sorted(one.name for one in tmp_path.iterdir()) == sorted(['bag', file.name])
+
+
+def test_a_file_that_appears_meanwhile_is_not_overwritten(tmp_path):
+    with pytest.raises(FileExistsError):
+        output_files.create(Path('/dev/null'), b'x')
+
+
+@pytest.mark.usefixtures('undrawn')
+@pytest.mark.parametrize('option', ['-o', '--csv'])
+def test_where_nobody_may_write_is_told(bag, tmp_path, capsys, option):
+    # For root, too, there is no such place.
+    place = Path('/proc/no') / ('a.png' if option == '-o' else 'a.csv')
+    arguments = [option, place] if option == '-o' else ['-o', tmp_path / 'a.png', option, place]
+    assert plot(bag, *arguments) == 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith(f'plot_run: error: {place} cannot be written: ')
+
+
+@pytest.mark.parametrize('option', ['-o', '--csv'])
+def test_a_missing_directory_is_reported_before_anything_is_read(tmp_path, capsys, option):
+    file = tmp_path / 'none' / 'deeper' / ('a.png' if option == '-o' else 'a.csv')
+    assert plot(tmp_path / 'no_bag', option, file) == 1
+    refuses(capsys, 1, f'{file} cannot be written: No such file or directory')
+
+
+@pytest.mark.parametrize('option', ['-o', '--csv'])
+def test_a_file_in_the_place_of_a_directory_is_told(tmp_path, capsys, option):
+    (tmp_path / 'notes').write_text('precious')
+    file = tmp_path / 'notes' / ('a.png' if option == '-o' else 'tables')
+    assert plot(tmp_path / 'no_bag', option, file) == 1
+    refuses(capsys, 1, 'cannot be written: Not a directory')
+
+
+@pytest.mark.usefixtures('undrawn')
+def test_a_file_that_cannot_be_finished_is_taken_away(bag, tmp_path, capsys, monkeypatch):
+    def full(self, data):
+        raise OSError(28, 'No space left on device')
+
+    class Full:
+        def __init__(self, path, mode):
+            Path(path).touch()
+
+        __enter__ = lambda self: self  # noqa: E731
+        __exit__ = lambda self, *_: None  # noqa: E731
+        write = full
+
+    monkeypatch.setattr(output_files, 'open', Full, raising=False)
+    assert plot(bag, '-o', tmp_path / 'a.png') == 1
+    refuses(capsys, 1, 'a.png cannot be written: No space left on device')
+    assert not (tmp_path / 'a.png').exists()
+
+
+@pytest.mark.parametrize('unbuffered', ['', '1'])
+def test_output_that_cannot_be_written_is_not_blamed_on_the_picture(plain, tmp_path, unbuffered):
+    picture = tmp_path / 'a.png'
+    with open('/dev/full', 'w') as full:
+        done = forked.run(
+            PROGRAM.format('plot_run'),
+            (plain, '-o', picture),
+            env={**os.environ, 'PYTHONUNBUFFERED': unbuffered},
+            stdout=full,
+        )
+    error = 'plot_run: error: the standard output cannot be written: No space left on device\n'
+    assert (done.returncode, done.stderr) == (1, error)
+    assert picture.exists()
+
+
+@pytest.mark.usefixtures('undrawn')
+def test_paths_are_printed_without_control_characters(bag, tmp_path, capsys):
+    place = tmp_path / os.fsdecode(b'\x1b]0;x\x07 \xff')
+    place.mkdir()
+    assert plot(bag, '-o', place / 'a.png', '--csv', place / 'a.csv') == 0
+    escaped = rf'{tmp_path}/\x1b]0;x\x07 \udcff'
+    assert capsys.readouterr().out == f'{escaped}/a.png\n{escaped}/a.csv\n'
+    assert plot(bag, '-o', place / 'a.png') == 2
+    refuses(capsys, 2, rf'{escaped}/a.png exists already')
+    assert plot(bag, '-o', place / 'none' / 'a.png') == 1
+    refuses(capsys, 1, rf'{escaped}/none/a.png cannot be written: No such file or directory')
+
+
+def test_without_matplotlib_it_says_how_to_get_it(bag, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'matplotlib', None)
+    monkeypatch.setitem(sys.modules, 'matplotlib.figure', None)
+    assert plot(bag) == 2
+    refuses(capsys, 2, "pip install 'diffdrive_jacobian[plot]'")
+    assert not (tmp_path / 'bag.png').exists()
+
+
+@pytest.mark.parametrize('topic', ['odom', 'odom=', '=/x', 'speed=/x', ''])
+def test_a_topic_must_be_known(bag, capsys, topic):
+    with pytest.raises(SystemExit, match='2'):
+        plot(bag, '--topic', topic)
+    refuses(capsys, 2, 'NAME=TOPIC')
+
+
+@pytest.mark.usefixtures('undrawn')
+def test_a_topic_may_have_another_name(tmp_path, capsys):
+    sent = [(at, f'/{robot}{topic}', one) for robot in 'ab' for at, topic, one in sample()]
+    bag = write_bag(tmp_path / 'bag', sent)
+    assert plot(bag) == 2
+    refuses(capsys, 2, 'several topics', '/a/')
+    named = [f'--topic={name}=b/{name}' for name in ('odom', 'joint_states')]
+    assert plot(bag, *named) == 0
+
+
+def test_the_numbers_of_several_runs_need_a_directory(bag, tmp_path, capsys):
+    other = write_bag(tmp_path / 'other', sample())
+    assert plot(bag, other, '--csv', tmp_path / 'a.csv') == 2
+    refuses(capsys, 2, '--csv must be a directory for 2 runs')
+
+
+@pytest.mark.parametrize('output', ['x.txt', 'x.csv.gz', 'x.png'])
+def test_another_ending_of_the_numbers_is_told(bag, tmp_path, capsys, monkeypatch, output):
+    monkeypatch.chdir(tmp_path)
+    assert plot(bag, '--csv', output) == 2
+    refuses(capsys, 2, f'--csv must be a file that ends in .csv or a directory, got {output!r}')
+    assert os.listdir(tmp_path) == ['bag']
+
+
+def test_the_picture_cannot_be_a_directory(bag, tmp_path, capsys):
+    (tmp_path / 'x.png').mkdir()
+    for output in (f'{tmp_path}/x.png', f'{tmp_path}/new.png/'):
+        assert plot(bag, '-o', output) == 2
+        refuses(capsys, 2, 'the picture must be a file', output)
+
+
+def test_a_bag_cannot_be_given_twice(bag, capsys):
+    assert plot(bag, f'{bag}/') == 2
+    refuses(capsys, 2, 'once')
+
+
+def test_a_signal_ends_it_before_anything_is_written(bag, tmp_path, capsys):
+    signals = Signals()
+    signals.count = 1
+    assert main([str(bag)], signals) == 130
+    assert capsys.readouterr().err == 'plot_run: interrupted\n'
+    assert not (tmp_path / 'bag.png').exists()
+
+
+def test_draw_checks_by_itself(run, bag, tmp_path):
+    with pytest.raises(ValueError, match=r'must end in \.png, \.svg, \.pdf'):
+        _figure.draw([run], tmp_path / 'a.gif')
+    with pytest.raises(FileExistsError):
+        _figure.draw([run], bag.rename(tmp_path / 'bag.png'))
+    empty = read_run(write_bag(tmp_path / 'empty', []))
+    with pytest.raises(BagError, match='no odometry'):
+        _figure.draw([run, empty], tmp_path / 'a.png')
+
+
+def test_a_bag_of_another_robot_is_drawn(tmp_path):
+    bag = shutil.copytree(REAL, tmp_path / 'bag')
+    assert plot(bag, '--csv', tmp_path / 'a.csv') == 0
+    _, rows = read_csv(tmp_path / 'a.csv')
+    assert rows[:, 4].max() == pytest.approx(0.15)
+    assert len(timeline(read_run(bag)).breaks) == 0
+
+
+def test_a_signal_ends_the_drawing(bag, tmp_path, monkeypatch):
+    class EndedError(Exception):
+        pass
+
+    def end():
+        raise EndedError
+
+    def signaled(*_):
+        os.kill(os.getpid(), signal.SIGHUP)
+        return b''
+
+    signals = Signals(end)
+    monkeypatch.setattr('diffdrive_jacobian.plots.run_figure.render', signaled)
+    before = {number: signal.getsignal(number) for number in CAUGHT}
+    try:
+        signals.catch()
+        with pytest.raises(EndedError):
+            main([str(bag), '-o', str(tmp_path / 'run.png')], signals)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert not (tmp_path / 'run.png').exists()
