@@ -24,6 +24,8 @@ from pathlib import Path
 
 from diffdrive_jacobian.lockstep._errors import LockstepError
 
+CLOSED = -1
+"""Stands for a file that was closed."""
 NEVER = -1
 """Place of a timeout that there is not."""
 SLEEPS = {'x86_64': (b'35', b'230'), 'aarch64': (b'101', b'115')}
@@ -139,6 +141,9 @@ class Quiet:
         self._sleeps, self._waits = SLEEPS[platform.machine()], WAITS[platform.machine()]
         self._links = {pid: 0}
         """Number of links of the folder of the threads, by process: it changes with their number."""
+        self._loadavg = os.open('/proc/loadavg', os.O_RDONLY)
+        self._newest = b''
+        """Id of the newest thread on this machine when it was last looked which threads there are."""
         self._own = [_Thread(os.getpid(), tid, own=True) for tid in own]
         self._threads: dict[tuple[int, int], _Thread] = {}
         self._busy: _Thread | None = None
@@ -165,7 +170,9 @@ class Quiet:
         """End the observation."""
         for thread in (*self._threads.values(), *self._own):
             thread.close()
-        self._threads, self._own = {}, []
+        if self._loadavg != CLOSED:
+            os.close(self._loadavg)
+        self._threads, self._own, self._loadavg = {}, [], CLOSED
 
     # --- Waiting
 
@@ -198,8 +205,12 @@ class Quiet:
                 return False
             self._busy = None
             before = self._times()
-            if self._update():
-                return False
+            # Ended threads are noticed below.
+            newest = os.pread(self._loadavg, 128, 0).rpartition(b' ')[2]
+            if newest != self._newest:
+                if self._update():
+                    return False
+                self._newest = newest
             for thread in (*self._threads.values(), *self._own):
                 if self._is_busy(thread):
                     self._busy = thread
@@ -207,7 +218,7 @@ class Quiet:
             return self._times() == before and not any(map(self._is_stopped, self._links))
         except ProcessLookupError:
             # A thread has ended. The next look is at what is left.
-            self._busy = None
+            self._busy, self._newest = None, b''
             self._links = dict.fromkeys(self._links, 0)
             with suppress(ProcessLookupError):
                 self._update()
