@@ -235,8 +235,10 @@ def test_lists_tuples_and_other_numbers_give_the_same_bits(call):
             assert np.array_equal(one, other)
 
 
-def test_the_law_of_one_step_of_the_node_returns_floats():
+def test_the_law_of_one_step_of_the_node_returns_floats_and_needs_the_wheels_for_their_limit():
     """Not NumPy's: messages and saturation take floats."""
     for pose in (POSE, np.array(POSE), list(POSE)):
         twist = control.saturate(*control.go_to_goal(pose, (1.0, 2.0), 3.0, 0.5), LIMITS, **WHEELS)
         assert [type(entry) for entry in twist] == [float, float]
+    with pytest.raises(ValueError, match='so r and L must be given'):
+        control.saturate(3.0, 5.0, LIMITS)
