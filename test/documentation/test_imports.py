@@ -65,6 +65,7 @@ def imports() -> dict[Path, set[str]]:
     return found
 
 
+@pytest.mark.slow
 def test_every_module_has_its_place_and_imports_go_down_only():
     assert {place(path) for path in FILES} == {*LAYERS, *COMMON, '__init__'}
     for path, names in imports().items():

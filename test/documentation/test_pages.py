@@ -292,6 +292,7 @@ def test_design_lists_every_package_and_files_that_exist():
         assert (package / file).exists() or (ROOT / file).exists(), file
 
 
+@pytest.mark.slow
 def test_the_page_of_public_names_is_as_generated():
     """To write it, every public name is imported."""
     assert pages.PAGES['doc/public.md'].read_text() == pages.public_page()

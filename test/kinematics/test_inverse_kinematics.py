@@ -180,6 +180,7 @@ def test_a_masked_entry_is_as_if_it_were_not_there(method):
     assert_same(masked, position.solve(target[:, :2], q0, method=method, max_iterations=50))
 
 
+@pytest.mark.slow
 def test_weights_say_what_matters_where_not_all_can_be_had():
     # Two joints for three entries.
     task, q0, target = Task(TWO, heading=True), np.array([0.5, 0.5]), np.array([0.9, 0.9, 2.5])
