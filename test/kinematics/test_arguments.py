@@ -44,7 +44,7 @@ NOT_NUMBERS = (
     *(None, 'text', '', '1.0', b'1', 1j, object(), {}, [1.0, [2.0, 3.0]], 10**400, 10**5000),
     *(float, [['a', 'b']]),
 )
-EXTREME = (1e308, -1e200, 1e155, 1e154, 1e-160, -5e-324, 0.0, -1.0, 10**30)
+EXTREME = (1e308, -1e200, 1e155, 1e154, 1e-160, 5e-324, -5e-324, 0.0, -1.0, 10**30)
 WRONG_SHAPES = ([], [1.0], [1.0] * 5, np.zeros((2, 2)), np.zeros((0, 3)), np.zeros((7, 4, 4)), ((),))
 UNLIMITED = {'max_velocity', 'max_correction', 'trans_stopped_velocity', 'rot_stopped_velocity'}
 """Limits that may be infinite: none."""
