@@ -53,6 +53,7 @@ def test_limits_keep_the_curvature_hold_for_the_running_command_and_let_it_go_ag
     full, limited = (-1.0, -3.0), saturate(-1.0, -3.0, limits, 0.033, 0.16)
     none = dict.fromkeys(parameters, math.nan)
     assert change(robot, **none).successful
+    lockstep.settle()
     topics.applied.clear()
     lockstep.publish('cmd_vel', twist(*full))
     for values in (parameters, none):
