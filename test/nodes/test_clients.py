@@ -305,7 +305,7 @@ def test_each_standstill_is_detected_once():
     assert [found.update(rest, now) for now in (0.0, 4.9, 5.0, 6.0, 20.0)] == [0, 0, 1, 0, 0]
     # Noise and a turn of the angle are no motion.
     found.update(later, 21.0)
-    noisy = later + [0.002, -0.002, 0.001 - math.tau]
+    noisy = later + np.array([0.002, -0.002, 0.001 - math.tau])
     assert [found.update(noisy, now) for now in (25.9, 26.0, 27.0)] == [0, 1, 0]
     # A robot without a goal may stand still.
     found.reset()

@@ -10,9 +10,6 @@ from nav_msgs.msg import Odometry
 from std_srvs.srv import Trigger
 from support.processes import open_world
 
-from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
-from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.ros.runner import ros_context
 
 NODES = {'virtual_robot': VirtualRobot, 'wheel_bridge': WheelBridge, 'go_to_goal': GoToGoal}
@@ -38,6 +35,7 @@ def world(tmp_path):
         yield world
 
 
+@pytest.mark.process
 def test_a_flooded_robot_answers_and_stops_when_the_flood_ends(world):
     robot = world.start('virtual_robot', '--ros-args', '-p', 'cmd_vel_timeout:=0.3')
     odometry = world.harness.listen(Odometry, 'odom')

@@ -94,9 +94,9 @@ REMAPPED = [argument for name in TOPICS for argument in ('-r', f'{name}:=my_{nam
         (VirtualRobot, WHEELS, None, 'no node publishes /{}joint_command: start wheel_bridge'),
         (
             *(VirtualRobot, {}, (PoseStamped, 'goal_pose', 1)),
-            '/lockstep publishes /{}goal_pose, but no controller is subscribed to it, so its goals are '
-            'lost: start go_to_goal',
+            '/lockstep publishes /{}goal_pose, but no controller is subscribed to it',
         ),
+        (VirtualRobot, {}, (PoseStamped, 'goal_pose', 1), 'goals are lost: start go_to_goal'),
         (
             *(VirtualRobot, {}, (Odometry, 'odom', 1)),
             '/lockstep and /virtual_robot publish /{}odom: their poses alternate',
@@ -254,7 +254,7 @@ def with_integer(message, value):
 @pytest.mark.parametrize(
     ('node_class', 'parameters', 'topic', 'message', 'expected'),
     [
-        (VirtualRobot, {}, 'cmd_vel', twist(0.7, 0.0), 'a command on cmd_vel'),
+        (VirtualRobot, {}, 'cmd_vel', twist(0.7, 0.0), 'a command'),
         (WheelBridge, {}, 'cmd_vel', twist(0.7, 0.0), 'a command on cmd_vel'),
         (VirtualRobot, WHEELS, 'joint_command', joint_command(0.7, -0.7), 'a command on joint_command'),
         (VirtualRobot, {}, 'initialpose', placement(0.7), 'initialpose'),

@@ -64,7 +64,7 @@ def test_value_of_an_unknown_type_is_refused(lockstep, add_complete, name):
 
     for number in (10, 255):
         # The others are set.
-        value = 2.0 + number
+        value = 1.0 + number / 10.0
         first, *others = results(
             of_type(changed, number), double(changed, value), of_type('no such', number)
         )
@@ -99,15 +99,15 @@ def test_odd_names_are_refused_quoted_in_short_and_without_control_characters(
         request = SetParameters.Request(parameters=parameters)
         return lockstep.call(SetParameters, 'go_to_goal/set_parameters', request).results
 
-    (result,) = results(double('', 1.0))
-    assert (result.successful, result.reason) == (False, 'a parameter must have a name, got none')
-    assert not node.has_parameter('')
     (result,) = results(of_type('\x1b[2J' + 100_000 * 'n', 10))
     lines = [one for one in capfd.readouterr().err.splitlines() if 'request refused: ' in one]
     for text in (result.reason, lines[-1]):
         assert len(text) < 300
         assert '\x1b' not in text
         assert r'\x1b[2Jnn' in text
+    (result,) = results(double('', 1.0))
+    assert (result.successful, result.reason) == (False, 'a parameter must have a name, got none')
+    assert not node.has_parameter('')
     assert not any(one.successful for one in results(*(of_type(one, 0) for one in [*ODD_NAMES, 'kp'])))
     # The other services answer.
     for name in ODD_NAMES:
@@ -172,15 +172,17 @@ def test_type_description_is_still_provided(ros):
 # --- /clock
 
 
-@pytest.mark.parametrize('name', NODES)
-def test_node_survives_an_invalid_clock(ros, capfd, name):
+@pytest.mark.parametrize(
+    ('name', 'sec', 'nanosec'),
+    [('virtual_robot', -1, 0), ('go_to_goal', -1, 1_000_000_000), ('wheel_bridge', -(2**31), 0)],
+)
+def test_node_survives_an_invalid_clock(ros, capfd, name, sec, nanosec):
     node = ros.add(NODES[name], parameters={'use_sim_time': True})
     time = ros.talk(Clock, '/clock')
     time.publish(clock(5))
     ros.until(lambda: node.now() == 5_000_000_000, 'the time is known')
-    for sec, nanosec in ((-1, 1_000_000_000), (-(2**31), 0)):
-        time.publish(clock(sec, nanosec))
-    ros.until_said(capfd, '/clock dropped: ', 'got sec -1, nanosec 1000000000')
+    time.publish(clock(sec, nanosec))
+    ros.until_said(capfd, '/clock dropped: ', f'got sec {sec}, nanosec {nanosec}')
     assert node.now() == 5_000_000_000
     time.publish(clock(6))
     ros.until(lambda: node.now() == 6_000_000_000, 'time goes on')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -47,15 +48,16 @@ def test_a_robot_rolls_as_far_as_predicted(command):
     assert ACTUATORS.rolled(command, robot.model) == pytest.approx((distance, turn), abs=1e-9)
 
 
-@pytest.mark.parametrize('command', [(3.0, 0.0), (2.0, 3.0), (-2.0, 0.5), (0.01, 0.0), (0.0, 2.0)])
-@pytest.mark.parametrize('room', [(0.5, math.inf), (math.inf, 0.3), (0.0, math.inf), (0.5, 0.3)])
-def test_a_stoppable_twist_needs_at_most_the_room(command, room):
-    v, omega = ACTUATORS.stoppable(command, room)
-    assert v * command[1] == pytest.approx(omega * command[0])
-    needed = np.abs(ACTUATORS.rolled((v, omega)))
-    assert (needed <= np.array(room) * (1.0 + 1e-9)).all()
-    # It is the fastest one: all of the command, or all of the room.
-    assert (v, omega) == command or np.isclose(needed, room).any()
+def test_a_stoppable_twist_needs_at_most_the_room():
+    commands = [(3.0, 0.0), (2.0, 3.0), (-2.0, 0.5), (0.01, 0.0), (0.0, 2.0)]
+    rooms = [(0.5, math.inf), (math.inf, 0.3), (0.0, math.inf), (0.5, 0.3)]
+    for command, room in itertools.product(commands, rooms):
+        v, omega = ACTUATORS.stoppable(command, room)
+        assert v * command[1] == pytest.approx(omega * command[0])
+        needed = np.abs(ACTUATORS.rolled((v, omega)))
+        assert (needed <= np.array(room) * (1.0 + 1e-9)).all(), (command, room)
+        # It is the fastest one: all of the command, or all of the room.
+        assert (v, omega) == command or np.isclose(needed, room).any(), (command, room)
 
 
 def test_the_description_is_empty_where_nothing_is_to_be_said():
@@ -66,8 +68,7 @@ def test_the_description_is_empty_where_nothing_is_to_be_said():
     assert rolls_on(Actuators(), (0.2, 0.0)) == rolls_on(ACTUATORS, (math.nan, 0.0)) == ''
 
 
-@pytest.mark.parametrize('max_v', [0.2, 0.6, 5.0])
-@pytest.mark.parametrize('kv', [0.5, 1.5])
+@pytest.mark.parametrize(('kv', 'max_v'), [(0.5, 0.6), (0.5, 5.0), (1.5, 0.2), (1.5, 0.6)])
 def test_the_advice_is_given_where_a_robot_overshoots(kv, max_v):
     """The law `v = kv distance`, straight on, with a limit and from far away."""
     limits = VelocityLimits(max_v=max_v, max_omega=1.0, min_omega=-1.0)
@@ -94,37 +95,34 @@ def test_the_node_logs_the_advice_and_not_with_a_stop_in_time(lockstep, capfd):
     assert 'too fast to stop' not in capfd.readouterr().err
 
 
-def overshoot(world, **parameters):
-    """Drive to (3, 0) with a robot that brakes slowly; return by how far it overshoots."""
-    robot = world.add(make(VirtualRobot, **SLOW))
-    world.add(make(GoToGoal, kv=1.0, **SLOW, **parameters))
-    topics = Topics(world)
-    world.run_for(0.1)
-    world.publish('goal_pose', goal(3.0, 0.0))
-    world.run_until(lambda: topics.statuses[-1:] == [SUCCEEDED], 60.0, 'arrival')
+AT_REST = {'trans_stopped_velocity': 0.01, 'rot_stopped_velocity': 0.01}
+
+
+@pytest.mark.parametrize(
+    'parameters', [{}, {'stop_in_time': True}, {'stop_in_time': True, **AT_REST}], ids=len
+)
+def test_a_robot_that_brakes_slowly_overshoots_unless_it_stops_in_time(lockstep, parameters):
+    robot = lockstep.add(make(VirtualRobot, **SLOW))
+    lockstep.add(make(GoToGoal, kv=1.0, **SLOW, **parameters))
+    topics = Topics(lockstep)
+    lockstep.run_for(0.1)
+    lockstep.publish('goal_pose', goal(1.0, 0.0))
+    lockstep.run_until(lambda: topics.statuses[-1:] == [SUCCEEDED], 60.0, 'arrival')
     arrived = robot.pose[0]
-    world.run_until(lambda: not any(robot._robot_now().twist), 60.0, 'rest')
-    return max(one.pose.pose.position.x for one in topics.odom) - 3.0, arrived, robot.pose[0]
-
-
-def test_it_overshoots(lockstep):
-    beyond, arrived, at_rest = overshoot(lockstep)
-    # It passes the goal while it counts as arrived.
-    assert beyond > 0.3
-    assert abs(arrived - 3.0) <= 0.02 < abs(at_rest - 3.0)
-
-
-def test_it_stops_in_time(lockstep):
-    beyond, _, at_rest = overshoot(lockstep, stop_in_time=True)
-    assert beyond < 0.02
-    assert abs(at_rest - 3.0) < 0.025
-
-
-def test_it_arrives_at_rest(lockstep):
-    stopped = {'trans_stopped_velocity': 0.01, 'rot_stopped_velocity': 0.01}
-    _, arrived, at_rest = overshoot(lockstep, stop_in_time=True, **stopped)
-    assert max(abs(arrived - 3.0), abs(at_rest - 3.0)) < 0.021
-    assert 0.0 < abs(at_rest - arrived) <= 0.01**2 / 0.2
+    lockstep.run_until(lambda: not any(robot._robot_now().twist), 60.0, 'rest')
+    beyond = max(one.pose.pose.position.x for one in topics.odom) - 1.0
+    rested = robot.pose[0]
+    assert abs(arrived - 1.0) < 0.021
+    if not parameters:
+        # It passes the goal while it counts as arrived.
+        assert beyond > 0.1
+        assert rested > 1.021
+    elif len(parameters) == 1:
+        assert beyond < 0.02
+        assert abs(rested - 1.0) < 0.025
+    else:
+        assert abs(rested - 1.0) < 0.021
+        assert 0.0 < abs(rested - arrived) <= 0.01**2 / 0.2
 
 
 def test_a_goal_is_reached_when_the_odometry_says_that_the_robot_rests(lockstep):
