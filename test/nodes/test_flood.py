@@ -10,6 +10,9 @@ from nav_msgs.msg import Odometry
 from std_srvs.srv import Trigger
 from support.processes import open_world
 
+from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
+from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
+from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
 from diffdrive_jacobian.ros.runner import ros_context
 
 NODES = {'virtual_robot': VirtualRobot, 'wheel_bridge': WheelBridge, 'go_to_goal': GoToGoal}
