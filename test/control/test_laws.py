@@ -17,11 +17,10 @@ from diffdrive_jacobian.control import (
     go_to_goal,
     go_to_pose,
     offset_point,
-    turn_in_place,
 )
 from diffdrive_jacobian.control.controllers import BUILT_IN
 from diffdrive_jacobian.kinematics import diff_drive, se2
-from diffdrive_jacobian.simulation import closed_loops, trajectories
+from diffdrive_jacobian.simulation import closed_loops
 
 KP, KV = 3.0, 0.5  # document A's gains
 COUNT = 2_000
@@ -168,37 +167,9 @@ def test_go_to_goal_is_document_as():
     assert_allclose(d_dot, -gains[1] * distance * np.cos(error) ** 2, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize('ratio', [0.3, 0.99])
-def test_with_kp_below_kv_the_heading_error_has_a_fixed_point_off_zero(ratio):
-    """`e_dot = Kv sin(e) cos(e) - Kp e` vanishes where sin(2e) / (2e) = Kp / Kv (doc/mathematics.md)."""
-    low, high = 1e-3, math.pi / 2.0
-    for _ in range(100):
-        error = (low + high) / 2.0
-        low, high = (error, high) if math.sin(2.0 * error) > 2.0 * error * ratio else (low, error)
-    step = 1e-5
-    before = np.array([0.0, 0.0, -error])
-    after = se2.integrate(before, go_to_goal(before, [1.0, 0.0], ratio, 1.0), step)
-    bearing = math.atan2(-after[1], 1.0 - after[0])
-    # The error stays at first order, while the robot turns.
-    assert abs(bearing - after[2] - error) < 10.0 * step**2
-    assert after[2] - before[2] > 0.1 * step * ratio
-
-
 def test_go_to_goal_arrives_from_every_start():
     states, targets = random_poses(9, 500)
     assert closed_loops(go_to_goal, states, targets[:, :2], KP, KV, duration=20.0).arrived.all()
-
-
-def test_turning_in_place_takes_the_smaller_angle_and_ends_at_the_heading():
-    here = np.random.default_rng(10).uniform(-np.pi, np.pi, 500)
-    heading = np.random.default_rng(11).uniform(-np.pi, np.pi, 500)
-    smaller, turned = np.arccos(np.cos(heading - here)), np.zeros(500)
-    for _ in range(500):
-        v, omega = turn_in_place(here, heading, KP)
-        assert not np.any(v)
-        here, turned = here + 0.02 * omega, turned + 0.02 * np.abs(omega)
-    assert np.abs(np.sin((here - heading) / 2.0)).max() < 1e-12
-    assert_allclose(turned, smaller, atol=1e-7)
 
 
 # --- Document B: the offset point goes straight to its goal, like exp(-k t)
@@ -228,32 +199,6 @@ def test_the_offset_point_moves_straight_towards_its_goal_whatever_the_heading()
     assert max(np.abs(v / k).max(), np.abs(omega * d / k).max()) < 1e-14
 
 
-def test_the_error_of_the_sampled_offset_point_is_of_first_order_in_the_sampling_time():
-    """From the straight line, and from exp(-k t) of the distance, over two decades."""
-    rng = np.random.default_rng(16)
-    count, duration, numbers = 20, 0.5, np.array([5, 50, 500])
-    start = rng.uniform([-1.0, -1.0, -np.pi], [1.0, 1.0, np.pi], (count, 3))
-    d = rng.choice([-1.0, 1.0], count) * rng.uniform(0.5, 1.0, count)
-    bearing = rng.uniform(-np.pi, np.pi, count)
-    along = np.stack([np.cos(bearing), np.sin(bearing)], -1)
-    target = point(start, d) + along
-    errors = []
-    for steps in numbers:
-        here, aside, decay = start, 0.0, 0.0
-        for step in range(1, steps + 1):
-            here = se2.integrate(
-                here, np.stack(offset_point(here, target, 1.0, d), -1), duration / steps
-            )
-            left = target - point(here, d)
-            exact = math.exp(-step * duration / steps)
-            aside = max(aside, np.abs(along[:, 0] * left[:, 1] - along[:, 1] * left[:, 0]).max())
-            decay = max(decay, np.abs(np.hypot(*left.T) - exact).max())
-        errors.append([aside, decay])
-    slopes = np.polyfit(np.log(duration / numbers), np.log(errors), 1)[0]
-    assert slopes == pytest.approx([1.0, 1.0], abs=0.07), errors
-    assert np.max(errors[-1]) < 1e-3
-
-
 def test_the_offset_point_arrives_when_it_should_with_the_axle_beside_the_goal():
     (states, targets), d = random_poses(17, 500), random_offsets(18, 500)
     d += np.copysign(0.2, d)
@@ -269,11 +214,6 @@ def test_the_offset_point_arrives_when_it_should_with_the_axle_beside_the_goal()
 
 
 # --- Aicardi et al.: position and heading
-
-
-def energy(states, targets, h):
-    rho, alpha, phi = polar(states, targets)
-    return rho**2 + alpha**2 + h * phi**2
 
 
 def test_go_to_pose_is_aicardis_law_with_document_as_speed():
@@ -343,25 +283,7 @@ def test_the_lyapunov_function_never_grows_along_the_polar_equations():
     assert np.mean(smooth) > 0.98
 
 
-def test_sampled_finely_the_energy_falls_at_every_step_until_the_pose_is_taken():
-    states, targets = random_poses(26, 30)
-    law = go_to_pose, states, targets, 2.0, 1.0, 1.0
-    gone = trajectories(*law, rate=100.0, duration=20.0, arrival=Arrival(xy_tolerance=1e-4))
-    V = energy(gone.poses, targets, 1.0)
-    assert np.all(np.diff(V, axis=0) <= 1e-5 * V[:-1])
-    assert np.all(V[-1] < 1e-4 * V[0])
-    assert gone.outcomes.arrived.all()
-
-
 # --- Robots that go_to_pose drives
-
-
-def test_the_law_alone_takes_position_and_heading():
-    states, targets = random_poses(27, 100)
-    never = Arrival(xy_tolerance=0.0)
-    end = closed_loops(go_to_pose, states, targets, KP, KV, duration=30.0, arrival=never).pose
-    assert np.hypot(*(end - targets).T[:2]).max() < 1e-3
-    assert np.abs(se2.wrap_angle((end - targets)[:, 2])).max() < 1e-6
 
 
 @pytest.mark.parametrize('case', ['free', 'limited', 'forwards', 'near'])
@@ -388,28 +310,3 @@ def test_poses_are_taken_from_everywhere(case):
     turned = np.abs(se2.wrap_angle((found.pose - targets)[:, 2]))
     failed = np.flatnonzero(~found.arrived | (off > 0.02) | (turned > 0.02))
     assert not failed.size, [(states[i].tolist(), targets[i].tolist()) for i in failed]
-
-
-def test_limits_slow_the_robot_down_on_the_same_path():
-    """To first order in the sampling time: a slower robot is controlled more often along its path."""
-    count = 3
-    states, targets = random_poses(30, count, 0.4)
-    slower = limits_of(0.1, 0.5, 4.0)
-
-    def deviation(rate):
-        free, slow = (
-            trajectories(go_to_pose, states, targets, KP, KV, rate=rate, limits=limits)
-            for limits in (VelocityLimits(), slower)
-        )
-        assert slow.outcomes.arrived.all()
-        assert slow.outcomes.time.mean() > 1.3 * free.outcomes.time.mean()
-        # From each tenth of a second of the limited path to the nearest point of the unlimited one.
-        paths = [one.poses[..., :2] @ [1.0, 1j] for one in (free, slow)]
-        return max(
-            np.abs(paths[0][:, i, np.newaxis] - paths[1][:: int(rate / 10.0), i]).min(axis=0).max()
-            for i in range(count)
-        )
-
-    coarse, fine = deviation(50.0), deviation(100.0)
-    assert coarse < 0.02
-    assert coarse / fine == pytest.approx(2.0, rel=0.2)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 import os
 import re
+import sys
 from dataclasses import fields, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -411,20 +413,13 @@ def blocks(language):
     }
 
 
-@pytest.mark.process
-@pytest.mark.pages
-def test_the_example_is_given_in_python(pytester):
-    pytester.makepyfile(**blocks('python'))
-    kwargs = {'cwd': pytester.path, 'env': {**os.environ, 'PYTHONPATH': str(pytester.path)}}
-    session = 'import sys, pytest\nsys.exit(pytest.main(sys.argv[1:]))'
-    without = [f'-pno:{name}' for name in ('hypothesispytest', 'xdist', 'launch_testing')]
-    ended = forked.run(session, [*without, 'test_my_law.py'], **kwargs)
-    assert ended.returncode == 0
-    assert re.search(r'^=+ 1 passed\b', ended.stdout, re.MULTILINE)
-    ended = forked.run((pytester.path / 'sweep_my_law.py').read_text(), **kwargs)
-    assert ended.returncode == 0
-    assert re.search(r'fastest: kp .*\n\[.* .*\]', ended.stdout)
-    assert (pytester.path / 'my_law.png').read_bytes().startswith(b'\x89PNG')
+def test_the_example_of_a_test_passes(lockstep, robot_at, monkeypatch):
+    """The other blocks are run with those of all pages."""
+    modules = {name: ModuleType(name) for name in ('my_law', 'test_my_law')}
+    monkeypatch.setitem(sys.modules, 'my_law', modules['my_law'])
+    for name, module in modules.items():
+        exec(blocks('python')[name], module.__dict__)
+    modules['test_my_law'].test_my_law_reaches_the_goal(lockstep, robot_at)
 
 
 @pytest.mark.process

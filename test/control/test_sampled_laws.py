@@ -14,9 +14,8 @@ import pytest
 from support.lockstep_nodes import Controller, change
 from support.ros_messages import goal
 
-from diffdrive_jacobian.control import find_controller, go_to_goal, go_to_pose
+from diffdrive_jacobian.control import find_controller, go_to_pose
 from diffdrive_jacobian.control.sampling import rate_warning, without_whole_turns
-from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.simulation import closed_loops
 
 TOO_FAST = 'not below the odometry rate'
@@ -62,40 +61,6 @@ def test_the_slope_is_the_largest_that_the_yaw_rate_has_over_the_heading(name, k
     # Of go_to_goal it is Kp. Kv is what the bearing changes by while the robot drives.
     assert largest <= stated * (1.0 + 1e-6)
     assert stated <= largest + (kv if name == 'go_to_goal' else 0.15 * stated)
-
-
-def radius(law, target, T, *gains):
-    """Return the spectral radius of a period in bearing and heading, linearized at the goal."""
-
-    def after(alpha, phi):
-        pose = (-math.cos(phi), -math.sin(phi), phi - alpha)
-        pose = se2.integrate(pose, law(pose, target, *gains), T)
-        phi = math.atan2(-pose[1], -pose[0])
-        return phi - pose[2], phi
-
-    small = 1e-7
-    step = np.array([after(small, 0.0), after(0.0, small)]).T / small
-    if len(target) == 2:
-        return abs(step[0, 0])
-    return np.abs(np.linalg.eigvals(step)).max()
-
-
-@pytest.mark.parametrize('T', [0.1, 0.02])
-@pytest.mark.parametrize('b', [0.02, 0.3, 0.7])
-def test_the_linearized_conditions_are_exact(T, b):
-    Kv = b / T
-    for Kp in (Kv / (1.0 - b / 2.0), 2.0 / T):
-        inside = 0.99 if Kp == 2.0 / T else 1.01
-        assert radius(go_to_goal, (0.0, 0.0), T, Kp * inside, Kv) < 1.0
-        assert radius(go_to_goal, (0.0, 0.0), T, Kp * (2.0 - inside), Kv) > 1.0
-    for a in (0.5, 1.0):
-        Kp = a / T
-        h = (2.0 - b) * a / b**2 - 1.0
-        if h > 0.0:
-            assert radius(go_to_pose, (0.0, 0.0, 0.0), T, Kp, Kv, 0.98 * h) < 1.0
-            assert radius(go_to_pose, (0.0, 0.0, 0.0), T, Kp, Kv, 1.02 * h) > 1.0
-    assert radius(go_to_pose, (0.0, 0.0, 0.0), T, (1.98 - b) / T, Kv, 1e-3) < 1.0
-    assert radius(go_to_pose, (0.0, 0.0, 0.0), T, (2.02 - b) / T, Kv, 1e-3) > 1.0
 
 
 def test_without_whole_turns_the_next_heading_is_the_same():

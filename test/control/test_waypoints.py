@@ -153,6 +153,10 @@ def test_arguments_are_checked_and_do_not_change_with_the_array_they_were_given(
     for bad in (-1, 3, 1.0, None, True):
         with pytest.raises(ValueError, match=r'^index must be '):
             Waypoints(POSES, bad)
+    with pytest.raises(ValueError, match=r'^law must be '):
+        Waypoints(POSES).follow(np.zeros(3), 3, WITH_HEADING, GAIN)
+    with pytest.raises(ValueError, match=r'^turning_gain must be '):
+        Waypoints(POSES).follow(np.zeros(3), law, WITH_HEADING, math.nan)
     poses, offsets = POSES.copy(), np.array([0.1, 0.2])
     waypoints, arrival = Waypoints(poses), Arrival(offset=offsets)
     poses[:], offsets[:] = 7.0, 7.0

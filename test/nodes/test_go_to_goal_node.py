@@ -41,12 +41,6 @@ def controller(lockstep):
     return Controller(lockstep)
 
 
-def test_golden_command_of_document_a(controller):
-    controller.send(goal(1.0, 1.0))
-    v, omega = controller.at(0.0, 0.0)
-    assert (round(v, 3), round(omega, 3)) == (0.5, 2.356)
-
-
 # --- Goals
 
 

@@ -236,14 +236,3 @@ def test_runner_guards_the_nodes_of_the_tools(capfd, make, isolated):
         future = parameters.call_async(SetParameters.Request(parameters=[of_type('use_sim_time', 10)]))
         assert runner.spin(future.done)
         assert not future.result().results[0].successful
-
-
-def test_rclpy_still_raises_for_what_the_guard_refuses(ros):
-    """Once that ends, the guard can go."""
-    node = ros.add(Node, node_name='bare', parameters={'use_sim_time': True})
-    services = {service.srv_type: service.callback for service in node.services}
-    request = SetParameters.Request(parameters=[of_type('kp', 10)])
-    with pytest.raises(ValueError, match='10 is not a valid'):
-        services[SetParameters](request, SetParameters.Response())
-    with pytest.raises(ValueError, match='must not be negative'):
-        node._time_source.clock_callback(clock(-1))

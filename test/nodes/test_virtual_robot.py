@@ -8,7 +8,7 @@ from functools import reduce
 import numpy as np
 import pytest
 from geometry_msgs.msg import Twist, TwistStamped
-from support.lockstep_nodes import SECOND, Topics, change, make
+from support.lockstep_nodes import SECOND, Topics, change
 from support.ros_messages import (
     WHEELS,
     covariance_of,
@@ -27,7 +27,6 @@ from diffdrive_jacobian.kinematics import se2
 from diffdrive_jacobian.kinematics.diff_drive import body_to_wheel
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
 from diffdrive_jacobian.nodes.wheel_bridge import WheelBridge
-from diffdrive_jacobian.testing import Lockstep
 
 UNEQUAL = {
     'left_wheel_radius_multiplier': 0.9,
@@ -165,18 +164,6 @@ def test_publish_rate_changes_no_bit_of_the_pose(lockstep, robot_at):
         assert other.states[-1].position == one.states[-1].position
 
 
-def test_a_way_there_and_back_ends_where_it_began(lockstep, robot_at):
-    topics, there = Topics(lockstep), way(2, 10)
-    robot_at(1.0, 2.0, 3.0, cmd_vel_timeout=0.0)
-    drive(lockstep, there)
-    lockstep.run_for(0.02)
-    assert math.dist(pose_of(topics.odom[-1])[:2], [1.0, 2.0]) > 0.002
-    drive(lockstep, [((-v, -omega), held) for (v, omega), held in reversed(there)])
-    lockstep.run_for(0.02)
-    assert pose_of(topics.odom[-1]) == pytest.approx([1.0, 2.0, 3.0], abs=1e-14)
-    assert list(topics.states[-1].position) == pytest.approx([0.0, 0.0], abs=1e-12)
-
-
 def reproduce(applied, starts, instant):
     """Where `cmd_vel_out` and `start_pose` say that the robot is at a time."""
     begin = max(
@@ -218,37 +205,6 @@ def test_cmd_vel_out_and_start_pose_tell_every_odometry_pose(lockstep, robot_at,
     assert max(abs(one.twist.twist.linear.x) for one in topics.odom) == 0.4
 
 
-def recorded(seed):
-    """Drive a way in a world of its own; give all that the robot says."""
-    with Lockstep() as world:
-        topics = Topics(world)
-        world.add(make(VirtualRobot, cmd_vel_timeout=0.03, wheel_travel_variance=1e-3))
-        drive(world, way(seed, 12))
-        world.run_for(0.2)
-        return [*topics.odom, *topics.applied, *topics.states, *topics.starts]
-
-
-def test_the_same_commands_give_the_same_messages():
-    first = recorded(0)
-    assert len(first) > 60
-    assert recorded(0) == first
-    assert recorded(1) != first
-
-
-def test_heading_and_pose_stay_sound_over_many_commands(lockstep, robot_at):
-    topics = Topics(lockstep)
-    robot_at(publish_rate=10.0)
-    random = np.random.default_rng(4)
-    for _ in range(200):
-        lockstep.publish('cmd_vel', twist(*random.uniform(-1000, 1000, 2)))
-        lockstep.run_for(0.1)
-    poses = np.array([pose_of(one) for one in topics.odom])
-    assert len(poses) == 201
-    assert np.all(np.isfinite(poses))
-    assert np.all(np.abs(poses[:, 2]) <= math.pi)
-    assert [one.twist.linear.x for one in topics.applied] == [v for v, _ in twists(topics.commands)]
-
-
 # --- Driven by its wheels
 
 
@@ -277,18 +233,6 @@ def test_wheels_and_twist_end_at_the_same_pose(lockstep, add, multipliers):
     assert np.hypot(*pose_of(one.odom[-1])[:2]) > 0.01
     assert pose_of(one.odom[-1]) == pytest.approx(pose_of(other.odom[-1]), abs=1e-14)
     assert covariance_of(one.odom[-1]) == pytest.approx(covariance_of(other.odom[-1]), abs=1e-14)
-
-
-@pytest.mark.parametrize('wheels', [(0.033, 0.16), (0.5, 2.0)], ids=str)
-def test_bridge_and_wheels_are_inverse_to_each_other(lockstep, add, wheels):
-    geometry = dict(zip(('wheel_radius', 'wheel_separation'), wheels, strict=True))
-    topics, commands = Topics(lockstep), [(0.2, 0.0), (0.0, 2.0), (-0.1, -1.0), (1e-9, 1e-9)]
-    add(VirtualRobot, command_interface='wheels', **geometry)
-    add(WheelBridge, **geometry)
-    for command in commands:
-        lockstep.publish('cmd_vel', twist(*command))
-    for driven, command in zip(twists(topics.applied), commands, strict=True):
-        assert driven == pytest.approx(command, rel=1e-14, abs=1e-16)
 
 
 def test_wheel_speeds_stay_when_the_wheels_change_and_are_limited_alike(lockstep, robot_at):

@@ -92,9 +92,9 @@ def test_every_parameter_counts_from_the_next_command_on(lockstep, add, out):
     [
         (math.nan, 0, 'twist must be finite'),
         (1e4, 0, 'twist must be within 1000 m/s'),
-        (0.1, 1, 'in the future'),
-        (0.1, -SECOND // 2 - 1, 'more than the timeout of 0.5 s'),
-        (0.1, -6, 'older than the last command'),
+        (0.1, SECOND, 'its stamp is 1.000000 s in the future'),
+        (0.1, -SECOND // 2 - 1, 's old, more than the timeout of 0.5 s'),
+        (0.1, -SECOND // 5, 's older than the last command, stop'),
     ],
 )
 def test_invalid_and_old_commands_are_dropped_and_named(lockstep, add, out, capfd, v, offset, words):
