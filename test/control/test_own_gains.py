@@ -150,7 +150,8 @@ def test_the_page_offers_the_gains_of_the_controller(install):
 
 
 def test_three_gains_are_swept_two_at_a_time(install, tmp_path, monkeypatch, capsys):
-    setup = SweepSetup(controller=POLAR, gains={'k_alpha': (1.5, 3.0), 'k_beta': -0.3}, grid=3, starts=2)
+    gains = {'k_alpha': (1.5, 3.0), 'k_beta': -0.3}
+    setup = SweepSetup(controller=POLAR, gains=gains, grid=3, starts=2, rate=10.0)
     assert [gain.name for gain in setup.axes] == ['k_rho', 'k_alpha']
     swept = sweep(setup)
     # 0.05/s is too slow for a minute.
@@ -158,17 +159,12 @@ def test_three_gains_are_swept_two_at_a_time(install, tmp_path, monkeypatch, cap
     header, *rows = sweep_table(swept).splitlines()
     assert header.startswith('k_rho_per_s,k_alpha_per_s,starts,arrived,time_mean_s,')
     assert rows[3].startswith('0.775,1.5,2,2,')
-    alone = closed_loops(
-        POLAR,
-        setup.poses(),
-        np.zeros(3),
-        *(0.775, 1.5, -0.3),
-        arrival=setup.arrival,
-    )
+    how = {'arrival': setup.arrival, 'rate': 10.0}
+    alone = closed_loops(POLAR, setup.poses(), np.zeros(3), 0.775, 1.5, -0.3, **how)
     np.testing.assert_array_equal(alone.time, swept.outcomes.time[0, 1])
     monkeypatch.chdir(tmp_path)
     arguments = ['--controller', install('polar'), '--k_beta', ' -0.8', ' -0.2', '--k_rho', '0.5']
-    small = ['--grid', '2', '--starts', '2', '--csv', 'a.csv', '-o', 'a.png']
+    small = ['--grid', '2', '--starts', '2', '--rate', '10', '--csv', 'a.csv', '-o', 'a.png']
     assert sweep_gains.main([*arguments, *small], Signals()) == 0
     assert (tmp_path / 'a.csv').read_text().startswith('k_alpha_per_s,k_beta_per_s,')
     assert 'fastest: k_alpha' in capsys.readouterr().out

@@ -84,13 +84,13 @@ def test_a_closed_path_is_driven_once_around(lockstep):
 
 
 def test_a_robot_that_faces_backwards_turns_in_place(lockstep):
-    poses, commands, _ = drive(lockstep, 'path', STRAIGHT, start=(0, 0, 3.0))
+    poses, commands, _ = drive(lockstep, 'path', STRAIGHT, start=(0, 0, 3.0), **FAST)
     assert commands[0] == (0.0, -9.0)
     # From across the path it turns along a circle of half the look-ahead distance.
     assert abs(poses[:, 1]).max() < 0.12
 
 
-@pytest.mark.parametrize('law', LAWS)
+@pytest.mark.parametrize('law', ['kanayama', 'dynamic_feedback'])
 def test_a_trajectory_is_driven_at_its_times(lockstep, law):
     """A line at 0.2 m/s, a pause of 1 s, and at 0.3 m/s to the end."""
     times = [0.0, 1.0, 2.0, *np.linspace(2.0, 4.0, 5)[1:]]
@@ -268,8 +268,8 @@ def test_passes_waypoints_without_stopping(lockstep):
 
 
 def test_a_waypoint_that_was_missed_is_driven_to(lockstep, capfd):
-    corner = [(0.5, 0.0), (1.0, 0.0), (1.0, 0.5), (1.0, 1.0)]
-    how = {'pass_waypoints': True, 'lookahead_distance': 0.4, 'waypoint_tolerance': 0.02}
+    corner = [(0.3, 0.0), (0.6, 0.0), (0.6, 0.3), (0.6, 0.6)]
+    how = {'pass_waypoints': True, 'lookahead_distance': 0.3, 'waypoint_tolerance': 0.02, 'kv': 2.0}
     poses, _, _ = drive(lockstep, 'goals', goals(*[goal(*one) for one in corner]), **how)
     assert 'waypoint 2 of 4 was passed at more than waypoint_tolerance, 0.02 m' in capfd.readouterr().err
     assert max(nearest(poses, point) for point in corner) <= 0.02
