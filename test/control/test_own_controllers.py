@@ -354,6 +354,7 @@ SMALL = SweepSetup(
 )
 
 
+@pytest.mark.slow
 def test_a_given_controller_is_swept_and_drawn():
     swept = sweep(SMALL)
     assert swept.complete.all()

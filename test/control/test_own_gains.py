@@ -149,6 +149,7 @@ def test_the_page_offers_the_gains_of_the_controller(install):
 # --- Sweeps
 
 
+@pytest.mark.slow
 def test_three_gains_are_swept_two_at_a_time(install, tmp_path, monkeypatch, capsys):
     gains = {'k_alpha': (1.5, 3.0), 'k_beta': -0.3}
     setup = SweepSetup(controller=POLAR, gains=gains, grid=3, starts=2, rate=10.0)

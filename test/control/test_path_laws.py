@@ -192,6 +192,7 @@ def eight(count=60):
     return Path(np.stack([np.sin(angles), np.sin(angles) * np.cos(angles)], axis=-1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('controller', PATH_CONTROLLERS, ids=lambda one: one.name)
 def test_follows_a_figure_eight_and_recovers_from_slip_when_it_is_localised(controller):
     path = eight()

@@ -30,6 +30,7 @@ def arrived(monkeypatch):
     return sampled_laws.arrived
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('law', 'beyond', 'late'),
     [

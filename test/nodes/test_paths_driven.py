@@ -33,6 +33,7 @@ from diffdrive_jacobian.tools.drive_to import main
 TAKES_TIME = {'linear.x.max_acceleration': 0.3, 'wheel_lag': 0.2, 'command_delay': 0.2}
 
 
+@pytest.mark.slow
 def test_a_robot_that_takes_time_stops_at_the_end():
     known, planned = {**TAKES_TIME, 'stop_in_time': True}, circle_path(0.15)
     outcome = drive(planned, lockstep=True, parameters=known, robot_parameters=TAKES_TIME)
@@ -59,6 +60,7 @@ def test_a_path_that_turns_back_is_driven_to_its_end(law):
     assert outcome.seconds > 2.8
 
 
+@pytest.mark.slow
 def test_drive_to_drives_along_a_circle_without_stopping(tmp_path, capsys):
     bag = tmp_path / 'circle'
     arguments = ['--path', 'circle:0.5', '--speed', '0.4', '--lockstep', '-o', str(bag), '--no-plot']
