@@ -180,26 +180,6 @@ def test_a_robot_is_driven_as_by_the_pure_functions(lockstep, name, use_heading)
     assert (abs(se2.wrap_angle(theta - target[2])) <= 0.02) == takes_heading
 
 
-@pytest.mark.parametrize(('first', 'second'), NEXT)
-def test_a_robot_whose_law_is_switched_during_a_drive_arrives_by_the_new_one(lockstep, first, second):
-    topics, target = Topics(lockstep), (0.8, 0.5, -2.0)
-    gains = {'kp': 10.0, 'kv': 4.0, 'offset': 0.3}
-    *_, controller = add_team(lockstep, pose=(0.0, 0.0, 2.0), controller=first, **gains)
-    topics.odom.clear()
-    lockstep.publish('goal_pose', goal(*target))
-    lockstep.run_for(0.2)
-    sent = len(topics.commands)
-    assert change(controller, controller=second).successful
-    arrives(lockstep, topics)
-    for index, name in ((sent - 1, first), (sent, second), (sent + 1, second)):
-        expected = LAWS[name](pose_of(topics.odom[index]), target, *gains.values())
-        assert twists(topics.commands)[index] == pytest.approx(expected, rel=1e-9)
-    assert topics.statuses == [ACCEPTED, EXECUTING, SUCCEEDED]
-    pose = pose_of(topics.odom[-1])
-    assert math.dist(point(pose, 0.3 if second == 'offset_point' else 0.0), target[:2]) <= 0.02
-    assert second != 'pose' or abs(se2.wrap_angle(pose[2] - target[2])) <= 0.02
-
-
 # --- Changes during the turn in place at the end
 
 HEADING = 3.0
