@@ -9,17 +9,15 @@ import numpy as np
 import pytest
 from std_srvs.srv import Trigger
 from support.lockstep_nodes import CANCELED, SUCCEEDED, Controller, Topics, change, make
-from support.ros_messages import goal, odometry, twist
+from support.ros_messages import goal, odometry
 
 from diffdrive_jacobian.control import VelocityLimits
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
 from diffdrive_jacobian.nodes.stopping import overshoot_warnings, rolls_on
 from diffdrive_jacobian.nodes.virtual_robot import VirtualRobot
-from diffdrive_jacobian.properties import AccelerationWithin
 from diffdrive_jacobian.simulation import Robot, RobotModel, closed_loops
 from diffdrive_jacobian.simulation.acceleration import AccelerationLimits, AxisLimits
 from diffdrive_jacobian.simulation.actuators import Actuators
-from diffdrive_jacobian.testing import PropertyViolation
 
 SLOW = {'linear.x.max_acceleration': 0.4, 'linear.x.max_deceleration': -0.1}
 ACTUATORS = Actuators(
@@ -156,19 +154,3 @@ def test_canceling_says_how_far_the_robot_rolls(lockstep, capfd):
     assert topics.statuses[-1] == CANCELED
     assert f'rolls on for about {v * v / 0.2:.3f} m' in response.message
     assert 'rolls on for about' in capfd.readouterr().err
-
-
-def test_acceleration_within_tells_robots_with_and_without_limits(lockstep):
-    """The property on the odometry, whose messages come every 20 ms."""
-    lockstep.require(AccelerationWithin(0.4, 2.0, topic='odom', slack=0.03, stops=False))
-    robot = lockstep.add(
-        make(VirtualRobot, **{'linear.x.max_acceleration': 0.4, 'angular.z.max_acceleration': 2.0})
-    )
-    lockstep.publish('cmd_vel', twist(0.3, 1.0))
-    lockstep.run_for(2.0)
-    lockstep.publish('cmd_vel', twist(-0.3, 1.0))
-    lockstep.run_for(2.0)
-    assert change(robot, **{'linear.x.max_acceleration': 0.5}).successful
-    lockstep.publish('cmd_vel', twist(0.3, 1.0))
-    with pytest.raises(PropertyViolation, match=r'changes of 0\.4 m/s'):
-        lockstep.run_for(2.0)
