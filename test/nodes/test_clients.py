@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import struct
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Goals, Odometry
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
-from rclpy.serialization import serialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from support.ros_messages import goal, goals, odometry, receive, value_of
 
@@ -23,6 +24,7 @@ from diffdrive_jacobian.messages.codecs import (
     MOTION,
     PARAMETER_EVENT,
 )
+from diffdrive_jacobian.messages.conversion import MAX_WAYPOINTS
 from diffdrive_jacobian.messages.goal_status import GoalState
 from diffdrive_jacobian.nodes import standstill
 from diffdrive_jacobian.nodes.go_to_goal import GoToGoal
@@ -402,3 +404,23 @@ def test_an_invalid_value_is_reported_and_what_is_too_large_is_not():
     assert [str(one) for one in refused] == [
         'position must be finite and within 1e+06 m, got x 1e+07, y 0'
     ]
+
+
+def test_a_number_of_goals_that_is_too_large_is_not_decoded(monkeypatch, capfd):
+    decoded = []
+
+    def deserialize(data, kind):
+        decoded.append(data)
+        return deserialize_message(data, kind)
+
+    monkeypatch.setattr(serialization, 'deserialize_message', deserialize)
+    callback = ignoring_invalid(GOALS, Goals, lambda route: None)
+    data = bytearray(serialize_message(goals(goal(1, 0))))
+    at = data.index(struct.pack('<I', 1), 12)
+    for number in (MAX_WAYPOINTS + 1, 2**31, 2**32 - 1):
+        struct.pack_into('<I', data, at, number)
+        callback(bytes(data))
+    assert decoded == []
+    callback(serialize_message(goals(*[goal(1, 0)] * MAX_WAYPOINTS)))
+    assert len(decoded) == 1
+    assert capfd.readouterr() == ('', '')
