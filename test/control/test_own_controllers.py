@@ -294,6 +294,9 @@ def test_advice_is_logged_and_its_failure_does_no_harm(lockstep, capfd):
     assert "the advice of controller 'mine' failed: KeyError: 'kp' (test_own_" in capfd.readouterr().err
     parameters = GoToGoalParameters()
     assert MINE.warnings(parameters, parameters.limits) == []
+    failing = replace(MINE, slope=lambda gains: 1.0 / 0.0)
+    (warning,) = failing.rate_warnings(parameters, 50.0, turns=False)
+    assert "the slope of controller 'mine' failed: ZeroDivisionError" in warning
 
 
 NUMBERS = 'must return (v, omega), two numbers, got'
