@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import gc
 import os
+import resource
 import signal
 import sys
 
@@ -36,6 +37,8 @@ LONGEST_FIRST = (
     *('test_flood', 'test_calibration', 'test_faults_same', 'test_tools'),
 )
 """Files with tests that take seconds. They start first, so that none is left for the end."""
+MEMORY = 700 << 20
+"""What a test with `bounded_memory` may take (bytes)."""
 CHUNK = 4
 """Most tests that a worker of pytest-xdist gets at once."""
 
@@ -106,6 +109,23 @@ def ros(request):
 def forked_python(tmp_path_factory):
     """Return a command that is used like the Python interpreter, and has done its imports."""
     return forked.make_commands(tmp_path_factory.mktemp('forked') / 'commands', ['python']) / 'python'
+
+
+@pytest.fixture
+def quick_disk(monkeypatch):
+    """Wait for no disk: the files of a test need not survive a power cut."""
+    monkeypatch.setattr(os, 'fsync', lambda descriptor: None)
+
+
+@pytest.fixture
+def bounded_memory():
+    """Let this process take a few hundred megabytes more, and no more."""
+    with open('/proc/self/statm') as file:
+        now = int(file.read().split()[0]) * resource.getpagesize()
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (now + MEMORY, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 @pytest.fixture
