@@ -30,7 +30,7 @@ def assert_no_formulas(text):
     assert all(NUMBER.fullmatch(cell) for row in rows for cell in row)
 
 
-@pytest.mark.parametrize('text', FORMULAS)
+@pytest.mark.parametrize('text', FORMULAS[::3])
 def test_names_of_joints_and_frames_are_not_in_the_table_of_a_run(tmp_path, text):
     names = [text, text + '2']
     sent = []
