@@ -234,7 +234,7 @@ PROMISES = (
         files.""",
         """Tests of all that prints or writes such texts.""",
         'tests',
-        tests('test_text.py', 'test_csv_cells.py', 'test_bounded_logs.py'),
+        tests('tools/test_text.py', 'bags/test_csv_cells.py', 'nodes/test_bounded_logs.py'),
         1,
         1,
     ),
