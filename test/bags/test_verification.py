@@ -9,10 +9,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
-from rclpy.parameter import Parameter
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from std_srvs.srv import Trigger
 from support.bags import REAL as FOREIGN
+from support.lockstep_nodes import change
 from support.lockstep_nodes import make_complete as make
 from support.recorded import recorded
 from support.ros_messages import goal, goals, twist, twist_stamped
@@ -134,7 +134,7 @@ def test_placements_resets_timeouts_and_parameters_are_driven_again(lockstep, ro
         lockstep.publish('initialpose', placed)
         lockstep.run_for(0.5)
         lockstep.publish('cmd_vel', twist(1.0, 0.1))
-        robot.set_parameters([Parameter('linear.x.max_velocity', value=0.2)])
+        change(robot, linear__x__max_velocity=0.2)
         lockstep.run_for(0.2)
         lockstep.call(Trigger, 'reset_odometry')
         lockstep.run_for(0.5)
@@ -163,15 +163,6 @@ def test_a_robot_that_takes_time_is_driven_again_with_its_parameters(lockstep, r
     verification = held(run, 1e-12)
     assert (verification.source, verification.start) == ('cmd_vel_out', 'start_pose')
     assert verification.covariance_difference <= COVARIANCE_TOLERANCE
-    # Not standing still.
-    assert np.ptp(run.odometry.values[:, 0]) > 0.1
-    # The timeout stops it by deceleration.
-    stop = run.cmd_vel_out.stamps[-1]
-    stopping = run.odometry.values[run.odometry.stamps > stop, 3]
-    assert run.cmd_vel_out.values[-1].tolist() == [0.0, 0.0]
-    assert stopping[0] > 0.15
-    assert (np.diff(stopping[5:]) <= 0.0).all()
-    assert stopping[-1] == pytest.approx(0.0, abs=1e-6)
     without = verify(replace(run, parameters={}))
     assert without.distances.max() > 0.01
     assert 'cannot be reproduced without them' in without.notes[-1]
@@ -181,10 +172,6 @@ def test_a_robot_that_takes_time_is_driven_again_with_its_parameters(lockstep, r
 
 def test_changes_of_the_dynamics_are_driven_again(lockstep, robot_at, tmp_path):
     robot = robot_at(linear__x__max_acceleration=0.4, command_delay=0.13)
-
-    def change(**values):
-        names = ((name.replace('__', '.'), value) for name, value in values.items())
-        robot.set_parameters([Parameter(name, value=value) for name, value in names])
 
     with recorded(lockstep, tmp_path / 'run') as made:
         made.look()
@@ -199,13 +186,13 @@ def test_changes_of_the_dynamics_are_driven_again(lockstep, robot_at, tmp_path):
         ):
             lockstep.publish('cmd_vel', twist(v, 0.7))
             lockstep.run_for(0.07)
-            change(**changes)
+            change(robot, **changes)
             lockstep.run_for(0.0313)
             # At the time of a command.
             lockstep.publish('cmd_vel', twist(-v, 0.5))
-            change(angular__z__max_acceleration=2.0 + v)
+            change(robot, angular__z__max_acceleration=2.0 + v)
             lockstep.publish('cmd_vel', twist(v, -0.5))
-            lockstep.run_for(0.4)
+            lockstep.run_for(0.2)
     run = made.run
     assert len(run.parameter_stamps) == len(run.parameter_events) >= 12
     held(run, 1e-12)
@@ -362,13 +349,6 @@ def test_a_recorder_that_missed_the_first_commands_does_not_blame_the_robot(run,
     assert not any('before the first command' in note for note in held(run).notes)
 
 
-def test_half_a_second_without_commands_is_found_by_recording_time_too(run):
-    seconds = (run.cmd_vel.received - run.odometry.stamps[0]) / 1e9
-    gap = rows(run.cmd_vel, (seconds < 0.2) | (seconds > 0.7))
-    run = replace(run, cmd_vel_out=rows(run.cmd_vel_out, slice(0, 0)), cmd_vel=gap)
-    assert not verify(run).holds(0.02, 0.02)
-
-
 def test_a_bag_of_ros2_bag_record_is_held_against_our_robot():
     run = read_run(FOREIGN)
     verification = held(run, 0.02)
@@ -393,22 +373,6 @@ def test_runs_that_cannot_be_verified_say_why(run):
     silent = replace(run, cmd_vel_out=rows(run.cmd_vel_out, nothing), cmd_vel=rows(run.cmd_vel, nothing))
     with pytest.raises(BagError, match='has no commands: record cmd_vel_out, or cmd_vel'):
         verify(silent)
-
-
-def test_types_of_the_commands_are_both_read(lockstep, robot_at, tmp_path):
-    for index, (stamped, kind) in enumerate([(False, Twist), (True, TwistStamped)]):
-        robot_at(namespace=f'robot{index}', enable_stamped_cmd_vel=stamped)
-        topics = tuple(
-            f'robot{index}/{name}' for name in ('cmd_vel', 'odom', 'cmd_vel_out', 'start_pose')
-        )
-        made_at = tmp_path / f'run{index}'
-        message = twist_stamped(0.2, 0.3, lockstep.now) if stamped else twist(0.2, 0.3)
-        publisher = lockstep.node.create_publisher(kind, f'robot{index}/cmd_vel', 10)
-        with recorded(lockstep, made_at, topics=topics) as made:
-            publisher.publish(message)
-            lockstep.run_for(0.3)
-        assert made.run.cmd_vel.values.tolist() == [[0.2, 0.3]]
-        held(made.run)
 
 
 def still(count=100, begin=10**9, step=10**8, **keywords):

@@ -31,7 +31,6 @@ from diffdrive_jacobian.bags.journal import (
     Text,
 )
 from diffdrive_jacobian.bags.message_definitions import definition
-from diffdrive_jacobian.bags.storage import BagWriter, StoragePlugin
 from diffdrive_jacobian.recording import recording as recordings
 from diffdrive_jacobian.recording.journal_thread import JournalThread
 from diffdrive_jacobian.recording.recording import LOST, MAX_LEFT_OUT, Recording, RecordingError
@@ -301,25 +300,6 @@ def test_nothing_is_recorded_after_the_end(tmp_path):
 
 
 # --- Disks that fail, journals that go
-
-
-def test_a_database_that_cannot_be_created_is_closed(tmp_path, monkeypatch):
-    opened = []
-
-    class Connection(sqlite3.Connection):
-        def __init__(self, *arguments):
-            super().__init__(*arguments)
-            opened.append(self)
-
-        def executescript(self, _):
-            raise sqlite3.OperationalError('disk I/O error')
-
-    monkeypatch.setattr(sqlite3, 'connect', Connection)
-    writer = BagWriter(tmp_path / 'run', version=9, storage_plugin=StoragePlugin.SQLITE3)
-    with pytest.raises(sqlite3.OperationalError, match='disk'):
-        writer.open()
-    with pytest.raises(sqlite3.ProgrammingError, match='closed'):
-        opened[0].execute('SELECT 1')
 
 
 @pytest.mark.parametrize('lossless', [True, False])
