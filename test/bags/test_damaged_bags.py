@@ -275,12 +275,16 @@ def test_topics_are_compared_with_those_of_the_data_file_in_linear_time():
         check_connections(topics[1:], topics)
 
 
-@pytest.mark.parametrize('text', ['', '[1, 2', '\0', 'x', '[[' * 1500, '{a: ' * 1500, '- ' * 1500])
+NO_MAPS = ('', '[1, 2', '\0', 'x', '- 1', 'rosbag2_bagfile_information: 3', 'x: !!y z')
+
+
+@pytest.mark.parametrize('text', [*NO_MAPS, '[[' * 1500, '{a: ' * 1500, '- ' * 1500])
 def test_metadata_that_is_no_map_or_too_deep_is_damage(whole, tmp_path, text):
     bag = shutil.copytree(whole['mcap'], tmp_path / 'bag')
     (bag / 'metadata.yaml').write_text(text)
     with pytest.raises(BagError, match=r'metadata\.yaml'):
         read_run(bag)
+    assert len(read_run(recover(bag).bag).odometry) == COUNT
 
 
 # --- Parameters

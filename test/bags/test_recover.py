@@ -183,18 +183,6 @@ def test_a_chunk_with_a_wrong_checksum_is_saved_and_reported(ours, capsys):
     assert sum(one != other for one, other in zip(found, MESSAGES, strict=True)) == 1
 
 
-def test_a_damaged_page_costs_no_other(run, capsys):
-    messages = make_messages(400, 1000)
-    file = write_without_metadata(run, 'sqlite3', messages)
-    page = file.stat().st_size // PAGE // 2 * PAGE
-    edit(file, lambda data: data.__setitem__(slice(page, page + PAGE), b'\xa5' * PAGE))
-    out, found = saved(capsys, run)
-    assert 'messages cannot be read' in out
-    rest = iter(messages)
-    assert all(one in rest for one in found)
-    assert len(messages) > len(found) > 380
-
-
 def test_the_end_of_an_sqlite_file_that_became_zeros(run, capsys):
     file = write_without_metadata(run, 'sqlite3', make_messages(400, 1000))
     size = file.stat().st_size
@@ -249,13 +237,6 @@ def test_cuts_in_a_compressed_chunk(run, tmp_path, capsys, name, compress):
         found = read_bag(tmp_path / f'{part}') if code == 0 else []
         assert found == messages[: len(found)]
         assert len(found) >= (part * size - 150_000) / 1500
-
-
-@pytest.mark.parametrize('text', ['', 'a: [', 'rosbag2_bagfile_information: 3', '- 1', '\0', 'x: !!y z'])
-def test_metadata_that_is_none_is_not_needed(run, capsys, text):
-    write_bag(run, 'mcap', MESSAGES)
-    (run / 'metadata.yaml').write_text(text)
-    assert saved(capsys, run)[1] == MESSAGES
 
 
 # --- Journals

@@ -345,7 +345,7 @@ def test_a_message_with_very_many_values_is_refused_unless_it_is_only_checked(mo
 
 def test_layouts_of_messages_of_many_sizes_take_little_memory():
     read = Reader(JointState, ['name', 'velocity'])
-    for count in (*range(300), 5000):
+    for count in (*range(60), 5000):
         message = JointState(name=[str(one) for one in range(count)], velocity=[0.5] * count)
         assert read(serialize_message(message)) == (tuple(message.name), tuple(message.velocity))
     assert len(read._layouts) <= 16
@@ -362,17 +362,11 @@ def test_the_start_of_a_message_can_be_read_without_the_rest():
 
 
 def test_a_field_that_cannot_be_read_is_an_error():
-    for wrong in (
-        'pose',
-        'header',
-        'pose.pose.position.q',
-        'header.stamp.sec.x',
-        'len(header)',
-        'len(q)',
-        '',
-    ):
+    for wrong in ('pose', 'header', 'pose.pose.position.q', 'header.stamp.sec.x', 'len(q)', ''):
         with pytest.raises(ValueError, match='a field of Odometry must be'):
             Reader(Odometry, [wrong])
+    with pytest.raises(TypeError, match=r'a_msgs/One.text must not be a wide string'):
+        Reader(defined('a_msgs/msg/One', 'int8 number\nwstring text\n'), ['number'])
 
 
 # --- Writing
@@ -428,36 +422,22 @@ def test_an_array_takes_a_number_for_each_element():
     assert read(second) == (4, ('left', 'right'), (), (1.0, 2.0))
 
 
-@pytest.mark.parametrize(
-    ('fields', 'error'),
-    [
+def test_what_cannot_be_written_is_an_error():
+    for fields, error in (
         (['linear.q'], 'a field must be a number'),
         (['linear'], 'a field must be a number'),
         (['angular.z', 'linear.x'], 'in the order of the message'),
         (['linear.x', 'linear.x'], 'in the order of the message'),
-    ],
-)
-def test_a_field_that_cannot_be_written_is_an_error(fields, error):
-    with pytest.raises(ValueError, match=error):
-        Writer(Twist(), fields)
-
-
-@pytest.mark.parametrize('numbers', [(), (1.0, 2.0), ('1',), (None,)])
-def test_wrong_numbers_are_an_error_of_the_message(numbers):
-    with pytest.raises(ValueError, match='Twist cannot be serialized'):
-        Writer(Twist(), ['linear.x'])(*numbers)
+    ):
+        with pytest.raises(ValueError, match=error):
+            Writer(Twist(), fields)
+    for numbers in ((), (1.0, 2.0), ('1',), (None,)):
+        with pytest.raises(ValueError, match='Twist cannot be serialized'):
+            Writer(Twist(), ['linear.x'])(*numbers)
     with pytest.raises(ValueError, match='Clock cannot be serialized'):
         Writer(Clock(), ['clock.sec'])(1 << 31)
-
-
-def test_a_template_that_cannot_be_serialized_is_an_error():
     with pytest.raises(MessageError, match='String cannot be serialized'):
         Writer(String(data='\ud800'), [])
-
-
-def test_types_that_are_not_supported_are_an_error():
-    with pytest.raises(TypeError, match=r'a_msgs/One.text must not be a wide string'):
-        Reader(defined('a_msgs/msg/One', 'int8 number\nwstring text\n'), ['number'])
 
 
 def test_a_message_without_fields_is_one_byte():

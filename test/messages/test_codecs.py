@@ -121,12 +121,12 @@ def test_names_change_with_the_parameters(lockstep):
         assert list(states[-1].name) == names['wheels']
 
 
-@pytest.mark.parametrize('message', [Odometry(), odometry(1.0, -2.0, 0.5, frame='Karte ä')])
-def test_the_controller_reads_frame_and_pose_of_an_odometry(message):
-    frame, twist, pose = ODOMETRY_STATE.reader(Odometry)(serialize_message(message))
-    assert frame == message.header.frame_id
-    assert twist == value_of(ODOMETRY, message).twist
-    assert pose == value_of(ODOMETRY, message).pose == tuple(pose_of(message))
+def test_the_controller_reads_frame_and_pose_of_an_odometry():
+    for message in (Odometry(), odometry(1.0, -2.0, 0.5, frame='Karte ä')):
+        frame, twist, pose = ODOMETRY_STATE.reader(Odometry)(serialize_message(message))
+        assert frame == message.header.frame_id
+        assert twist == value_of(ODOMETRY, message).twist
+        assert pose == value_of(ODOMETRY, message).pose == tuple(pose_of(message))
 
 
 times = st.integers(0, 2**31 * 10**9 - 1)
