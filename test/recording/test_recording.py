@@ -78,7 +78,7 @@ def add_all(recording, *records):
 def content(bag):
     """Return the messages of a bag in their order."""
     with open_bag(bag) as reader:
-        return [bytes(data) for _, _, data in reader.messages(reader.connections)]
+        return [data for _, _, data in bag_reader.messages(reader, reader.connections)]
 
 
 def custom_data(bag):
@@ -89,6 +89,13 @@ def custom_data(bag):
 def losses(bag, key=LOST):
     """Return the losses that a bag notes."""
     return json.loads(custom_data(bag)[key])
+
+
+def failed(recording, match):
+    """Finish a recording, which must fail; return the error."""
+    with pytest.raises(RecordingError, match=match) as caught:
+        recording.finish()
+    return caught.value
 
 
 def until(condition, what):
@@ -175,11 +182,8 @@ def test_the_journal_stays_if_the_bag_reads_back_otherwise(tmp_path, monkeypatch
 
     monkeypatch.setattr(building.BagWriter, 'write', lossy)
     recording = recorded(tmp_path / 'run', *messages(20), storage=storage)
-    with pytest.raises(
-        RecordingError, match=r'what was read back .* recover_run .*run\.journal\.mcap'
-    ) as caught:
-        recording.finish()
-    assert caught.value.summary is None
+    error = failed(recording, r'what was read back .* recover_run .*run\.journal\.mcap')
+    assert error.summary is None
     assert os.listdir(tmp_path) == ['run.journal.mcap']
 
 
@@ -191,11 +195,8 @@ def test_the_journal_stays_if_it_was_altered_on_the_disk(tmp_path):
     with open(path, 'r+b') as file:
         file.seek(place + 10)
         file.write(b'!')
-    with pytest.raises(
-        RecordingError, match=r'is damaged: its messages may be altered.* is kept'
-    ) as caught:
-        recording.finish()
-    assert caught.value.summary.messages == 20
+    error = failed(recording, r'is damaged: its messages may be altered.* is kept')
+    assert error.summary.messages == 20
     assert path.exists()
 
 
@@ -244,9 +245,8 @@ def test_memory_is_bounded_and_what_is_dropped_is_counted(tmp_path, disk, size):
     assert dropped == count - 9 if size == 1_000_000 else 0 < dropped < count
     disk.ready.set()
     words = rf'{dropped} were received faster than the disk .*/cmd_vel {dropped}'
-    with pytest.raises(RecordingError, match=words) as caught:
-        recording.finish()
-    summary = caught.value.summary
+    error = failed(recording, words)
+    summary = error.summary
     assert (summary.messages, summary.lost) == (1 + count - dropped, {'/cmd_vel': dropped})
     assert len(content(tmp_path / 'run')) == summary.messages
     assert losses(tmp_path / 'run') == {'/cmd_vel': dropped}
@@ -304,17 +304,15 @@ def test_nothing_is_recorded_after_the_end(tmp_path):
 
 @pytest.mark.parametrize('lossless', [True, False])
 def test_a_full_disk_is_raised_by_finish(tmp_path, disk, lossless):
-    recording = Recording(tmp_path / 'run', 'mcap', lossless=lossless)
-    add_all(recording, channel(), *messages(10))
+    recording = recorded(tmp_path / 'run', *messages(10), lossless=lossless)
     until(lambda: recording.journal.waiting == 0, 'these are written')
     disk.error = errno.ENOSPC
     add_all(recording, *messages(20))
     until(lambda: recording.error is not None, 'the thread notices')
     add_all(recording, *messages(5))
-    with pytest.raises(RecordingError, match='aborted: No space left on device') as caught:
-        recording.finish()
-    assert str(caught.value).endswith(f'{journal_of(tmp_path / "run")}. 25 messages are missing')
-    summary = caught.value.summary
+    error = failed(recording, 'aborted: No space left on device')
+    assert str(error).endswith(f'{journal_of(tmp_path / "run")}. 25 messages are missing')
+    summary = error.summary
     assert (summary.messages, summary.lost) == (10, {'/cmd_vel': 25})
     assert losses(tmp_path / 'run') == {'/cmd_vel': 25}
     assert journal_of(tmp_path / 'run').exists()
@@ -323,11 +321,8 @@ def test_a_full_disk_is_raised_by_finish(tmp_path, disk, lossless):
 def test_finish_raises_if_the_bag_cannot_be_written(tmp_path):
     recording = recorded(tmp_path / 'run', *messages(10))
     (tmp_path / 'run').write_text('somebody else came first')
-    with pytest.raises(
-        RecordingError, match=r'run exists already.*recover_run .*run\.journal\.mcap'
-    ) as caught:
-        recording.finish()
-    assert caught.value.summary is None
+    error = failed(recording, r'run exists already.*recover_run .*run\.journal\.mcap')
+    assert error.summary is None
     assert (tmp_path / 'run').read_text() == 'somebody else came first'
 
 
@@ -352,10 +347,9 @@ def test_a_journal_that_goes_is_noticed_and_saved(tmp_path, change):
     recording = recorded(folder / 'run', *messages(50))
     WAYS[change](folder)
     until(lambda: recording.error is not None, 'it is noticed')
-    with pytest.raises(RecordingError, match='was removed, renamed or replaced') as caught:
-        recording.finish()
-    assert caught.value.summary is None
-    saved = str(caught.value).split('The recorded messages are in ')[1].split(': recover_run')[0]
+    error = failed(recording, 'was removed, renamed or replaced')
+    assert error.summary is None
+    saved = str(error).split('The recorded messages are in ')[1].split(': recover_run')[0]
     recover(Path(saved), tmp_path / 'new')
     assert content(tmp_path / 'new') == [one.data for one in messages(50)]
     if change == 'replace':
@@ -406,12 +400,9 @@ def test_topics_that_are_left_out_are_reported_and_noted_also_after_a_crash(tmp_
 
     until(noted, 'it is noted')
     shutil.copy(journal_of(bag), tmp_path / 'crashed.journal.mcap')
-    with pytest.raises(
-        RecordingError, match='/topic_0 was not recorded: it has several types'
-    ) as caught:
-        recording.finish()
-    assert f'others was not recorded: more than {MAX_LEFT_OUT} topics' in str(caught.value)
-    assert caught.value.summary.messages == 3
+    error = failed(recording, '/topic_0 was not recorded: it has several types')
+    assert f'others was not recorded: more than {MAX_LEFT_OUT} topics' in str(error)
+    assert error.summary.messages == 3
     assert losses(bag, LEFT_OUT)['/topic_0'] == 'it has several types'
     assert len(losses(bag, LEFT_OUT)) == MAX_LEFT_OUT + 1
     assert not journal_of(bag).exists()
@@ -432,14 +423,10 @@ def test_custom_data_that_readers_would_refuse_stays_in_the_journal(tmp_path, mo
         for index in range(4)
     }
     add_all(recording, channel(), *messages(3), *(Text(*one) for one in large.items()))
-    with pytest.raises(
-        RecordingError, match=r'robot_3.*too large.*run\.journal\.mcap is kept'
-    ) as caught:
-        recording.finish()
-    assert caught.value.summary.messages == 3
-    with open_bag(tmp_path / 'run') as reader:
-        kept = bag_reader.custom_data(reader)
-        assert len(list(bag_reader.messages(reader, reader.connections))) == 3
+    error = failed(recording, r'robot_3.*too large.*run\.journal\.mcap is kept')
+    assert error.summary.messages == 3
+    kept = custom_data(tmp_path / 'run')
+    assert len(content(tmp_path / 'run')) == 3
     assert kept['storage'] == storage
     assert f'{PARAMETERS}/robot_0' in kept
     assert len(large) > sum(key in kept for key in large)
@@ -455,22 +442,14 @@ def test_a_message_that_readers_would_refuse_stays_in_the_journal(tmp_path, monk
     for module in (building, recordings):
         monkeypatch.setattr(module, 'MAX_MESSAGE', 3_000_000)
     monkeypatch.setattr(journal, 'BLOCK', 1_000_000)
-    recording = Recording(tmp_path / 'run', storage)
-    add_all(
-        recording,
-        channel(),
-        *messages(1),
-        *messages(1, size=4_000_000),
-        *messages(1, size=6_000_000),
-        *messages(1),
-    )
-    with pytest.raises(RecordingError, match=r'/cmd_vel: 2 messages larger than 3\.0 MB') as caught:
-        recording.finish()
-    summary = caught.value.summary
+    sizes = (40, 4_000_000, 6_000_000, 40)
+    records = [one for size in sizes for one in messages(1, size=size)]
+    recording = recorded(tmp_path / 'run', *records, storage=storage)
+    error = failed(recording, r'/cmd_vel: 2 messages larger than 3\.0 MB')
+    summary = error.summary
     assert (summary.messages, summary.lost) == (2, {'/cmd_vel': 2})
     assert losses(tmp_path / 'run') == {'/cmd_vel': 2}
-    with open_bag(tmp_path / 'run') as reader:
-        assert len(list(bag_reader.messages(reader, reader.connections))) == 2
+    assert len(content(tmp_path / 'run')) == 2
     recovery = recover(journal_of(tmp_path / 'run'), tmp_path / 'again')
     assert recovery.records_left_out
     lost = ' '.join(recovery.lost)
@@ -483,13 +462,9 @@ def test_more_than_the_readers_unpack_at_once_can_be_recorded_at_one_time(
     tmp_path, monkeypatch, storage
 ):
     monkeypatch.setattr(bounded_reader, 'MAX_OVERLAP', 4_000_000)
-    recording = Recording(tmp_path / 'run', storage)
     records = [replace(one, stamp=7) for one in messages(12, size=1_000_000)]
-    add_all(recording, channel(), *records)
-    assert recording.finish().messages == 12
-    with open_bag(tmp_path / 'run') as reader:
-        found = [data for _, _, data in bag_reader.messages(reader, reader.connections)]
-    assert found == [one.data for one in records]
+    assert recorded(tmp_path / 'run', *records, storage=storage).finish().messages == 12
+    assert content(tmp_path / 'run') == [one.data for one in records]
 
 
 # --- File systems that lack something
@@ -552,9 +527,7 @@ def test_a_path_too_long_for_sqlite_is_refused_before_recording(tmp_path):
     # Below it: .run.building-xxxxxxxx/run/run.db3
     longest = 504 - len('/.run.building-xxxxxxxx/run/run.db3')
     fits = nested(tmp_path / 'fits', longest)
-    recording = Recording(fits / 'run', 'sqlite3')
-    add_all(recording, channel(), *messages(3))
-    assert recording.finish().messages == 3
+    assert recorded(fits / 'run', *messages(3), storage='sqlite3').finish().messages == 3
     too_long = nested(tmp_path / 'long', longest + 1)
     with pytest.raises(OSError, match='too long for SQLite: at most 504 bytes, got 505'):
         Recording(too_long / 'run', 'sqlite3')
