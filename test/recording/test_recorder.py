@@ -94,14 +94,10 @@ class Setting:
         self.harness.until(self.recorder.drained, 'all is collected')
 
 
-@pytest.fixture
-def executor_kind():
-    return 'single'
-
-
 @pytest.fixture(autouse=True)
-def _on_one_thread(executor_kind):
+def executor_kind():
     """Serve the recorder as record_run does."""
+    return 'single'
 
 
 @pytest.fixture(autouse=True)
@@ -182,7 +178,7 @@ def test_the_recording_ends_although_messages_are_still_published(setting):
 class Doubt:
     """A recording that has ended after a burst, of which a heartbeat may bring more for a long time."""
 
-    def __init__(self, ros, monkeypatch, reliability=ReliabilityPolicy.RELIABLE):
+    def __init__(self, ros, monkeypatch, reliability=RELIABLE):
         monkeypatch.setattr(recorder, 'HEARTBEAT', 1e6)
         monkeypatch.setattr(recorder, 'BURST_VOLUME', 10 * recorder.OVERHEAD)
         self.setting = Setting(ros, *[{'reliability': reliability}] * 2)
@@ -220,7 +216,7 @@ def test_without_a_burst_nothing_is_waited_for(ros, monkeypatch):
 
 
 def test_a_best_effort_publisher_is_not_waited_for(ros, monkeypatch):
-    doubt = Doubt(ros, monkeypatch, ReliabilityPolicy.BEST_EFFORT)
+    doubt = Doubt(ros, monkeypatch, BEST_EFFORT)
     doubt.end()
     assert doubt.setting.recorder.drained()
 
@@ -279,7 +275,7 @@ def test_what_was_repaired_at_the_end_may_have_been_too_much_again(ros, monkeypa
 
 
 def test_a_recorder_that_was_held_at_the_end_still_waits(ros, monkeypatch):
-    doubt = Doubt(ros, monkeypatch, ReliabilityPolicy.BEST_EFFORT)
+    doubt = Doubt(ros, monkeypatch, BEST_EFFORT)
     doubt.end()
     doubt.setting.recorder._called -= 2 * recorder.HELD
     assert not doubt.setting.recorder.drained()
