@@ -72,7 +72,7 @@ def test_other_messages_on_the_topic_are_noted(tmp_path):
     run = run_of(tmp_path, *((11.0, '/fault_events', String(data=data)) for data in texts))
     assert run.fault_events == ()
     assert '5 of 5 messages on /fault_events hold invalid' in run.notes[0]
-    assert labels(figure([run])) == []
+    assert fault_spans(timeline(run)) == []
 
 
 def test_lines_are_broken_where_time_goes_back_and_a_push_is_a_line(lockstep, robot_at, tmp_path):

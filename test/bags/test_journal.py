@@ -40,7 +40,7 @@ def described(number, depth=10):
 
 NEW_PROFILES = st.builds(described, st.sampled_from(CHANNELS), st.integers(0, 1000))
 FLUSHES = st.lists(st.lists(MESSAGES | TEXTS | NEW_PROFILES, max_size=6), max_size=4)
-quickly = settings(deadline=None, max_examples=25)
+quickly = settings(deadline=None, max_examples=20)
 
 
 def written(flushes):
@@ -104,7 +104,7 @@ def test_a_cut_at_any_byte_leaves_the_records_before_it(flushes, data):
     assert lost or left == expected(flushes) or cut in ends(whole)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=40)
 @given(FLUSHES, st.data())
 def test_a_flipped_bit_is_noticed(flushes, data):
     damaged = bytearray(written(flushes)[0])

@@ -158,7 +158,7 @@ def test_a_robot_that_takes_time_is_driven_again_with_its_parameters(lockstep, r
         for v, omega in ((0.5, 1.0), (-0.3, 1.0), (0.4, -2.0), (0.0, 0.0), (0.3, 0.3)):
             lockstep.publish('cmd_vel', twist(v, omega))
             lockstep.run_for(0.43)
-        lockstep.run_for(2.0)
+        lockstep.run_for(0.8)
     run = made.run
     verification = held(run, 1e-12)
     assert (verification.source, verification.start) == ('cmd_vel_out', 'start_pose')

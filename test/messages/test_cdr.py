@@ -42,7 +42,7 @@ CLASSES = (
     *(Goals, Float64MultiArray, GoalStatus),
 )
 by_class = pytest.mark.parametrize('message_class', CLASSES, ids=lambda one: one.__name__)
-quickly = settings(max_examples=10, deadline=None)
+quickly = settings(max_examples=8, deadline=None)
 ENCAPSULATIONS = (b'\0\0', b'\0\1', b'\0\2', b'\0\3', b'\0\6', b'\0\7', b'\0\10', b'\0\11', b'\1\1')
 """Plain CDR, parameter lists and version 2, in both byte orders, and an unknown one."""
 
