@@ -376,6 +376,17 @@ def test_recover_run_says_what_it_did_not_check(tmp_path):
     )
 
 
+def test_messages_that_were_skipped_are_named_where_they_are_missed(whole, tmp_path, tools):
+    bag = shutil.copytree(whole['mcap'], tmp_path / 'bag')
+    text = (bag / 'metadata.yaml').read_text()
+    (bag / 'metadata.yaml').write_text(text.replace(ODOMETRY.type_hash, f'RIHS01_{64 * "0"}'))
+    for tool in (plot_run, replay_run):
+        code, _, err = tools(tool, bag)
+        assert code != 0
+        assert 'has no odometry' in err
+        assert f'{COUNT} of {COUNT} messages on /odom were recorded with another definition' in err
+
+
 # --- What the message about an unreadable bag says
 
 

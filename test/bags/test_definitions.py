@@ -242,6 +242,9 @@ def test_a_parsed_definition_has_the_hash_of_the_type():
         other = Topic(1, '/x', name.replace('/msg/', '/msg/X'), 'cdr', '', '', known.text)
         assert definition_and_hash(Topic(1, '/x', name, 'cdr', '', '', ''))[1] == known.type_hash
         assert definition_and_hash(other)[1] != known.type_hash
+        # Recorded with another definition, which is kept.
+        foreign = Topic(1, '/x', name, 'cdr', '', OTHER_HASH, 'float64 x\n')
+        assert definition_and_hash(foreign) == ('float64 x\n', OTHER_HASH)
     for text in ('evil_msgs/Evil a\n', 'x' * 1000, '%', '\0'):
         with pytest.raises(UnknownTypeError):
             definition_and_hash(Topic(1, '/x', 'evil_msgs/msg/Evil', 'cdr', '', '', text))

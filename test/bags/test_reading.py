@@ -19,6 +19,7 @@ from support.ros_messages import (
     goals,
     joint_command,
     path,
+    spoiled,
     twist,
     twist_stamped,
 )
@@ -121,6 +122,7 @@ def test_messages_that_the_nodes_drop_are_left_out_and_counted(tmp_path):
         '/odom': odom(math.inf, 0.0, 0.0),
         '/joint_states': JointState(name=['left_wheel_joint'], velocity=[1.0]),
         '/goal_pose': goal(1e9, 0.0),
+        '/start_pose': spoiled(start(0, 0, 0, seconds=1), 'pose.pose.orientation.w', 2.0),
         '/joint_command': joint_command(1e308, 0.0),
         '/goals': goals(*[goal(1.0, 0.0)] * (MAX_WAYPOINTS + 1)),
     }
